@@ -1,0 +1,357 @@
+"""Scan geometries and voxel grids: frozen, validated, in mm and rad.
+
+Conventions (one page, used everywhere in the package)
+-------------------------------------------------------
+* Index ``k`` of ``n`` sits at ``(k - (n - 1) / 2) * pitch + offset``.
+* ``e_r(β) = (cos β, sin β)``, ``e_t(β) = (-sin β, cos β)``; β grows counter-clockwise.
+* The source of view β is at ``sod * e_r(β)``; columns grow along ``+e_t``, rows along ``+z``.
+* A flat detector has its centre at ``-(sdd - sod) * e_r``. A curved detector lies on an arc of radius
+  ``sdd`` about the source: column ``u`` (mm along the arc) is seen at the fan angle ``γ = u / sdd``.
+  Its rows stand parallel to z (a cylinder segment).
+* A parallel ray of column ``u`` runs along ``-e_r`` through ``u * e_t``.
+* Volumes are ``(..., z, y, x)`` (2-D ``(..., y, x)``), line integrals ``(..., view, row, column)``
+  (2-D ``(..., view, column)``).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = [
+    "ConeBeam",
+    "FanBeam",
+    "Geometry",
+    "ParallelBeam",
+    "VolumeGrid",
+    "full_turn",
+]
+
+Floats = NDArray[np.float64]
+_DETECTORS = ("flat", "curved")
+
+
+def full_turn(views: int, start: float = 0.0) -> Floats:
+    """``views`` equally spaced source angles over 2π, ``(views,)`` rad float64, the first at ``start``."""
+    return np.arange(_count("views", views), dtype=np.float64) * (2.0 * math.pi / views) + start
+
+
+def _count(name: str, value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise TypeError(f"{name} must be a whole number, got {value!r} ({type(value).__name__})")
+    if value < 1:
+        raise ValueError(f"{name} must be at least 1, got {value}")
+    return int(value)
+
+
+def _number(name: str, value: Any, *, positive: bool = False) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        raise TypeError(f"{name} must be a number in mm, got {value!r} ({type(value).__name__})") from None
+    if not math.isfinite(number):
+        raise ValueError(f"{name} must be finite, got {value!r}")
+    if positive and number <= 0:
+        raise ValueError(f"{name} must be greater than 0 mm, got {number}")
+    return number
+
+
+def _per_axis(name: str, value: Any, axes: int, *, positive: bool = False) -> tuple[float, ...]:
+    if isinstance(value, Sequence | np.ndarray) and not isinstance(value, str):
+        if len(value) != axes:
+            raise ValueError(f"{name} must be one number or {axes} numbers (one per axis), got {value!r}")
+        return tuple(_number(f"{name}[{i}]", v, positive=positive) for i, v in enumerate(value))
+    return (_number(name, value, positive=positive),) * axes
+
+
+def _angles(value: Any) -> Floats:
+    try:
+        angles = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise TypeError(f"angles must be numbers in rad, got {type(value).__name__}") from None
+    if angles.ndim != 1 or angles.size == 0:
+        raise ValueError(f"angles must be a non-empty 1-D sequence in rad, got shape {angles.shape}")
+    if not np.isfinite(angles).all():
+        raise ValueError(f"angles must be finite, but view {int(np.argmin(np.isfinite(angles)))} is not")
+    angles.setflags(write=False)
+    return angles
+
+
+def _axis(count: int, pitch: float, offset: float) -> Floats:
+    return (np.arange(count, dtype=np.float64) - (count - 1) / 2.0) * pitch + offset
+
+
+G = TypeVar("G", bound="Geometry")
+
+
+class Geometry:
+    """What all scan geometries share: ``angles`` (rad), equality by value, view subsets and scaling."""
+
+    angles: Floats
+    columns: int
+
+    @property
+    def views(self) -> int:
+        """Number of views."""
+        return int(self.angles.size)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of one sinogram: ``(views, columns)`` or ``(views, rows, columns)``."""
+        return (self.views, self.columns)
+
+    def select(self: G, views: Any) -> G:
+        """The same scanner with a subset (or reordering) of the views: an index array, mask or slice."""
+        return replace(self, angles=self.angles[views])  # type: ignore[type-var]
+
+    def _key(self) -> tuple[Any, ...]:
+        values = (getattr(self, f.name) for f in fields(self))  # type: ignore[arg-type]
+        return (type(self), *(v.tobytes() if isinstance(v, np.ndarray) else v for v in values))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Geometry) and self._key() == other._key()
+
+    def __hash__(self) -> int:
+        return hash(self._key())
+
+
+@dataclass(frozen=True, eq=False)
+class ParallelBeam(Geometry):
+    """Parallel rays in a plane.
+
+    Args:
+        angles: view angles β, ``(views,)`` rad. Rays of a view run along ``-e_r(β)``.
+        columns: detector cells per view.
+        pitch: cell width in mm.
+        offset: position of the detector's centre along ``e_t``, in mm (a quarter column: ``pitch / 4``).
+
+    Raises:
+        ValueError: a count < 1, a length ≤ 0, a non-finite or empty value.
+        TypeError: a value of the wrong kind.
+    """
+
+    angles: Any
+    columns: int
+    pitch: float
+    offset: float = 0.0
+
+    def __post_init__(self) -> None:
+        set_ = object.__setattr__
+        set_(self, "angles", _angles(self.angles))
+        set_(self, "columns", _count("columns", self.columns))
+        set_(self, "pitch", _number("pitch", self.pitch, positive=True))
+        set_(self, "offset", _number("offset", self.offset))
+
+    @property
+    def column_positions(self) -> Floats:
+        """Cell centres along ``e_t``, ``(columns,)`` mm."""
+        return _axis(self.columns, self.pitch, self.offset)
+
+
+class _Divergent(Geometry):
+    """What fan and cone beams share: a point source at ``sod`` and a detector at ``sdd``."""
+
+    sod: float
+    sdd: float
+    detector: str
+
+    def _validate_divergent(self) -> None:
+        set_ = object.__setattr__
+        set_(self, "angles", _angles(self.angles))
+        set_(self, "sod", _number("sod", self.sod, positive=True))
+        set_(self, "sdd", _number("sdd", self.sdd, positive=True))
+        set_(self, "columns", _count("columns", self.columns))
+        if self.sdd <= self.sod:
+            raise ValueError(
+                f"sdd ({self.sdd} mm) must be greater than sod ({self.sod} mm): "
+                "sdd is the distance from the source to the detector, not from the isocentre"
+            )
+        if self.detector not in _DETECTORS:
+            raise ValueError(f"detector must be one of {_DETECTORS}, got {self.detector!r}")
+
+    def _validate_arc(self, pitch: float, offset: float) -> None:
+        if self.detector == "curved":
+            half = (self.columns * pitch / 2 + abs(offset)) / self.sdd
+            if half >= math.pi / 2:
+                raise ValueError(
+                    f"a curved detector of {self.columns} columns × {pitch} mm at sdd {self.sdd} mm spans a half-fan "
+                    f"of {math.degrees(half):.1f}°, 90° or more: reduce columns or pitch"
+                )
+
+    @property
+    def magnification(self) -> float:
+        """``sdd / sod``."""
+        return self.sdd / self.sod
+
+    @property
+    def column_positions(self) -> Floats:
+        """Cell centres along the detector (flat: along ``e_t``; curved: along the arc), ``(columns,)`` mm."""
+        raise NotImplementedError
+
+    @property
+    def fan_angles(self) -> Floats:
+        """Fan angle γ of each column centre, ``(columns,)`` rad."""
+        u = self.column_positions
+        return u / self.sdd if self.detector == "curved" else np.arctan(u / self.sdd)
+
+    @property
+    def fov_radius(self) -> float:
+        """Radius in mm of the disc about the isocentre that every view sees whole (outer cell edges)."""
+        u = self.column_positions
+        half_pitch = 0.5 * (u[-1] - u[0]) / max(self.columns - 1, 1) if self.columns > 1 else 0.0
+        edge = min(-(u[0] - half_pitch), u[-1] + half_pitch)
+        gamma = edge / self.sdd if self.detector == "curved" else math.atan(edge / self.sdd)
+        return self.sod * math.sin(max(gamma, 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class FanBeam(_Divergent):
+    """A fan of rays in the plane z = 0.
+
+    Args:
+        angles: source angles β, ``(views,)`` rad.
+        sod: distance source–isocentre in mm.
+        sdd: distance source–detector in mm (greater than ``sod``).
+        columns: detector cells per view.
+        pitch: cell width in mm, measured on the detector.
+        offset: position of the detector's centre along the columns, in mm.
+        detector: ``"flat"`` or ``"curved"`` (arc about the source).
+
+    Raises:
+        ValueError: a count < 1, a length ≤ 0, ``sdd <= sod``, an unknown detector, a half-fan of 90° or more.
+        TypeError: a value of the wrong kind.
+    """
+
+    angles: Any
+    sod: float
+    sdd: float
+    columns: int
+    pitch: float
+    offset: float = 0.0
+    detector: str = "flat"
+
+    def __post_init__(self) -> None:
+        self._validate_divergent()
+        object.__setattr__(self, "pitch", _number("pitch", self.pitch, positive=True))
+        object.__setattr__(self, "offset", _number("offset", self.offset))
+        self._validate_arc(self.pitch, self.offset)
+
+    @property
+    def column_positions(self) -> Floats:
+        return _axis(self.columns, self.pitch, self.offset)
+
+
+@dataclass(frozen=True, eq=False)
+class ConeBeam(_Divergent):
+    """A cone of rays on a circular orbit.
+
+    Args:
+        angles: source angles β, ``(views,)`` rad.
+        sod: distance source–isocentre in mm.
+        sdd: distance source–detector in mm (greater than ``sod``).
+        columns: detector columns.
+        rows: detector rows.
+        pitch: ``(row, column)`` pitch in mm on the detector, or one number for both.
+        offset: ``(row, column)`` position of the detector's centre in mm, or one number for both.
+        detector: ``"flat"`` or ``"curved"`` (arc about the source, rows parallel to z).
+
+    Raises:
+        ValueError: a count < 1, a length ≤ 0, ``sdd <= sod``, an unknown detector, a half-fan of 90° or more.
+        TypeError: a value of the wrong kind.
+    """
+
+    angles: Any
+    sod: float
+    sdd: float
+    columns: int
+    rows: int
+    pitch: Any
+    offset: Any = (0.0, 0.0)
+    detector: str = "flat"
+
+    def __post_init__(self) -> None:
+        self._validate_divergent()
+        object.__setattr__(self, "rows", _count("rows", self.rows))
+        object.__setattr__(self, "pitch", _per_axis("pitch", self.pitch, 2, positive=True))
+        object.__setattr__(self, "offset", _per_axis("offset", self.offset, 2))
+        self._validate_arc(self.pitch[1], self.offset[1])
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return (self.views, self.rows, self.columns)
+
+    @property
+    def column_positions(self) -> Floats:
+        return _axis(self.columns, self.pitch[1], self.offset[1])
+
+    @property
+    def row_positions(self) -> Floats:
+        """Row centres along z on the detector, ``(rows,)`` mm."""
+        return _axis(self.rows, self.pitch[0], self.offset[0])
+
+    @property
+    def central_fan(self) -> FanBeam:
+        """The fan beam of the plane z = 0."""
+        return FanBeam(self.angles, self.sod, self.sdd, self.columns, self.pitch[1], self.offset[1], self.detector)
+
+
+@dataclass(frozen=True)
+class VolumeGrid:
+    """A regular voxel grid.
+
+    Args:
+        shape: ``(y, x)`` or ``(z, y, x)`` voxel counts.
+        spacing: voxel size in mm, one number or one per axis in the order of ``shape``.
+        center: position of the grid's centre in mm, one number or one per axis in the order of ``shape``.
+
+    Raises:
+        ValueError: a count < 1, a spacing ≤ 0, a wrong number of axes.
+        TypeError: a value of the wrong kind.
+    """
+
+    shape: Any
+    spacing: Any
+    center: Any = 0.0
+    ndim: int = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        set_ = object.__setattr__
+        if not isinstance(self.shape, Sequence) or isinstance(self.shape, str):
+            raise TypeError(f"shape must be (y, x) or (z, y, x), got {self.shape!r}")
+        if len(self.shape) not in (2, 3):
+            raise ValueError(f"shape must have 2 or 3 axes, (y, x) or (z, y, x), got {self.shape!r}")
+        set_(self, "shape", tuple(_count(f"shape[{i}]", n) for i, n in enumerate(self.shape)))
+        set_(self, "ndim", len(self.shape))
+        set_(self, "spacing", _per_axis("spacing", self.spacing, self.ndim, positive=True))
+        set_(self, "center", _per_axis("center", self.center, self.ndim))
+
+    @property
+    def axes(self) -> tuple[Floats, ...]:
+        """Voxel centres per axis in mm, in the order of ``shape``."""
+        return tuple(_axis(n, s, c) for n, s, c in zip(self.shape, self.spacing, self.center, strict=True))
+
+    @property
+    def extent(self) -> tuple[float, ...]:
+        """Edge lengths in mm, in the order of ``shape``."""
+        return tuple(n * s for n, s in zip(self.shape, self.spacing, strict=True))
+
+    @property
+    def in_plane_radius(self) -> float:
+        """Distance in mm of the farthest voxel corner from the rotation axis."""
+        reach = [abs(c) + e / 2 for c, e in zip(self.center, self.extent, strict=True)]
+        return math.hypot(reach[-1], reach[-2])
+
+    @property
+    def voxels(self) -> int:
+        """Number of voxels."""
+        return math.prod(self.shape)
+
+    @property
+    def slice(self) -> VolumeGrid:
+        """The 2-D ``(y, x)`` grid of one slice."""
+        return VolumeGrid(self.shape[-2:], self.spacing[-2:], self.center[-2:])

@@ -1,0 +1,127 @@
+"""The part of the detector that a grid casts its shadow on."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
+
+__all__ = ["DetectorWindow", "shadow"]
+
+
+@dataclass(frozen=True, eq=False)
+class DetectorWindow:
+    """The part of a detector that matters: the same number of columns in every view, starting where the view says.
+
+    A small inset far from the isocentre is seen by a few per cent of the cells; its window follows it around
+    the turn. Data on a window have the shape ``(..., views, rows, columns)`` (2-D: ``(..., views, columns)``).
+
+    Args:
+        first_column: ``(views,)`` int64, index of the window's first column in each view (0 ≤ first).
+        columns: number of columns, the same in all views.
+        first_row, rows: the rows kept, the same in all views (2-D geometries: 0 and 1).
+    """
+
+    first_column: Any
+    columns: int
+    first_row: int = 0
+    rows: int = 1
+
+    def __post_init__(self) -> None:
+        first = np.array(self.first_column, dtype=np.int64)
+        if first.ndim != 1 or first.size == 0 or first.min() < 0:
+            raise ValueError("first_column must be a non-empty 1-D array of indices ≥ 0")
+        first.setflags(write=False)
+        object.__setattr__(self, "first_column", first)
+        object.__setattr__(self, "columns", int(self.columns))
+        object.__setattr__(self, "rows", int(self.rows))
+        if self.columns < 1 or self.rows < 1:
+            raise ValueError(f"a window needs at least 1 row and 1 column, got {self.rows} × {self.columns}")
+        if self.first_row < 0:
+            raise ValueError(f"first_row must be at least 0, got {self.first_row}")
+
+    def __eq__(self, other: object) -> bool:
+        return (
+            isinstance(other, DetectorWindow)
+            and (self.columns, self.first_row, self.rows) == (other.columns, other.first_row, other.rows)
+            and np.array_equal(self.first_column, other.first_column)
+        )
+
+    def __hash__(self) -> int:
+        return hash((self.first_column.tobytes(), self.columns, self.first_row, self.rows))
+
+    @property
+    def views(self) -> int:
+        return int(self.first_column.size)
+
+    @property
+    def column_indices(self) -> NDArray[np.int64]:
+        """Detector column of every window cell, ``(views, columns)``."""
+        return self.first_column[:, None] + np.arange(self.columns)
+
+    def fraction(self, geometry: Geometry) -> float:
+        """Share of the detector's readings inside the window, 0…1."""
+        return self.views * self.rows * self.columns / math.prod(geometry.shape)
+
+
+def shadow(geometry: Geometry, grid: VolumeGrid, margin: int = 0) -> DetectorWindow:
+    """The smallest window that sees every voxel corner of ``grid`` in every view.
+
+    Args:
+        geometry: parallel, fan or cone beam.
+        grid: 2-D grid for a 2-D geometry, 3-D grid for a cone beam.
+        margin: columns added on either side (clipped at the detector's edge).
+
+    Raises:
+        ValueError: the grid leaves the field of view, or the source's orbit crosses it.
+    """
+    gz = grid.extent[0] / 2 if grid.ndim == 3 else 0.0
+    cy, cx = grid.center[-2:]
+    hy, hx = grid.extent[-2] / 2, grid.extent[-1] / 2
+    corners = np.array([(cx + sx * hx, cy + sy * hy) for sx in (-1, 1) for sy in (-1, 1)])
+    beta = geometry.angles[:, None]
+    along = corners[:, 0] * np.cos(beta) + corners[:, 1] * np.sin(beta)  # (views, 4), towards the source
+    across = -corners[:, 0] * np.sin(beta) + corners[:, 1] * np.cos(beta)
+    first_row, rows = 0, 1
+    if isinstance(geometry, ParallelBeam):
+        position, pitch = across, geometry.pitch
+    elif isinstance(geometry, FanBeam | ConeBeam):
+        depth = geometry.sod - along
+        if depth.min() <= 0:
+            raise ValueError(
+                f"the grid reaches {grid.in_plane_radius:.1f} mm from the axis, beyond the source orbit "
+                f"(sod {geometry.sod} mm): move or shrink the grid"
+            )
+        if geometry.detector == "curved":
+            position = geometry.sdd * np.arctan2(across, depth)
+        else:
+            position = geometry.sdd * across / depth
+        pitch = geometry.pitch if isinstance(geometry, FanBeam) else geometry.pitch[1]
+        if isinstance(geometry, ConeBeam):
+            reach = np.array([grid.center[0] - gz, grid.center[0] + gz]) if grid.ndim == 3 else np.zeros(2)
+            # On a curved detector the height follows the slant in-plane distance, on a flat one the depth.
+            distance = np.hypot(across, depth) if geometry.detector == "curved" else depth
+            v = geometry.sdd * reach[:, None, None] / distance
+            row0 = (v.min() - geometry.row_positions[0]) / geometry.pitch[0] - 0.5
+            row1 = (v.max() - geometry.row_positions[0]) / geometry.pitch[0] + 0.5
+            first_row = int(np.clip(math.floor(row0), 0, geometry.rows - 1))
+            rows = int(np.clip(math.ceil(row1), first_row, geometry.rows - 1)) - first_row + 1
+    else:
+        raise TypeError(f"unknown geometry {type(geometry).__name__}")
+    index = (position - geometry.column_positions[0]) / pitch
+    low, high = index.min(axis=1), index.max(axis=1)
+    if low.min() < -0.5 - 1e-9 or high.max() > geometry.columns - 0.5 + 1e-9:
+        raise ValueError(
+            f"the grid (centre x {cx:g}, y {cy:g} mm, {grid.extent[-1]:g} × {grid.extent[-2]:g} mm) leaves the field "
+            f"of view of {geometry.columns} columns in some views: move or shrink it"
+        )
+    first = np.floor(low + 0.5 - 1e-9).astype(np.int64) - margin
+    last = np.ceil(high - 0.5 + 1e-9).astype(np.int64) + margin
+    width = min(int((last - first).max()) + 1, geometry.columns)
+    first = np.clip(first, 0, geometry.columns - width)
+    return DetectorWindow(first, width, first_row, rows)
