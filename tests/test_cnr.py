@@ -1,0 +1,71 @@
+"""The paper's CNR and its intervals."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from torchpcct.metrics import cnr, cnr_from_moments, cnr_interval, mean_interval, sd_interval
+from torchpcct.study import paper
+
+
+def test_paper_table_from_its_own_moments():
+    fg, bg = paper.FOREGROUND, paper.BACKGROUND
+    ours = cnr_from_moments(fg[..., 0], fg[..., 1], bg[..., 0], bg[..., 1])
+    assert ours.shape == (4, 5)
+    np.testing.assert_allclose(ours, paper.CNR, atol=0.01)
+
+
+def test_definition_by_hand():
+    assert cnr([1.0, 3.0], [11.0, 15.0]) == pytest.approx((13 - 2) / np.sqrt(2 + 8))
+    batch = cnr(np.array([[1.0, 3.0], [2.0, 6.0]]), np.array([[11.0, 15.0], [22.0, 30.0]]))
+    np.testing.assert_allclose(batch, [(13 - 2) / np.sqrt(10)] * 2)
+
+
+@given(st.floats(0.01, 100), st.floats(-1e4, 1e4), st.integers(2, 40))
+def test_invariant_under_offset_and_scale(scale, offset, n):
+    rng = np.random.default_rng(n)
+    fg, bg = rng.normal(40, 10, n), rng.normal(90, 20, n)
+    assert cnr(scale * fg + offset, scale * bg + offset) == pytest.approx(cnr(fg, bg), rel=1e-6)
+    assert cnr(bg, fg) == pytest.approx(-cnr(fg, bg))
+
+
+def test_sd_interval_matches_the_known_factors():
+    low, high = sd_interval(1.0, 10)
+    assert (low, high) == (pytest.approx(0.688, abs=1e-3), pytest.approx(1.826, abs=1e-3))
+
+
+@pytest.mark.parametrize(("n", "rho"), [(5, 0.0), (10, 0.0), (10, 0.7), (50, -0.5)])
+def test_interval_coverage(n, rho):
+    """Of 400 simulated experiments about 95 % must cover the true CNR, at every n and correlation."""
+    rng = np.random.default_rng(7)
+    sd_fg, sd_bg = 10.0, 20.0
+    truth = 50 / np.hypot(sd_fg, sd_bg)
+    cov = [[sd_fg**2, rho * sd_fg * sd_bg], [rho * sd_fg * sd_bg, sd_bg**2]]
+    covered = 0
+    for _ in range(400):
+        fg, bg = rng.multivariate_normal([40, 90], cov, n).T
+        low, high = cnr_interval(fg, bg, draws=2000)
+        covered += low <= truth <= high
+    assert 0.92 <= covered / 400 <= 0.99
+
+
+def test_mean_interval_coverage():
+    rng = np.random.default_rng(3)
+    samples = rng.normal(5, 2, (2000, 6))
+    inside = [low <= 5 <= high for low, high in map(mean_interval, samples)]
+    assert 0.93 <= np.mean(inside) <= 0.97
+
+
+@pytest.mark.parametrize(
+    ("fg", "bg", "match"),
+    [
+        ([1.0], [2.0], "at least 2"),
+        ([1.0, np.nan], [2.0, 3.0], "NaN"),
+        ([1.0, 2.0], [1.0, 2.0, 3.0], "same shape"),
+        ([1.0, 1.0], [2.0, 2.0], "do not vary"),
+    ],
+)
+def test_refusals(fg, bg, match):
+    with pytest.raises(ValueError, match=match):
+        cnr(fg, bg)

@@ -1,0 +1,69 @@
+"""Counting noise: right distribution, and a pure function of (seed, reading)."""
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+from torchpcct.noise import normal, poisson
+
+
+@pytest.mark.parametrize("mean", [0.03, 0.7, 4.0, 9.99, 10.0, 37.3, 115.0, 16070.0, 3e6])
+def test_poisson_distribution(mean):
+    n = 400_000
+    draws = poisson(torch.full((1, n), mean, dtype=torch.float64), [0], seed=3).numpy().ravel()
+    assert (draws == np.round(draws)).all()
+    assert draws.min() >= 0
+    assert abs(draws.mean() - mean) < 4.5 * np.sqrt(mean / n)
+    # Var of the sample variance of a Poisson law: (mu4 - var²)/n with mu4 = mean + 3 mean²
+    assert abs(draws.var() - mean) < 4.5 * np.sqrt((mean + 2 * mean**2) / n)
+    low, high = stats.poisson.ppf([1e-3, 1 - 1e-3], mean).astype(int)
+    edges = np.unique(np.linspace(low, high, 24).astype(int))
+    cdf = stats.poisson.cdf(edges, mean)
+    expected = np.diff(np.concatenate([[0], cdf, [1]])) * n
+    observed = np.histogram(draws, bins=np.concatenate([[-1], edges + 0.5, [np.inf]]))[0]
+    keep = expected > 10
+    chi2 = ((observed - expected)[keep] ** 2 / expected[keep]).sum()
+    assert chi2 < stats.chi2.ppf(1 - 1e-5, keep.sum())
+
+
+def test_window_is_the_crop():
+    mean = torch.rand(6, 50, generator=torch.Generator().manual_seed(0)) * 200
+    full = poisson(mean, np.arange(6) * 50, seed=11)
+    crop = poisson(mean[2:5, 7:30], np.arange(2, 5) * 50 + 7, seed=11)
+    assert torch.equal(crop, full[2:5, 7:30])
+
+
+def test_seeds_and_neighbours_are_uncorrelated():
+    mean = torch.full((200, 1000), 50.0)
+    index = np.arange(200) * 1000
+    a, b = (poisson(mean, index, seed=s).numpy() - 50 for s in (0, 1))
+    bound = 4.5 / np.sqrt(a.size) * 50
+    assert abs((a * b).mean()) < bound
+    assert abs((a[:, 1:] * a[:, :-1]).mean()) < bound
+    assert abs((a[1:] * a[:-1]).mean()) < bound
+
+
+def test_scale_edge_values_and_dtype():
+    mean = torch.tensor([[0.0, -1.0, float("nan"), 5.0]])
+    out = poisson(mean, [0], seed=0, scale=2.0)
+    assert out.dtype == torch.float32
+    assert out[0, 0] == 0
+    assert torch.isnan(out[0, 1:3]).all()
+    assert poisson(mean[:, 3:], [3], seed=0, scale=2.0)[0, 0] == out[0, 3]
+
+
+def test_normal():
+    z = normal((100, 3000), np.arange(100) * 3000, seed=5, dtype=torch.float64).numpy().ravel()
+    assert stats.kstest(z, "norm").pvalue > 1e-4
+
+
+@pytest.mark.parametrize(("seed", "error"), [(-1, ValueError), (1.5, TypeError), (True, TypeError)])
+def test_bad_seed(seed, error):
+    with pytest.raises(error, match="seed"):
+        poisson(torch.ones(1, 1), [0], seed=seed)
+
+
+def test_bad_index():
+    with pytest.raises(ValueError, match="first_index"):
+        poisson(torch.ones(2, 1), [0], seed=0)

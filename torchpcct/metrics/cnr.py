@@ -1,0 +1,122 @@
+"""The paper's contrast-to-noise ratio, over realisations of ROI means, with intervals.
+
+Li et al., "Coronary Atherosclerotic Plaque Characterization with Photon-counting CT": per noise realisation take the
+mean of each ROI; CNR = (μ_bg − μ_fg) / sqrt(σ²_bg + σ²_fg), where μ and σ are the mean and the (n − 1) standard
+deviation ACROSS realisations. The noise in it is that of an ROI mean, not of a pixel, and hinges on the ROI.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+__all__ = ["Interval", "cnr", "cnr_from_moments", "cnr_interval", "mean_interval", "sd_interval"]
+
+Floats = NDArray[np.float64]
+
+
+class Interval(NamedTuple):
+    """A confidence interval."""
+
+    low: float
+    high: float
+
+
+def _means(name: str, values: Any) -> Floats:
+    means = np.asarray(values, dtype=np.float64)
+    if means.ndim == 0 or means.shape[-1] < 2:
+        raise ValueError(f"{name} must hold at least 2 realisations on its last axis, got shape {means.shape}")
+    if not np.isfinite(means).all():
+        raise ValueError(f"{name} holds NaN or Inf: check the reconstruction before measuring it")
+    return means
+
+
+def cnr(foreground_means: Any, background_means: Any) -> Any:
+    """CNR from the ROI means of every realisation.
+
+    Args:
+        foreground_means: ``(..., realisations)`` mean of the foreground ROI (necrotic core) in HU.
+        background_means: the same shape, background ROI (fibrous tissue).
+
+    Returns:
+        ``(...)`` float64 (a float without leading axes). Invariant under ``a * image + b`` for a > 0.
+
+    Raises:
+        ValueError: fewer than 2 realisations, shapes that differ, NaN or Inf, no noise at all.
+    """
+    fg, bg = _means("foreground_means", foreground_means), _means("background_means", background_means)
+    if fg.shape != bg.shape:
+        raise ValueError(f"foreground_means {fg.shape} and background_means {bg.shape} must have the same shape")
+    return cnr_from_moments(fg.mean(-1), fg.std(-1, ddof=1), bg.mean(-1), bg.std(-1, ddof=1))
+
+
+def cnr_from_moments(fg_mean: Any, fg_sd: Any, bg_mean: Any, bg_sd: Any) -> Any:
+    """CNR from published means and standard deviations across realisations (any broadcastable shapes).
+
+    Raises:
+        ValueError: a negative standard deviation, or both zero (noise-free data have no CNR).
+    """
+    fg_sd, bg_sd = np.asarray(fg_sd, dtype=np.float64), np.asarray(bg_sd, dtype=np.float64)
+    if (fg_sd < 0).any() or (bg_sd < 0).any():
+        raise ValueError("standard deviations must not be negative")
+    noise = np.hypot(fg_sd, bg_sd)
+    if (noise == 0).any():
+        raise ValueError("the ROI means do not vary: CNR needs noisy realisations (exposure_s is not None)")
+    value = (np.asarray(bg_mean, dtype=np.float64) - np.asarray(fg_mean, dtype=np.float64)) / noise
+    return float(value) if value.ndim == 0 else value
+
+
+def mean_interval(means: Any, level: float = 0.95) -> Interval:
+    """Student's interval for the mean over realisations, ``means`` ``(realisations,)``."""
+    m = _means("means", means)
+    half = stats.t.ppf(0.5 + level / 2, m.size - 1) * m.std(ddof=1) / np.sqrt(m.size)
+    return Interval(float(m.mean() - half), float(m.mean() + half))
+
+
+def sd_interval(sd: float, realizations: int, level: float = 0.95) -> Interval:
+    """χ² interval for a standard deviation estimated from ``realizations`` normal draws: ×[0.69, 1.83] at n = 10."""
+    if realizations < 2:
+        raise ValueError(f"realizations must be at least 2, got {realizations}")
+    dof = realizations - 1
+    high, low = stats.chi2.ppf([0.5 - level / 2, 0.5 + level / 2], dof)
+    return Interval(float(sd * np.sqrt(dof / low)), float(sd * np.sqrt(dof / high)))
+
+
+def cnr_interval(
+    foreground_means: Any, background_means: Any, level: float = 0.95, draws: int = 20_000, seed: int = 0
+) -> Interval:
+    """Generalised confidence interval for the CNR of correlated, jointly normal ROI means.
+
+    A percentile bootstrap is far too narrow at n = 10. Here the unknown covariance is drawn from the Wishart pivot
+    and the unknown means from their normal pivot (Weerahandi 1993), which keeps its coverage at small n.
+
+    Args:
+        foreground_means, background_means: ``(realisations,)`` paired ROI means, HU; at least 3.
+        level: coverage.
+        draws: Monte Carlo size of the pivot.
+        seed: seed of the pivot's random numbers.
+    """
+    fg, bg = _means("foreground_means", foreground_means), _means("background_means", background_means)
+    if fg.ndim != 1 or fg.shape != bg.shape or fg.size < 3:
+        raise ValueError(f"cnr_interval needs two 1-D arrays of ≥ 3 paired means, got {fg.shape} and {bg.shape}")
+    n = fg.size
+    data = np.stack([fg, bg])
+    scatter = np.cov(data) * (n - 1)
+    if np.trace(scatter) == 0:
+        raise ValueError("the ROI means do not vary: CNR needs noisy realisations (exposure_s is not None)")
+    lower = np.linalg.cholesky(scatter + 1e-12 * np.trace(scatter) * np.eye(2))
+    rng = np.random.default_rng(seed)
+    # If S ~ Wishart(Σ, n-1), the pivot for Σ is L (B Bᵀ)⁻¹ Lᵀ with S = L Lᵀ and B Bᵀ ~ Wishart(I, n-1) (Bartlett).
+    b = np.zeros((draws, 2, 2))
+    b[:, 0, 0] = np.sqrt(rng.chisquare(n - 1, draws))
+    b[:, 1, 1] = np.sqrt(rng.chisquare(n - 2, draws))
+    b[:, 1, 0] = rng.standard_normal(draws)
+    root = lower @ np.linalg.inv(b).transpose(0, 2, 1)
+    variance = np.einsum("dij,dij->di", root, root)
+    mean = data.mean(1) - np.einsum("dij,dj->di", root, rng.standard_normal((draws, 2))) / np.sqrt(n)
+    pivot = (mean[:, 1] - mean[:, 0]) / np.sqrt(variance.sum(1))
+    low, high = np.quantile(pivot, [0.5 - level / 2, 0.5 + level / 2])
+    return Interval(float(low), float(high))

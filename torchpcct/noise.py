@@ -1,0 +1,143 @@
+"""Counting noise that is a pure function of (seed, reading): the same for any thread count, crop or order.
+
+Each reading owns a random stream, keyed by the seed and by the reading's index on the full detector. So a window
+of a scan carries exactly the noise that the full scan has there, and realisations can be spread over machines.
+The stream is SplitMix64 (Steele, Lea, Flood 2014); Poisson numbers come from Hörmann's transformed rejection PTRS
+(1993) for means of 10 and more, and from inversion below; normal numbers from Box and Muller (1958).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from numba import njit, prange
+from torch import Tensor
+
+__all__ = ["normal", "poisson"]
+
+_GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+_MIX1 = np.uint64(0xBF58476D1CE4E5B9)
+_MIX2 = np.uint64(0x94D049BB133111EB)
+_S30, _S27, _S31, _S11 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(11)
+_TO_UNIT = 1.0 / 9007199254740992.0  # 2**-53
+
+
+@njit(inline="always", cache=True)
+def _mix(z: Any) -> Any:
+    z = (z ^ (z >> _S30)) * _MIX1
+    z = (z ^ (z >> _S27)) * _MIX2
+    return z ^ (z >> _S31)
+
+
+@njit(inline="always", cache=True)
+def _unit(state: Any) -> Any:
+    """Uniform in the open interval (0, 1)."""
+    return (np.float64(_mix(state) >> _S11) + 0.5) * _TO_UNIT
+
+
+@njit(inline="always", cache=True)
+def _stream(key: Any, index: Any) -> Any:
+    return _mix(key ^ _mix(np.uint64(index) * _GOLDEN + _MIX2))
+
+
+@njit(cache=True)
+def _poisson_one(mean: float, state: Any) -> float:
+    if mean < 10.0:
+        state = state + _GOLDEN
+        u = _unit(state)
+        p = math.exp(-mean)
+        k = 0.0
+        while u > p and k < 200.0:  # P(k ≥ 200 | mean < 10) < 1e-180: a guard against round-off only
+            u -= p
+            k += 1.0
+            p *= mean / k
+        return k
+    log_mean = math.log(mean)
+    b = 0.931 + 2.53 * math.sqrt(mean)
+    a = -0.059 + 0.02483 * b
+    inv_alpha = 1.1239 + 1.1328 / (b - 3.4)
+    v_r = 0.9277 - 3.6224 / (b - 2.0)
+    while True:
+        state = state + _GOLDEN
+        u = _unit(state) - 0.5
+        state = state + _GOLDEN
+        v = _unit(state)
+        us = 0.5 - abs(u)
+        k = math.floor((2.0 * a / us + b) * u + mean + 0.43)
+        if us >= 0.07 and v <= v_r:
+            return k
+        if k < 0.0 or (us < 0.013 and v > us):
+            continue
+        if math.log(v) + math.log(inv_alpha) - math.log(a / (us * us) + b) <= (
+            k * log_mean - mean - math.lgamma(k + 1.0)
+        ):
+            return k
+
+
+@njit(parallel=True, cache=True)
+def _poisson_rows(mean: Any, first: Any, scale: float, key: Any, out: Any) -> None:
+    for i in prange(mean.shape[0]):
+        for j in range(mean.shape[1]):
+            lam = np.float64(mean[i, j]) * scale
+            if lam > 0.0:
+                out[i, j] = _poisson_one(lam, _stream(key, first[i] + j))
+            elif lam == 0.0:
+                out[i, j] = 0.0
+            else:
+                out[i, j] = np.nan
+
+
+@njit(parallel=True, cache=True)
+def _normal_rows(first: Any, key: Any, out: Any) -> None:
+    for i in prange(out.shape[0]):
+        for j in range(out.shape[1]):
+            state = _stream(key, first[i] + j)
+            radius = math.sqrt(-2.0 * math.log(_unit(state + _GOLDEN)))
+            out[i, j] = radius * math.cos(2.0 * math.pi * _unit(state + _GOLDEN + _GOLDEN))
+
+
+def _key(seed: int) -> Any:
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer):
+        raise TypeError(f"seed must be a whole number, got {seed!r}")
+    if not 0 <= seed < 2**63:
+        raise ValueError(f"seed must lie in 0 … 2**63 - 1, got {seed}")
+    with np.errstate(over="ignore"):
+        return np.uint64(_mix.py_func(np.uint64(seed) * _GOLDEN + _MIX1))
+
+
+def _first(first: Any, rows: int) -> Any:
+    index = np.ascontiguousarray(first, dtype=np.int64).reshape(-1)
+    if index.size != rows:
+        raise ValueError(f"first_index must hold one index per row of the last axis, {rows}, got {index.size}")
+    return index
+
+
+def poisson(mean: Tensor, first_index: Any, seed: int, scale: float = 1.0) -> Tensor:
+    """Poisson counts with expectation ``scale * mean``.
+
+    Args:
+        mean: ``(..., n)`` float32 or float64 expectations ≥ 0 on the CPU.
+        first_index: ``(...)`` whole numbers, the global index of the first reading of each row of ``n``.
+        seed: realisation number, ≥ 0.
+        scale: factor on ``mean`` (exposure).
+
+    Returns:
+        Tensor of the shape and dtype of ``mean``. A negative or NaN expectation gives NaN.
+
+    Raises:
+        TypeError, ValueError: a seed that is no whole number ≥ 0, indices that do not match ``mean``.
+    """
+    flat = mean.detach().cpu().contiguous().reshape(-1, mean.shape[-1])
+    out = torch.empty_like(flat)
+    _poisson_rows(flat.numpy(), _first(first_index, flat.shape[0]), float(scale), _key(seed), out.numpy())
+    return out.reshape(mean.shape)
+
+
+def normal(shape: tuple[int, ...], first_index: Any, seed: int, dtype: torch.dtype = torch.float32) -> Tensor:
+    """Standard normal numbers keyed like :func:`poisson`; ``shape`` is ``(..., n)``."""
+    out = torch.empty((math.prod(shape[:-1]), shape[-1]), dtype=dtype)
+    _normal_rows(_first(first_index, out.shape[0]), _key(seed), out.numpy())
+    return out.reshape(shape)

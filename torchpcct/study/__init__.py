@@ -1,0 +1,1 @@
+"""Whole studies: simulate, reconstruct, measure, report."""

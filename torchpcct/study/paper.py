@@ -1,0 +1,62 @@
+"""The figures of the paper that this package reproduces, and the tolerances that we hold ourselves to.
+
+Source: Li, Wu, Pack, Wu, De Man, Wang, Nieman, Wang, "Coronary Atherosclerotic Plaque Characterization with
+Photon-counting CT: a Simulation-based Feasibility Study", tables "Statistics on the means of the ROI over 10
+realizations" and "Necrotic core detectability measured as the CNR".
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+__all__ = [
+    "BACKGROUND",
+    "CNR",
+    "DOSES",
+    "FOREGROUND",
+    "KERNELS",
+    "NOISE_FREE_ROI_HU",
+    "REALIZATIONS",
+    "TABLE_EXPOSURE_S",
+    "VOXELS_MM",
+]
+
+KERNELS = ("soft", "standard", "detail", "bone")
+VOXELS_MM = (0.20, 0.25, 0.30, 0.35, 0.40)
+DOSES = {"1x": 0.35, "2x": 0.70, "5.7x": 2.00, "8x": 2.80}
+"""Exposure (one rotation) in s of each dose level, at 1000 mA."""
+
+TABLE_EXPOSURE_S = 2.00
+"""Exposure of both tables. The paper does not state it; the text of its noise section and the size of its standard
+deviations point to the assumed 5.7× dose (an inference of ours)."""
+
+REALIZATIONS = 10
+
+NOISE_FREE_ROI_HU = {"foreground": 40.1, "background": 91.8}
+"""Noise-free ROI means, standard kernel, 0.1 mm voxels."""
+
+# (kernel, voxel size, (mean, SD)) in HU
+FOREGROUND = np.array(
+    [
+        [[48.76, 11.93], [43.47, 9.73], [49.62, 10.76], [49.30, 10.33], [51.56, 10.44]],
+        [[50.05, 14.29], [43.04, 10.54], [49.86, 12.44], [48.97, 11.52], [50.92, 12.42]],
+        [[50.58, 14.19], [43.91, 10.45], [50.12, 13.09], [49.43, 11.54], [51.39, 12.77]],
+        [[51.26, 17.56], [44.38, 12.05], [47.48, 22.38], [48.14, 14.61], [50.35, 20.36]],
+    ]
+)
+BACKGROUND = np.array(
+    [
+        [[88.38, 27.37], [86.44, 16.91], [84.07, 24.28], [83.48, 21.43], [82.12, 17.30]],
+        [[97.51, 34.28], [93.10, 21.92], [90.86, 29.60], [90.01, 24.49], [88.40, 18.25]],
+        [[98.40, 34.55], [93.07, 23.35], [90.17, 31.22], [91.28, 24.56], [88.51, 16.58]],
+        [[111.06, 47.88], [99.80, 39.66], [91.62, 52.88], [104.60, 32.34], [91.97, 17.85]],
+    ]
+)
+CNR = np.array(
+    [
+        [1.33, 2.20, 1.30, 1.44, 1.51],
+        [1.28, 2.06, 1.28, 1.52, 1.70],
+        [1.28, 1.92, 1.18, 1.54, 1.77],
+        [1.17, 1.34, 0.77, 1.59, 1.54],
+    ]
+)
