@@ -109,12 +109,12 @@ def cnr_interval(
         raise ValueError("the ROI means do not vary: CNR needs noisy realisations (exposure_s is not None)")
     lower = np.linalg.cholesky(scatter + 1e-12 * np.trace(scatter) * np.eye(2))
     rng = np.random.default_rng(seed)
-    # If S ~ Wishart(Σ, n-1), the pivot for Σ is L (B Bᵀ)⁻¹ Lᵀ with S = L Lᵀ and B Bᵀ ~ Wishart(I, n-1) (Bartlett).
+    # S = L Lᵀ ~ Wishart(Σ, n-1) and B Bᵀ ~ Wishart(I, n-1) (Bartlett, B lower): the pivot for Σ is (L B⁻¹)(L B⁻¹)ᵀ.
     b = np.zeros((draws, 2, 2))
     b[:, 0, 0] = np.sqrt(rng.chisquare(n - 1, draws))
     b[:, 1, 1] = np.sqrt(rng.chisquare(n - 2, draws))
     b[:, 1, 0] = rng.standard_normal(draws)
-    root = lower @ np.linalg.inv(b).transpose(0, 2, 1)
+    root = lower @ np.linalg.inv(b)
     variance = np.einsum("dij,dij->di", root, root)
     mean = data.mean(1) - np.einsum("dij,dj->di", root, rng.standard_normal((draws, 2))) / np.sqrt(n)
     pivot = (mean[:, 1] - mean[:, 0]) / np.sqrt(variance.sum(1))
