@@ -1,0 +1,83 @@
+"""ROI means as linear functionals; volume files."""
+
+import numpy as np
+import pytest
+import torch
+
+from torchpcct.geometry import VolumeGrid
+from torchpcct.metrics.roi import RoiMean, axial_grid, sample_axial
+from torchpcct.volume import Volume, written_whole
+
+GRID = VolumeGrid((8, 45, 46), 0.2, (0.1, -30.38, -29.63))
+
+
+def affine_volume(grid, c, dtype=torch.float64):
+    z, y, x = (torch.as_tensor(a) for a in grid.axes)
+    return (c[0] + c[1] * z[:, None, None] + c[2] * y[:, None] + c[3] * x).to(dtype)
+
+
+def test_interpolation_is_exact_for_affine_volumes():
+    coefficients = (40.0, 3.0, -2.0, 5.0)
+    image = axial_grid((0.0, -30.38, -29.63))
+    inner = VolumeGrid((1, 200, 200), 0.035, image.center)
+    expected = affine_volume(inner, coefficients)
+    torch.testing.assert_close(sample_axial(affine_volume(GRID, coefficients), GRID, inner), expected)
+
+
+def test_roi_mean_is_the_mean_of_the_interpolated_image():
+    image = axial_grid((0.0, -30.38, -29.63))
+    mask = np.zeros(image.shape, bool)
+    mask[0, 100:140, 90:170] = np.random.default_rng(0).random((40, 80)) > 0.5
+    volume = torch.randn(3, *GRID.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    roi = RoiMean(GRID, image, mask)
+    direct = sample_axial(volume, GRID, image)[:, torch.from_numpy(mask)].mean(-1)
+    torch.testing.assert_close(roi(volume), direct)
+    assert roi.weights.sum().item() == pytest.approx(1)
+    assert roi.area_mm2 == pytest.approx(mask.sum() * 0.035**2)
+
+
+def test_refusals():
+    image = axial_grid((0.0, -30.38, -29.63))
+    with pytest.raises(ValueError, match="empty"):
+        RoiMean(GRID, image, np.zeros(image.shape, bool))
+    with pytest.raises(ValueError, match="beyond the volume"):
+        RoiMean(GRID, axial_grid((0.0, 0.0, 0.0)), np.ones(image.shape, bool))
+
+
+def test_files_round_trip(tmp_path):
+    import nibabel
+
+    data = torch.randn(GRID.shape, generator=torch.Generator().manual_seed(1))
+    volume = Volume(data, GRID, {"method": "fbp", "kernel": "soft"})
+    volume.save(tmp_path / "v.h5")
+    back = Volume.load(tmp_path / "v.h5")
+    assert torch.equal(back.data, data)
+    assert back.grid == GRID
+    assert back.report == volume.report
+    volume.save(tmp_path / "v.nii.gz")
+    image = nibabel.load(tmp_path / "v.nii.gz")
+    corner = image.affine @ [3, 2, 1, 1]
+    np.testing.assert_allclose(corner[:3], [GRID.axes[2][3], GRID.axes[1][2], GRID.axes[0][1]], rtol=1e-6)
+    np.testing.assert_array_equal(np.asarray(image.dataobj)[3, 2, 1], data[1, 2, 3])
+
+
+def test_no_half_written_file(tmp_path):
+    def interrupted():
+        with written_whole(tmp_path / "v.h5") as part:
+            part.write_bytes(b"half")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_foreign_and_truncated_files(tmp_path):
+    volume = Volume(torch.zeros(GRID.shape), GRID)
+    volume.save(tmp_path / "v.h5")
+    content = (tmp_path / "v.h5").read_bytes()
+    (tmp_path / "cut.h5").write_bytes(content[: len(content) // 2])
+    with pytest.raises(ValueError, match="truncated"):
+        Volume.load(tmp_path / "cut.h5")
+    with pytest.raises(ValueError, match="unknown volume format"):
+        volume.save(tmp_path / "v.png")

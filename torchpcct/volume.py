@@ -1,0 +1,123 @@
+"""A reconstructed volume in HU, with its grid and its report; files are written whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchpcct.geometry import VolumeGrid
+
+__all__ = ["Volume", "written_whole"]
+
+
+@contextmanager
+def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Yield a temporary name beside ``path``; rename it to ``path`` on success, remove it on any failure.
+
+    Raises:
+        FileNotFoundError: the folder of ``path`` does not exist.
+    """
+    target = Path(path)
+    if not target.parent.is_dir():
+        raise FileNotFoundError(f"cannot write {target}: the folder {target.parent} does not exist, create it first")
+    # Keep the ending: some writers choose the format by it.
+    part = target.with_name(f".{os.getpid()}.part.{target.name}")
+    try:
+        yield part
+        os.replace(part, target)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+@dataclass(frozen=True)
+class Volume:
+    """A volume in HU.
+
+    Args:
+        data: ``(..., z, y, x)`` HU, float32 or float64.
+        grid: its voxel grid.
+        report: how it was made: method, kernel, iterations, residual, seconds, …
+    """
+
+    data: Tensor
+    grid: VolumeGrid
+    report: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.data, Tensor) or not self.data.is_floating_point():
+            raise TypeError(f"data must be a floating point tensor in HU, got {type(self.data).__name__}")
+        if tuple(self.data.shape[-self.grid.ndim :]) != self.grid.shape:
+            raise ValueError(f"data has shape {tuple(self.data.shape)}, its grid {self.grid.shape}")
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write ``.nii`` / ``.nii.gz`` (NIfTI-1, mm, RAS) or ``.h5`` (HDF5 with grid and report).
+
+        Raises:
+            ValueError: another ending, or a batch of volumes (save them one by one).
+        """
+        name = str(path)
+        if self.data.ndim != self.grid.ndim:
+            raise ValueError(f"save one volume at a time, this one has shape {tuple(self.data.shape)}")
+        if name.endswith((".nii", ".nii.gz")):
+            self._save_nifti(path)
+        elif name.endswith((".h5", ".hdf5")):
+            self._save_hdf5(path)
+        else:
+            raise ValueError(f"unknown volume format {Path(name).name!r}: use .nii, .nii.gz or .h5")
+
+    def _save_nifti(self, path: str | os.PathLike[str]) -> None:
+        import nibabel
+
+        if self.grid.ndim != 3:
+            raise ValueError("NIfTI needs a 3-D volume; save a 2-D image as .h5")
+        affine = np.diag([*self.grid.spacing[::-1], 1.0])
+        affine[:3, 3] = [axis[0] for axis in self.grid.axes[::-1]]
+        # NIfTI stores (x, y, z).
+        image = nibabel.Nifti1Image(self.data.detach().cpu().to(torch.float32).numpy().transpose(2, 1, 0), affine)
+        image.header.set_xyzt_units("mm")
+        image.header["descrip"] = b"torchpcct, HU"
+        with written_whole(path) as part:
+            nibabel.save(image, part)
+
+    def _save_hdf5(self, path: str | os.PathLike[str]) -> None:
+        import h5py
+
+        with written_whole(path) as part, h5py.File(part, "w") as file:
+            file.attrs["format"] = "torchpcct-volume"
+            file.attrs["unit"] = "HU"
+            file.attrs["spacing_mm"] = self.grid.spacing
+            file.attrs["center_mm"] = self.grid.center
+            file.attrs["report"] = json.dumps(dict(self.report), default=str)
+            file.create_dataset("data", data=self.data.detach().cpu().numpy())
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Volume:
+        """Read a volume written by :meth:`save` as HDF5.
+
+        Raises:
+            ValueError: the file is truncated, or is no torchpcct volume.
+        """
+        import h5py
+
+        try:
+            with h5py.File(path, "r") as file:
+                if file.attrs.get("format") != "torchpcct-volume":
+                    raise ValueError(f"{path} is an HDF5 file, but not a torchpcct volume")
+                data = torch.from_numpy(file["data"][()])
+                grid = VolumeGrid(
+                    tuple(int(n) for n in data.shape), tuple(file.attrs["spacing_mm"]), tuple(file.attrs["center_mm"])
+                )
+                return cls(data, grid, json.loads(file.attrs["report"]))
+        except (OSError, KeyError) as error:
+            if isinstance(error, FileNotFoundError):
+                raise
+            raise ValueError(f"{path} cannot be read as a torchpcct volume (truncated or foreign): {error}") from error
