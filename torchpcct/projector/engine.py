@@ -1,0 +1,145 @@
+"""From arrays to kernels: what one geometry, grid and window need, computed once, and the CPU passes.
+
+numba is imported on first use. Launches are serialised by a lock, since numba's fallback threading layer must not be
+entered from two threads at once.
+"""
+
+from __future__ import annotations
+
+import threading
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchpcct.geometry import Geometry, VolumeGrid
+from torchpcct.projector.rays import Rays, Segments, check_pair, check_source, rays_of, split
+from torchpcct.window import DetectorWindow
+
+__all__ = ["Engine"]
+
+_LAUNCH = threading.Lock()
+# Row sums of the adjoint are made for chunks of views of about this size: large enough to keep all threads busy.
+ROW_SUMS_BYTES = 64 << 20
+
+
+class Engine:
+    """Forward and adjoint passes on NumPy arrays with exactly one leading batch axis.
+
+    Args:
+        geometry, grid, window: as for ``Projector``.
+
+    Raises:
+        TypeError, ValueError: see ``rays.check_pair`` and ``rays.check_source``.
+    """
+
+    def __init__(self, geometry: Geometry, grid: VolumeGrid, window: DetectorWindow | None) -> None:
+        check_pair(geometry, grid, window)
+        self.grid = grid
+        self.rays: Rays = rays_of(geometry, window)
+        check_source(self.rays, grid)
+        hy, hx = grid.spacing[-2:]
+        y, x = grid.axes[-2:]
+        self.lattice = np.array([y[0], hy, x[0] - hx / 2, hx, x[0], hx, y[0] - hy / 2, hy])
+
+    @property
+    def domain_shape(self) -> tuple[int, ...]:
+        return tuple(self.grid.shape)
+
+    @property
+    def range_shape(self) -> tuple[int, ...]:
+        r = self.rays
+        return (r.views, r.rows, r.columns) if self.grid.ndim == 3 else (r.views, r.columns)
+
+    @cached_property
+    def segments(self) -> Segments:
+        return split(self.rays, self.grid)
+
+    @cached_property
+    def _poses(self) -> NDArray[np.float64]:
+        return self.rays.pose
+
+    def forward(self, x: NDArray) -> NDArray:
+        """Line integrals of ``x``, ``(batch, *domain_shape)``, as ``(batch, *range_shape)``."""
+        with _LAUNCH:
+            return self._forward_volume(x) if self.grid.ndim == 3 else self._forward_plane(x)
+
+    def adjoint(self, y: NDArray) -> NDArray:
+        """The transpose: ``(batch, *range_shape)`` to ``(batch, *domain_shape)``."""
+        with _LAUNCH:
+            return self._adjoint_volume(y) if self.grid.ndim == 3 else self._adjoint_plane(y)
+
+    def workspace(self, batch: int, itemsize: int) -> int:
+        """Bytes that one pass holds besides its input and output (the larger of the two directions)."""
+        r, table = self.rays, 8 * (8 * self.rays.views + 4 * len(self.segments.table))
+        if self.grid.ndim == 3:
+            nz, ny, nx = self.grid.shape
+            forward = batch * ny * nx * (nz + 1) + batch * r.columns * r.rows * _threads()
+            row_sums = batch * r.columns * (r.rows + 1)
+            row_sums *= int(max(1, min(r.views, ROW_SUMS_BYTES // (row_sums * itemsize))))
+            adjoint = 3 * batch * ny * nx * nz + row_sums
+        else:
+            ny, nx = self.grid.shape
+            forward = batch * (ny * (nx + 1) + nx * (ny + 1))
+            adjoint = 3 * batch * ny * nx
+        return table + itemsize * max(forward, adjoint)
+
+    def _heights(self) -> tuple[float, float, float, float]:
+        z, dz = self.grid.axes[0][0], self.grid.spacing[0]
+        return z - dz / 2, dz, self.rays.row_edge + self.rays.first_row * self.rays.row_pitch, self.rays.row_pitch
+
+    def _forward_volume(self, x: NDArray) -> NDArray:
+        from torchpcct.projector import volume_kernels
+
+        r, seg = self.rays, self.segments
+        nz, ny, nx = self.grid.shape
+        sums = np.zeros((x.shape[0], ny, nx, nz + 1), dtype=x.dtype)
+        np.cumsum(x.transpose(0, 2, 3, 1), axis=-1, out=sums[..., 1:])
+        y = np.empty((x.shape[0], *self.range_shape), dtype=x.dtype)
+        volume_kernels.project(
+            sums, self._poses, r.edges, r.centers, r.first, seg.table, seg.start, self.lattice, *self._heights(), y
+        )
+        return y
+
+    def _adjoint_volume(self, y: NDArray) -> NDArray:
+        from torchpcct.projector import volume_kernels
+
+        r, seg = self.rays, self.segments
+        return volume_kernels.backproject(
+            y, self._poses, r.edges, r.centers, r.first, seg.table, seg.start, self.lattice, *self._heights(),
+            self.grid.shape, ROW_SUMS_BYTES,
+        )  # fmt: skip
+
+    def _forward_plane(self, x: NDArray) -> NDArray:
+        from torchpcct.projector import plane_kernels
+
+        r, seg = self.rays, self.segments
+        y = np.zeros((x.shape[0], *self.range_shape), dtype=x.dtype)
+        for axis in (0, 1):
+            slabs = x if axis == 0 else x.transpose(0, 2, 1)
+            sums = np.zeros((*slabs.shape[:2], slabs.shape[2] + 1), dtype=x.dtype)
+            np.cumsum(slabs, axis=-1, out=sums[..., 1:])
+            plane_kernels.project(
+                sums, axis, self._poses, r.edges, r.centers, r.first, seg.table, seg.start, self.lattice, r.parallel, y
+            )
+        return y
+
+    def _adjoint_plane(self, y: NDArray) -> NDArray:
+        from torchpcct.projector import plane_kernels
+
+        r, seg = self.rays, self.segments
+        ny, nx = self.grid.shape
+        parts = []
+        for axis, shape in ((0, (ny, nx)), (1, (nx, ny))):
+            out = np.empty((y.shape[0], *shape), dtype=y.dtype)
+            plane_kernels.backproject(
+                y, axis, self._poses, r.edges, r.centers, r.first, seg.table, self.lattice, r.parallel, out
+            )
+            parts.append(out)
+        return parts[0] + parts[1].transpose(0, 2, 1)
+
+
+def _threads() -> int:
+    import numba
+
+    return int(numba.get_num_threads())

@@ -1,0 +1,218 @@
+"""Where the rays of every view run: per-view poses, cell edges, and the split of each view by its main axis.
+
+The kernels never see a geometry. They see, for each view, a source, an in-plane vector ``axial`` and an in-plane
+vector ``across``; the in-plane ray of the detector position with table entries ``(a, b)`` points along
+``a * axial + b * across``. Flat detector: ``a = 1, b = u``. Curved: ``a = cos γ, b = sdd * sin γ``. Both reach the
+detector at the ray parameter λ = 1, so that heights scale with λ. A parallel beam has the one direction ``axial``
+and starts at ``source + b * across``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
+from torchpcct.window import DetectorWindow
+
+__all__ = ["Rays", "Segments", "check_pair", "check_source", "rays_of", "split"]
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Poses of all views and the detector cells they are read with (mm, float64).
+
+    Args:
+        parallel: parallel rays (see the module's text) instead of a point source.
+        source: ``(views, 3)`` source position x, y, z (parallel: a point of the ray ``b = 0``).
+        axial: ``(views, 2)`` in-plane vector from the source to the detector's foot.
+        across: ``(views, 2)`` in-plane direction of growing columns.
+        foot_z: ``(views,)`` height of the detector position ``v = 0``.
+        edges: ``(columns + 1, 2)`` table entries (a, b) of the cell edges.
+        centers: ``(columns, 2)`` table entries of the cell centres.
+        row_edge, row_pitch: height of the first row's lower edge above ``v = 0``, and the row pitch (2-D: -0.5, 1).
+        first: ``(views,)`` first column kept in each view.
+        columns, first_row, rows: the columns and rows kept.
+    """
+
+    parallel: bool
+    source: Floats
+    axial: Floats
+    across: Floats
+    foot_z: Floats
+    edges: Floats
+    centers: Floats
+    row_edge: float
+    row_pitch: float
+    first: Ints
+    columns: int
+    first_row: int
+    rows: int
+
+    @property
+    def views(self) -> int:
+        return int(self.source.shape[0])
+
+    @property
+    def pose(self) -> Floats:
+        """``(views, 8)``: source x, y, z; axial x, y; across x, y; foot height. What the kernels read."""
+        return np.ascontiguousarray(
+            np.concatenate([self.source, self.axial, self.across, self.foot_z[:, None]], axis=1, dtype=np.float64)
+        )
+
+    def moved(self, shift: Floats) -> Rays:
+        """The rays seen from an object displaced by ``shift``, ``(views, 2)`` mm (x, y) per view."""
+        source = self.source.copy()
+        source[:, :2] -= shift
+        return replace(self, source=source)
+
+
+def check_pair(geometry: Any, grid: Any, window: Any) -> None:
+    """Refuse a geometry, grid and window that do not belong together.
+
+    Raises:
+        TypeError: an argument of the wrong kind.
+        ValueError: a 3-D grid with a 2-D geometry or the reverse, a window that does not fit the detector.
+    """
+    if not isinstance(geometry, ParallelBeam | FanBeam | ConeBeam):
+        raise TypeError(f"geometry must be ParallelBeam, FanBeam or ConeBeam, got {type(geometry).__name__}")
+    if not isinstance(grid, VolumeGrid):
+        raise TypeError(f"grid must be a VolumeGrid, got {type(grid).__name__}")
+    axes = 3 if isinstance(geometry, ConeBeam) else 2
+    if grid.ndim != axes:
+        raise ValueError(
+            f"{type(geometry).__name__} needs a {axes}-D grid, got shape {grid.shape}: "
+            + ("use FanBeam for one slice" if axes == 3 else "use grid.slice, or ConeBeam for a volume")
+        )
+    if window is None:
+        return
+    if not isinstance(window, DetectorWindow):
+        raise TypeError(f"window must be a DetectorWindow or None, got {type(window).__name__}")
+    if window.views != geometry.views:
+        raise ValueError(f"window has {window.views} views, the geometry {geometry.views}: they must be equal")
+    if int(window.first_column.max()) + window.columns > geometry.columns:
+        raise ValueError(
+            f"window reaches column {int(window.first_column.max()) + window.columns - 1}, the detector has columns "
+            f"0…{geometry.columns - 1}: make it narrower"
+        )
+    rows = geometry.rows if isinstance(geometry, ConeBeam) else 1
+    if window.first_row + window.rows > rows:
+        raise ValueError(
+            f"window reaches row {window.first_row + window.rows - 1}, the detector has rows 0…{rows - 1}: "
+            "reduce first_row or rows"
+        )
+
+
+def rays_of(geometry: Geometry, window: DetectorWindow | None = None) -> Rays:
+    """The rays of a circular scan (see :class:`Rays`)."""
+    views, columns = geometry.views, geometry.columns
+    beta = geometry.angles
+    radial = np.stack([np.cos(beta), np.sin(beta)], axis=1)
+    tangent = np.stack([-np.sin(beta), np.cos(beta)], axis=1)
+    row_edge, row_pitch, rows = -0.5, 1.0, 1
+    centers = geometry.column_positions  # type: ignore[attr-defined]
+    pitch = geometry.pitch  # type: ignore[attr-defined]
+    if isinstance(geometry, ConeBeam):
+        row_edge, row_pitch, rows = geometry.row_positions[0] - pitch[0] / 2, pitch[0], geometry.rows
+        pitch = pitch[1]
+    edges = np.append(centers - pitch / 2, centers[-1] + pitch / 2)
+    source = np.zeros((views, 3))
+    if isinstance(geometry, ParallelBeam):
+        axial = -radial
+        table = [np.stack([np.ones(t.size), t], axis=1) for t in (edges, centers)]
+    else:
+        assert isinstance(geometry, FanBeam | ConeBeam)
+        source[:, :2] = geometry.sod * radial
+        axial = -geometry.sdd * radial
+        if geometry.detector == "curved":
+            table = [
+                np.stack([np.cos(t / geometry.sdd), geometry.sdd * np.sin(t / geometry.sdd)], axis=1)
+                for t in (edges, centers)
+            ]
+        else:
+            table = [np.stack([np.ones(t.size), t], axis=1) for t in (edges, centers)]
+    first = np.zeros(views, dtype=np.int64) if window is None else np.asarray(window.first_column)
+    return Rays(
+        parallel=isinstance(geometry, ParallelBeam),
+        source=source,
+        axial=axial,
+        across=tangent,
+        foot_z=np.zeros(views),
+        edges=table[0],
+        centers=table[1],
+        row_edge=row_edge,
+        row_pitch=row_pitch,
+        first=first,
+        columns=columns if window is None else window.columns,
+        first_row=0 if window is None else window.first_row,
+        rows=rows if window is None else window.rows,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Segments:
+    """Runs of neighbouring columns of a view whose rays share their main axis.
+
+    Rays that cross more grid rows than columns are followed row by row (axis 0), the others column by column (axis 1),
+    whatever the view: this keeps the step along a grid line below one voxel for every ray of a wide fan.
+
+    Args:
+        table: ``(segments, 4)`` int64: view, axis, first column (within the window), number of columns;
+            sorted by view.
+        start: ``(views + 1,)`` int64, the segments of view ``v`` are ``start[v]:start[v + 1]``.
+    """
+
+    table: Ints
+    start: Ints
+
+
+def split(rays: Rays, grid: VolumeGrid) -> Segments:
+    """The segments of all views for the voxels of ``grid`` (see :class:`Segments`)."""
+    hy, hx = grid.spacing[-2:]
+    rows: list[Ints] = []
+    offset = np.arange(rays.columns)
+    for begin in range(0, rays.views, 256):
+        view = slice(begin, min(begin + 256, rays.views))
+        cell = rays.centers[rays.first[view, None] + offset]  # (views, columns, 2)
+        b = np.zeros_like(cell[..., 1]) if rays.parallel else cell[..., 1]
+        dx = cell[..., 0] * rays.axial[view, None, 0] + b * rays.across[view, None, 0]
+        dy = cell[..., 0] * rays.axial[view, None, 1] + b * rays.across[view, None, 1]
+        # A hair's breadth in favour of rows, so that exact diagonals do not flip with the rounding of the cosine.
+        along_x = (np.abs(dx) * hy > np.abs(dy) * hx * (1 + 1e-9)).astype(np.int64)
+        change = np.diff(along_x, axis=1) != 0
+        cut = np.concatenate([np.ones((along_x.shape[0], 1), bool), change], axis=1)
+        v, first = np.nonzero(cut)
+        stop = np.append(first[1:], 0)
+        stop[stop == 0] = rays.columns
+        rows.append(np.stack([v + begin, along_x[v, first], first, stop - first], axis=1))
+    table = np.ascontiguousarray(np.concatenate(rows).astype(np.int64))
+    start = np.searchsorted(table[:, 0], np.arange(rays.views + 1)).astype(np.int64)
+    return Segments(table, start)
+
+
+def check_source(rays: Rays, grid: VolumeGrid) -> None:
+    """Refuse a source inside the grid: its line integrals would start in the middle of the object.
+
+    Raises:
+        ValueError: some view's source lies inside the grid's rectangle (or touches it).
+    """
+    if rays.parallel:
+        return
+    cy, cx = grid.center[-2:]
+    ey, ex = grid.extent[-2:]
+    inside = (np.abs(rays.source[:, 0] - cx) <= ex / 2) & (np.abs(rays.source[:, 1] - cy) <= ey / 2)
+    if inside.any():
+        v = int(np.argmax(inside))
+        x, y = rays.source[v, :2]
+        raise ValueError(
+            f"the source of view {v} at x {x:.1f}, y {y:.1f} mm lies inside the grid "
+            f"({ex:g} × {ey:g} mm about x {cx:g}, y {cy:g}): shrink or move the grid, or increase sod "
+            f"(now {math.hypot(x, y):.1f} mm from the axis)"
+        )
