@@ -1,0 +1,42 @@
+"""One autograd function for every linear operator of this package that is given with its exact transpose."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+__all__ = ["apply_linear"]
+
+Linear = Callable[[Tensor], Tensor]
+
+
+class _Linear(torch.autograd.Function):
+    """``forward(x)``; its gradient is ``transpose``, whose gradient is ``forward`` again (any order)."""
+
+    @staticmethod
+    def forward(x: Tensor, forward: Linear, transpose: Linear) -> Tensor:
+        return forward(x)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        _, ctx.forward_map, ctx.transpose_map = inputs
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Any) -> Any:
+        return _Linear.apply(gradients[0], ctx.transpose_map, ctx.forward_map), None, None
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Any:
+        return _Linear.apply(tangents[0], ctx.forward_map, ctx.transpose_map)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[Any, ...], x: Tensor, forward: Linear, transpose: Linear) -> tuple[Tensor, int]:
+        return _Linear.apply(x.movedim(in_dims[0], 0), forward, transpose), 0
+
+
+def apply_linear(x: Tensor, forward: Linear, transpose: Linear) -> Tensor:
+    """``forward(x)`` with gradients of any order; both maps take and keep leading batch dimensions."""
+    return _Linear.apply(x, forward, transpose)
