@@ -1,0 +1,34 @@
+"""The scanned object: analytic bodies in mm, their materials and their motion; see :mod:`torchpcct.scene.scene`."""
+
+from typing import TYPE_CHECKING, Any
+
+from torchpcct.scene.bodies import Box, Ellipsoid, EllipticCylinder, Shape, rotation_matrix
+from torchpcct.scene.motion import SinusoidalMotion
+from torchpcct.scene.scene import Body, Scene
+from torchpcct.scene.tubes import BulgedTube, NarrowedTube
+
+if TYPE_CHECKING:
+    from torchpcct.scene.chords import chord_lengths
+
+__all__ = [
+    "Body",
+    "Box",
+    "BulgedTube",
+    "Ellipsoid",
+    "EllipticCylinder",
+    "NarrowedTube",
+    "Scene",
+    "Shape",
+    "SinusoidalMotion",
+    "chord_lengths",
+    "rotation_matrix",
+]
+
+
+def __getattr__(name: str) -> Any:
+    # The chord kernels need numba: loaded on first use, so that importing the package stays quick.
+    if name == "chord_lengths":
+        from torchpcct.scene.chords import chord_lengths
+
+        return chord_lengths
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
