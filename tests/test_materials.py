@@ -1,0 +1,180 @@
+"""Materials: published compositions, the molecular derivation, attenuation, CT numbers, mixing, validation."""
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from torchpcct.scene.materials import (
+    MATERIALS,
+    PLAQUE_MATERIALS,
+    Material,
+    blend,
+    calcification,
+    compound,
+    formula_mass_fractions,
+    material,
+    mixture,
+)
+from torchpcct.scene.materials_tables import BASIS_FORMULAS, PLAQUE_RECIPES, elastin_formula, plaque_tissue
+
+
+@pytest.mark.parametrize("name", list(PLAQUE_RECIPES))
+def test_the_molecular_recipe_gives_the_published_element_table(name):
+    derived, published = plaque_tissue(name), material(name)
+    assert derived.density_g_cm3 == published.density_g_cm3
+    assert set(derived.mass_fractions) == set(published.mass_fractions)
+    for element, fraction in published.mass_fractions.items():
+        assert derived.mass_fractions[element] == pytest.approx(fraction, abs=1e-4)
+
+
+def test_elastin_residues_give_the_published_formula():
+    formula = elastin_formula()
+    for element, atoms in BASIS_FORMULAS["elastin"].items():
+        assert formula[element] == pytest.approx(atoms, abs=0.012)
+
+
+def test_water_fractions_are_those_of_h2o():
+    fractions = material("water").mass_fractions
+    assert fractions["H"] == pytest.approx(0.111894, abs=2e-5)
+    assert fractions["O"] == pytest.approx(0.888106, abs=2e-5)
+
+
+def test_attenuation_is_the_mass_weighted_sum_of_the_elam_total_cross_sections():
+    import xraydb
+
+    energies = np.array([[20.0, 33.0, 34.0], [60.0, 80.0, 100.0]])
+    for name in ("blood_iodine", "water", "cortical_bone"):
+        m = material(name)
+        expected = sum(
+            fraction * xraydb.mu_elam(element, energies.ravel() * 1e3) for element, fraction in m.mass_fractions.items()
+        )
+        expected = expected.reshape(2, 3) * m.density_g_cm3 / 10
+        np.testing.assert_allclose(m.attenuation(energies), expected, rtol=1e-13)
+        assert m.attenuation(energies).dtype == np.float64
+
+
+def test_water_attenuation_against_nist_xcom():
+    # NIST X-ray mass attenuation coefficients of liquid water, cm²/g, coherent scatter included.
+    nist = {30.0: 0.3756, 40.0: 0.2683, 50.0: 0.2269, 60.0: 0.2059, 80.0: 0.1837, 100.0: 0.1707}
+    ours = material("water").attenuation(list(nist)) * 10
+    np.testing.assert_allclose(ours, list(nist.values()), rtol=0.01)
+
+
+def test_the_kinds_of_interaction_add_up_to_the_total():
+    energies = np.linspace(15, 120, 36)
+    m = material("blood_iodine")
+    parts = sum(m.attenuation(energies, kind) for kind in ("photo", "incoh", "coh"))
+    np.testing.assert_allclose(parts, m.attenuation(energies), rtol=1e-12)
+
+
+def test_iodine_k_edge_is_in_the_table():
+    below, above = material("iodine").attenuation([33.0, 33.3])
+    assert above > 5 * below
+
+
+def test_ct_numbers_of_the_plaque_at_64_kev():
+    expected = {"vessel_wall": 60, "fibrous_tissue": 100, "necrotic_core": 40}
+    for name, hu in expected.items():
+        for energy in (63.0, 64.0, 65.0):
+            assert material(name).hu(energy) == pytest.approx(hu, abs=0.8)
+
+
+def test_ct_numbers_at_55_kev():
+    assert material("blood_iodine").hu(55.0) == pytest.approx(522, abs=2)
+    assert material("pericoronary_fat").hu(55.0) == pytest.approx(-99, abs=1)
+
+
+def test_water_reads_zero_and_air_minus_1000_for_any_spectrum():
+    energies, weights = np.arange(20.0, 100), np.linspace(1, 0.1, 80)
+    assert material("water").hu(energies, weights) == pytest.approx(0, abs=1e-9)
+    assert material("air").hu(energies, weights) == pytest.approx(-1000, abs=2)
+
+
+@given(st.lists(st.floats(0.05, 1.0), min_size=2, max_size=4), st.floats(20, 120))
+@settings(max_examples=50, deadline=None)
+def test_blending_by_volume_is_linear_in_attenuation(shares, energy):
+    names = ["water", "hydroxyapatite", "adipose", "blood_iodine"][: len(shares)]
+    shares = np.array(shares) / sum(shares)
+    parts = {material(n): float(s) for n, s in zip(names, shares, strict=True)}
+    expected = sum(s * m.attenuation(energy) for m, s in parts.items())
+    assert float(blend("b", parts).attenuation(energy)) == pytest.approx(float(expected), rel=1e-10)
+
+
+def test_mixing_by_mass_adds_mass_fractions():
+    m = mixture("saline-like", 1.0, {material("water"): 0.9, material("iodine"): 0.1})
+    assert m.mass_fractions["I"] == pytest.approx(0.1)
+    assert m.mass_fractions["H"] == pytest.approx(0.9 * material("water").mass_fractions["H"])
+
+
+@pytest.mark.parametrize("hu", [200.0, 800.0, 1500.0, 3000.0])
+def test_calcification_reads_what_was_asked_for(hu):
+    energies, weights = np.arange(40.0, 100), np.hanning(60)
+    assert calcification(hu, energies, weights).hu(energies, weights) == pytest.approx(hu, abs=1e-6)
+
+
+def test_rounded_tables_are_normalised():
+    assert sum(material("blood_iodine").mass_fractions.values()) == pytest.approx(1, abs=1e-14)
+    assert material("blood_iodine").mass_fractions["I"] == pytest.approx(0.0100 / 1.0002, rel=1e-12)
+
+
+def test_every_material_of_the_registry_builds_and_attenuates():
+    assert set(PLAQUE_MATERIALS) <= set(MATERIALS)
+    for name in MATERIALS:
+        m = MATERIALS[name]
+        assert m.name == name
+        mu = m.attenuation(np.array([20.0, 60.0, 100.0]))
+        assert np.all(mu > 0)
+        assert mu[0] > mu[1]
+
+
+def test_materials_are_values():
+    m = material("blood_iodine")
+    assert pickle.loads(pickle.dumps(m)) == m
+    assert hash(copy.deepcopy(m)) == hash(m)
+    assert m.with_density(1.2) != m
+    with pytest.raises(TypeError):
+        m.mass_fractions["I"] = 0.5  # type: ignore[index]
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Material("m", 0.0, {"H": 1}), "greater than 0"),
+        (lambda: Material("m", float("nan"), {"H": 1}), "greater than 0"),
+        (lambda: Material("m", 1.0, {"H": 0.5, "O": 0.4}), "sum to 0.9"),
+        (lambda: Material("m", 1.0, {"H": 11.2, "O": 88.8}), "not per cent"),
+        (lambda: Material("m", 1.0, {"H": 1.5, "O": -0.5}), "must be ≥ 0"),
+        (lambda: Material("m", 1.0, {"Xx": 1.0}), "unknown element 'Xx'"),
+        (lambda: Material("m", 1.0, {}), "at least one element"),
+        (lambda: compound("m", 1.0, {"Qq": 2}), "unknown element 'Qq'"),
+        (lambda: formula_mass_fractions({}), "at least one atom"),
+        (lambda: mixture("m", 1.0, {material("water"): 0.5}), "sum to 0.5"),
+        (lambda: blend("m", {material("water"): 0.5}), "sum to 0.5"),
+        (lambda: material("watr"), "unknown material 'watr'"),
+        (lambda: material("water").attenuation(60e3), "keV, not eV"),
+        (lambda: material("water").attenuation([60.0, float("nan")]), "got nan"),
+        (lambda: material("water").attenuation(0.1), r"1…500 keV"),
+        (lambda: material("water").attenuation(60.0, "pair"), "kind must be one of"),
+        (lambda: material("water").hu([60.0], [-1.0]), "weights must be"),
+        (lambda: calcification(10_000.0), "hu must lie between"),
+        (lambda: plaque_tissue("water"), "no recipe"),
+    ],
+)
+def test_bad_input_is_refused_with_a_remedy(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_repeated_attenuation_is_fast():
+    import time
+
+    m, energies = material("blood_iodine"), np.arange(10.5, 100)
+    m.attenuation(energies)
+    start = time.perf_counter()
+    for _ in range(100):
+        m.attenuation(energies)
+    assert (time.perf_counter() - start) / 100 < 5e-3

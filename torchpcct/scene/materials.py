@@ -1,0 +1,281 @@
+"""Materials: mass fractions of elements, and the linear attenuation that they give.
+
+Cross-sections are the tabulated values of Elam, Ravel and Sieber (2002) as shipped by ``xraydb``. Attenuation uses the
+*total* cross-section, coherent scatter included: the narrow-beam value that a line integral needs.
+
+Compositions: the coronary plaque of Li et al., "Coronary Atherosclerotic Plaque Characterization with Photon-counting
+CT" (composition tables), body tissues of ICRU Report 44 (heart: Woodard and White 1986), and compounds from their
+chemical formulas.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = [
+    "FRACTION_TOLERANCE",
+    "MATERIALS",
+    "PLAQUE_MATERIALS",
+    "Material",
+    "blend",
+    "calcification",
+    "compound",
+    "formula_mass_fractions",
+    "material",
+    "mixture",
+]
+
+Floats = NDArray[np.float64]
+
+FRACTION_TOLERANCE = 0.005
+"""Largest deviation of a sum of mass fractions from 1: published tables are rounded. Fractions are normalised."""
+
+ENERGY_RANGE_KEV = (1.0, 500.0)
+"""Photon energies accepted by :meth:`Material.attenuation`; the Elam tables are unreliable above 800 keV."""
+
+_KINDS = ("total", "photo", "incoh", "coh")
+
+
+# Symbols of the elements in the cross-section table (Z = 1…98), written out so that building a material needs no table.
+_SYMBOLS = (
+    "H He Li Be B C N O F Ne Na Mg Al Si P S Cl Ar K Ca Sc Ti V Cr Mn Fe Co Ni Cu Zn Ga Ge As Se Br Kr Rb Sr Y Zr Nb "
+    "Mo Tc Ru Rh Pd Ag Cd In Sn Sb Te I Xe Cs Ba La Ce Pr Nd Pm Sm Eu Gd Tb Dy Ho Er Tm Yb Lu Hf Ta W Re Os Ir Pt Au "
+    "Hg Tl Pb Bi Po At Rn Fr Ra Ac Th Pa U Np Pu Am Cm Bk Cf"
+)
+_ELEMENTS = frozenset(_SYMBOLS.split())
+
+
+@functools.lru_cache(maxsize=4096)
+def _mass_attenuation(element: str, energies: bytes, kind: str) -> Floats:
+    """Mass attenuation of an element in cm²/g at packed float64 energies (keV); cached, read-only."""
+    import xraydb
+
+    values = np.array(xraydb.mu_elam(element, np.frombuffer(energies) * 1e3, kind=kind), dtype=np.float64)
+    values.setflags(write=False)
+    return values
+
+
+@functools.cache
+def _atomic_mass(element: str) -> float:
+    if element not in _ELEMENTS:
+        raise ValueError(f"unknown element {element!r}: use chemical symbols such as 'H', 'Ca', 'I'")
+    import xraydb
+
+    return float(xraydb.atomic_mass(element))
+
+
+def _energies(energies_kev: Any) -> Floats:
+    energies = np.array(energies_kev, dtype=np.float64, order="C")
+    low, high = ENERGY_RANGE_KEV
+    bad = ~((energies >= low) & (energies <= high))
+    if bad.any():
+        raise ValueError(
+            f"photon energies must lie in {low:g}…{high:g} keV (the cross-section table), got "
+            f"{float(energies[bad].flat[0]):g}: energies are in keV, not eV"
+        )
+    return energies
+
+
+@dataclass(frozen=True)
+class Material:
+    """A homogeneous material.
+
+    Args:
+        name: what it is called.
+        density_g_cm3: mass density in g/cm³.
+        mass_fractions: chemical symbol → mass fraction. They must sum to 1 within :data:`FRACTION_TOLERANCE` (published
+            tables are rounded) and are then normalised to sum to 1 exactly.
+
+    Raises:
+        ValueError: density ≤ 0, a negative or non-finite fraction, a sum off by more than the tolerance, no element at
+            all, an unknown element.
+    """
+
+    name: str
+    density_g_cm3: float
+    mass_fractions: Mapping[str, float]
+
+    def __post_init__(self) -> None:
+        density = float(self.density_g_cm3)
+        if not (math.isfinite(density) and density > 0):
+            raise ValueError(f"density of {self.name!r} must be greater than 0 g/cm³, got {self.density_g_cm3!r}")
+        fractions = {str(k): float(v) for k, v in dict(self.mass_fractions).items()}
+        if not fractions:
+            raise ValueError(f"material {self.name!r} needs at least one element")
+        for element, fraction in fractions.items():
+            if element not in _ELEMENTS:
+                raise ValueError(
+                    f"unknown element {element!r} in {self.name!r}: use chemical symbols such as 'H', 'Ca', 'I'"
+                )
+            if not (math.isfinite(fraction) and fraction >= 0):
+                raise ValueError(f"mass fraction of {element} in {self.name!r} must be ≥ 0 and finite, got {fraction}")
+        total = math.fsum(fractions.values())
+        if abs(total - 1.0) > FRACTION_TOLERANCE:
+            raise ValueError(
+                f"mass fractions of {self.name!r} sum to {total:.4f}, not 1 ± {FRACTION_TOLERANCE}: "
+                "give fractions (not per cent) of every element"
+            )
+        if abs(total - 1.0) < 1e-12:
+            total = 1.0  # rounding only: leave the values as they are, so that copies compare equal
+        normalised = {k: v / total for k, v in fractions.items() if v > 0}
+        object.__setattr__(self, "density_g_cm3", density)
+        object.__setattr__(self, "mass_fractions", MappingProxyType(normalised))
+
+    def __hash__(self) -> int:
+        return hash((self.name, self.density_g_cm3, tuple(self.mass_fractions.items())))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (Material, (self.name, self.density_g_cm3, dict(self.mass_fractions)))
+
+    def attenuation(self, energies_kev: Any, kind: str = "total") -> Floats:
+        """Linear attenuation coefficient in mm⁻¹.
+
+        Args:
+            energies_kev: photon energies in keV, any shape.
+            kind: ``"total"`` (coherent scatter included), or one part of it: ``"photo"`` (photoelectric), ``"incoh"``
+                (Compton), ``"coh"`` (Rayleigh).
+
+        Returns:
+            float64, the shape of ``energies_kev``.
+
+        Raises:
+            ValueError: an energy outside the table, an unknown ``kind``.
+        """
+        if kind not in _KINDS:
+            raise ValueError(f"kind must be one of {_KINDS}, got {kind!r}")
+        energies = _energies(energies_kev)
+        packed = energies.tobytes()
+        total = np.zeros(energies.size)
+        for element, fraction in self.mass_fractions.items():
+            total += fraction * _mass_attenuation(element, packed, kind)
+        return (total * (self.density_g_cm3 / 10.0)).reshape(energies.shape)  # cm⁻¹ → mm⁻¹
+
+    def hu(self, energies_kev: Any, weights: Any = 1.0) -> float:
+        """Effective CT number against water for a spectrum: 1000 (Σ w μ / Σ w μ_water − 1).
+
+        Args:
+            energies_kev: energies ``(E,)`` keV, or one energy.
+            weights: relative detected signal per energy, broadcast to ``energies_kev``.
+        """
+        energies = np.atleast_1d(np.asarray(energies_kev, dtype=np.float64))
+        w = np.broadcast_to(np.asarray(weights, dtype=np.float64), energies.shape)
+        if not (np.isfinite(w).all() and (w >= 0).all() and w.sum() > 0):
+            raise ValueError("weights must be finite, ≥ 0 and not all zero")
+        return float(
+            1000.0
+            * ((w * self.attenuation(energies)).sum() / (w * MATERIALS["water"].attenuation(energies)).sum() - 1.0)
+        )
+
+    def with_density(self, density_g_cm3: float, name: str | None = None) -> Material:
+        """The same composition at another density."""
+        return Material(self.name if name is None else name, density_g_cm3, self.mass_fractions)
+
+
+def formula_mass_fractions(formula: Mapping[str, float]) -> dict[str, float]:
+    """Mass fractions of a molecular formula, element → number of atoms (which may be fractional)."""
+    masses = {element: count * _atomic_mass(element) for element, count in formula.items()}
+    total = sum(masses.values())
+    if not total > 0:
+        raise ValueError(f"a formula needs at least one atom, got {dict(formula)!r}")
+    return {element: mass / total for element, mass in masses.items()}
+
+
+def compound(name: str, density_g_cm3: float, formula: Mapping[str, float]) -> Material:
+    """A material from its molecular formula, e.g. ``compound("water", 1.0, {"H": 2, "O": 1})``."""
+    return Material(name, density_g_cm3, formula_mass_fractions(formula))
+
+
+def mixture(name: str, density_g_cm3: float, parts: Mapping[Material, float]) -> Material:
+    """A mixture by *mass* at a given density; the shares must sum to 1 within :data:`FRACTION_TOLERANCE`."""
+    fractions: dict[str, float] = {}
+    for part, share in parts.items():
+        if not (math.isfinite(share) and share >= 0):
+            raise ValueError(f"share of {part.name!r} in {name!r} must be ≥ 0 and finite, got {share}")
+        for element, fraction in part.mass_fractions.items():
+            fractions[element] = fractions.get(element, 0.0) + share * fraction
+    return Material(name, density_g_cm3, fractions)
+
+
+def blend(name: str, parts: Mapping[Material, float]) -> Material:
+    """A mixture by *volume*: density and attenuation are the volume-weighted means of the parts (ideal mixing)."""
+    shares = {part: float(share) for part, share in parts.items()}
+    total = sum(shares.values())
+    if abs(total - 1.0) > FRACTION_TOLERANCE:
+        raise ValueError(f"volume fractions of {name!r} sum to {total:.4f}, not 1 ± {FRACTION_TOLERANCE}")
+    density = sum(share * part.density_g_cm3 for part, share in shares.items()) / total
+    return mixture(name, density, {p: s * p.density_g_cm3 / (total * density) for p, s in shares.items()})
+
+
+def calcification(
+    hu: float = 1500.0,
+    energies_kev: Any = 64.0,
+    weights: Any = 1.0,
+    matrix: Material | None = None,
+    name: str = "calcification",
+) -> Material:
+    """Hydroxyapatite in a soft matrix, mixed by volume so that it reads ``hu`` for the given spectrum.
+
+    Args:
+        hu: CT number to reach, between that of the matrix and that of pure hydroxyapatite.
+        energies_kev, weights: the spectrum, as for :meth:`Material.hu`. The default, 64 keV, is the mean energy of a
+            100 kVp beam behind 24 cm of adipose tissue.
+        matrix: what the mineral is embedded in (default: fibrous tissue).
+
+    Raises:
+        ValueError: ``hu`` outside what a mixture can reach.
+    """
+    matrix = MATERIALS["fibrous_tissue"] if matrix is None else matrix
+    mineral = MATERIALS["hydroxyapatite"]
+    low, high = matrix.hu(energies_kev, weights), mineral.hu(energies_kev, weights)
+    if not low <= hu <= high:
+        raise ValueError(
+            f"hu must lie between {low:.0f} ({matrix.name}) and {high:.0f} (hydroxyapatite) HU for this "
+            f"spectrum, got {hu}"
+        )
+    share = (hu - low) / (high - low)  # exact: attenuation is linear in the volume share
+    return blend(name, {matrix: 1.0 - share, mineral: share})
+
+
+class _Registry(Mapping[str, Material]):
+    """Materials by name, each built when first asked for: compounds need the table of atomic masses, a slow import."""
+
+    def __init__(self) -> None:
+        self._built: dict[str, Material] = {}
+
+    def __getitem__(self, name: str) -> Material:
+        if name not in self._built:
+            from torchpcct.scene.materials_tables import FACTORIES
+
+            self._built[name] = FACTORIES[name]()
+        return self._built[name]
+
+    def __iter__(self) -> Iterator[str]:
+        from torchpcct.scene.materials_tables import FACTORIES
+
+        return iter(FACTORIES)
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+
+MATERIALS: Mapping[str, Material] = _Registry()
+"""All built-in materials by name (read-only)."""
+
+PLAQUE_MATERIALS = ("vessel_wall", "fibrous_tissue", "necrotic_core", "blood_iodine", "pericoronary_fat")
+"""Names of the five tissues of the plaque scene."""
+
+
+def material(name: str) -> Material:
+    """The material of the registry :data:`MATERIALS` with this name; a ``ValueError`` lists the known names."""
+    try:
+        return MATERIALS[name]
+    except KeyError:
+        raise ValueError(f"unknown material {name!r}: known are {', '.join(sorted(MATERIALS))}") from None
