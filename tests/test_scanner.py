@@ -1,0 +1,235 @@
+"""The scanner: published and assumed numbers, counts, CT numbers, water correction, validation."""
+
+import dataclasses
+import pickle
+
+import numpy as np
+import pytest
+import torch
+
+from torchpcct.geometry import ConeBeam
+from torchpcct.scanner import Scanner, SiliconDetector, Source, presets
+from torchpcct.scene.materials import PLAQUE_MATERIALS, material
+
+FAT_MM = 240.0
+
+
+@pytest.fixture(scope="module")
+def pcct():
+    return presets.pcct()
+
+
+@pytest.fixture(scope="module")
+def eid():
+    return presets.eid()
+
+
+def test_published_geometry(pcct, eid):
+    g = pcct.geometry
+    assert (g.sod, g.sdd, g.columns, g.rows, g.views, g.detector) == (626.0, 1098.0, 1500, 40, 1968, "curved")
+    assert (g.pitch, pcct.source.focal_spot, pcct.source.kvp) == ((0.50, 0.35), (0.5, 0.5), 100.0)
+    assert 2 * g.fov_radius == pytest.approx(296, abs=1)
+    g = eid.geometry
+    assert (g.sod, g.sdd, g.columns, g.rows, g.views, g.detector) == (541.0, 949.0, 888, 64, 984, "curved")
+    assert (g.pitch, eid.source.focal_spot, eid.source.current_ma) == ((1.0988, 1.0239), (0.9, 0.7), 1000.0)
+    assert g.offset == (0.0, pytest.approx(-1.25 * 1.0239))
+
+
+def test_photons_per_cell_and_view(pcct):
+    """Quanta of a CatSim-like beam at 0.35 s: 16 070 in air, 161 behind 24 cm of fat, of which 115 are counted."""
+    energies, quanta = pcct.quanta()
+    load = pcct.mas_per_view(0.35)
+    assert load == pytest.approx(1000 * 0.35 / 1968)
+    fat = np.exp(-material("pericoronary_fat").attenuation(energies) * FAT_MM)
+    centre = pcct.geometry.columns // 2
+    assert load * quanta[centre].sum() == pytest.approx(16_070, rel=0.02)
+    assert load * (quanta[centre] * fat).sum() == pytest.approx(161, rel=0.02)
+    counted = load * pcct.behind({material("pericoronary_fat"): FAT_MM})[0, centre].sum()
+    assert counted == pytest.approx(115, rel=0.03)
+
+
+def test_quanta_from_first_principles(pcct):
+    """Central cell: fluence at 1 m × inverse square × cell area × filters, each by hand."""
+    spectrum = pcct.source.spectrum()
+    energies, quanta = pcct.quanta()
+    aluminium = material("aluminium").attenuation(energies)
+    column = 1000
+    gamma = pcct.geometry.fan_angles[column]
+    path = 3.0 / np.cos(gamma) + pcct.bowties[0].thickness(gamma)
+    expected = spectrum.fluence * (1000 / 1098) ** 2 * 0.35 * 0.50 * np.exp(-aluminium * path)
+    np.testing.assert_allclose(quanta[column], expected, rtol=1e-12)
+
+
+def test_a_flat_detector_loses_by_the_cube_of_the_cosine(pcct):
+    bare = pcct.replace(filters=(), bowties=())
+    g = bare.geometry
+    flat = bare.replace(geometry=ConeBeam((0.0,), g.sod, g.sdd, 501, 1, (0.5, 1.0)))
+    quanta = flat.quanta()[1].sum(1)
+    np.testing.assert_allclose(quanta / quanta[250], np.cos(flat.geometry.fan_angles) ** 3, rtol=1e-12)
+
+
+def test_ct_numbers_of_the_plaque_for_the_transmitted_spectrum(pcct):
+    energies, quanta = pcct.quanta()
+    behind = quanta[750] * np.exp(-material("pericoronary_fat").attenuation(energies) * FAT_MM)
+    for name, hu in zip(PLAQUE_MATERIALS, (58, 97, 36, 464, -94), strict=True):
+        assert material(name).hu(energies, behind) == pytest.approx(hu, abs=4), name
+
+
+def test_row_factor_is_inverse_square_times_obliquity(pcct):
+    g = pcct.geometry
+    assert pcct.row_factor.shape == (40,)
+    z = g.row_positions[0]
+    distance = np.hypot(g.sdd, z)
+    assert pcct.row_factor[0] == pytest.approx((g.sdd / distance) ** 2 * (g.sdd / distance), rel=1e-14)
+    assert pcct.row_factor[0] == pcct.row_factor[-1] < pcct.row_factor[19] < 1
+
+
+@pytest.mark.parametrize("make", [presets.pcct, presets.eid, lambda: presets.pcct(mode="spectral")])
+def test_weights_are_quanta_times_response(make):
+    scanner = make()
+    energies, quanta = scanner.quanta()
+    same, weights = scanner.weights()
+    assert weights.shape == (scanner.detector.bins, scanner.geometry.columns, energies.size)
+    np.testing.assert_array_equal(same, energies)
+    response = scanner.detector.response(energies)
+    np.testing.assert_allclose(weights, response[:, None] * quanta, rtol=1e-14)
+    air = scanner.air_readings(0.35)
+    assert air.shape == (scanner.detector.bins, scanner.geometry.rows, scanner.geometry.columns)
+    assert (air > 0).all()
+    np.testing.assert_allclose(air[:, 5, 7], weights[:, 7].sum(-1) * scanner.row_factor[5] * scanner.mas_per_view(0.35))
+
+
+def test_counting_is_the_sum_of_the_energy_bins(pcct):
+    spectral = presets.pcct(mode="spectral")
+    np.testing.assert_allclose(spectral.weights()[1].sum(0), pcct.weights()[1][0], rtol=1e-10)
+
+
+def test_noise_weights(pcct, eid):
+    np.testing.assert_array_equal(pcct.noise_weights()[1], pcct.weights()[1])
+    energies, weights = eid.weights()
+    np.testing.assert_allclose(eid.noise_weights()[1], weights * energies, rtol=1e-14)
+
+
+def test_the_number_of_views_changes_the_load_only(pcct):
+    few = pcct.with_views(123)
+    assert few.geometry.views == 123
+    assert few.weights()[1] is pcct.weights()[1]  # cached, whatever the views
+    assert few.mas_per_view(1.0) * 123 == pytest.approx(pcct.mas_per_view(1.0) * 1968)
+    assert few.geometry.angles[1] == pytest.approx(2 * np.pi / 123)
+
+
+def test_arrays_are_read_only(pcct):
+    with pytest.raises(ValueError, match="read-only"):
+        pcct.weights()[1][0, 0, 0] = 1.0
+
+
+@pytest.mark.parametrize("make", [presets.pcct, presets.eid])
+def test_water_reads_linear_from_0_to_380_mm(make):
+    scanner = make()
+    lin = scanner.water_linearisation()
+    energies, weights = scanner.weights()
+    mu = material("water").attenuation(energies)
+    for t in (0.01, 1.0, 7.0, 33.0, 100.0, 171.0, 240.0, 333.0, 380.0):
+        p = -np.log((weights[0] * np.exp(-mu * t)).sum(-1) / weights[0].sum(-1))
+        linear = lin.apply(torch.from_numpy(p)).numpy() / (lin.mu_ref * t)
+        np.testing.assert_allclose(linear, 1.0, atol=2e-5, err_msg=f"{t} mm")
+
+
+def test_the_water_correction_of_each_energy_bin():
+    scanner = presets.pcct(mode="spectral", columns=8)
+    energies, weights = scanner.weights()
+    mu = material("water").attenuation(energies)
+    for b in range(8):
+        lin = scanner.water_linearisation(bin=b)
+        for t in (0.01, 5.0, 50.0, 100.0, 200.0, 300.0, 380.0):
+            p = -np.log((weights[b] * np.exp(-mu * t)).sum(-1) / weights[b].sum(-1))
+            np.testing.assert_allclose(lin.apply(torch.from_numpy(p)).numpy() / (lin.mu_ref * t), 1.0, atol=2e-5)
+
+
+def test_the_water_correction_is_tame_outside_its_range(pcct):
+    lin = pcct.water_linearisation()
+    p = torch.linspace(-0.5, 20.0, 4001, dtype=torch.float64)[:, None].expand(-1, 1500)
+    out = lin.apply(p)
+    assert torch.isfinite(out).all()
+    assert (torch.diff(out, dim=0) > 0).all()
+    assert torch.equal(lin.apply(torch.zeros(1500)), torch.zeros(1500))
+    slope = lin.slope(torch.full((1500,), -0.1, dtype=torch.float64))
+    np.testing.assert_allclose(lin.apply(torch.full((1500,), -0.1, dtype=torch.float64)), -0.1 * slope, rtol=1e-12)
+
+
+def test_mu_ref_is_a_plausible_effective_attenuation(pcct):
+    water = material("water")
+    assert water.attenuation(70.0) < pcct.water_linearisation().mu_ref < water.attenuation(50.0)
+
+
+def test_coarser_energy_bins_change_little(pcct):
+    coarse = presets.pcct(energy_bin_kev=2.0)
+    fine_hu = [
+        material(n).hu(pcct.quanta()[0], pcct.behind({material("water"): 200.0})[0, 750]) for n in PLAQUE_MATERIALS
+    ]
+    hu = [
+        material(n).hu(coarse.quanta()[0], coarse.behind({material("water"): 200.0})[0, 750]) for n in PLAQUE_MATERIALS
+    ]
+    np.testing.assert_allclose(hu, fine_hu, atol=3.0)
+    assert coarse.weights()[1][0, 750].sum() == pytest.approx(pcct.weights()[1][0, 750].sum(), rel=0.01)
+
+
+def test_the_roi_bowtie_leaves_the_region_and_darkens_the_rest(pcct):
+    roi = presets.pcct(bowtie="large+roi")
+    gamma = np.abs(pcct.geometry.fan_angles)
+    ratio = roi.weights()[1][0].sum(-1) / pcct.weights()[1][0].sum(-1)
+    np.testing.assert_allclose(ratio[gamma < np.arcsin(50 / 626)], 1.0, rtol=1e-12)
+    assert ratio[gamma > 0.2].max() < 0.25
+
+
+def test_scanners_are_values(pcct):
+    assert presets.pcct() == pcct
+    assert hash(presets.pcct()) == hash(pcct)
+    assert pickle.loads(pickle.dumps(pcct)) == pcct
+    assert pcct.replace(source=Source(kvp=120.0)) != pcct
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        pcct.name = "x"
+
+
+def test_quarter_offset():
+    assert presets.pcct(quarter_offset=True).geometry.offset[1] == pytest.approx(0.35 / 4)
+
+
+def test_description_is_json(pcct, eid):
+    import json
+
+    for scanner in (pcct, eid):
+        assert json.loads(json.dumps(scanner.describe()))["name"] == scanner.name
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"geometry": None}, TypeError, "geometry must be a ConeBeam"),
+        ({"source": 100.0}, TypeError, "source must be a Source"),
+        ({"detector": "silicon"}, TypeError, "detector must be a Detector"),
+        ({"bowties": ("large",)}, TypeError, "Bowtie objects"),
+        ({"filters": (("aluminium", 3.0),)}, TypeError, "Material, mm"),
+        ({"filters": ((material("aluminium"), -3.0),)}, ValueError, "must be ≥ 0 mm"),
+        ({"energy_bin_kev": 0.0}, ValueError, "energy_bin_kev"),
+    ],
+)
+def test_bad_parts_are_refused(pcct, change, error, message):
+    with pytest.raises(error, match=message):
+        pcct.replace(**change)
+
+
+@pytest.mark.parametrize("exposure", [0.0, -1.0, float("nan"), float("inf")])
+def test_bad_exposures_are_refused(pcct, exposure):
+    with pytest.raises(ValueError, match="exposure_s must be greater than 0 s"):
+        pcct.mas_per_view(exposure)
+
+
+def test_bad_presets_are_refused():
+    with pytest.raises(ValueError, match="bowtie must be one of"):
+        presets.pcct(bowtie="medium")
+    with pytest.raises(ValueError, match="mode must be one of"):
+        presets.pcct(mode="integrating")
+    with pytest.raises(ValueError, match="bin must lie in"):
+        presets.pcct(columns=4).water_linearisation(bin=1)
+    assert isinstance(presets.pcct(detector=SiliconDetector("spectral")), Scanner)

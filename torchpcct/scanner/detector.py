@@ -1,0 +1,300 @@
+"""Detectors: what one incident photon leaves in each reading.
+
+A detector turns photons that reach a cell into *bins* of signal. ``response(energies)`` is the expected signal per
+incident photon and ``variance(energies)`` its second moment, so that for Poisson-distributed photons N(E) the reading
+of bin i has mean Σ N response_i and variance Σ N variance_i + electronic_noise². A counting detector has response =
+variance (a sum of Poisson numbers is Poisson); an energy-integrating one has one bin, in keV.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from dataclasses import dataclass, field
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from torchpcct.scanner.compton import recoil
+from torchpcct.scene.materials import MATERIALS, Material
+
+__all__ = ["SILICON_THRESHOLDS_KEV", "Detector", "Scintillator", "SiliconDetector"]
+
+Floats = NDArray[np.float64]
+
+SILICON_THRESHOLDS_KEV = (5.0, 12.0, 22.0, 32.0, 42.0, 52.0, 62.0, 74.0)
+"""Assumed thresholds of the eight energy bins of a deep-silicon detector."""
+
+SILICON_LENGTH_MM = 60.0
+SILICON_SEGMENTS = 3
+SILICON_SIGMA_KEV = 1.6
+"""Assumed energy resolution (standard deviation) of a silicon strip with its electronics."""
+
+SILICON_FILL_FACTOR = 0.96
+"""Assumed sensitive share of a cell: tungsten foils of 20 µm between silicon sheets at 0.5 mm pitch absorb the rest."""
+
+SEGMENT_DESIGN_KEV = 60.0
+"""Assumed energy at which the depth segments share the load equally."""
+
+SCINTILLATOR_DEPTH_MM = 3.0
+SCINTILLATOR_FILL_FACTOR = 0.81
+"""Assumed sensitive share of a scintillator cell: 0.9 in either direction (public CatSim/XCIST default)."""
+
+SCINTILLATOR_NOISE_KEV = 206.0
+"""Assumed electronic noise of an energy-integrating cell, per reading: 3500 electrons at 17 electrons per keV (public
+CatSim/XCIST default)."""
+
+_MODES = ("counting", "spectral")
+
+
+@runtime_checkable
+class Detector(Protocol):
+    """What :class:`torchpcct.scanner.Scanner` needs of a detector."""
+
+    @property
+    def bins(self) -> int:
+        """Number of readings per cell and view."""
+
+    @property
+    def energy_integrating(self) -> bool:
+        """Whether readings are energies (keV) instead of counts."""
+
+    @property
+    def electronic_noise(self) -> float:
+        """Standard deviation added to every reading, in its unit (counts or keV)."""
+
+    def response(self, energies_kev: ArrayLike) -> Floats:
+        """Expected signal per incident photon, ``(bins, E)``."""
+
+    def variance(self, energies_kev: ArrayLike) -> Floats:
+        """Expected squared signal per incident photon, ``(bins, E)``."""
+
+    def __hash__(self) -> int:
+        """Detectors are values: equal ones share cached spectra."""
+
+
+def _check(name: str, value: Any, low: float, high: float, unit: str) -> float:
+    number = float(value)
+    if not (low <= number <= high and math.isfinite(number)):
+        raise ValueError(f"{name} must lie in {low:g}…{high:g} {unit}, got {value!r}")
+    return number
+
+
+@dataclass(frozen=True)
+class SiliconDetector:
+    """Edge-on ("deep") silicon strips that count photons in energy bins.
+
+    Model: a photon that reaches the silicon interacts once, photoelectrically (all its energy stays: electron range and
+    fluorescence escape are negligible at this size) or by Compton scattering (the recoil electron's energy stays,
+    distributed after Klein and Nishina; the scattered photon is lost to the tungsten foils or leaves). Coherent scatter
+    is forward peaked and taken as no interaction. Energies are blurred by a normal distribution and sorted by the
+    thresholds; what lies below the lowest one is lost.
+
+    Args:
+        mode: ``"spectral"``: one bin per threshold, the last one open; ``"counting"``: one bin, their sum.
+        thresholds_kev: lower edges of the bins in keV, increasing.
+        length_mm: length of silicon along the beam.
+        segments: number of depth segments, read out one by one and summed; they share the count rate
+            (:meth:`segment_shares`), which matters for pile-up only.
+        sigma_kev: standard deviation of the recorded energy.
+        fill_factor: sensitive share of the cell's area (tungsten foils, guard structures).
+        dead_layer_mm: insensitive silicon at the entrance.
+        charge_sharing: share of the interactions whose charge is split, at a uniformly distributed ratio, between two
+            cells; each part counts where it exceeds a threshold. 0 switches it off. The correlation that it makes
+            between neighbours is not modelled.
+        dead_time_ns: dead time per depth segment after a count; 0 switches pile-up off. See :meth:`live_fraction`.
+
+    Raises:
+        ValueError: a value outside its range, thresholds that do not increase, an unknown mode.
+    """
+
+    mode: str = "counting"
+    thresholds_kev: tuple[float, ...] = SILICON_THRESHOLDS_KEV
+    length_mm: float = SILICON_LENGTH_MM
+    segments: int = SILICON_SEGMENTS
+    sigma_kev: float = SILICON_SIGMA_KEV
+    fill_factor: float = SILICON_FILL_FACTOR
+    dead_layer_mm: float = 0.0
+    charge_sharing: float = 0.0
+    dead_time_ns: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.mode not in _MODES:
+            raise ValueError(f"mode must be one of {_MODES}, got {self.mode!r}")
+        thresholds = tuple(float(t) for t in self.thresholds_kev)
+        if not thresholds or any(not b > a for a, b in itertools.pairwise(thresholds)):
+            raise ValueError(f"thresholds_kev must be a non-empty increasing sequence, got {self.thresholds_kev!r}")
+        if not (thresholds[0] >= 0 and math.isfinite(thresholds[-1])):
+            raise ValueError(f"thresholds_kev must be ≥ 0 keV and finite, got {self.thresholds_kev!r}")
+        if isinstance(self.segments, bool) or not isinstance(self.segments, int) or self.segments < 1:
+            raise ValueError(f"segments must be a whole number ≥ 1, got {self.segments!r}")
+        set_ = object.__setattr__
+        set_(self, "thresholds_kev", thresholds)
+        set_(self, "length_mm", _check("length_mm", self.length_mm, 1e-3, 1e3, "mm"))
+        set_(self, "sigma_kev", _check("sigma_kev", self.sigma_kev, 1e-3, 50.0, "keV"))
+        set_(self, "fill_factor", _check("fill_factor", self.fill_factor, 1e-6, 1.0, "(a share of the cell)"))
+        set_(self, "dead_layer_mm", _check("dead_layer_mm", self.dead_layer_mm, 0.0, 1e3, "mm"))
+        set_(self, "charge_sharing", _check("charge_sharing", self.charge_sharing, 0.0, 1.0, "(a share of events)"))
+        set_(self, "dead_time_ns", _check("dead_time_ns", self.dead_time_ns, 0.0, 1e6, "ns"))
+
+    @property
+    def bins(self) -> int:
+        """1 in counting mode, else one per threshold."""
+        return 1 if self.mode == "counting" else len(self.thresholds_kev)
+
+    @property
+    def energy_integrating(self) -> bool:
+        return False
+
+    @property
+    def electronic_noise(self) -> float:
+        """0: the lowest threshold keeps electronic noise out of the counts."""
+        return 0.0
+
+    def interaction(self, energies_kev: ArrayLike) -> tuple[Floats, Floats]:
+        """Probability of a (photoelectric, Compton) interaction in the sensitive silicon per incident photon."""
+        silicon = MATERIALS["silicon"]
+        photo, compton = silicon.attenuation(energies_kev, "photo"), silicon.attenuation(energies_kev, "incoh")
+        both = photo + compton
+        reached = self.fill_factor * np.exp(-both * self.dead_layer_mm)
+        stopped = reached * -np.expm1(-both * self.length_mm) / both
+        return stopped * photo, stopped * compton
+
+    def above(self, energies_kev: ArrayLike, thresholds_kev: ArrayLike) -> Floats:
+        """Expected counts above thresholds per incident photon, ``(thresholds, E)``.
+
+        Args:
+            energies_kev: ``(E,)`` photon energies in keV.
+            thresholds_kev: ``(T,)`` any thresholds in keV (−inf: all interactions).
+        """
+        from scipy.special import ndtr
+
+        energies = np.atleast_1d(np.asarray(energies_kev, dtype=np.float64))
+        thresholds = np.atleast_1d(np.asarray(thresholds_kev, dtype=np.float64))
+        photo, compton = self.interaction(energies)
+        electron, probability = recoil(energies)
+        # All deposits of one photon energy with their probabilities: the photopeak first, then the Compton continuum.
+        deposit = np.concatenate([energies[:, None], electron], axis=1)
+        chance = np.concatenate([photo[:, None], compton[:, None] * probability], axis=1)
+        out = np.empty((thresholds.size, energies.size))
+        parts, weights = np.polynomial.legendre.leggauss(24)
+        parts, weights = (parts + 1) / 2, weights / 2
+        for i, t in enumerate(thresholds):
+            whole = ndtr((deposit - t) / self.sigma_kev)
+            if self.charge_sharing:
+                shared = sum(
+                    2 * w * ndtr((u * deposit - t) / self.sigma_kev) for u, w in zip(parts, weights, strict=True)
+                )
+                whole = (1 - self.charge_sharing) * whole + self.charge_sharing * shared
+            out[i] = (chance * whole).sum(axis=1)
+        return out
+
+    def response(self, energies_kev: ArrayLike) -> Floats:
+        """Expected counts per incident photon, ``(bins, E)`` float64."""
+        if self.mode == "counting":
+            return self.above(energies_kev, self.thresholds_kev[:1])
+        cumulative = self.above(energies_kev, self.thresholds_kev)
+        cumulative[:-1] -= cumulative[1:]
+        return np.maximum(cumulative, 0.0)  # round-off of the difference
+
+    def variance(self, energies_kev: ArrayLike) -> Floats:
+        """Equal to :meth:`response`: counts are Poisson."""
+        return self.response(energies_kev)
+
+    @functools.cached_property
+    def segment_mm(self) -> tuple[float, ...]:
+        """Length of each depth segment in mm, entrance first: equal numbers of interactions at 60 keV."""
+        silicon = MATERIALS["silicon"]
+        mu = float(sum(silicon.attenuation(SEGMENT_DESIGN_KEV, kind) for kind in ("photo", "incoh")))
+        stopped = -math.expm1(-mu * self.length_mm)
+        ends = [-math.log1p(-stopped * k / self.segments) / mu for k in range(self.segments + 1)]
+        return tuple(b - a for a, b in itertools.pairwise(ends))
+
+    def segment_shares(self, energies_kev: ArrayLike) -> Floats:
+        """Share of the interactions that falls into each depth segment, ``(segments, E)``, summing to 1."""
+        silicon = MATERIALS["silicon"]
+        mu = silicon.attenuation(energies_kev, "photo") + silicon.attenuation(energies_kev, "incoh")
+        ends = np.concatenate([[0.0], np.cumsum(self.segment_mm)])
+        left = np.exp(-np.multiply.outer(ends, mu))
+        return np.asarray((left[:-1] - left[1:]) / (1.0 - left[-1]))
+
+    def live_fraction(self, count_rate: ArrayLike, energies_kev: ArrayLike, weights: ArrayLike) -> Floats:
+        """Recorded over true counts at a count rate: non-paralysable dead time in every depth segment.
+
+        A factor on the summed counts: the spectral distortion by pulses that merge is not modelled.
+
+        Args:
+            count_rate: true counts per second and cell (all segments), any shape.
+            energies_kev, weights: spectrum ``(E,)`` that makes these counts; it sets the load of each segment.
+
+        Returns:
+            0…1, the shape of ``count_rate``; all 1 when ``dead_time_ns`` is 0.
+        """
+        w = np.asarray(weights, dtype=np.float64)
+        shares = (self.segment_shares(energies_kev) * w).sum(-1) / w.sum()
+        rate = np.asarray(count_rate, dtype=np.float64)
+        load = np.multiply.outer(rate, shares) * (self.dead_time_ns * 1e-9)
+        return np.asarray((shares / (1.0 + load)).sum(-1))
+
+
+@dataclass(frozen=True)
+class Scintillator:
+    """An energy-integrating scintillator: the signal is the absorbed energy in keV.
+
+    Every stopped photon deposits all its energy (K-fluorescence escape and optical gain noise are neglected), so the
+    signal per photon is η E and its second moment η E².
+
+    Args:
+        material: scintillator (default: the garnet "lumex").
+        depth_mm: thickness along the beam.
+        fill_factor: sensitive share of the cell's area.
+        electronic_noise_kev: standard deviation of the electronic noise per reading, in keV of absorbed energy.
+
+    Raises:
+        ValueError: a value outside its range.
+    """
+
+    material: Material = field(default_factory=lambda: MATERIALS["lumex"])
+    depth_mm: float = SCINTILLATOR_DEPTH_MM
+    fill_factor: float = SCINTILLATOR_FILL_FACTOR
+    electronic_noise_kev: float = SCINTILLATOR_NOISE_KEV
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.material, Material):
+            raise TypeError(f"material must be a Material, got {self.material!r}: use material('lumex')")
+        set_ = object.__setattr__
+        set_(self, "depth_mm", _check("depth_mm", self.depth_mm, 1e-3, 1e3, "mm"))
+        set_(self, "fill_factor", _check("fill_factor", self.fill_factor, 1e-6, 1.0, "(a share of the cell)"))
+        noise = _check("electronic_noise_kev", self.electronic_noise_kev, 0.0, 1e9, "keV")
+        set_(self, "electronic_noise_kev", noise)
+
+    @property
+    def bins(self) -> int:
+        """1."""
+        return 1
+
+    @property
+    def energy_integrating(self) -> bool:
+        return True
+
+    @property
+    def electronic_noise(self) -> float:
+        """Standard deviation per reading in keV."""
+        return self.electronic_noise_kev
+
+    def absorbed(self, energies_kev: ArrayLike) -> Floats:
+        """Probability that an incident photon is absorbed, ``(E,)``."""
+        energies = np.atleast_1d(np.asarray(energies_kev, dtype=np.float64))
+        return np.asarray(self.fill_factor * -np.expm1(-self.material.attenuation(energies) * self.depth_mm))
+
+    def response(self, energies_kev: ArrayLike) -> Floats:
+        """Expected absorbed energy in keV per incident photon, ``(1, E)`` float64."""
+        energies = np.atleast_1d(np.asarray(energies_kev, dtype=np.float64))
+        return (self.absorbed(energies) * energies)[None]
+
+    def variance(self, energies_kev: ArrayLike) -> Floats:
+        """Expected squared absorbed energy in keV² per incident photon, ``(1, E)`` float64."""
+        energies = np.atleast_1d(np.asarray(energies_kev, dtype=np.float64))
+        return (self.absorbed(energies) * energies**2)[None]

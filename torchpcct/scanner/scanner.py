@@ -1,0 +1,230 @@
+"""A scanner: geometry, tube, filters, bowties and detector, and the photons and signals that follow from them."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchpcct.geometry import ConeBeam, full_turn
+from torchpcct.scanner.detector import Detector
+from torchpcct.scanner.filters import Bowtie
+from torchpcct.scanner.linearisation import WaterLinearisation
+from torchpcct.scanner.source import Slabs, Source, slabs
+from torchpcct.scene.materials import MATERIALS, Material
+
+__all__ = ["Scanner"]
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Scanner:
+    """A CT scanner.
+
+    Args:
+        name: what it is called.
+        geometry: cone beam with the view angles of one turn.
+        source: the tube.
+        detector: counting or energy integrating (:mod:`torchpcct.scanner.detector`).
+        filters: flat slabs in front of the tube, ``((material, mm), …)``; a ray at fan angle γ crosses mm / cos γ.
+        bowties: one bowtie or a sequence of them, one behind the other.
+        energy_bin_kev: width of the energy bins of the simulation in keV, 0.1…5.
+
+    Raises:
+        TypeError: a part of the wrong kind.
+        ValueError: a value outside its range.
+    """
+
+    name: str
+    geometry: ConeBeam
+    source: Source
+    detector: Detector
+    filters: Slabs = ()
+    bowties: tuple[Bowtie, ...] = ()
+    energy_bin_kev: float = 1.0
+
+    def __post_init__(self) -> None:
+        for field_name, kind in (("geometry", ConeBeam), ("source", Source), ("detector", Detector)):
+            value = getattr(self, field_name)
+            if not isinstance(value, kind):
+                raise TypeError(f"{field_name} must be a {kind.__name__}, got {type(value).__name__}")
+        bowties: Any = self.bowties
+        bowties = (bowties,) if isinstance(bowties, Bowtie) else tuple(bowties or ())
+        if not all(isinstance(b, Bowtie) for b in bowties):
+            raise TypeError(f"bowties must be Bowtie objects, got {self.bowties!r}")
+        width = float(self.energy_bin_kev)
+        if not 0.1 <= width <= 5.0:
+            raise ValueError(f"energy_bin_kev must lie in 0.1…5 keV, got {self.energy_bin_kev!r}")
+        object.__setattr__(self, "filters", slabs("filters", self.filters))
+        object.__setattr__(self, "bowties", bowties)
+        object.__setattr__(self, "energy_bin_kev", width)
+
+    def replace(self, **changes: Any) -> Scanner:
+        """A copy with some fields changed."""
+        return replace(self, **changes)
+
+    def with_views(self, views: int) -> Scanner:
+        """The same scanner with another number of views over one turn."""
+        angles = full_turn(views, float(self.geometry.angles[0]))
+        return replace(self, geometry=replace(self.geometry, angles=angles))
+
+    def quanta(self) -> tuple[Floats, Floats]:
+        """Photons that reach a cell of the central plane (z = 0) in air, per reading and mAs of tube load.
+
+        Fluence behind inherent filtration × inverse square of the distance source–cell × cell area seen by the beam ×
+        transmission of flat filters (oblique path) and bowties. Air itself is not in the way.
+
+        Returns:
+            ``energies`` (E,) keV and ``photons`` (columns, E), float64, read-only, cached.
+        """
+        return _quanta(_Optics.of(self))
+
+    def weights(self) -> tuple[Floats, Floats]:
+        """Expected signal in air per reading and mAs, by the energy of the photons that make it.
+
+        Returns:
+            ``energies`` (E,) keV and ``weights`` (bins, columns, E) in counts or keV, float64, read-only, cached:
+            quanta × detector response. Their sum over E is the air reading per mAs.
+        """
+        return _weights(_Optics.of(self), self.detector, False)
+
+    def noise_weights(self) -> tuple[Floats, Floats]:
+        """As :meth:`weights`, for the variance of a reading: quanta × second moment of the detector's signal.
+
+        The electronic noise ``detector.electronic_noise**2`` comes on top.
+        """
+        return _weights(_Optics.of(self), self.detector, True)
+
+    @property
+    def row_factor(self) -> Floats:
+        """Quanta of each row relative to the central plane, ``(rows,)``: inverse square and obliquity.
+
+        The longer path through the filters, below 1e-4 at 1° of cone angle, is left out.
+        """
+        height = self.geometry.row_positions / self.geometry.sdd
+        return np.asarray((1.0 + height**2) ** -1.5)
+
+    def mas_per_view(self, exposure_s: float) -> float:
+        """Tube load of one view in mAs for a scan of ``exposure_s`` seconds over all views.
+
+        Raises:
+            ValueError: ``exposure_s`` ≤ 0 or not finite.
+        """
+        if not (math.isfinite(exposure_s) and exposure_s > 0):
+            raise ValueError(f"exposure_s must be greater than 0 s, got {exposure_s}")
+        return self.source.current_ma * exposure_s / self.geometry.views
+
+    def air_readings(self, exposure_s: float) -> Floats:
+        """Expected reading of every cell in air, ``(bins, rows, columns)`` counts or keV."""
+        signal = self.weights()[1].sum(-1) * self.mas_per_view(exposure_s)
+        return np.asarray(signal[:, None, :] * self.row_factor[:, None])
+
+    def behind(self, paths: Mapping[Material, float]) -> Floats:
+        """:meth:`weights` behind homogeneous slabs, material → path in mm: ``(bins, columns, E)``."""
+        energies, weights = self.weights()
+        depth = sum(m.attenuation(energies) * float(t) for m, t in paths.items()) if paths else 0.0
+        return np.asarray(weights * np.exp(-depth))
+
+    def water_linearisation(
+        self, max_mm: float = 400.0, bin: int | None = None, order: int | None = None
+    ) -> WaterLinearisation:
+        """Beam-hardening correction that makes water linear, one polynomial per column; within 2e-5 of the path.
+
+        Args:
+            max_mm: thickest water of the calibration.
+            bin: calibrate this energy bin alone; None: the sum of all bins.
+            order: coefficients per column; None: 7 for the sum, 11 for a single bin (the low bins hold Compton counts
+                of hard photons beside photoelectric counts of soft ones, which bends their curve more).
+
+        Raises:
+            ValueError: no such bin, ``max_mm`` ≤ 0.
+        """
+        if bin is not None and not 0 <= bin < self.detector.bins:
+            raise ValueError(f"bin must lie in 0…{self.detector.bins - 1}, got {bin}")
+        return _linearisation(_Optics.of(self), self.detector, float(max_mm), bin, order)
+
+    def describe(self) -> dict[str, Any]:
+        """The scanner's numbers as JSON values, for reports and file headers."""
+        g, s = self.geometry, self.source
+        return {
+            "name": self.name,
+            "sod_mm": g.sod,
+            "sdd_mm": g.sdd,
+            "views": g.views,
+            "rows": g.rows,
+            "columns": g.columns,
+            "pitch_mm": list(g.pitch),
+            "offset_mm": list(g.offset),
+            "kvp": s.kvp,
+            "current_ma": s.current_ma,
+            "focal_spot_mm": list(s.focal_spot),
+            "filtration_mm": [[m.name, t] for m, t in (*s.filtration, *self.filters)],
+            "bowties": [b.name for b in self.bowties],
+            "detector": type(self.detector).__name__,
+            "bins": self.detector.bins,
+            "energy_bin_kev": self.energy_bin_kev,
+        }
+
+
+@dataclass(frozen=True)
+class _Optics:
+    """What the quanta depend on; not on the views, so that scanners with other views share the cache."""
+
+    geometry: ConeBeam
+    source: Source
+    filters: Slabs
+    bowties: tuple[Bowtie, ...]
+    energy_bin_kev: float
+
+    @classmethod
+    def of(cls, scanner: Scanner) -> _Optics:
+        geometry = replace(scanner.geometry, angles=(0.0,))
+        return cls(geometry, scanner.source, scanner.filters, scanner.bowties, scanner.energy_bin_kev)
+
+
+def _read_only(*arrays: Floats) -> tuple[Floats, ...]:
+    for array in arrays:
+        array.setflags(write=False)
+    return arrays
+
+
+@functools.lru_cache(maxsize=8)
+def _quanta(optics: _Optics) -> tuple[Floats, Floats]:
+    g = optics.geometry
+    spectrum = optics.source.spectrum(optics.energy_bin_kev)
+    gamma = g.fan_angles
+    # The arc stands square to the beam; a flat detector is hit obliquely, at a greater distance.
+    obliquity = np.ones_like(gamma) if g.detector == "curved" else np.cos(gamma)
+    per_mm2 = (1000.0 * obliquity / g.sdd) ** 2 * obliquity
+    slab = sum((m.attenuation(spectrum.energies) * t for m, t in optics.filters), np.zeros(spectrum.energies.size))
+    photons = np.multiply.outer(per_mm2 * g.pitch[0] * g.pitch[1], spectrum.fluence)
+    photons *= np.exp(-np.multiply.outer(1.0 / np.cos(gamma), slab))
+    for bowtie in optics.bowties:
+        photons *= bowtie.transmission(gamma, spectrum.energies)
+    _read_only(photons)
+    return spectrum.energies, photons
+
+
+@functools.lru_cache(maxsize=8)
+def _weights(optics: _Optics, detector: Detector, squared: bool) -> tuple[Floats, Floats]:
+    energies, photons = _quanta(optics)
+    response = detector.variance(energies) if squared else detector.response(energies)
+    weights = photons * response[:, None, :]
+    _read_only(weights)
+    return energies, weights
+
+
+@functools.lru_cache(maxsize=16)
+def _linearisation(
+    optics: _Optics, detector: Detector, max_mm: float, bin: int | None, order: int | None
+) -> WaterLinearisation:
+    energies, weights = _weights(optics, detector, False)
+    spectra = weights.sum(0) if bin is None else weights[bin]
+    order = (7 if bin is None else 11) if order is None else order
+    return WaterLinearisation.calibrate(spectra, MATERIALS["water"].attenuation(energies), max_mm, order)
