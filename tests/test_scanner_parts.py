@@ -99,8 +99,8 @@ def test_bowtie_interpolation_never_overshoots(values):
     high = np.maximum(np.array(values)[left], np.array(values)[left + 1])
     # The rounding of 0.1 * i can put a sample one interval off: allow for that at the nodes.
     inside = np.abs(gamma / 0.1 - np.round(gamma / 0.1)) > 1e-9
-    assert np.all(thickness[inside] >= low[inside] - 1e-9)
-    assert np.all(thickness[inside] <= high[inside] + 1e-9)
+    assert np.all(thickness[inside] >= low[inside] - 2e-9)
+    assert np.all(thickness[inside] <= high[inside] + 2e-9)
 
 
 def test_roi_bowtie_geometry():
@@ -237,8 +237,9 @@ def test_detection_falls_with_the_threshold_and_grows_with_the_length():
     counts = detector.above(ENERGIES, np.arange(0.0, 30.0))
     assert np.all(np.diff(counts, axis=0) <= 1e-12)
     assert np.all(np.diff(counts[:6], axis=0)[:, ENERGIES > 40] < -0.01)
-    short = SiliconDetector(length_mm=30.0)
-    assert np.all(short.response(ENERGIES) < detector.response(ENERGIES))
+    short = SiliconDetector(length_mm=30.0).response(ENERGIES)
+    assert np.all(short <= detector.response(ENERGIES))
+    assert np.all((short < 0.9 * detector.response(ENERGIES))[:, ENERGIES > 60])
 
 
 def test_a_dead_layer_takes_soft_photons():

@@ -69,7 +69,8 @@ class Bowtie:
         """Path length in mm at fan angles in rad (either sign), same shape, float64."""
         from scipy.interpolate import PchipInterpolator
 
-        nodes, values = np.array(self.fan_angles_rad), np.array(self.thickness_mm)
+        # Rounded to the picometre: slopes near the smallest float overflow inside the interpolator.
+        nodes, values = np.array(self.fan_angles_rad), np.round(self.thickness_mm, 9)
         curve = PchipInterpolator(np.r_[-nodes[:0:-1], nodes], np.r_[values[:0:-1], values])
         return np.asarray(curve(np.minimum(np.abs(np.asarray(fan_angles_rad, np.float64)), nodes[-1])))
 
