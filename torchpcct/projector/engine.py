@@ -84,6 +84,14 @@ class Engine:
             adjoint = 3 * batch * ny * nx
         return table + itemsize * max(forward, adjoint)
 
+    @cached_property
+    def _layer(self) -> float:
+        from torchpcct.projector import volume_kernels
+
+        r = self.rays
+        _, _, row0, row_pitch = self._heights()
+        return volume_kernels.layer_spacing(self._poses, self.grid, row0, row_pitch, r.rows)
+
     def _heights(self) -> tuple[float, float, float, float]:
         z, dz = self.grid.axes[0][0], self.grid.spacing[0]
         return z - dz / 2, dz, self.rays.row_edge + self.rays.first_row * self.rays.row_pitch, self.rays.row_pitch
@@ -92,13 +100,12 @@ class Engine:
         from torchpcct.projector import volume_kernels
 
         r, seg = self.rays, self.segments
-        nz, ny, nx = self.grid.shape
-        sums = np.zeros((x.shape[0], ny, nx, nz + 1), dtype=x.dtype)
-        np.cumsum(x.transpose(0, 2, 3, 1), axis=-1, out=sums[..., 1:])
+        _, ny, nx = self.grid.shape
         y = np.empty((x.shape[0], *self.range_shape), dtype=x.dtype)
         volume_kernels.project(
-            sums, self._poses, r.edges, r.centers, r.first, seg.table, seg.start, self.lattice, *self._heights(), y
-        )
+            volume_kernels.running_sums(x), ny, nx, self._poses, r.edges, r.centers, r.first,
+            seg.table, seg.start, self.lattice, *self._heights(), self._layer, y,
+        )  # fmt: skip
         return y
 
     def _adjoint_volume(self, y: NDArray) -> NDArray:
@@ -107,7 +114,7 @@ class Engine:
         r, seg = self.rays, self.segments
         return volume_kernels.backproject(
             y, self._poses, r.edges, r.centers, r.first, seg.table, seg.start, self.lattice, *self._heights(),
-            self.grid.shape, ROW_SUMS_BYTES,
+            self._layer, self.grid.shape, ROW_SUMS_BYTES,
         )  # fmt: skip
 
     def _forward_plane(self, x: NDArray) -> NDArray:

@@ -18,14 +18,28 @@ import math
 import numpy as np
 from numba import njit, prange
 
-__all__ = ["backproject", "project"]
+__all__ = ["backproject", "layer_spacing", "padded", "project", "running_sums"]
 
 # NaN and Inf must survive, so only the flags that leave them alone.
 _FLAGS = {"contract", "nsz", "arcp", "reassoc"}
-_inline = njit(inline="always", fastmath=_FLAGS)
+# Row edges may move by this part of the blur between two depth layers (see layer_spacing).
+LAYER_SHIFT = 0.04
+MAX_LAYERS_PER_SLAB = 0.4
+# Slabs closer to the source than this part of the source-detector distance are behind it.
+NEAREST = 1e-6
+# Slabs of one task of the adjoint: enough to reuse a layer, few enough to share the work. Fixed, for determinism.
+SLAB_BLOCK = 12
+# Ray geometry in float64, called per cell and not per voxel.
+_small = njit(cache=True, fastmath=_FLAGS, error_model="numpy")
 
 
-@_inline
+@_small
+def padded(n):
+    """``n`` rounded up to whole SIMD registers, so that no loop along z has a scalar remainder."""
+    return (n + 7) // 8 * 8
+
+
+@_small
 def _edge_line(pose, table, j, axis, lattice, parallel):
     """In-slab coordinate of a ray, ``t(r) = p + q r``: r counts slabs, t voxel edges along the slab."""
     a, b = table[j, 0], table[j, 1]
@@ -43,7 +57,7 @@ def _edge_line(pose, table, j, axis, lattice, parallel):
     return (sy - lattice[6] + (lattice[4] - sx) * slope) / lattice[7], slope * lattice[5] / lattice[7]
 
 
-@_inline
+@_small
 def _depth_line(pose, table, j, axis, lattice, parallel):
     """Ray parameter at the slabs, ``λ(r) = l + m r``, the path per slab, and the squared in-plane ray length."""
     a, b = table[j, 0], table[j, 1]
@@ -57,162 +71,321 @@ def _depth_line(pose, table, j, axis, lattice, parallel):
     return (lattice[4] - pose[0]) / dx, lattice[5] / dx, lattice[5] * math.sqrt(square) / abs(dx), square
 
 
-@njit(parallel=True, cache=True, fastmath=_FLAGS)
-def project(sums, pose, edges, centers, first, segments, start, lattice, z0, dz, row0, row_pitch, data):
+@_small
+def _rows_at(zeta0, step, last, index, part):
+    """Interpolation knots of equally spaced heights: ``zeta0 + step * i`` clamped to the knots 0…last."""
+    real = part.dtype.type
+    top = real(last)
+    for i in range(index.size):
+        zeta = min(max(zeta0 + step * real(i), real(0)), top)
+        k = min(np.int32(zeta), np.int32(last - 1))
+        index[i] = k
+        part[i] = zeta - real(k)
+
+
+@_small
+def _read(line, index, part, read):
+    for i in range(index.size):
+        k = np.uint64(index[i])
+        low = line[k]
+        read[i] = low + part[i] * (line[k + np.uint64(1)] - low)
+
+
+@_small
+def _blend(lines, base, stride, k0, k1, lo, hi, scale, out):
+    """``out = scale * Σ_k overlap(k) lines[base + k * stride]`` over the voxels that the interval [lo, hi] touches."""
+    real = out.dtype.type
+    n = out.size
+    first = lines[base + k0 * stride]
+    w0 = real(scale * (min(hi, k0 + 1.0) - lo))
+    if k1 - k0 == 1:
+        for z in range(n):
+            out[z] = w0 * first[z]
+        return
+    second = lines[base + (k0 + 1) * stride]
+    w1 = real(scale * (min(hi, k0 + 2.0) - (k0 + 1.0)))
+    if k1 - k0 == 2:
+        for z in range(n):
+            out[z] = w0 * first[z] + w1 * second[z]
+        return
+    third = lines[base + (k0 + 2) * stride]
+    w2 = real(scale * (min(hi, k0 + 3.0) - (k0 + 2.0)))
+    for z in range(n):
+        out[z] = w0 * first[z] + w1 * second[z] + w2 * third[z]
+    for k in range(k0 + 3, k1):
+        w = real(scale * (min(hi, k + 1.0) - k))
+        line = lines[base + k * stride]
+        for z in range(n):
+            out[z] += w * line[z]
+
+
+@_small
+def _share(values, part, low, high):
+    """Share a slab between the two layers it lies between."""
+    keep = values.dtype.type(1) - part
+    for z in range(values.size):
+        low[z] += keep * values[z]
+        high[z] += part * values[z]
+
+
+@_small
+def _add_rows(line, at, depth, z0, dz, row0, row_pitch, index, part, read, out):
+    """Add the row means of one layer (running sums ``line``) at the ray parameter ``depth`` to ``out``."""
+    real = line.dtype.type
+    step = depth * row_pitch / dz
+    _rows_at(real((at[2] + depth * (row0 + at[7] - at[2]) - z0) / dz), real(step), line.size - 8, index, part)
+    _read(line, index, part, read)
+    gain = real(1.0 / step)
+    for i in range(out.size):
+        out[i] += gain * (read[i + 1] - read[i])
+
+
+@_small
+def _project_view(
+    lines, ny, nx, at, edges, centers, first, segments, s0, s1, lattice, z0, dz, row0, row_pitch, layer, acc, data
+):
+    """All segments of one view; ``lines``: ``(batch, ny * nx, knots)``, ``data``: ``(batch, rows, columns)``."""
+    batch, _, knots = lines.shape
+    columns, rows = acc.shape[1:]
+    real = lines.dtype.type
+    blend = np.empty(knots, dtype=lines.dtype)
+    pair = np.zeros((2, batch, knots), dtype=lines.dtype)
+    index = np.zeros(padded(rows + 1), dtype=np.uint32)
+    part = np.zeros(index.size, dtype=lines.dtype)
+    read = np.zeros(index.size, dtype=lines.dtype)
+    acc[:] = 0
+    for s in range(s0, s1):
+        axis = segments[s, 1]
+        slabs, width = (ny, nx) if axis == 0 else (nx, ny)
+        across, along = (nx, 1) if axis == 0 else (1, nx)
+        for j in range(segments[s, 2], segments[s, 2] + segments[s, 3]):
+            p0, q0 = _edge_line(at, edges, first + j, axis, lattice, False)
+            p1, q1 = _edge_line(at, edges, first + j + 1, axis, lattice, False)
+            l0, l1, path, square = _depth_line(at, centers, first + j, axis, lattice, False)
+            layered = abs(l1) < MAX_LAYERS_PER_SLAB * layer
+            low = -1  # the pair holds layers ``low`` (at pair[low % 2]) and ``low + 1``
+            for r in range(slabs):
+                ta, tb = p0 + q0 * r, p1 + q1 * r
+                lo, hi = max(min(ta, tb), 0.0), min(max(ta, tb), float(width))
+                depth = l0 + l1 * r
+                if hi <= lo or depth <= NEAREST:
+                    continue
+                k0, k1 = int(lo), min(math.ceil(hi), width)
+                scale = path / abs(tb - ta)
+                now = int(depth / layer) if layered else -1
+                if layered and now != low:
+                    for m in range(low, low + 2):
+                        if low >= 0 and m != now and m != now + 1:
+                            for n in range(batch):
+                                line = pair[m % 2, n]
+                                _add_rows(
+                                    line, at, m * layer, z0, dz, row0, row_pitch, index, part, read, acc[n, j]
+                                )  # fmt: skip
+                                line[:] = 0
+                    low = now
+                for n in range(batch):
+                    _blend(lines[n], r * across, along, k0, k1, lo, hi, scale, blend)
+                    if layered:
+                        _share(blend, real(depth / layer - now), pair[now % 2, n], pair[(now + 1) % 2, n])
+                    else:
+                        _add_rows(blend, at, depth, z0, dz, row0, row_pitch, index, part, read, acc[n, j])
+            if low >= 0:
+                for m in range(low, low + 2):
+                    for n in range(batch):
+                        line = pair[m % 2, n]
+                        _add_rows(line, at, m * layer, z0, dz, row0, row_pitch, index, part, read, acc[n, j])
+                        line[:] = 0
+            for i in range(rows):
+                rise = row0 + (i + 0.5) * row_pitch + at[7] - at[2]
+                slant = real(math.sqrt(1.0 + rise * rise / square))
+                for n in range(batch):
+                    acc[n, j, i] *= slant
+    for n in range(batch):
+        for i in range(rows):
+            for j in range(columns):
+                data[n, i, j] = acc[n, j, i]
+
+
+@njit(parallel=True, cache=True)
+def project(lines, ny, nx, pose, edges, centers, first, segments, start, lattice, z0, dz, row0, row_pitch, layer, data):
     """Cone-beam line integrals.
 
     Args:
-        sums: ``(batch, ny, nx, nz + 1)`` running sums of the volume along z (0 first).
+        lines: ``(batch, ny * nx, padded(nz) + 8)`` running sums of the volume along z: 0 first, the total repeated.
         pose, edges, centers, first: see ``rays.Rays``.
         segments, start: see ``rays.Segments``.
         lattice: ``(8,)`` slab positions, see ``_edge_line``.
         z0, dz: lower edge of the grid along z and its pitch (mm).
         row0, row_pitch: lower edge of the first row kept, and the pitch (mm on the detector).
+        layer: spacing of the depth layers in the ray parameter, see ``layer_spacing``.
         data: ``(batch, views, rows, columns)`` output, overwritten.
     """
-    batch, ny, nx, nze = sums.shape
-    views, rows, columns = data.shape[1:]
-    real = sums.dtype.type
-    zero, one = real(0), real(1)
-    z_top = real(nze - 1)
+    batch, views, rows, columns = data.shape
     for v in prange(views):
-        acc = np.zeros((batch, columns, rows), dtype=sums.dtype)
-        blend = np.empty(nze, dtype=sums.dtype)
-        index = np.empty(rows + 1, dtype=np.uint32)
-        part = np.empty(rows + 1, dtype=sums.dtype)
-        read = np.empty(rows + 1, dtype=sums.dtype)
-        at = pose[v]
-        for s in range(start[v], start[v + 1]):
-            axis = segments[s, 1]
-            slabs = ny if axis == 0 else nx
-            width = nx if axis == 0 else ny
-            for j in range(segments[s, 2], segments[s, 2] + segments[s, 3]):
-                col = first[v] + j
-                p0, q0 = _edge_line(at, edges, col, axis, lattice, False)
-                p1, q1 = _edge_line(at, edges, col + 1, axis, lattice, False)
-                l0, l1, path, _ = _depth_line(at, centers, col, axis, lattice, False)
-                for r in range(slabs):
-                    ta, tb = p0 + q0 * r, p1 + q1 * r
-                    lo, hi = max(min(ta, tb), 0.0), min(max(ta, tb), float(width))
-                    depth = l0 + l1 * r
-                    if hi <= lo or depth <= 0.0:
-                        continue
-                    scale = path / abs(tb - ta)
-                    zeta0 = real((at[2] + depth * (row0 + at[7] - at[2]) - z0) / dz)
-                    zeta1 = real(depth * row_pitch / dz)
-                    for i in range(rows + 1):
-                        zeta = min(max(zeta0 + zeta1 * real(i), zero), z_top)
-                        k = min(np.int32(zeta), np.int32(nze - 2))
-                        index[i] = k
-                        part[i] = zeta - real(k)
-                    gain = real(1.0 / (depth * row_pitch / dz))
-                    k0 = int(lo)
-                    k1 = min(math.ceil(hi), width)
-                    for n in range(batch):
-                        for k in range(k0, k1):
-                            w = real(scale * (min(hi, k + 1.0) - max(lo, float(k))))
-                            line = sums[n, r, k] if axis == 0 else sums[n, k, r]
-                            if k == k0:
-                                for z in range(nze):
-                                    blend[z] = w * line[z]
-                            else:
-                                for z in range(nze):
-                                    blend[z] += w * line[z]
-                        for i in range(rows + 1):
-                            k = np.uint64(index[i])
-                            read[i] = blend[k] * (one - part[i]) + blend[k + np.uint64(1)] * part[i]
-                        out = acc[n, j]
-                        for i in range(rows):
-                            out[i] += gain * (read[i + 1] - read[i])
-                _, _, _, square = _depth_line(at, centers, col, axis, lattice, False)
-                for i in range(rows):
-                    rise = row0 + (i + 0.5) * row_pitch + at[7] - at[2]
-                    slant = real(math.sqrt(1.0 + rise * rise / square))
-                    for n in range(batch):
-                        acc[n, j, i] *= slant
+        acc = np.empty((batch, columns, rows), dtype=lines.dtype)
+        _project_view(
+            lines, ny, nx, pose[v], edges, centers, first[v], segments, start[v], start[v + 1], lattice,
+            z0, dz, row0, row_pitch, layer, acc, data[:, v],
+        )  # fmt: skip
+
+
+@_small
+def _row_sums_view(data, at, centers, first, row0, row_pitch, sums):
+    batch, columns, edges = sums.shape
+    for j in range(columns):
+        a, b = centers[first + j, 0], centers[first + j, 1]
+        dx, dy = a * at[3] + b * at[5], a * at[4] + b * at[6]
+        square = dx * dx + dy * dy
         for n in range(batch):
-            for i in range(rows):
-                for j in range(columns):
-                    data[n, v, i, j] = acc[n, j, i]
+            sums[n, j, 0] = 0
+        for i in range(edges - 1):
+            rise = row0 + (i + 0.5) * row_pitch + at[7] - at[2]
+            slant = data.dtype.type(math.sqrt(1.0 + rise * rise / square))
+            for n in range(batch):
+                sums[n, j, i + 1] = sums[n, j, i] + slant * data[n, i, j]
 
 
-@njit(parallel=True, cache=True, fastmath=_FLAGS)
+@njit(parallel=True, cache=True)
 def _row_sums(data, pose, centers, first, row0, row_pitch, begin, sums):
     """Readings times their slant, summed along the rows: ``(batch, views, columns, rows + 1)``."""
-    batch, chunk, columns, edges = sums.shape
-    for v in prange(chunk):
-        at = pose[begin + v]
-        for j in range(columns):
-            a, b = centers[first[begin + v] + j, 0], centers[first[begin + v] + j, 1]
-            dx, dy = a * at[3] + b * at[5], a * at[4] + b * at[6]
-            square = dx * dx + dy * dy
-            for n in range(batch):
-                sums[n, v, j, 0] = 0
-            for i in range(edges - 1):
-                rise = row0 + (i + 0.5) * row_pitch + at[7] - at[2]
-                slant = data.dtype.type(math.sqrt(1.0 + rise * rise / square))
-                for n in range(batch):
-                    sums[n, v, j, i + 1] = sums[n, v, j, i] + slant * data[n, begin + v, i, j]
+    for v in prange(sums.shape[1]):
+        _row_sums_view(data[:, begin + v], pose[begin + v], centers, first[begin + v], row0, row_pitch, sums[:, v])
 
 
-@njit(parallel=True, cache=True, fastmath=_FLAGS)
-def _gather(
-    sums, pose, edges, centers, first, segments, seg0, seg1, begin, axis, lattice, z0, dz, row0, row_pitch, out
-):
-    """Add the segments of one axis to ``out``, ``(batch, slabs, width, nz)``; see ``project``."""
-    batch, slabs, width, nz = out.shape
-    rows = sums.shape[3] - 1
+@_small
+def _spread(target, k0, k1, lo, hi, scale, values):
+    """Transpose of ``_blend`` on one slab: ``target``, ``(width, nz)``."""
+    real = values.dtype.type
+    for k in range(k0, k1):
+        w = real(scale * (min(hi, k + 1.0) - max(lo, float(k))))
+        line = target[k]
+        for z in range(values.size):
+            line[z] += w * values[z]
+
+
+@_small
+def _layer_values(sums, at, depth, z0, dz, row0, row_pitch, index, part, read, values):
+    """Transpose of ``_add_rows``: what each voxel of a line at ``depth`` collects from the running row sums."""
     real = sums.dtype.type
-    zero, one = real(0), real(1)
-    top = real(rows)
-    block = 8
-    for task in prange((slabs + block - 1) // block):
-        index = np.empty(nz + 1, dtype=np.uint32)
-        part = np.empty(nz + 1, dtype=sums.dtype)
-        read = np.empty(nz + 1, dtype=sums.dtype)
-        diff = np.empty(nz, dtype=sums.dtype)
-        for s in range(seg0, seg1):
-            if segments[s, 1] != axis:
-                continue
-            v = segments[s, 0]
-            at = pose[v]
-            for j in range(segments[s, 2], segments[s, 2] + segments[s, 3]):
-                col = first[v] + j
-                p0, q0 = _edge_line(at, edges, col, axis, lattice, False)
-                p1, q1 = _edge_line(at, edges, col + 1, axis, lattice, False)
-                l0, l1, path, _ = _depth_line(at, centers, col, axis, lattice, False)
-                for r in range(task * block, min(task * block + block, slabs)):
-                    ta, tb = p0 + q0 * r, p1 + q1 * r
-                    lo, hi = max(min(ta, tb), 0.0), min(max(ta, tb), float(width))
-                    depth = l0 + l1 * r
-                    if hi <= lo or depth <= 0.0:
-                        continue
-                    scale = path / abs(tb - ta)
-                    rho1 = dz / (depth * row_pitch)
-                    rho0 = real(((z0 - at[2]) / depth - (row0 + at[7] - at[2])) / row_pitch)
-                    step = real(rho1)
-                    for z in range(nz + 1):
-                        rho = min(max(rho0 + step * real(z), zero), top)
-                        k = min(np.int32(rho), np.int32(rows - 1))
-                        index[z] = k
-                        part[z] = rho - real(k)
-                    k0 = int(lo)
-                    k1 = min(math.ceil(hi), width)
-                    for n in range(batch):
-                        line = sums[n, v - begin, j]
-                        for z in range(nz + 1):
-                            k = np.uint64(index[z])
-                            read[z] = line[k] * (one - part[z]) + line[k + np.uint64(1)] * part[z]
+    rho = ((z0 - at[2]) / depth - (row0 + at[7] - at[2])) / row_pitch
+    _rows_at(real(rho), real(dz / (depth * row_pitch)), sums.size - 1, index, part)
+    _read(sums, index, part, read)
+    for z in range(values.size):
+        values[z] = read[z + 1] - read[z]
+
+
+@_small
+def _gather_slabs(
+    sums, pose, edges, centers, first, segments, seg0, seg1, begin, axis, lattice, z0, dz, row0, row_pitch, layer,
+    r0, r1, out,
+):  # fmt: skip
+    """Slabs ``r0 … r1`` of ``_gather``; ``out``: ``(batch, slabs, width, padded(nz))``."""
+    batch, _, width, nz = out.shape
+    real = sums.dtype.type
+    index = np.empty(nz + 8, dtype=np.uint32)
+    part = np.empty(nz + 8, dtype=sums.dtype)
+    read = np.empty(nz + 8, dtype=sums.dtype)
+    pair = np.empty((2, batch, nz), dtype=sums.dtype)
+    mixed = np.empty(nz, dtype=sums.dtype)
+    for s in range(seg0, seg1):
+        if segments[s, 1] != axis:
+            continue
+        v = segments[s, 0]
+        at = pose[v]
+        for j in range(segments[s, 2], segments[s, 2] + segments[s, 3]):
+            p0, q0 = _edge_line(at, edges, first[v] + j, axis, lattice, False)
+            p1, q1 = _edge_line(at, edges, first[v] + j + 1, axis, lattice, False)
+            l0, l1, path, _ = _depth_line(at, centers, first[v] + j, axis, lattice, False)
+            layered = abs(l1) < MAX_LAYERS_PER_SLAB * layer
+            low = -1
+            for r in range(r0, r1):
+                ta, tb = p0 + q0 * r, p1 + q1 * r
+                lo, hi = max(min(ta, tb), 0.0), min(max(ta, tb), float(width))
+                depth = l0 + l1 * r
+                if hi <= lo or depth <= NEAREST:
+                    continue
+                k0, k1 = int(lo), min(math.ceil(hi), width)
+                scale = path / abs(tb - ta)
+                now = int(depth / layer) if layered else -1
+                if layered and now != low:
+                    for m in range(now, now + 2):
+                        if low < 0 or (m != low and m != low + 1):
+                            for n in range(batch):
+                                _layer_values(
+                                    sums[n, v - begin, j], at, m * layer, z0, dz, row0, row_pitch,
+                                    index, part, read, pair[m % 2, n],
+                                )  # fmt: skip
+                    low = now
+                for n in range(batch):
+                    if layered:
+                        high = real(depth / layer - now)
+                        keep = real(1) - high
+                        a, b = pair[now % 2, n], pair[(now + 1) % 2, n]
                         for z in range(nz):
-                            diff[z] = read[z + 1] - read[z]
-                        for k in range(k0, k1):
-                            w = real(scale * (min(hi, k + 1.0) - max(lo, float(k))))
-                            target = out[n, r, k]
-                            for z in range(nz):
-                                target[z] += w * diff[z]
+                            mixed[z] = keep * a[z] + high * b[z]
+                    else:
+                        _layer_values(
+                            sums[n, v - begin, j], at, depth, z0, dz, row0, row_pitch, index, part, read, mixed
+                        )  # fmt: skip
+                    _spread(out[n, r], k0, k1, lo, hi, scale, mixed)
 
 
-def backproject(data, pose, edges, centers, first, segments, start, lattice, z0, dz, row0, row_pitch, shape, memory):
+@njit(parallel=True, cache=True)
+def _gather(
+    sums, pose, edges, centers, first, segments, seg0, seg1, begin, lattice, z0, dz, row0, row_pitch, layer,
+    by_row, by_column,
+):  # fmt: skip
+    """Add a chunk of views to ``by_row``, ``(batch, ny, nx, padded(nz))``, and ``by_column``, its transpose."""
+    ny, nx = by_row.shape[1:3]
+    row_tasks = (ny + SLAB_BLOCK - 1) // SLAB_BLOCK
+    tasks = row_tasks + (nx + SLAB_BLOCK - 1) // SLAB_BLOCK
+    for task in prange(tasks):
+        axis = 0 if task < row_tasks else 1
+        out, r0 = (by_row, task * SLAB_BLOCK) if axis == 0 else (by_column, (task - row_tasks) * SLAB_BLOCK)
+        _gather_slabs(
+            sums, pose, edges, centers, first, segments, seg0, seg1, begin, axis, lattice,
+            z0, dz, row0, row_pitch, layer, r0, min(r0 + SLAB_BLOCK, out.shape[1]), out,
+        )  # fmt: skip
+
+
+def running_sums(x):
+    """``(batch, nz, ny, nx)`` to the ``lines`` of :func:`project`."""
+    batch, nz, ny, nx = x.shape
+    lines = np.empty((batch, ny * nx, padded(nz) + 8), dtype=x.dtype)
+    lines[..., 0] = 0
+    np.cumsum(x.reshape(batch, nz, ny * nx).transpose(0, 2, 1), axis=-1, out=lines[..., 1 : nz + 1])
+    lines[..., nz + 1 :] = lines[..., nz, None]
+    return lines
+
+
+def layer_spacing(pose, grid, row0, row_pitch, rows):
+    """Spacing of depth layers in the ray parameter λ; layers replace slabs where slabs are closer than this.
+
+    The heights of the row edges grow with λ, so each slab needs its own interpolation along z. Where the magnification
+    changes little (a small grid), slabs are instead shared linearly between two layers, and only layers are
+    interpolated. Between two layers the row edges move by at most ``LAYER_SHIFT`` of the blur that the voxel and the
+    row have anyway; the error is of second order in it.
+    """
+    z, hz = grid.axes[0], grid.spacing[0]
+    reach = max(abs(z[0] - hz / 2 - pose[:, 2]).max(), abs(z[-1] + hz / 2 - pose[:, 2]).max())
+    ends = np.array([row0, row0 + rows * row_pitch])
+    rise = np.abs(ends + (pose[:, 7] - pose[:, 2])[:, None]).max()
+    # Depths of the grid's corners and centre in every view; rows are finest, and moves largest, at the nearest.
+    x, y = (grid.center[i] + grid.extent[i] / 2 * np.array([-1, -1, 1, 1, 0]) for i in (2, 1))
+    y[:4] = y[[0, 2, 0, 2]]
+    offset = np.stack([x, y], axis=-1) - pose[:, None, :2]
+    depth = (offset * pose[:, None, 3:5]).sum(axis=-1) / (pose[:, None, 3:5] ** 2).sum(axis=-1)
+    near = depth.min()
+    if near <= 0:
+        return NEAREST
+    depth = depth[:, 4].min()
+    blur = math.hypot(hz, depth * row_pitch)
+    return float(min(LAYER_SHIFT * blur / max(min(rise, reach / depth), 1e-12), near / 4))
+
+
+def backproject(
+    data, pose, edges, centers, first, segments, start, lattice, z0, dz, row0, row_pitch, layer, shape, memory
+):
     """The exact transpose of :func:`project`.
 
     Args:
@@ -225,18 +398,17 @@ def backproject(data, pose, edges, centers, first, segments, start, lattice, z0,
     """
     batch, views, rows, columns = data.shape
     nz, ny, nx = shape
-    by_row = np.zeros((batch, ny, nx, nz), dtype=data.dtype)
-    by_column = np.zeros((batch, nx, ny, nz), dtype=data.dtype)
+    by_row = np.zeros((batch, ny, nx, padded(nz)), dtype=data.dtype)
+    by_column = np.zeros((batch, nx, ny, padded(nz)), dtype=data.dtype)
     per_view = batch * columns * (rows + 1) * data.itemsize
     chunk = int(max(1, min(views, memory // per_view)))
     for begin in range(0, views, chunk):
         stop = min(begin + chunk, views)
         sums = np.empty((batch, stop - begin, columns, rows + 1), dtype=data.dtype)
         _row_sums(data, pose, centers, first, row0, row_pitch, begin, sums)
-        seg0, seg1 = start[begin], start[stop]
-        for axis, out in ((0, by_row), (1, by_column)):
-            _gather(
-                sums, pose, edges, centers, first, segments, seg0, seg1, begin, axis, lattice,
-                z0, dz, row0, row_pitch, out,
-            )  # fmt: skip
-    return np.ascontiguousarray((by_row + by_column.transpose(0, 2, 1, 3)).transpose(0, 3, 1, 2))
+        _gather(
+            sums, pose, edges, centers, first, segments, start[begin], start[stop], begin, lattice,
+            z0, dz, row0, row_pitch, layer, by_row, by_column,
+        )  # fmt: skip
+    by_row += by_column.transpose(0, 2, 1, 3)
+    return np.ascontiguousarray(by_row[..., :nz].transpose(0, 3, 1, 2))
