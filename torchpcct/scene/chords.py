@@ -12,7 +12,8 @@ Quadrics and boxes are met at most once. The tubes of :mod:`torchpcct.scene.tube
 * a steeper ray may leave the tube at a flank of the bulge and enter it again. It is searched piece by piece for all
   crossings; the interval returned starts at the first entry and has the exact TOTAL length inside.
 
-Callers that compile against these functions with numba's ``cache=True`` must clear their cache when this file changes.
+numba's ``cache=True`` does not see a change of a function that is called from another file: after a change of
+``_rays.py`` touch the files whose kernels call :func:`interval`, or clear their caches.
 """
 
 from __future__ import annotations
@@ -21,26 +22,56 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from torchpcct.scene import _tube_rays
+from torchpcct.scene._rays import BOX, BULGED, CYLINDER, ELLIPSOID, NARROWED, chords, interval
 from torchpcct.scene.bodies import Box, Ellipsoid, EllipticCylinder, Shape
 from torchpcct.scene.tubes import BulgedTube, NarrowedTube
 
 __all__ = ["PARAMETERS", "chord_lengths", "interval", "pack"]
 
-ELLIPSOID, CYLINDER, BOX, BULGED, NARROWED = range(5)
 # Row of ``params``: 0-2 centre of the bounding z cylinder, 3 its radius squared, 4 radius, 5 half height; 6-8 position;
 # 9-17 matrix from scanner to local axes (scaled to the unit shape for ellipsoid, cylinder section and box);
 # 18 half length; 19-23 tubes: radius, amplitude, 2 π / bulge length, bulge length / 2, largest slope of the fast path.
 PARAMETERS = 24
 
-# Contraction to FMA is safe; reassociation would undo the cancellation-free order of the operations below.
-_FAST = {"contract", "arcp", "nsz"}
+# Largest phase of the profile (rad) that the series in the kernels carry to 1e-11.
+_SERIES = 0.7
 # The bounding cylinder is a little wider than the shape, so that rounding never rejects a ray that grazes it.
 _SLACK = 1.0 + 1e-9
+
+
+def _slope_limit(shape: Any) -> float:
+    """Largest ``|dz|`` for which ``h`` is convex along the ray and the phase stays in the series' range.
+
+    In the section's coordinates the ray is a curve of acceleration ``P''`` and speed ``|P'|``.
+    ``h'' = 2 |P'|² + 2 P·P''`` is positive while ``|P| |P''| < |P'|²``; the bounds hold in the whole bounding disc, and
+    a factor 2 is in hand.
+    """
+    r, a = shape.radius, shape.amplitude
+    if a == 0.0:
+        return math.inf
+    reach = 2.0 * (r + a)
+    steepest, bend = math.pi * a / shape.bulge_length, 2.0 * (math.pi / shape.bulge_length) ** 2 * a
+    if isinstance(shape, NarrowedTube):
+        first, second = steepest / r**2, bend / r**2
+        scale = 1.0 / r
+    else:
+        first, second = steepest / r**2, bend / r**2 + 2.0 * steepest**2 / r**3
+        scale = 1.0 / (r + a)
+    farthest = 2.0 * ((r + a) / r) ** 2
+    low, high = 0.0, 1.0
+    for _ in range(40):
+        s = 0.5 * (low + high)
+        acceleration = s * (2.0 * first + reach * second * s)
+        speed = math.sqrt(1.0 - s * s) * scale - s * reach * first
+        phase = 2.0 * math.pi / shape.bulge_length * s * reach
+        if speed > 0 and 2.0 * farthest * acceleration <= speed * speed and phase <= _SERIES:
+            low = s
+        else:
+            high = s
+    return low
 
 
 def _bounding_radius(shape: Shape) -> float:
@@ -97,100 +128,11 @@ def pack(shapes: Sequence[Shape]) -> tuple[NDArray[np.int64], NDArray[np.float64
             row[18] = shape.half_length
             row[19], row[20] = shape.radius, shape.amplitude
             row[21], row[22] = 2.0 * math.pi / shape.bulge_length, shape.bulge_length / 2.0
-            row[23] = _tube_rays.slope_limit(shape)
+            row[23] = _slope_limit(shape)
         else:
             raise TypeError(f"shapes[{b}]: no chord kernel for {type(shape).__name__}")
         row[9:18] = (shape.matrix.T / scale[:, None]).ravel()
     return kinds, params
-
-
-@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
-def _ellipsoid(lx: float, ly: float, lz: float, ux: float, uy: float, uz: float) -> Any:
-    a = ux * ux + uy * uy + uz * uz
-    # Measured from the point of closest approach: no difference of large numbers for a far source.
-    t = -(lx * ux + ly * uy + lz * uz) / a
-    x, y, z = lx + t * ux, ly + t * uy, lz + t * uz
-    rest = 1.0 - (x * x + y * y + z * z)
-    if rest <= 0.0:
-        return 0.0, 0.0
-    half = math.sqrt(rest / a)
-    return t - half, t + half
-
-
-@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
-def _box(lx: float, ly: float, lz: float, ux: float, uy: float, uz: float) -> Any:
-    t0, t1 = -math.inf, math.inf
-    for axis in range(3):
-        p = lx if axis == 0 else (ly if axis == 1 else lz)
-        u = ux if axis == 0 else (uy if axis == 1 else uz)
-        if u == 0.0:
-            if abs(p) >= 1.0:
-                return 0.0, 0.0
-        else:
-            near, far = (-1.0 - p) / u, (1.0 - p) / u
-            if near > far:
-                near, far = far, near
-            # Written so that a NaN replaces the bound instead of being skipped.
-            t0 = t0 if t0 >= near else near
-            t1 = t1 if t1 <= far else far
-    return t0, t1
-
-
-@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
-def interval(
-    kind: int, row: NDArray[np.float64], ox: float, oy: float, oz: float, dx: float, dy: float, dz: float
-) -> Any:
-    """Where the straight line ``o + t d`` is inside one packed shape.
-
-    Args:
-        kind, row: one element of each of the arrays of :func:`pack` (``kinds[b]``, ``params[b]``).
-        ox, oy, oz: a point of the line, usually the source, in mm. Subtract a body's displacement from it.
-        dx, dy, dz: unit direction.
-
-    Returns:
-        ``(t0, t1)`` in mm along the line, not clipped to ``t > 0``; ``t1 <= t0`` where the line misses the shape.
-        A line inside an endless shape and parallel to it gives ``(-inf, inf)``.
-    """
-    qx, qy = row[0] - ox, row[1] - oy
-    cross = qx * dy - qy * dx
-    p2 = dx * dx + dy * dy
-    if cross * cross > row[3] * p2:
-        return 0.0, 0.0
-    if abs((oz - row[2]) * p2 + (qx * dx + qy * dy) * dz) > row[5] * p2 + row[4] * abs(dz):
-        return 0.0, 0.0
-    x, y, z = ox - row[6], oy - row[7], oz - row[8]
-    lx = row[9] * x + row[10] * y + row[11] * z
-    ly = row[12] * x + row[13] * y + row[14] * z
-    lz = row[15] * x + row[16] * y + row[17] * z
-    ux = row[9] * dx + row[10] * dy + row[11] * dz
-    uy = row[12] * dx + row[13] * dy + row[14] * dz
-    uz = row[15] * dx + row[16] * dy + row[17] * dz
-    if kind == ELLIPSOID:
-        return _ellipsoid(lx, ly, lz, ux, uy, uz)
-    if kind == CYLINDER:
-        t0, t1 = _tube_rays.unit_circle(lx, ly, ux, uy)
-        if t1 <= t0:
-            return 0.0, 0.0
-        return _tube_rays.clip(t0, t1, lz, uz, row[18])
-    if kind == BOX:
-        return _box(lx, ly, lz, ux, uy, uz)
-    narrowed = kind == NARROWED
-    if abs(uz) <= row[23]:
-        t0, t1 = _tube_rays.shallow(narrowed, lx, ly, lz, ux, uy, uz, row[19], row[20], row[21], row[22])
-        if t1 <= t0:
-            return 0.0, 0.0
-        return _tube_rays.clip(t0, t1, lz, uz, row[18])
-    return _tube_rays.steep(narrowed, lx, ly, lz, ux, uy, uz, row[19], row[20], row[21], row[22], row[18])
-
-
-@numba.njit(cache=True, parallel=True, fastmath=_FAST, error_model="numpy")
-def _chords(kinds: Any, params: Any, origins: Any, directions: Any, out: Any) -> None:
-    for n in numba.prange(origins.shape[0]):
-        ox, oy, oz = origins[n, 0], origins[n, 1], origins[n, 2]
-        dx, dy, dz = directions[n, 0], directions[n, 1], directions[n, 2]
-        for b in range(kinds.shape[0]):
-            t0, t1 = interval(kinds[b], params[b], ox, oy, oz, dx, dy, dz)
-            out[b, n] = 0.0 if t1 <= t0 else t1 - t0
 
 
 def chord_lengths(scene: Any, origins: ArrayLike, directions: ArrayLike) -> NDArray[np.float64]:
@@ -223,5 +165,5 @@ def chord_lengths(scene: Any, origins: ArrayLike, directions: ArrayLike) -> NDAr
         raise ValueError(f"directions must have a length greater than 0, but row {int(np.argmin(length))} is 0")
     o, d = np.broadcast_arrays(o, d / length)
     out = np.empty((kinds.size, o.shape[0]), dtype=np.float64)
-    _chords(kinds, params, np.ascontiguousarray(o), np.ascontiguousarray(d), out)
+    chords(kinds, params, np.ascontiguousarray(o), np.ascontiguousarray(d), out)
     return out

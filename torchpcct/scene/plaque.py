@@ -7,8 +7,8 @@ number given; what it adds are parameters of :class:`Plaque`.
 
 In the plaque's own frame z runs along the vessel and x from the vessel's axis towards the plaque. With
 ``d(z) = bulge · cos²(π z / bulge_length)`` the outer surface is the ellipse about ``(d, 0)`` with semi-axes
-``(R + d, R)``, the inner wall the same with ``R`` less the wall, the lumen the largest circle that touches the inner wall
-opposite the plaque from inside; between inner wall and lumen lies fibrous tissue, and in it the core.
+``(R + d, R)``, the inner wall the same with ``R`` less the wall, the lumen the largest circle that touches the inner
+wall opposite the plaque from inside; between inner wall and lumen lies fibrous tissue, and in it the core.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ class Plaque:
 
     @cached_property
     def core_center(self) -> tuple[float, float, float]:
-        """Centre of the core in the plaque's frame, mm: on the x axis where the cap has its thickness, plus the shift."""
+        """Centre of the core in the plaque's frame, mm: on the x axis where the cap is as thick as asked, plus the shift."""
         a, b, c = self.core_semi_axes
         lumen_edge = 2.0 * float(self.lumen.section(0.0)[1]) - self.inner_radius
         x = lumen_edge + self.cap_thickness + a
@@ -235,7 +235,8 @@ def interpolate_material(name: str, start: Any, end: Any, weight: float) -> Mate
         value = first + w * (last - first)
         if value < -1e-12:
             raise ValueError(
-                f"weight {w:g} between {a.name!r} and {b.name!r} needs a negative amount of {element}: choose one closer to 0…1"
+                f"weight {w:g} between {a.name!r} and {b.name!r} needs a negative amount of {element}: "
+                "choose one closer to 0…1"
             )
         if value > 0:
             partial[element] = value
