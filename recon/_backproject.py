@@ -1,14 +1,15 @@
 """Numba kernels of the voxel-driven backprojector and of its exact transpose.
 
-Detector data come padded by one repeated column (and row) at the far end, so that a position anywhere in
-``[0, n − 1]`` may read its two neighbours without a branch. Every voxel belongs to one thread in the
-backprojection and every view to one thread in the transpose, with a fixed order of summation: results do not
-depend on the number of threads.
+Every voxel belongs to one task of the backprojection and every view to one task of the transpose, each with a fixed
+order of summation: results do not depend on the number of threads. Positions on a curved detector are
+``γ = 2 atan(across / (distance + depth))``, with the arc tangent as a polynomial that is fitted to the fans that
+occur, because a library call per voxel and view would cost more than all the rest.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numba import njit, prange
@@ -16,161 +17,294 @@ from numba import njit, prange
 __all__ = ["backproject_2d", "backproject_3d", "spread_2d", "spread_3d"]
 
 PARALLEL, FLAT, CURVED = 0, 1, 2
-_OPTIONS = {"parallel": True, "cache": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
-_INLINE = {"cache": True, "error_model": "numpy", "inline": "always"}
+
+# No "nnan" or "ninf": NaN and Inf of the data must reach the image.
+_FAST = {"contract", "nsz", "arcp"}
+_OPTIONS: Any = {"parallel": True, "cache": True, "error_model": "numpy", "fastmath": _FAST}
+_INLINE: Any = {"cache": True, "error_model": "numpy", "fastmath": _FAST}
 
 
 @njit(**_INLINE)
-def _sample(kind, x, y, c, s, sod, sdd, scale, start, last):
-    """Column index of a voxel (clamped to the data), distance weight, and magnification of heights."""
-    across = y * c - x * s
-    if kind == 0:
-        index = across * scale + start
-        weight = 1.0
-        height = 1.0
-    else:
-        depth = sod - (x * c + y * s)
-        if kind == 1:
-            index = sdd * across / depth * scale + start
-            weight = sod * sod / (depth * depth)
-            height = sdd / depth
+def _positions_2d(kind, x, y, c, s, sod, sdd, scale, start, last, atan, index, near, far):
+    """Left neighbour and the two weights of a line of pixels, in the precision of ``x``."""
+    number = x.dtype.type
+    zero, one, edge, first = number(0), number(1), number(last), number(start)
+    depth0, depth1 = number(sod - y * s), number(-c)
+    across0, across1 = number(y * c), number(-s)
+    unit, radius = number(sdd * scale), number(sod)
+    for i in range(x.size):
+        across = across0 + across1 * x[i]
+        if kind == 0:
+            position = across * number(scale) + first
+            weight = one
         else:
-            square = across * across + depth * depth
-            index = sdd * math.atan2(across, depth) * scale + start
-            weight = sod * sod / square
-            height = sdd / math.sqrt(square)
-    return min(max(index, 0.0), last), weight, height
+            depth = depth0 + depth1 * x[i]
+            if kind == 1:
+                inverse = one / depth
+                position = across * inverse * unit + first
+                weight = radius * inverse
+                weight = weight * weight
+            else:
+                square = depth * depth + across * across
+                t = across / (math.sqrt(square) + depth)
+                t2 = t * t
+                value = number(atan[0])
+                for m in range(1, len(atan)):
+                    value = value * t2 + number(atan[m])
+                position = value * t * unit + first
+                weight = radius * radius / square
+        position = min(max(position, zero), edge)
+        left = np.int32(position)
+        fraction = (position - number(left)) * weight
+        index[i] = left
+        near[i] = weight - fraction
+        far[i] = fraction
 
 
 @njit(**_OPTIONS)
-def backproject_2d(kind, data, cosines, sines, starts, x, y, sod, sdd, scale, out):
-    """``data (B, V, columns + 1)`` into ``out (B, Y, X)``."""
-    batch, views, padded = data.shape
+def backproject_2d(kind, data, cosines, sines, starts, x, y, sod, sdd, scale, atan, out):
+    """``data (B, V, columns)`` into ``out (B, Y, X)``."""
+    batch, views, columns = data.shape
     ny, nx = out.shape[1], out.shape[2]
     number = data.dtype.type
-    last = padded - 2.0
-    for iy in prange(ny):
-        index = np.empty(nx, np.uint32)
-        near = np.empty(nx, data.dtype)
-        far = np.empty(nx, data.dtype)
-        out[:, iy, :] = number(0)
+    block = 16
+    blocks = (ny + block - 1) // block
+    for task in prange(batch * blocks):
+        b, first = task // blocks, (task % blocks) * block
+        end = min(first + block, ny)
+        total = np.zeros((block, nx), data.dtype)
+        index = np.empty(nx, np.int32)
+        near, far = np.empty(nx, data.dtype), np.empty(nx, data.dtype)
+        row = np.empty(columns + 1, data.dtype)
+        xs = np.empty(nx, data.dtype)
+        for i in range(nx):
+            xs[i] = number(x[i])
         for v in range(views):
-            for ix in range(nx):
-                position, weight, _ = _sample(
-                    kind, x[ix], y[iy], cosines[v], sines[v], sod, sdd, scale, starts[v], last
+            for i in range(columns):
+                row[i] = data[b, v, i]
+            row[columns] = number(0)  # read with weight 0 at the last column's centre
+            for iy in range(first, end):
+                _positions_2d(
+                    kind,
+                    xs,
+                    y[iy],
+                    cosines[v],
+                    sines[v],
+                    sod,
+                    sdd,
+                    scale,
+                    starts[v],
+                    columns - 1,
+                    atan,
+                    index,
+                    near,
+                    far,
                 )
-                i = np.int32(position)
-                fraction = (position - i) * weight
-                index[ix] = np.uint32(i)
-                far[ix] = number(fraction)
-                near[ix] = number(weight - fraction)
-            for b in range(batch):
-                row = data[b, v]
-                line = out[b, iy]
-                for ix in range(nx):
-                    line[ix] += near[ix] * row[index[ix]] + far[ix] * row[index[ix] + np.uint32(1)]
+                line = total[iy - first]
+                for i in range(nx):
+                    k = np.uint32(index[i])
+                    line[i] += near[i] * row[k] + far[i] * row[k + np.uint32(1)]
+        for iy in range(first, end):
+            for i in range(nx):
+                out[b, iy, i] = total[iy - first, i]
 
 
 @njit(**_OPTIONS)
-def spread_2d(kind, volume, cosines, sines, starts, x, y, sod, sdd, scale, out):
-    """Transpose of :func:`backproject_2d`: ``volume (B, Y, X)`` into ``out (B, V, columns + 1)``."""
-    batch, views, padded = out.shape
+def spread_2d(kind, volume, cosines, sines, starts, x, y, sod, sdd, scale, atan, out):
+    """Transpose of :func:`backproject_2d`: ``volume (B, Y, X)`` into ``out (B, V, columns)``."""
+    batch, views, columns = out.shape
     ny, nx = volume.shape[1], volume.shape[2]
     number = volume.dtype.type
-    last = padded - 2.0
-    for v in prange(views):
-        out[:, v, :] = number(0)
+    for task in prange(batch * views):
+        b, v = task // views, task % views
+        index = np.empty(nx, np.int32)
+        near, far = np.empty(nx, volume.dtype), np.empty(nx, volume.dtype)
+        row = np.zeros(columns + 1, volume.dtype)
+        xs = np.empty(nx, volume.dtype)
+        for i in range(nx):
+            xs[i] = number(x[i])
         for iy in range(ny):
-            for ix in range(nx):
-                position, weight, _ = _sample(
-                    kind, x[ix], y[iy], cosines[v], sines[v], sod, sdd, scale, starts[v], last
-                )
-                i = np.uint32(np.int32(position))
-                fraction = (position - np.float64(i)) * weight
-                far = number(fraction)
-                near = number(weight - fraction)
-                for b in range(batch):
-                    out[b, v, i] += near * volume[b, iy, ix]
-                    out[b, v, i + np.uint32(1)] += far * volume[b, iy, ix]
+            _positions_2d(
+                kind, xs, y[iy], cosines[v], sines[v], sod, sdd, scale, starts[v], columns - 1, atan, index, near, far
+            )
+            for i in range(nx):
+                k = np.uint32(index[i])
+                row[k] += near[i] * volume[b, iy, i]
+                row[k + np.uint32(1)] += far[i] * volume[b, iy, i]
+        for i in range(columns):
+            out[b, v, i] = row[i]
+
+
+@njit(**_INLINE)
+def _positions_3d(kind, x, y, c, s, sod, sdd, scale, start, atan, index, weight, height):
+    """Column position, distance weight and magnification of heights of voxel columns, in float64."""
+    for p in range(x.size):
+        across = y[p] * c - x[p] * s
+        depth = sod - (x[p] * c + y[p] * s)
+        if kind == 1:
+            inverse = 1.0 / depth
+            height[p] = sdd * inverse
+            index[p] = sdd * inverse * across * scale + start
+            weight[p] = sod * inverse * (sod * inverse)
+        else:
+            square = across * across + depth * depth
+            distance = math.sqrt(square)
+            t = across / (distance + depth)
+            t2 = t * t
+            value = atan[0]
+            for m in range(1, len(atan)):
+                value = value * t2 + atan[m]
+            height[p] = sdd / distance
+            index[p] = sdd * scale * value * t + start
+            weight[p] = sod * sod / square
+
+
+@njit(**_INLINE)
+def _add_by_kink(near, far, left, right, z, tau, step, total):
+    """One voxel column: ``total += row interpolation``, three rows of each neighbour for every voxel.
+
+    Where the heights of a voxel on the detector stay within one row of row κ for the whole tile, interpolation is
+    ``g(κ) + min(t, 0) · (g(κ) − g(κ−1)) + max(t, 0) · (g(κ+1) − g(κ))`` with t the distance from κ: no index depends
+    on the voxel column, and the loop along z vectorises.
+    """
+    zero = z.dtype.type(0)
+    g0, d0, e0 = left[0], left[1], left[2]
+    g1, d1, e1 = right[0], right[1], right[2]
+    for k in range(total.size):
+        t = z[k] * step + tau[k]
+        below, above = min(t, zero), max(t, zero)
+        total[k] += (
+            (near * g0[k] + far * g1[k]) + below * (near * d0[k] + far * d1[k]) + above * (near * e0[k] + far * e1[k])
+        )
+
+
+@njit(**_INLINE)
+def _add_by_index(near, far, slab, i, j, z, step, origin, column, total):
+    """One voxel column, any magnification: interpolate the columns first, then look the rows up."""
+    number = z.dtype.type
+    rows = slab.shape[0]
+    for r in range(rows):
+        column[r] = near * slab[r, i] + far * slab[r, j]
+    column[rows] = number(0)
+    zero, last = number(0), number(rows - 1)
+    for k in range(z.size):
+        row = min(max(z[k] * step + origin, zero), last)
+        lower = np.int32(row)
+        f = row - number(lower)
+        n = np.uint32(lower)
+        total[k] += (number(1) - f) * column[n] + f * column[n + np.uint32(1)]
 
 
 @njit(**_OPTIONS)
-def backproject_3d(kind, data, cosines, sines, starts, x, y, z, sod, sdd, scale, row_scale, row_start, out):
-    """``data (V, columns + 1, rows + 1, B)`` into ``out (Y, X, Z, B)``."""
-    views, padded, row_count, batch = data.shape
-    ny, nx, nz = out.shape[0], out.shape[1], out.shape[2]
+def backproject_3d(
+    kind, data, cosines, sines, starts, x, y, z, sod, sdd, scale, row_scale, row_start, atan, tile_y, tile_x, out
+):
+    """``data (B, V, rows, columns)`` into ``out (B, Z, Y, X)``, tile by tile of ``tile_y × tile_x`` voxel columns."""
+    batch, views, rows, columns = data.shape
+    nz, ny, nx = out.shape[1], out.shape[2], out.shape[3]
     number = data.dtype.type
-    zero = number(0)
-    last = padded - 2.0
-    last_row = number(row_count - 2.0)
-    origin = number(row_start)
-    tile = 16
-    for t in prange((ny * nx + tile - 1) // tile):
-        column = np.empty((row_count, batch), data.dtype)
-        low, high = t * tile, min((t + 1) * tile, ny * nx)
-        for p in range(low, high):
-            out[p // nx, p % nx] = zero
+    tiles_y, tiles_x = (ny + tile_y - 1) // tile_y, (nx + tile_x - 1) // tile_x
+    tiles = tiles_y * tiles_x
+    padded = (nz + 7) // 8 * 8
+    last = columns - 1.0
+    reach = max(abs(z[0]), abs(z[nz - 1])) * row_scale
+    for task in prange(batch * tiles):
+        b = task // tiles
+        iy, ix = (task % tiles) // tiles_x, task % tiles_x
+        y0, y1 = iy * ny // tiles_y, (iy + 1) * ny // tiles_y
+        x0, x1 = ix * nx // tiles_x, (ix + 1) * nx // tiles_x
+        width = x1 - x0
+        n = (y1 - y0) * width
+        px, py = np.empty(n), np.empty(n)
+        for p in range(n):
+            px[p], py[p] = x[x0 + p % width], y[y0 + p // width]
+        index, weight, height = np.empty(n), np.empty(n), np.empty(n)
+        total = np.zeros((n, padded), data.dtype)
+        heights = np.zeros(padded, data.dtype)
+        for k in range(nz):
+            heights[k] = number(z[k])
+        tau = np.zeros(padded, data.dtype)
+        table = np.zeros((columns + 1, 3, padded), data.dtype)
+        column = np.empty(rows + 1, data.dtype)
         for v in range(views):
-            for p in range(low, high):
-                iy, ix = p // nx, p % nx
-                position, weight, height = _sample(
-                    kind, x[ix], y[iy], cosines[v], sines[v], sod, sdd, scale, starts[v], last
-                )
-                i = np.uint64(position)
-                fraction = (position - np.float64(i)) * weight
-                far, near = number(fraction), number(weight - fraction)
-                left, right = data[v, i], data[v, i + np.uint64(1)]
-                for r in range(row_count):
-                    for b in range(batch):
-                        column[r, b] = near * left[r, b] + far * right[r, b]
-                step = number(height * row_scale)
-                target = out[iy, ix]
+            _positions_3d(kind, px, py, cosines[v], sines[v], sod, sdd, scale, starts[v], atan, index, weight, height)
+            low, high, left, right = height[0], height[0], index[0], index[0]
+            for p in range(n):
+                low, high = min(low, height[p]), max(high, height[p])
+                left, right = min(left, index[p]), max(right, index[p])
+            first = int(min(max(left, 0.0), last))
+            end = int(min(max(right, 0.0), last)) + 2
+            slab = data[b, v]
+            kink = reach * (high - low) <= 1.0
+            if kink:
                 for k in range(nz):
-                    row = min(max(z[k] * step + origin, zero), last_row)
-                    j = np.int32(row)
-                    f = row - number(j)
-                    lower = np.uint32(j)
-                    upper = lower + np.uint32(1)
-                    for b in range(batch):
-                        a = column[lower, b]
-                        target[k, b] += a + f * (column[upper, b] - a)
+                    r = max(z[k] * low, z[k] * high) * row_scale + row_start
+                    middle = int(min(max(math.floor(r), 0.0), rows - 1.0))
+                    tau[k] = number(row_start - middle)
+                    below, here, above = slab[max(middle - 1, 0)], slab[middle], slab[min(middle + 1, rows - 1)]
+                    for i in range(first, end):
+                        j = min(i, columns - 1)
+                        table[i - first, 0, k] = here[j]
+                        table[i - first, 1, k] = here[j] - below[j]
+                        table[i - first, 2, k] = above[j] - here[j]
+            for p in range(n):
+                position = min(max(index[p], 0.0), last)
+                i = int(position)
+                fraction = (position - i) * weight[p]
+                near, far = number(weight[p] - fraction), number(fraction)
+                step = number(height[p] * row_scale)
+                if kink:
+                    m = np.uint64(i - first)
+                    _add_by_kink(near, far, table[m], table[m + np.uint64(1)], heights, tau, step, total[p])
+                else:
+                    j = min(i + 1, columns - 1)
+                    _add_by_index(near, far, slab, i, j, heights, step, number(row_start), column, total[p])
+        for k in range(nz):
+            for p in range(n):
+                out[b, k, y0 + p // width, x0 + p % width] = total[p, k]
 
 
 @njit(**_OPTIONS)
-def spread_3d(kind, volume, cosines, sines, starts, x, y, z, sod, sdd, scale, row_scale, row_start, out):
-    """Transpose of :func:`backproject_3d`: ``volume (Y, X, Z, B)`` into ``out (V, columns + 1, rows + 1, B)``."""
-    views, padded, row_count, batch = out.shape
-    ny, nx, nz = volume.shape[0], volume.shape[1], volume.shape[2]
+def spread_3d(kind, volume, cosines, sines, starts, x, y, z, sod, sdd, scale, row_scale, row_start, atan, out):
+    """Transpose of :func:`backproject_3d`: ``volume (B, Y, X, Z)`` into ``out (B, V, rows, columns)``."""
+    batch, views, rows, columns = out.shape
+    ny, nx, nz = volume.shape[1], volume.shape[2], volume.shape[3]
     number = volume.dtype.type
-    zero = number(0)
-    last = padded - 2.0
-    last_row = number(row_count - 2.0)
-    origin = number(row_start)
-    for v in prange(views):
-        column = np.empty((row_count, batch), volume.dtype)
-        out[v] = zero
+    zero, last = number(0), columns - 1.0
+    last_row, origin = number(rows - 1), number(row_start)
+    for task in prange(batch * views):
+        b, v = task // views, task % views
+        index, weight, height = np.empty(nx), np.empty(nx), np.empty(nx)
+        line = np.empty(nx)
+        column = np.empty(rows + 1, volume.dtype)
+        slab = np.zeros((columns + 1, rows), volume.dtype)
+        heights = np.empty(nz, volume.dtype)
+        for k in range(nz):
+            heights[k] = number(z[k])
         for iy in range(ny):
             for ix in range(nx):
-                position, weight, height = _sample(
-                    kind, x[ix], y[iy], cosines[v], sines[v], sod, sdd, scale, starts[v], last
-                )
-                i = np.uint64(position)
-                fraction = (position - np.float64(i)) * weight
-                far, near = number(fraction), number(weight - fraction)
-                column[:] = zero
-                step = number(height * row_scale)
+                line[ix] = y[iy]
+            _positions_3d(kind, x, line, cosines[v], sines[v], sod, sdd, scale, starts[v], atan, index, weight, height)
+            for ix in range(nx):
+                position = min(max(index[ix], 0.0), last)
+                left = np.uint64(int(position))
+                fraction = (position - int(position)) * weight[ix]
+                near, far = number(weight[ix] - fraction), number(fraction)
+                step = number(height[ix] * row_scale)
+                for r in range(rows + 1):
+                    column[r] = zero
+                values = volume[b, iy, ix]
                 for k in range(nz):
-                    row = min(max(z[k] * step + origin, zero), last_row)
-                    j = np.int32(row)
-                    f = row - number(j)
-                    lower = np.uint32(j)
-                    upper = lower + np.uint32(1)
-                    for b in range(batch):
-                        value = volume[iy, ix, k, b]
-                        part = f * value
-                        column[lower, b] += value - part
-                        column[upper, b] += part
-                for r in range(row_count):
-                    for b in range(batch):
-                        out[v, i, r, b] += near * column[r, b]
-                        out[v, i + np.uint64(1), r, b] += far * column[r, b]
+                    row = min(max(heights[k] * step + origin, zero), last_row)
+                    lower = np.int32(row)
+                    f = row - number(lower)
+                    part = f * values[k]
+                    m = np.uint32(lower)
+                    column[m] += values[k] - part
+                    column[m + np.uint32(1)] += part
+                for r in range(rows):
+                    slab[left, r] += near * column[r]
+                    slab[left + np.uint64(1), r] += far * column[r]
+        for r in range(rows):
+            for i in range(columns):
+                out[b, v, r, i] = slab[i, r]

@@ -7,8 +7,9 @@ depend on how it is computed: as a matrix product where few columns go in or out
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,69 +28,10 @@ CHUNK_BYTES = 48 * 2**20
 _GEMM_FLOPS, _FFT_FLOPS = 40.0, 4.0
 
 
-def _convolve(
-    data: Tensor,
-    first_in: NDArray[np.int64],
-    kernels: NDArray[np.float64],
-    first_out: NDArray[np.int64],
-    width_out: int,
-) -> Tensor:
-    """Convolve rows that are zero outside their window.
-
-    Args:
-        data: ``(V, M, width_in)``; row i of view v starts at column ``first_in[v]``.
-        kernels: ``(K, N)``, samples for lags 0 … N−1 of even kernels.
-        first_out: ``(V,)`` first column wanted in each view.
-
-    Returns:
-        ``(V, M, K, width_out)``.
-    """
-    views, rows, width_in = data.shape
-    count = kernels.shape[0]
-    shift = first_in - first_out  # lag of the first reading relative to the first result
-    low, high = int(shift.min()), int(shift.max())
-    size = fast_length(high - low + width_in + width_out - 1)
-    gemm = 2.0 * width_in * width_out * count / _GEMM_FLOPS
-    fft = (1 + count) * 2.5 * size * math.log2(size) / _FFT_FLOPS
-    if gemm <= fft:
-        # strip[q, k, j] = h_k(|q + low − j|): the rows of view v start at q = shift[v] − low
-        lag = np.abs(np.arange(high - low + width_in)[:, None] + low - np.arange(width_out))
-        strip_np = np.ascontiguousarray(np.moveaxis(_lookup(kernels, lag), 0, 1)).reshape(lag.shape[0], -1)
-        strip = torch.from_numpy(strip_np).to(data)
-        out = data.new_empty((views, rows, count * width_out))
-        for v0, v1 in _runs(shift):
-            q = int(shift[v0]) - low
-            torch.mm(
-                data[v0:v1].reshape(-1, width_in),
-                strip[q : q + width_in],
-                out=out[v0:v1].view(-1, count * width_out),
-            )
-        return out.view(views, rows, count, width_out)
-    # result column j of view v needs lag j − shift[v] − i, from −high − (width_in − 1) on
-    lag = np.arange(size)
-    base = -high
-    lag = np.where(lag < size - (width_in - 1), lag, lag - size) + base
-    circular = torch.from_numpy(np.fft.rfft(_lookup(kernels, np.abs(lag)))).to(
-        dtype=torch.complex128 if data.dtype == torch.float64 else torch.complex64, device=data.device
-    )
-    spectrum = torch.fft.rfft(data, n=size)
-    result = torch.fft.irfft(spectrum[:, :, None, :] * circular, n=size)
-    if low == high:
-        return result[..., :width_out].contiguous()
-    index = torch.from_numpy((high - shift)[:, None] + np.arange(width_out)).to(data.device)
-    return torch.gather(result, 3, index[:, None, None, :].expand(views, rows, count, width_out))
-
-
 def _lookup(kernels: NDArray[np.float64], lag: NDArray[np.int64]) -> NDArray[np.float64]:
     """``kernels[:, lag]``, zero where the lag lies beyond the samples (no data at that distance)."""
     inside = lag < kernels.shape[1]
     return np.where(inside, kernels[:, np.where(inside, lag, 0)], 0.0)
-
-
-def _runs(values: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
-    """Stretches of equal neighbours."""
-    ends = np.flatnonzero(np.diff(values)) + 1
-    yield from zip([0, *ends.tolist()], [*ends.tolist(), values.size], strict=True)
 
 
 def full_window(geometry: Geometry) -> DetectorWindow:
@@ -146,78 +88,108 @@ class FilterPlan:
         object.__setattr__(self, "samples", samples)
         object.__setattr__(self, "cosine", cosine)
 
-    def _weights(self, v0: int, v1: int, like: Tensor) -> Tensor:
-        """``(v, rows_out, width_in)`` weights of the readings of views v0 … v1−1."""
-        columns = self.window_in.column_indices[v0:v1]
-        angular = self.angular[v0:v1]
-        if angular.shape[1] > 1:
-            angular = np.take_along_axis(angular, columns, axis=1)
-        if self.window_in.columns == self.geometry.columns:
-            cosine = self.cosine[None]
-        else:
-            cosine = self.cosine[:, columns].swapaxes(0, 1)
-        # two factors in the data's precision: much less memory traffic than a float64 product
-        return torch.from_numpy(np.ascontiguousarray(angular[:, None, :])).to(like) * torch.from_numpy(
-            np.ascontiguousarray(cosine)
-        ).to(like)
+    @property
+    def _offset(self) -> NDArray[np.int64]:
+        """Position of the data of every view in a frame in which the results start at the same place."""
+        shift = self.window_in.first_column - self.window_out.first_column
+        return shift - shift.min()
 
-    def _chunk(self, batch: int, itemsize: int) -> int:
-        a, b, k = self.window_in, self.window_out, len(self.kernels)
-        widest = int((a.first_column - b.first_column).max() - (a.first_column - b.first_column).min())
-        reach = widest + a.columns + b.columns
-        per_view = batch * b.rows * itemsize * (a.columns + (1 + 3 * k) * reach)
-        return max(1, min(a.views, CHUNK_BYTES // max(per_view, 1)))
+    @property
+    def _length(self) -> int:
+        """Width of that frame."""
+        return int(self._offset.max()) + self.window_in.columns
+
+    @property
+    def _fft_size(self) -> int:
+        return fast_length(self._length + self.window_out.columns - 1)
+
+    @property
+    def by_matrix(self) -> bool:
+        """Whether a matrix product is cheaper than FFTs."""
+        width, size, count = self.window_out.columns, self._fft_size, len(self.kernels)
+        gemm = 2.0 * self._length * width * count / _GEMM_FLOPS
+        fft = (1 + count) * 2.5 * size * math.log2(size) / _FFT_FLOPS
+        return gemm <= fft
+
+    @property
+    def chunk(self) -> int:
+        """Views whose intermediate results in float64 stay near :data:`CHUNK_BYTES`."""
+        width = self._length if self.by_matrix else self._length + 4 * self._fft_size
+        return max(1, min(self.window_in.views, CHUNK_BYTES // (8 * self.window_out.rows * width)))
+
+    def _responses(self, like: Tensor) -> Tensor:
+        """Matrices ``(K, length, width_out)``, or frequency responses ``(K, size // 2 + 1)``."""
+        low = int((self.window_in.first_column - self.window_out.first_column).min())
+        if self.by_matrix:
+            lag = np.arange(self._length)[:, None] + low - np.arange(self.window_out.columns)
+            return torch.from_numpy(_lookup(self.samples, np.abs(lag))).to(like)
+        size = self._fft_size
+        lag = np.arange(size)
+        lag = np.where(lag < size - (self._length - 1), lag, lag - size) - low
+        response = torch.from_numpy(np.fft.rfft(_lookup(self.samples, np.abs(lag))))
+        return response.to(dtype=torch.promote_types(like.dtype, torch.complex32), device=like.device)
+
+    def _weights(self, like: Tensor) -> list[Any]:
+        number = np.float64 if like.dtype == torch.float64 else np.float32
+        rows = np.broadcast_to(self.cosine, (self.window_out.rows, self.geometry.columns))
+        return [self.angular.astype(number), np.ascontiguousarray(rows, dtype=number)]
 
     def forward(self, data: Tensor) -> Tensor:
         """Weight and filter: ``(..., V, rows_in, width_in)`` to ``(..., K, V, rows_out, width_out)``."""
-        a, b, k = self.window_in, self.window_out, len(self.kernels)
+        from recon._filter_kernels import align
+
+        a, b = self.window_in, self.window_out
         lead = data.shape[:-3]
-        data = data.reshape(-1, *data.shape[-3:])
-        batch = data.shape[0]
-        out = data.new_empty((batch, k, a.views, b.rows, b.columns))
-        if batch == 0:
-            return out.view(*lead, *out.shape[1:])
-        r0 = b.first_row - a.first_row
-        chunk = self._chunk(batch, data.element_size())
+        data = data.reshape(math.prod(lead), *data.shape[-3:])
+        out = data.new_empty((data.shape[0], len(self.kernels), a.views, b.rows, b.columns))
+        responses, (angular, cosine), offset = self._responses(data), self._weights(data), self._offset
+        r0, first, chunk = b.first_row - a.first_row, a.first_column, self.chunk
+        buffer = data.new_empty((chunk, b.rows, self._length))
         for v0 in range(0, a.views, chunk):
             v1 = min(v0 + chunk, a.views)
-            part = data[:, v0:v1, r0 : r0 + b.rows].transpose(0, 1)
-            weighted = part.new_empty((v1 - v0, batch, b.rows, a.columns))
-            torch.mul(part, self._weights(v0, v1, data)[:, None], out=weighted)
-            filtered = _convolve(
-                weighted.view(v1 - v0, -1, a.columns),
-                a.first_column[v0:v1],
-                self.samples,
-                b.first_column[v0:v1],
-                b.columns,
-            )
-            filtered = filtered.view(v1 - v0, batch, b.rows, k, b.columns)
-            out[:, :, v0:v1] = filtered.permute(1, 3, 0, 2, 4)
+            frame = buffer[: v1 - v0]
+            for source, target in zip(data, out, strict=True):
+                rows = source[v0:v1, r0 : r0 + b.rows]
+                align(rows.numpy(), angular[v0:v1], cosine, first[v0:v1], offset[v0:v1], frame.numpy())
+                self._convolve(frame, responses, target[:, v0:v1])
         return out.view(*lead, *out.shape[1:])
+
+    def _convolve(self, frame: Tensor, responses: Tensor, out: Tensor) -> None:
+        """``frame (v, R, length)`` into ``out (K, v, R, width_out)``."""
+        width = self.window_out.columns
+        if self.by_matrix:
+            for matrix, target in zip(responses, out, strict=True):
+                torch.mm(frame.view(-1, self._length), matrix, out=target.view(-1, width))
+            return
+        spectrum = torch.fft.rfft(frame, n=self._fft_size)
+        for response, target in zip(responses, out, strict=True):
+            target.copy_(torch.fft.irfft(spectrum * response, n=self._fft_size)[..., :width])
 
     def transpose(self, gradient: Tensor) -> Tensor:
         """Transpose of :meth:`forward`: ``(..., K, V, rows_out, width_out)`` to ``(..., V, rows_in, width_in)``."""
-        a, b, k = self.window_in, self.window_out, len(self.kernels)
+        from recon._filter_kernels import unalign
+
+        a, b = self.window_in, self.window_out
         lead = gradient.shape[:-4]
-        gradient = gradient.reshape(-1, *gradient.shape[-4:])
-        batch = gradient.shape[0]
-        out = gradient.new_zeros((batch, a.views, a.rows, a.columns))
-        if batch == 0:
-            return out.view(*lead, *out.shape[1:])
-        r0 = b.first_row - a.first_row
-        chunk = self._chunk(batch, gradient.element_size())
+        gradient = gradient.reshape(math.prod(lead), *gradient.shape[-4:])
+        out = gradient.new_zeros((gradient.shape[0], a.views, a.rows, a.columns))
+        responses, (angular, cosine), offset = self._responses(gradient), self._weights(gradient), self._offset
+        r0, first, chunk = b.first_row - a.first_row, a.first_column, self.chunk
         for v0 in range(0, a.views, chunk):
             v1 = min(v0 + chunk, a.views)
-            total = out.new_zeros((v1 - v0, batch, b.rows, a.columns))
-            for i in range(k):
-                part = gradient[:, i, v0:v1].transpose(0, 1).reshape(v1 - v0, batch * b.rows, b.columns)
-                spread = _convolve(
-                    part, b.first_column[v0:v1], self.samples[i : i + 1], a.first_column[v0:v1], a.columns
-                )
-                total += spread.view(v1 - v0, batch, b.rows, a.columns)
-            total *= self._weights(v0, v1, gradient)[:, None]
-            out[:, v0:v1, r0 : r0 + b.rows] = total.transpose(0, 1)
+            for source, target in zip(gradient, out, strict=True):
+                frame = self._correlate(source[:, v0:v1], responses)
+                rows = target[v0:v1, r0 : r0 + b.rows]
+                unalign(frame.numpy(), angular[v0:v1], cosine, first[v0:v1], offset[v0:v1], rows.numpy())
         return out.view(*lead, *out.shape[1:])
+
+    def _correlate(self, gradient: Tensor, responses: Tensor) -> Tensor:
+        """Transpose of :meth:`_convolve`: ``(K, v, R, width_out)`` to ``(v, R, length)``."""
+        if self.by_matrix:
+            return torch.einsum("kvrj,kij->vri", gradient, responses)
+        spectrum = torch.fft.rfft(gradient, n=self._fft_size)
+        total = (spectrum * responses[:, None, None, :].conj()).sum(dim=0)
+        return torch.fft.irfft(total, n=self._fft_size)[..., : self._length].contiguous()
 
 
 def kernel_names(kernel: str | Sequence[str]) -> tuple[tuple[str, ...], bool]:

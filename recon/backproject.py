@@ -1,0 +1,239 @@
+"""Weighted backprojection of filtered detector data, and its exact transpose."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from recon._filtering import full_window
+from recon._operator import apply_linear
+from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
+from torchpcct.window import DetectorWindow
+
+__all__ = ["BackprojectionPlan", "backproject", "check_data", "data_shape"]
+
+_KIND = {"parallel": 0, "flat": 1, "curved": 2}
+#: Voxel columns of one task of the 3-D backprojection: small enough for the caches, large enough to share look-ups.
+_TILE = (12, 24)
+#: Polynomial lengths of the arc tangent; each length is one compiled variant of the kernels.
+_ATAN_TERMS = (5, 9, 20)
+
+
+def _atan_polynomial(reach: float, tolerance: float) -> tuple[float, ...]:
+    """Coefficients c of ``2 atan(t) ≈ t · c(t²)`` for |t| ≤ reach, highest power first; error below the tolerance."""
+    from numpy.polynomial import Chebyshev, Polynomial
+
+    reach = max(reach, 1e-3)
+    u = 0.5 * reach**2 * (1.0 - np.cos((np.arange(200) + 0.5) / 200 * math.pi))
+    value = 2.0 * np.arctan(np.sqrt(u)) / np.sqrt(u)
+    for terms in _ATAN_TERMS:
+        fit = Chebyshev.fit(u, value, terms - 1, domain=[0.0, reach**2])
+        if np.abs(fit(u) - value).max() * reach < tolerance:
+            break
+    return tuple(float(c) for c in fit.convert(kind=Polynomial).coef[::-1])
+
+
+def check_data(name: str, data: Any, shape: tuple[int, ...]) -> None:
+    if not isinstance(data, Tensor):
+        raise TypeError(f"{name} must be a torch.Tensor, got {type(data).__name__}: use torch.as_tensor")
+    if data.dtype not in (torch.float32, torch.float64):
+        raise TypeError(f"{name} must be float32 or float64, got {data.dtype}: convert it with .float() or .double()")
+    if data.ndim < len(shape) or tuple(data.shape[data.ndim - len(shape) :]) != shape:
+        expected = ", ".join(["...", *map(str, shape)])
+        raise ValueError(f"{name} must have the shape ({expected}), got {tuple(data.shape)}")
+
+
+def data_shape(geometry: Geometry, window: DetectorWindow) -> tuple[int, ...]:
+    if isinstance(geometry, ConeBeam):
+        return (window.views, window.rows, window.columns)
+    return (window.views, window.columns)
+
+
+class BackprojectionPlan:
+    """Geometry of one backprojection, and its two maps for numba."""
+
+    def __init__(self, geometry: Geometry, grid: VolumeGrid, window: DetectorWindow) -> None:
+        self.grid, self.window = grid, window
+        self.cone = isinstance(geometry, ConeBeam)
+        if isinstance(geometry, ParallelBeam):
+            self.kind, self.sod, self.sdd, pitch = _KIND["parallel"], 0.0, 0.0, geometry.pitch
+        elif isinstance(geometry, FanBeam | ConeBeam):
+            self.kind, self.sod, self.sdd = _KIND[geometry.detector], geometry.sod, geometry.sdd
+            pitch = geometry.pitch if isinstance(geometry, FanBeam) else geometry.pitch[1]
+        else:
+            raise TypeError(f"geometry must be a ParallelBeam, FanBeam or ConeBeam, got {type(geometry).__name__}")
+        axes = 3 if self.cone else 2
+        if grid.ndim != axes:
+            raise ValueError(f"a {type(geometry).__name__} needs a {axes}-D grid, got {grid.ndim} axes")
+        if window.views != geometry.views:
+            raise ValueError(f"the window has {window.views} views, but the geometry has {geometry.views}")
+        if self.kind != 0 and grid.in_plane_radius >= self.sod:
+            raise ValueError(
+                f"the grid reaches {grid.in_plane_radius:.1f} mm from the axis, beyond the source orbit "
+                f"(sod {self.sod} mm): move or shrink the grid"
+            )
+        self.cosines, self.sines = np.cos(geometry.angles), np.sin(geometry.angles)
+        self.scale = 1.0 / pitch
+        first = geometry.column_positions[0]
+        self.starts = -first / pitch - window.first_column.astype(np.float64)
+        self.row_scale = self.row_start = 0.0
+        if isinstance(geometry, ConeBeam):
+            self.row_scale = 1.0 / geometry.pitch[0]
+            self.row_start = -geometry.row_positions[0] / geometry.pitch[0] - window.first_row
+        self.mask = self._outside(geometry)
+        self._check_window(geometry)
+
+    def _outside(self, geometry: Any) -> NDArray[np.bool_] | None:
+        """Voxel columns that some view does not see, or None. An inset must be seen whole."""
+        if isinstance(geometry, ParallelBeam):
+            u = geometry.column_positions
+            radius = max(min(-u[0], u[-1]) + geometry.pitch / 2.0, 0.0)
+        else:
+            radius = geometry.fov_radius
+        y, x = self.grid.axes[-2:]
+        outside = np.hypot(y[:, None], x[None, :]) > radius * (1.0 + 1e-9)
+        if not outside.any():
+            return None
+        half_y, half_x = self.grid.extent[-2] / 2.0, self.grid.extent[-1] / 2.0
+        cy, cx = self.grid.center[-2:]
+        if abs(cy) > half_y or abs(cx) > half_x or outside.all():
+            raise ValueError(
+                f"the grid (centre x {cx:g}, y {cy:g} mm, {2 * half_x:g} × {2 * half_y:g} mm) leaves the field of view "
+                f"of radius {radius:.2f} mm: move or shrink it"
+            )
+        return outside
+
+    def _check_window(self, geometry: Any) -> None:
+        """Every neighbour that interpolation reads must be in the window, or beyond the detector's edge."""
+        if self.mask is not None:
+            if self.window.columns != geometry.columns:
+                raise ValueError("a grid that is larger than the field of view needs all columns: pass no window")
+            return
+        y, x = self.grid.axes[-2:]
+        cy, cx = np.meshgrid(y[[0, -1]], x[[0, -1]], indexing="ij")
+        c, s = self.cosines[:, None], self.sines[:, None]
+        across = cy.ravel() * c - cx.ravel() * s
+        depth = self.sod - (cx.ravel() * c + cy.ravel() * s)
+        if self.kind == 0:
+            position, height = across, np.ones_like(across)
+        elif self.kind == 1:
+            position, height = self.sdd * across / depth, self.sdd / depth
+        else:
+            position, height = self.sdd * np.arctan2(across, depth), self.sdd / np.hypot(across, depth)
+        index = position * self.scale + self.starts[:, None]
+        first = self.window.first_column
+        low, high = index.min(axis=1), index.max(axis=1)
+        missing = (low < -1e-6) & (first > 0)
+        missing |= (high > self.window.columns - 1 + 1e-6) & (first + self.window.columns < geometry.columns)
+        if missing.any():
+            raise ValueError(
+                f"the window misses columns that the grid needs in view {int(np.argmax(missing))}: "
+                "use torchpcct.window.shadow(geometry, grid, margin=1)"
+            )
+        if isinstance(geometry, ConeBeam):
+            z = self.grid.axes[0][[0, -1]]
+            row = z[:, None] * np.array([height.min(), height.max()]) * self.row_scale + self.row_start
+            w = self.window
+            short = row.min() < -1e-6 and w.first_row > 0
+            short |= row.max() > w.rows - 1 + 1e-6 and w.first_row + w.rows < geometry.rows
+            if short:
+                raise ValueError(
+                    f"the window's rows {w.first_row}…{w.first_row + w.rows - 1} do not cover the grid: "
+                    "use torchpcct.window.shadow(geometry, grid, margin=1)"
+                )
+
+    def _arguments(self, dtype: torch.dtype) -> list[Any]:
+        axes = self.grid.axes
+        common: list[Any] = [self.cosines, self.sines, self.starts, axes[-1], axes[-2]]
+        if self.cone:
+            common.append(axes[0])
+        common += [self.sod, self.sdd, self.scale]
+        if self.cone:
+            common += [self.row_scale, self.row_start]
+        # γ to a fraction of a column that rounding hides anyway: 1e-5 columns in float32, 1e-11 in float64
+        tolerance = (1e-5 if dtype == torch.float32 else 1e-11) / max(self.sdd * self.scale, 1.0)
+        reach = math.tan(0.5 * math.asin(self.grid.in_plane_radius / self.sod)) if self.kind == 2 else 0.0
+        return [*common, _atan_polynomial(reach, tolerance)]
+
+    def _tile(self) -> tuple[int, int]:
+        """Tile of voxel columns over which heights on the detector change by about a row at most."""
+        _, dy, dx = self.grid.spacing
+        reach = float(np.abs(self.grid.axes[0]).max()) * self.row_scale
+        near = max(self.sod - math.hypot(*self.grid.center[1:]), 0.1 * self.sod)
+        diagonal = near**2 / (self.sdd * max(reach, 1e-9))
+        y, x = _TILE
+        while math.hypot(y * dy, x * dx) > diagonal and max(y, x) > 4:
+            y, x = max(y // 2, 4), max(x // 2, 4)
+        return y, x
+
+    def forward(self, data: Tensor) -> Tensor:
+        """``(..., views, [rows,] columns)`` to ``(..., [z,] y, x)``."""
+        from recon import _backproject as kernels
+
+        n = 3 if self.cone else 2
+        lead, shape = data.shape[:-n], data.shape[-n:]
+        out = data.new_empty((math.prod(lead), *self.grid.shape))
+        if out.shape[0]:
+            numbers = data.reshape(-1, *shape).contiguous().numpy()
+            arguments = self._arguments(data.dtype)
+            if self.cone:
+                kernels.backproject_3d(self.kind, numbers, *arguments, *self._tile(), out.numpy())
+            else:
+                kernels.backproject_2d(self.kind, numbers, *arguments, out.numpy())
+            if self.mask is not None:
+                out.masked_fill_(torch.from_numpy(self.mask), 0.0)
+        return out.view(*lead, *self.grid.shape)
+
+    def transpose(self, volume: Tensor) -> Tensor:
+        """``(..., [z,] y, x)`` to ``(..., views, [rows,] columns)``: the exact transpose of :meth:`forward`."""
+        from recon import _backproject as kernels
+
+        n = self.grid.ndim
+        lead = volume.shape[:-n]
+        w = self.window
+        shape = (w.views, w.rows, w.columns) if self.cone else (w.views, w.columns)
+        out = volume.new_empty((math.prod(lead), *shape))
+        if out.shape[0]:
+            volume = volume.reshape(-1, *self.grid.shape)
+            if self.mask is not None:
+                volume = volume.masked_fill(torch.from_numpy(self.mask), 0.0)
+            arguments = self._arguments(volume.dtype)
+            if self.cone:
+                numbers = volume.permute(0, 2, 3, 1).contiguous().numpy()
+                kernels.spread_3d(self.kind, numbers, *arguments, out.numpy())
+            else:
+                kernels.spread_2d(self.kind, volume.contiguous().numpy(), *arguments, out.numpy())
+        return out.view(*lead, *shape)
+
+
+def backproject(filtered: Tensor, geometry: Geometry, grid: VolumeGrid, window: DetectorWindow | None = None) -> Tensor:
+    """Backproject filtered data with FBP's distance weights: the second half of filtered backprojection.
+
+    Voxel driven, with linear interpolation along columns and rows. A voxel whose shadow lies above or below the
+    detector's rows reads the outermost row. It is not the adjoint of a projector; that is the projector's ``T``.
+
+    Args:
+        filtered: result of :func:`filter_sinogram`, ``(..., views, [rows,] columns)``, float32 or float64.
+        geometry: parallel or fan beam (2-D grid), or cone beam (3-D grid).
+        grid: voxels to reconstruct. A grid about the isocentre may be larger than the field of view: voxels outside
+            are 0. A grid beside the isocentre must lie inside.
+        window: the readings that ``filtered`` holds, default: the whole detector. It must hold the grid's shadow,
+            ``torchpcct.window.shadow(geometry, grid, margin=1)``.
+
+    Returns:
+        ``(..., *grid.shape)`` mm⁻¹, dtype and device of ``filtered``. Differentiable to any order.
+
+    Raises:
+        ValueError: a wrong shape, a grid outside the field of view or the source's orbit, a window that is too small.
+        TypeError: data that are not float32 or float64 tensors, or not a geometry.
+    """
+    if window is None:
+        window = full_window(geometry)
+    check_data("filtered", filtered, data_shape(geometry, window))
+    plan = BackprojectionPlan(geometry, grid, window)
+    return apply_linear(filtered, plan.forward, plan.transpose)
