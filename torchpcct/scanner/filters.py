@@ -18,8 +18,11 @@ Floats = NDArray[np.float64]
 
 # Aluminium path in cm against the fan angle in rad: public "large" bowtie table of the CatSim/XCIST simulator, thinned
 # out to where cubic interpolation follows it.
-_LARGE_RAD = (0.0, 0.10, 0.15, 0.20, 0.25, 0.30, 0.40, 0.48)
-_LARGE_CM = (0.2548, 0.363, 0.738, 1.363, 2.157, 3.013, 3.564, 3.712)
+_LARGE_RAD = (0.0, 0.04, 0.05, 0.06, 0.08, 0.10, 0.12, 0.15, 0.20, 0.25, 0.30, 0.32, 0.34, 0.36, 0.40, 0.48)
+_LARGE_CM = (
+    0.2548, 0.2553, 0.2574, 0.2635, 0.2947, 0.363, 0.4791, 0.738,
+    1.363, 2.157, 3.013, 3.2756, 3.4318, 3.4967, 3.564, 3.712
+)  # fmt: skip
 
 ROI_THICKNESS_MM = 39.0
 ROI_DIAMETER_MM = 100.0

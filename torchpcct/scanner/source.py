@@ -88,7 +88,9 @@ class Source:
             the isocentre. ``(0, 0)`` is a point.
         anode_angle_deg: anode angle in degrees, 3…45.
         filtration: inherent filtration of the tube, ``((material, mm), …)``.
-        output: photon output relative to spekpy's ideal target.
+        output: photon output relative to spekpy's ideal target, or to ``table``.
+        table: a measured or tabulated spectrum instead of spekpy's, ``(energies in keV, photons / mm² / mAs at 1 m)``,
+            already behind ``filtration``; see :meth:`tabulated`.
 
     Raises:
         ValueError: a value outside its range; no filtration at all (unfiltered spectra are dominated by photons below
@@ -102,6 +104,7 @@ class Source:
     anode_angle_deg: float = ANODE_ANGLE_DEG
     filtration: Slabs = field(default_factory=lambda: ((MATERIALS["aluminium"], INHERENT_ALUMINIUM_MM),))
     output: float = TUBE_OUTPUT
+    table: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
     def __post_init__(self) -> None:
         set_ = object.__setattr__
@@ -123,8 +126,26 @@ class Source:
             raise ValueError(f"focal_spot must be ≥ 0 mm and finite, got {self.focal_spot!r}")
         set_(self, "focal_spot", (width, length))
         set_(self, "filtration", slabs("filtration", self.filtration))
-        if not any(t > 0 for _, t in self.filtration):
+        if self.table is not None:
+            set_(self, "table", _table(self.table))
+        elif not any(t > 0 for _, t in self.filtration):
             raise ValueError("filtration must not be empty: a tube has at least about 2 mm aluminium equivalent")
+
+    @classmethod
+    def tabulated(cls, energies_kev: Any, fluence: Any, **changes: Any) -> Source:
+        """A tube with a measured or tabulated spectrum.
+
+        Args:
+            energies_kev: ``(E,)`` energies in keV, increasing.
+            fluence: ``(E,)`` photons per entry, mm² and mAs at 1 m, behind the tube's inherent filtration.
+            changes: other fields; ``output`` is 1, ``kvp`` the highest energy unless given.
+
+        Raises:
+            ValueError: tables of different lengths, energies that do not increase, negative or no photons.
+        """
+        energies = tuple(float(v) for v in energies_kev)
+        table = (energies, tuple(float(v) for v in fluence))
+        return cls(**{"kvp": max(energies, default=0.0), "output": 1.0, "filtration": (), "table": table, **changes})
 
     def spectrum(self, bin_kev: float = 1.0) -> Spectrum:
         """Photons / mm² / mAs at 1 m behind the tube's inherent filtration.
@@ -140,7 +161,32 @@ class Source:
         """
         if not 0.1 <= bin_kev <= 5.0:
             raise ValueError(f"bin_kev must lie in 0.1…5 keV, got {bin_kev}")
+        if self.table is not None:
+            return _rebinned(self.table, self.output, float(bin_kev))
         return _spectrum(self.kvp, self.anode_angle_deg, self.filtration, self.output, float(bin_kev))
+
+
+def _table(value: Any) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    energies, fluence = (np.asarray(v, dtype=np.float64) for v in value)
+    if energies.ndim != 1 or energies.shape != fluence.shape or energies.size == 0:
+        raise ValueError(f"table must hold as many fluences as energies, got {energies.shape} and {fluence.shape}")
+    if not (np.isfinite(energies).all() and energies[0] > 0 and (np.diff(energies) > 0).all()):
+        raise ValueError("table energies must be finite, > 0 keV and strictly increasing")
+    if not (np.isfinite(fluence).all() and (fluence >= 0).all() and fluence.sum() > 0):
+        raise ValueError("table fluences must be finite, ≥ 0 and not all 0")
+    return tuple(energies.tolist()), tuple(fluence.tolist())
+
+
+@functools.lru_cache(maxsize=8)
+def _rebinned(table: tuple[tuple[float, ...], tuple[float, ...]], output: float, bin_kev: float) -> Spectrum:
+    energies, fluence = np.array(table[0]), output * np.array(table[1])
+    # Photon number and energy are kept: a bin stands at the mean energy of its photons. An energy on an edge (up to
+    # round-off) belongs to the upper bin.
+    index = np.floor(energies / bin_kev + 1e-9).astype(np.int64)
+    index -= index[0]
+    photons: Floats = np.bincount(index, fluence).astype(np.float64)
+    filled = photons > 0
+    return _trimmed(np.bincount(index, fluence * energies)[filled] / photons[filled], photons[filled])
 
 
 @functools.lru_cache(maxsize=32)
@@ -158,6 +204,10 @@ def _spectrum(kvp: float, angle: float, filtration: Slabs, output: float, bin_ke
     energies, fluence = _bare_tube(kvp, angle, bin_kev)
     depth = sum(m.attenuation(energies) * t for m, t in filtration)
     fluence = output * fluence * np.exp(-depth)
+    return _trimmed(energies, fluence)
+
+
+def _trimmed(energies: Floats, fluence: Floats) -> Spectrum:
     share = np.cumsum(fluence) / fluence.sum()
     first = int(np.searchsorted(share, _NEGLIGIBLE / 2))
     last = int(np.searchsorted(share, 1.0 - _NEGLIGIBLE / 2))
