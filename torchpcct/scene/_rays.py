@@ -159,8 +159,9 @@ def shallow(
         for _ in range(30):
             h0, g0 = _shallow_level(narrowed, t0, X, y, z, ux, uy, uz, radius, half_amplitude, omega, reach, c0, s0)
             h1, g1 = _shallow_level(narrowed, t1, X, y, z, ux, uy, uz, radius, half_amplitude, omega, reach, c0, s0)
-            step0, step1 = h0 / g0, h1 / g1
-            step0, step1 = step0 * (1.0 + curvature * step0 / g0), step1 * (1.0 + curvature * step1 / g1)
+            g0, g1 = 1.0 / g0, 1.0 / g1
+            step0, step1 = h0 * g0, h1 * g1
+            step0, step1 = step0 * (1.0 + curvature * step0 * g0), step1 * (1.0 + curvature * step1 * g1)
             t0, t1 = t0 - step0, t1 - step1
             if not step0 * step0 + step1 * step1 > enough:
                 break

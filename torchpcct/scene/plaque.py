@@ -126,7 +126,7 @@ class Plaque:
 
     @cached_property
     def core_center(self) -> tuple[float, float, float]:
-        """Centre of the core in the plaque's frame, mm: on the x axis where the cap is as thick as asked, plus the shift."""
+        """Centre of the core in the plaque's frame, mm: where the cap is as thick as asked, plus the shift."""
         a, b, c = self.core_semi_axes
         lumen_edge = 2.0 * float(self.lumen.section(0.0)[1]) - self.inner_radius
         x = lumen_edge + self.cap_thickness + a

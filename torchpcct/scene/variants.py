@@ -208,8 +208,8 @@ def plaque_variant(name: str, **options: Any) -> tuple[Scene, Plaque]:
 
     * ``paper``: as published; ``absent_core``: fibrous tissue instead of the core; ``core_for_fibrous``: all fibrous
       tissue replaced by necrotic core;
-    * ``moved_core``: core displaced by (0, 0.1, 0.3) mm in the plaque's frame, as far as the wall allows; ``turned``: the
-      plaque turned by 90° about the vessel and moved 1 mm along it; ``mirrored``: on the vessel's other side;
+    * ``moved_core``: core displaced by (0, 0.1, 0.3) mm in the plaque's frame, as far as the wall allows; ``turned``:
+      the plaque turned by 90° about the vessel and moved 1 mm along it; ``mirrored``: on the vessel's other side;
     * ``half_size_core``; ``half_contrast`` and ``flipped_contrast`` of the core;
     * ``calcification``: 1500 HU at the plaque's shoulder; ``stent``: metal rings in the lumen; ``textured``: fibrous
       tissue and fat of varying attenuation (option ``seed``);
