@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpcct.geometry import Geometry, VolumeGrid
+from torchpcct.projector.plane import PlanePasses
 from torchpcct.projector.rays import Rays, Segments, check_pair, check_source, rays_of, split
 from torchpcct.window import DetectorWindow
 
@@ -35,7 +36,7 @@ class Engine:
 
     def __init__(self, geometry: Geometry, grid: VolumeGrid, window: DetectorWindow | None) -> None:
         check_pair(geometry, grid, window)
-        self.grid = grid
+        self.geometry, self.grid, self.windowed = geometry, grid, window is not None
         self.rays: Rays = rays_of(geometry, window)
         check_source(self.rays, grid)
         hy, hx = grid.spacing[-2:]
@@ -62,27 +63,28 @@ class Engine:
     def forward(self, x: NDArray) -> NDArray:
         """Line integrals of ``x``, ``(batch, *domain_shape)``, as ``(batch, *range_shape)``."""
         with _LAUNCH:
-            return self._forward_volume(x) if self.grid.ndim == 3 else self._forward_plane(x)
+            return self._forward_volume(x) if self.grid.ndim == 3 else self._plane.forward(x)
 
     def adjoint(self, y: NDArray) -> NDArray:
         """The transpose: ``(batch, *range_shape)`` to ``(batch, *domain_shape)``."""
         with _LAUNCH:
-            return self._adjoint_volume(y) if self.grid.ndim == 3 else self._adjoint_plane(y)
+            return self._adjoint_volume(y) if self.grid.ndim == 3 else self._plane.adjoint(y)
 
     def workspace(self, batch: int, itemsize: int) -> int:
         """Bytes that one pass holds besides its input and output (the larger of the two directions)."""
+        if self.grid.ndim == 2:
+            return self._plane.workspace(batch, itemsize)
         r, table = self.rays, 8 * (8 * self.rays.views + 4 * len(self.segments.table))
-        if self.grid.ndim == 3:
-            nz, ny, nx = self.grid.shape
-            forward = batch * ny * nx * (nz + 1) + batch * r.columns * r.rows * _threads()
-            row_sums = batch * r.columns * (r.rows + 1)
-            row_sums *= int(max(1, min(r.views, ROW_SUMS_BYTES // (row_sums * itemsize))))
-            adjoint = 3 * batch * ny * nx * nz + row_sums
-        else:
-            ny, nx = self.grid.shape
-            forward = batch * (ny * (nx + 1) + nx * (ny + 1))
-            adjoint = 3 * batch * ny * nx
+        nz, ny, nx = self.grid.shape
+        forward = batch * ny * nx * (nz + 16) + batch * r.columns * r.rows * _threads()
+        row_sums = batch * r.columns * (r.rows + 1)
+        row_sums *= int(max(1, min(r.views, ROW_SUMS_BYTES // (row_sums * itemsize))))
+        adjoint = 3 * batch * ny * nx * (nz + 8) + row_sums
         return table + itemsize * max(forward, adjoint)
+
+    @cached_property
+    def _plane(self) -> PlanePasses:
+        return PlanePasses(self.geometry, self.grid, self.rays, self.lattice, self.windowed)
 
     @cached_property
     def _layer(self) -> float:
@@ -116,34 +118,6 @@ class Engine:
             y, self._poses, r.edges, r.centers, r.first, seg.table, seg.start, self.lattice, *self._heights(),
             self._layer, self.grid.shape, ROW_SUMS_BYTES,
         )  # fmt: skip
-
-    def _forward_plane(self, x: NDArray) -> NDArray:
-        from torchpcct.projector import plane_kernels
-
-        r, seg = self.rays, self.segments
-        y = np.zeros((x.shape[0], *self.range_shape), dtype=x.dtype)
-        for axis in (0, 1):
-            slabs = x if axis == 0 else x.transpose(0, 2, 1)
-            sums = np.zeros((*slabs.shape[:2], slabs.shape[2] + 1), dtype=x.dtype)
-            np.cumsum(slabs, axis=-1, out=sums[..., 1:])
-            plane_kernels.project(
-                sums, axis, self._poses, r.edges, r.centers, r.first, seg.table, seg.start, self.lattice, r.parallel, y
-            )
-        return y
-
-    def _adjoint_plane(self, y: NDArray) -> NDArray:
-        from torchpcct.projector import plane_kernels
-
-        r, seg = self.rays, self.segments
-        ny, nx = self.grid.shape
-        parts = []
-        for axis, shape in ((0, (ny, nx)), (1, (nx, ny))):
-            out = np.empty((y.shape[0], *shape), dtype=y.dtype)
-            plane_kernels.backproject(
-                y, axis, self._poses, r.edges, r.centers, r.first, seg.table, self.lattice, r.parallel, out
-            )
-            parts.append(out)
-        return parts[0] + parts[1].transpose(0, 2, 1)
 
 
 def _threads() -> int:

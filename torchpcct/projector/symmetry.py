@@ -1,0 +1,126 @@
+"""Which rotations and reflections of the image map the scan onto itself.
+
+An operation ``(m, s)`` maps a point ``p`` to ``R^m S^s p``: R turns by 90° counter-clockwise, S mirrors y. If it maps
+every view to another view of the scan, the readings of view β of the image ``f(R^m S^s p)`` are the readings of the
+mapped view of ``f``. Then one pass over a part of the views serves all operations at once.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchpcct.geometry import Geometry, VolumeGrid
+from torchpcct.projector.rays import Rays
+
+__all__ = ["Orbits", "address", "find_orbits"]
+
+Ints = NDArray[np.int64]
+_TURNS = [(m, 0) for m in range(4)]
+_SETS = (
+    _TURNS + [(m, 1) for m in range(4)],
+    _TURNS,
+    [(0, 0), (1, 0), (0, 1), (1, 1)],
+    [(0, 0), (2, 0), (0, 1), (2, 1)],
+    [(0, 0), (1, 0)],
+    [(0, 0), (2, 0)],
+    [(0, 0), (0, 1)],
+    [(0, 0)],
+)
+# Relative time of one pass with that many lanes (a vector of 8 float32 is one register).
+_COST = {1: 1.0, 2: 1.2, 4: 1.3, 8: 1.5}
+_TOLERANCE = 1e-9  # rad
+
+
+@dataclass(frozen=True, eq=False)
+class Orbits:
+    """Views that are projected, and where the lanes of each go.
+
+    Args:
+        operations: the operations ``(m, s)``, the identity first.
+        views: ``(n,)`` int64, the views that are projected.
+        target: ``(n, lanes)`` int64, the view that each lane is the reading of, or -1 (a double, to be ignored).
+        reverse: ``(n, lanes)`` int64, 1 if the lane's columns run backwards.
+    """
+
+    operations: tuple[tuple[int, int], ...]
+    views: Ints
+    target: Ints
+    reverse: Ints
+
+
+def find_orbits(geometry: Geometry, grid: VolumeGrid, rays: Rays, windowed: bool) -> Orbits:
+    """The cheapest set of operations (the identity alone, if the scan or the grid has no symmetry)."""
+    views = geometry.views
+    trivial = Orbits(((0, 0),), np.arange(views), np.arange(views)[:, None], np.zeros((views, 1), dtype=np.int64))
+    turn = 2 * math.pi
+    angles = np.mod(geometry.angles, turn)
+    order = np.argsort(angles, kind="stable")
+    sorted_angles = angles[order]
+    gaps = np.diff(np.append(sorted_angles, sorted_angles[0] + turn))
+    centred = all(abs(c) < 1e-9 * e for c, e in zip(grid.center, grid.extent, strict=True))
+    if windowed or not centred or (views > 1 and gaps.min() < _TOLERANCE):
+        return trivial
+    square = grid.shape[0] == grid.shape[1] and math.isclose(grid.spacing[0], grid.spacing[1], rel_tol=1e-12)
+    position = rays.edges[:, 1] if rays.edges.shape[0] else np.zeros(1)
+    even = bool(np.abs(position + position[::-1]).max() <= 1e-9 * np.abs(position).max())
+
+    def find(wanted: NDArray[np.float64]) -> Ints:
+        """Index of the view at each angle, -1 where there is none."""
+        wanted = np.mod(wanted, turn)
+        right = np.searchsorted(sorted_angles, wanted) % views
+        best = np.full(wanted.shape, -1)
+        for near in (right, (right - 1) % views):
+            distance = np.abs(np.mod(sorted_angles[near] - wanted + math.pi, turn) - math.pi)
+            best = np.where(distance < _TOLERANCE, order[near], best)
+        return best
+
+    best, best_cost = trivial, views * _COST[1]
+    for operations in _SETS[:-1]:
+        if any((m % 2 and not square) or (s and not even) for m, s in operations):
+            continue
+        target = np.empty((views, len(operations)), dtype=np.int64)
+        reverse = np.empty_like(target)
+        for lane, (m, s) in enumerate(operations):
+            wanted = (-angles if s else angles) + m * math.pi / 2
+            target[:, lane], reverse[:, lane] = find(wanted), s
+            if rays.parallel and even:
+                # A parallel view and the one from the other side read the same lines, columns reversed.
+                other = find(wanted + math.pi)
+                swap = target[:, lane] < 0
+                target[swap, lane], reverse[swap, lane] = other[swap], 1 - s
+        if (target < 0).any():
+            continue
+        seen = np.zeros(views, dtype=bool)
+        chosen = []
+        for v in range(views):
+            if seen[v]:
+                continue
+            for lane in range(len(operations)):
+                if seen[target[v, lane]]:
+                    target[v, lane] = -1
+                else:
+                    seen[target[v, lane]] = True
+            chosen.append(v)
+        cost = len(chosen) * _COST[len(operations)]
+        if cost < best_cost:
+            best_cost = cost
+            best = Orbits(tuple(operations), np.array(chosen), target[chosen], reverse[chosen])
+    return best
+
+
+def address(operation: tuple[int, int], ny: int, nx: int) -> Ints:
+    """``(base, per row, per column)``: flat index in the image that the operated image reads at (row, column)."""
+    m, s = operation
+    index = np.arange(ny * nx).reshape(ny, nx)
+    for _ in range(m):
+        index = index[:, ::-1].T
+    if s:
+        index = index[::-1]
+    base = int(index[0, 0])
+    down = int(index[1, 0]) - base if index.shape[0] > 1 else 0
+    right = int(index[0, 1]) - base if index.shape[1] > 1 else 0
+    return np.array([base, down, right], dtype=np.int64)
