@@ -20,18 +20,21 @@ __all__ = ["BackprojectionPlan", "backproject", "check_data", "data_shape"]
 _KIND = {"parallel": 0, "flat": 1, "curved": 2}
 #: Voxel columns of one task of the 3-D backprojection: small enough for the caches, large enough to share look-ups.
 _TILE = (12, 24)
-#: Polynomial lengths of the arc tangent; each length is one compiled variant of the kernels.
-_ATAN_TERMS = (5, 9, 20)
+#: Polynomial lengths of the arc tangent, for usual fans and for half-fans near 90°: one compiled variant each.
+_ATAN_TERMS = {torch.float32: (7, 20), torch.float64: (12, 20)}
+#: Errors of the fan angle, in columns, at which the longer polynomial takes over: far below rounding.
+_ATAN_TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-11}
 
 
-def _atan_polynomial(reach: float, tolerance: float) -> tuple[float, ...]:
-    """Coefficients c of ``2 atan(t) ≈ t · c(t²)`` for |t| ≤ reach, highest power first; error below the tolerance."""
+def _atan_polynomial(reach: float, columns_per_rad: float, dtype: torch.dtype) -> tuple[float, ...]:
+    """Coefficients c of ``2 atan(t) ≈ t · c(t²)`` for |t| ≤ reach, highest power first."""
     from numpy.polynomial import Chebyshev, Polynomial
 
+    tolerance = _ATAN_TOLERANCE[dtype] / max(columns_per_rad, 1.0)
     reach = max(reach, 1e-3)
     u = 0.5 * reach**2 * (1.0 - np.cos((np.arange(200) + 0.5) / 200 * math.pi))
     value = 2.0 * np.arctan(np.sqrt(u)) / np.sqrt(u)
-    for terms in _ATAN_TERMS:
+    for terms in _ATAN_TERMS[dtype]:
         fit = Chebyshev.fit(u, value, terms - 1, domain=[0.0, reach**2])
         if np.abs(fit(u) - value).max() * reach < tolerance:
             break
@@ -155,10 +158,8 @@ class BackprojectionPlan:
         common += [self.sod, self.sdd, self.scale]
         if self.cone:
             common += [self.row_scale, self.row_start]
-        # γ to a fraction of a column that rounding hides anyway: 1e-5 columns in float32, 1e-11 in float64
-        tolerance = (1e-5 if dtype == torch.float32 else 1e-11) / max(self.sdd * self.scale, 1.0)
         reach = math.tan(0.5 * math.asin(self.grid.in_plane_radius / self.sod)) if self.kind == 2 else 0.0
-        return [*common, _atan_polynomial(reach, tolerance)]
+        return [*common, _atan_polynomial(reach, self.sdd * self.scale, dtype)]
 
     def _tile(self) -> tuple[int, int]:
         """Tile of voxel columns over which heights on the detector change by about a row at most."""
