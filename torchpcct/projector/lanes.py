@@ -69,11 +69,25 @@ class _Code:
         return self.b.mul(index, ir.Constant(self.index, factor), flags=("nsw", "nuw"))
 
     def knot(self, p: Any, q: Any, r: Any, weight: Any, top: Any) -> tuple[Any, Any, Any]:
-        """Index of the lower knot of ``t = p + q r`` and the weights of the two knots."""
-        t = self.clamp(self.add(p, self.mul(q, self.b.sitofp(r, self.real))), top)
+        """Index of the lower knot of ``t = p + q r`` and the weights of the two knots; ``r`` is a real number."""
+        t = self.clamp(self.add(p, self.mul(q, r)), top)
         k = self.b.fptosi(t, ir.IntType(32))
         high = self.mul(weight, self.sub(t, self.b.sitofp(k, self.real)))
         return self.b.zext(k, self.index), self.sub(weight, high), high
+
+    def slabs(self, r0: Any, r1: Any, body: Any) -> None:
+        """Call ``body(indices, reals)`` for four slabs at a time, so that latencies overlap, then for the rest."""
+        four = ir.Constant(self.index, 4)
+        groups = self.b.sdiv(self.b.sub(r1, r0), four)
+        with cgutils.for_range(self.b, groups) as loop:
+            first = self.b.add(r0, self.b.mul(loop.index, four))
+            real = self.b.sitofp(first, self.real)
+            body(
+                [self.b.add(first, ir.Constant(self.index, i)) for i in range(4)],
+                [self.add(real, ir.Constant(self.real, float(i))) for i in range(4)],
+            )
+        with cgutils.for_range(self.b, r1, start=self.b.add(r0, self.b.mul(groups, four))) as loop:
+            body([loop.index], [self.b.sitofp(loop.index, self.real)])
 
 
 @intrinsic
@@ -89,20 +103,28 @@ def sum_edges(typingctx, lanes, sums, stride, p, q, weight, gain, e0, e1, r0, r1
         c = _Code(context, builder, signature, args)
         _, sums, stride, p, q, weight, gain, e0, e1, r0, r1, top, out = c.values
         before = cgutils.alloca_once(builder, c.wide)
-        total = cgutils.alloca_once(builder, c.wide)
+        totals = [cgutils.alloca_once(builder, c.wide) for _ in range(4)]
         zero = ir.Constant(c.wide, [ir.Constant(c.real, 0.0)] * c.width)
         builder.store(zero, before)
         with cgutils.for_range(builder, e1, start=e0) as edge:
             pe, qe = c.load(p, edge.index, c.real), c.load(q, edge.index, c.real)
-            builder.store(zero, total)
-            with cgutils.for_range(builder, r1, start=r0) as slab:
-                k, low, high = c.knot(pe, qe, slab.index, c.load(weight, slab.index, c.real), top)
-                base = builder.add(builder.mul(slab.index, stride), c.times(k, c.width))
-                a = c.load(sums, base, c.wide)
-                b = c.load(sums, builder.add(base, ir.Constant(c.index, c.width)), c.wide)
-                value = c.add(builder.load(total), c.mul(c.splat(low), a))
-                builder.store(c.add(value, c.mul(c.splat(high), b)), total)
-            now = builder.load(total)
+            for total in totals:
+                builder.store(zero, total)
+
+            def body(indices, reals):
+                knots = [c.knot(pe, qe, x, c.load(weight, r, c.real), top) for r, x in zip(indices, reals, strict=True)]
+                for r, (k, low, high), total in zip(indices, knots, totals, strict=False):
+                    base = builder.add(builder.mul(r, stride), c.times(k, c.width))
+                    a = c.load(sums, base, c.wide)
+                    b = c.load(sums, builder.add(base, ir.Constant(c.index, c.width)), c.wide)
+                    value = c.add(c.mul(c.splat(low), a), c.mul(c.splat(high), b))
+                    builder.store(c.add(builder.load(total), value), total)
+
+            c.slabs(r0, r1, body)
+            now = c.add(
+                c.add(builder.load(totals[0]), builder.load(totals[1])),
+                c.add(builder.load(totals[2]), builder.load(totals[3])),
+            )
             with builder.if_then(builder.icmp_signed(">", edge.index, e0)):
                 cell = builder.sub(edge.index, ir.Constant(c.index, 1))
                 change = c.mul(c.splat(c.load(gain, cell, c.real)), c.sub(now, builder.load(before)))
@@ -135,12 +157,16 @@ def add_edges(typingctx, lanes, out, stride, p, q, weight, e0, e1, r0, r1, top, 
             cell = builder.select(builder.icmp_signed("==", edge.index, last), zero, cell)
             value = c.sub(builder.load(before), cell)
             builder.store(cell, before)
-            with cgutils.for_range(builder, r1, start=r0) as slab:
-                k, low, high = c.knot(pe, qe, slab.index, c.load(weight, slab.index, c.real), top)
-                base = builder.add(builder.mul(builder.sub(slab.index, r0), stride), c.times(k, c.width))
-                above = builder.add(base, ir.Constant(c.index, c.width))
-                c.store(c.add(c.load(out, base, c.wide), c.mul(c.splat(low), value)), out, base)
-                c.store(c.add(c.load(out, above, c.wide), c.mul(c.splat(high), value)), out, above)
+
+            def body(indices, reals):
+                knots = [c.knot(pe, qe, x, c.load(weight, r, c.real), top) for r, x in zip(indices, reals, strict=True)]
+                for r, (k, low, high) in zip(indices, knots, strict=True):
+                    base = builder.add(builder.mul(builder.sub(r, r0), stride), c.times(k, c.width))
+                    above = builder.add(base, ir.Constant(c.index, c.width))
+                    c.store(c.add(c.load(out, base, c.wide), c.mul(c.splat(low), value)), out, base)
+                    c.store(c.add(c.load(out, above, c.wide), c.mul(c.splat(high), value)), out, above)
+
+            c.slabs(r0, r1, body)
         return context.get_dummy_value()
 
     return signature, codegen
