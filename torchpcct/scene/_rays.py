@@ -23,7 +23,7 @@ _FAST = {"contract", "arcp", "nsz"}
 _PIECES = 64
 
 
-@numba.njit(inline="always", cache=True, fastmath=_FAST, error_model="numpy")
+@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
 def unit_circle(lx: float, ly: float, ux: float, uy: float) -> Any:
     """Interval of a line inside the unit circle (its height does not matter); ``t1 <= t0`` for a miss."""
     a = ux * ux + uy * uy
@@ -42,7 +42,7 @@ def unit_circle(lx: float, ly: float, ux: float, uy: float) -> Any:
     return t - half, t + half
 
 
-@numba.njit(inline="always", cache=True, fastmath=_FAST, error_model="numpy")
+@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
 def clip(t0: float, t1: float, lz: float, uz: float, half_length: float) -> Any:
     """The part of ``(t0, t1)`` with ``|lz + t uz| <= half_length``."""
     if half_length == math.inf:
@@ -57,7 +57,7 @@ def clip(t0: float, t1: float, lz: float, uz: float, half_length: float) -> Any:
     return (near if near > t0 else t0), (far if far < t1 else t1)
 
 
-@numba.njit(inline="always", cache=True, fastmath=_FAST, error_model="numpy")
+@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
 def _level(
     narrowed: bool, X: float, y: float, ux: float, uy: float, radius: float, d: float, slope: float
 ) -> tuple[float, float]:
@@ -72,7 +72,7 @@ def _level(
     return u * u + v * v - 1.0, 2.0 * (u * s * (ux - X * s * slope) + v * uy * inverse)
 
 
-@numba.njit(inline="always", cache=True, fastmath=_FAST, error_model="numpy")
+@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
 def _cos_sin(phase: float) -> tuple[float, float]:
     """Cosine and sine of a phase within ±4 to 1e-12: a quarter of the time of two library calls."""
     half = 0.5 * phase
@@ -84,7 +84,7 @@ def _cos_sin(phase: float) -> tuple[float, float]:
     return 2.0 * c * c - 1.0, 2.0 * s * c
 
 
-@numba.njit(inline="always", cache=True, fastmath=_FAST, error_model="numpy")
+@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
 def _shallow_level(
     narrowed: bool, t: float, X: float, y: float, z: float, ux: float, uy: float, uz: float,
     radius: float, half_amplitude: float, omega: float, reach: float, c0: float, s0: float,
@@ -134,13 +134,15 @@ def shallow(
     t = -(u0 * du + v0 * dv) / curvature
     u0, v0 = u0 + t * du, v0 + t * dv
     lowest = u0 * u0 + v0 * v0 - 1.0
+    grazing = False
     if uz == 0.0:
         if lowest >= 0.0:
             return 0.0, 0.0
     elif lowest > -0.02 - 12.0 * half_amplitude * omega * abs(uz):
         if lowest > 1.0:
             return 0.0, 0.0
-        # Near grazing: the true minimum of h. The fixed section's curvature is within a few per cent of the true one.
+        grazing = True
+        # The true minimum of h. The fixed section's curvature is within a few per cent of the true one.
         for _ in range(12):
             h, slope = _shallow_level(narrowed, t, X, y, z, ux, uy, uz, radius, half_amplitude, omega, reach, c0, s0)
             step = 0.5 * slope / curvature
@@ -153,6 +155,20 @@ def shallow(
     half = math.sqrt(-lowest / curvature)
     t0, t1 = t - half, t + half
     if uz != 0.0:
+        # First the change of the profile on the way to either end, to first order where the fixed section has h = 0.
+        if not grazing and abs(z) < reach:
+            phase = omega * uz
+            turn, bend = half_amplitude * phase * s0, 0.5 * half_amplitude * phase * phase * c0
+            u0, u1 = (X + t0 * ux) * sx - 1.0, (X + t1 * ux) * sx - 1.0
+            scale = 1.0 / (curvature * half)
+            if narrowed:
+                scale /= radius + d
+                t0 -= scale * (1.0 + u0) * (turn + bend * t0) * t0
+                t1 += scale * (1.0 + u1) * (turn + bend * t1) * t1
+            else:
+                scale *= sx
+                t0 += scale * u0 * (1.0 + u0) * (turn + bend * t0) * t0
+                t1 -= scale * u1 * (1.0 + u1) * (turn + bend * t1) * t1
         # Newton's method at both ends at once, with the fixed section's curvature as second derivative. After a step s
         # the error is less than s² / (20 half).
         enough = 2e-10 * half
@@ -253,7 +269,7 @@ def steep(
     return first, first + total
 
 
-@numba.njit(inline="always", cache=True, fastmath=_FAST, error_model="numpy")
+@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
 def _ellipsoid(lx: float, ly: float, lz: float, ux: float, uy: float, uz: float) -> Any:
     a = ux * ux + uy * uy + uz * uz
     # Measured from the point of closest approach: no difference of large numbers for a far source.
@@ -267,7 +283,7 @@ def _ellipsoid(lx: float, ly: float, lz: float, ux: float, uy: float, uz: float)
     return t - half, t + half
 
 
-@numba.njit(inline="always", cache=True, fastmath=_FAST, error_model="numpy")
+@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
 def _box(lx: float, ly: float, lz: float, ux: float, uy: float, uz: float) -> Any:
     t0, t1 = -math.inf, math.inf
     for axis in range(3):
@@ -333,12 +349,21 @@ def interval(
     return steep(narrowed, lx, ly, lz, ux, uy, uz, row[19], row[20], row[21], row[22], row[18])
 
 
-@numba.njit(cache=True, parallel=True, fastmath=_FAST, error_model="numpy")
-def chords(kinds: Any, params: Any, origins: Any, directions: Any, out: Any) -> None:
-    """Chord of every line in every shape, ``out (B, N)``."""
-    for n in numba.prange(origins.shape[0]):
+@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
+def _chords(kinds: Any, params: Any, origins: Any, directions: Any, first: int, last: int, out: Any) -> None:
+    for n in range(first, last):
         ox, oy, oz = origins[n, 0], origins[n, 1], origins[n, 2]
         dx, dy, dz = directions[n, 0], directions[n, 1], directions[n, 2]
         for b in range(kinds.shape[0]):
             t0, t1 = interval(kinds[b], params[b], ox, oy, oz, dx, dy, dz)
             out[b, n] = 0.0 if t1 <= t0 else t1 - t0
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def chords(kinds: Any, params: Any, origins: Any, directions: Any, out: Any) -> None:
+    """Chord of every line in every shape, ``out (B, N)``."""
+    # In blocks, so that the large body of the loop is no part of the parallel function, which compiles slowly.
+    block = 512
+    lines = origins.shape[0]
+    for k in numba.prange((lines + block - 1) // block):
+        _chords(kinds, params, origins, directions, k * block, min((k + 1) * block, lines), out)
