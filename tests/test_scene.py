@@ -87,7 +87,8 @@ def test_rotational_symmetry_is_recognised():
     upright = rotation_matrix((1.0, 0.0, 0.0), math.pi)
     for shape in (
         EllipticCylinder(3.0), EllipticCylinder(3.0, 2.0, position=(0, 0, 5.0), rotation=upright),
-        Ellipsoid(2.0, rotation=TILT), Ellipsoid((2.0, 2.0, 1.0), rotation=0.7), BulgedTube(1.0, 0.0, 3.0), NarrowedTube(1.0, 0.0, 3.0),
+        Ellipsoid(2.0, rotation=TILT), Ellipsoid((2.0, 2.0, 1.0), rotation=0.7),
+        BulgedTube(1.0, 0.0, 3.0), NarrowedTube(1.0, 0.0, 3.0),
     ):  # fmt: skip
         assert shape.rotationally_symmetric, shape
     for shape in (
