@@ -1,1 +1,7 @@
-"""Reconstruction: FBP, PWLS, MBIR."""
+"""Reconstruction: FBP and model-based, from scans to volumes in HU."""
+
+# The function deliberately takes the place of the submodule of the same name: ``recon.fbp(sinogram, …)``.
+from recon.fbp import fbp  # isort: skip
+from recon.api import METHODS, reconstruct
+
+__all__ = ["METHODS", "fbp", "reconstruct"]

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchpcct.metrics import cnr, cnr_from_moments, cnr_interval, mean_interval, sd_interval
-from torchpcct.study import paper
+from recon.study import paper
 
 
 def test_paper_table_from_its_own_moments():

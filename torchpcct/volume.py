@@ -16,7 +16,22 @@ from torch import Tensor
 
 from torchpcct.geometry import VolumeGrid
 
-__all__ = ["Volume", "written_whole"]
+__all__ = ["Volume", "check_volume_name", "require_folder", "written_whole"]
+
+_NIFTI, _HDF5 = (".nii", ".nii.gz"), (".h5", ".hdf5")
+
+
+def require_folder(path: str | os.PathLike[str]) -> None:
+    """Raise ``FileNotFoundError`` unless the folder that ``path`` would be written to exists."""
+    parent = Path(path).parent
+    if not parent.is_dir():
+        raise FileNotFoundError(f"cannot write {path}: the folder {parent} does not exist, create it first")
+
+
+def check_volume_name(path: str | os.PathLike[str]) -> None:
+    """Raise ``ValueError`` unless the ending of ``path`` names a volume format."""
+    if not str(path).endswith((*_NIFTI, *_HDF5)):
+        raise ValueError(f"unknown volume format {Path(path).name!r}: use .nii, .nii.gz or .h5")
 
 
 @contextmanager
@@ -27,8 +42,7 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
         FileNotFoundError: the folder of ``path`` does not exist.
     """
     target = Path(path)
-    if not target.parent.is_dir():
-        raise FileNotFoundError(f"cannot write {target}: the folder {target.parent} does not exist, create it first")
+    require_folder(target)
     # Keep the ending: some writers choose the format by it.
     part = target.with_name(f".{os.getpid()}.part.{target.name}")
     try:
@@ -64,15 +78,13 @@ class Volume:
         Raises:
             ValueError: another ending, or a batch of volumes (save them one by one).
         """
-        name = str(path)
+        check_volume_name(path)
         if self.data.ndim != self.grid.ndim:
             raise ValueError(f"save one volume at a time, this one has shape {tuple(self.data.shape)}")
-        if name.endswith((".nii", ".nii.gz")):
+        if str(path).endswith(_NIFTI):
             self._save_nifti(path)
-        elif name.endswith((".h5", ".hdf5")):
-            self._save_hdf5(path)
         else:
-            raise ValueError(f"unknown volume format {Path(name).name!r}: use .nii, .nii.gz or .h5")
+            self._save_hdf5(path)
 
     def _save_nifti(self, path: str | os.PathLike[str]) -> None:
         import nibabel

@@ -86,7 +86,12 @@ def sd_interval(sd: float, realizations: int, level: float = 0.95) -> Interval:
 
 
 def cnr_interval(
-    foreground_means: Any, background_means: Any, level: float = 0.95, draws: int = 20_000, seed: int = 0
+    foreground_means: Any,
+    background_means: Any,
+    level: float = 0.95,
+    draws: int = 20_000,
+    seed: int = 0,
+    future: int | None = None,
 ) -> Interval:
     """Generalised confidence interval for the CNR of correlated, jointly normal ROI means.
 
@@ -98,6 +103,8 @@ def cnr_interval(
         level: coverage.
         draws: Monte Carlo size of the pivot.
         seed: seed of the pivot's random numbers.
+        future: None: interval for the true CNR; else prediction interval for the CNR that another experiment with so
+            many realisations measures.
     """
     fg, bg = _means("foreground_means", foreground_means), _means("background_means", background_means)
     if fg.ndim != 1 or fg.shape != bg.shape or fg.size < 3:
@@ -110,13 +117,22 @@ def cnr_interval(
     lower = np.linalg.cholesky(scatter + 1e-12 * np.trace(scatter) * np.eye(2))
     rng = np.random.default_rng(seed)
     # S = L Lᵀ ~ Wishart(Σ, n-1) and B Bᵀ ~ Wishart(I, n-1) (Bartlett, B lower): the pivot for Σ is (L B⁻¹)(L B⁻¹)ᵀ.
-    b = np.zeros((draws, 2, 2))
-    b[:, 0, 0] = np.sqrt(rng.chisquare(n - 1, draws))
-    b[:, 1, 1] = np.sqrt(rng.chisquare(n - 2, draws))
-    b[:, 1, 0] = rng.standard_normal(draws)
-    root = lower @ np.linalg.inv(b)
-    variance = np.einsum("dij,dij->di", root, root)
+    root = lower @ np.linalg.inv(_bartlett(rng, draws, n - 1))
     mean = data.mean(1) - np.einsum("dij,dj->di", root, rng.standard_normal((draws, 2))) / np.sqrt(n)
+    if future is not None:
+        # A new experiment under the drawn means and covariance: its mean, and its Wishart scatter root C Cᵀ rootᵀ.
+        mean = mean + np.einsum("dij,dj->di", root, rng.standard_normal((draws, 2))) / np.sqrt(future)
+        root = root @ _bartlett(rng, draws, future - 1) / np.sqrt(future - 1)
+    variance = np.einsum("dij,dij->di", root, root)
     pivot = (mean[:, 1] - mean[:, 0]) / np.sqrt(variance.sum(1))
     low, high = np.quantile(pivot, [0.5 - level / 2, 0.5 + level / 2])
     return Interval(float(low), float(high))
+
+
+def _bartlett(rng: np.random.Generator, draws: int, dof: int) -> Floats:
+    """Lower factors of ``draws`` Wishart(I, dof) matrices, ``(draws, 2, 2)``."""
+    b = np.zeros((draws, 2, 2))
+    b[:, 0, 0] = np.sqrt(rng.chisquare(dof, draws))
+    b[:, 1, 1] = np.sqrt(rng.chisquare(dof - 1, draws))
+    b[:, 1, 0] = rng.standard_normal(draws)
+    return b

@@ -105,7 +105,7 @@ class RoiMean:
     @property
     def weights(self) -> Tensor:
         """``grid.shape`` float64 weights that sum to 1."""
-        return self._weights  # type: ignore[attr-defined, no-any-return]
+        return self._weights  # type: ignore[attr-defined]
 
     @property
     def pixels(self) -> int:

@@ -71,21 +71,25 @@ class WaterLinearisation:
         coefficients = np.stack([np.linalg.lstsq(a, b, rcond=None)[0] for a, b in zip(powers, target, strict=True)])
         return cls(coefficients, scale, mu_ref)
 
-    def _columns(self, values: Floats, window: DetectorWindow | None, like: Tensor) -> Tensor:
-        t = torch.as_tensor(values, dtype=like.dtype, device=like.device)
-        if window is None:
-            return t
-        return t[torch.as_tensor(window.column_indices, device=like.device)].unsqueeze(-2)
-
     def _evaluate(self, p: Tensor, window: DetectorWindow | None, *, slope: bool) -> Tensor:
-        scale = self._columns(self.scale, window, p)
-        x = (p / scale).clamp(0.0, 1.0)
-        value, derivative = torch.zeros_like(x), torch.zeros_like(x)
-        for k in range(self.coefficients.shape[1] - 1, -1, -1):
-            derivative = derivative.mul_(x).add_(value)
-            value = value.mul_(x).add_(self._columns(self.coefficients[:, k], window, p))
-        local = value + x * derivative  # d(mu_ref t) / dp at the clamped p
-        return local if slope else scale * x * value + (p - scale * x) * local
+        from torchpcct.scanner._linearisation_kernel import evaluate
+
+        columns = self.scale.size if window is None else window.columns
+        if p.shape[-1] != columns:
+            raise ValueError(f"p must have {columns} columns on its last axis, got shape {tuple(p.shape)}")
+        flat = p.detach().cpu().contiguous().reshape(-1, columns)
+        if window is None:
+            first = np.zeros(1, np.int64)
+        else:
+            if tuple(p.shape[-3:-1]) != (window.views, window.rows):
+                raise ValueError(
+                    f"p must have the shape (..., {window.views}, {window.rows}, {columns}) on this window, "
+                    f"got {tuple(p.shape)}"
+                )
+            first = np.repeat(window.first_column, window.rows)
+        out = torch.empty_like(flat)
+        evaluate(flat.numpy(), first, self.coefficients, self.scale, slope, out.numpy())
+        return out.reshape(p.shape).to(p.device)
 
     def apply(self, p: Tensor, window: DetectorWindow | None = None) -> Tensor:
         """Water-equivalent line integrals ``mu_ref t``.
@@ -95,7 +99,10 @@ class WaterLinearisation:
             window: the part of the detector that ``p`` holds.
 
         Returns:
-            Tensor of the shape, dtype and device of ``p``. NaN stays NaN.
+            Tensor of the shape, dtype and device of ``p``. NaN stays NaN. Not differentiable: see :meth:`slope`.
+
+        Raises:
+            ValueError: a shape that does not fit the detector or the window.
         """
         return self._evaluate(p, window, slope=False)
 

@@ -1,0 +1,98 @@
+"""The inference API: one call from a scan to a volume in HU."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, Literal, overload
+
+import torch
+
+from recon.inset import InsetFbp
+from torchpcct.geometry import VolumeGrid
+from torchpcct.scan import Scan
+from torchpcct.volume import Volume
+
+__all__ = ["METHODS", "reconstruct"]
+
+Method = Literal["fbp", "pwls"]
+METHODS: tuple[str, ...] = ("fbp", "pwls")
+
+Progress = Callable[[float], None]
+
+# More zero counts than this, and the logarithm no longer describes the data: FBP and PWLS would be guesswork.
+_STARVED = 0.5
+
+
+@overload
+def reconstruct(scan: Scan, grid: VolumeGrid, method: str = ..., **options: Any) -> Volume: ...
+@overload
+def reconstruct(scan: Sequence[Scan], grid: VolumeGrid, method: str = ..., **options: Any) -> list[Volume]: ...
+
+
+def reconstruct(
+    scan: Scan | Sequence[Scan],
+    grid: VolumeGrid,
+    method: str = "fbp",
+    *,
+    progress: Progress | None = None,
+    device: str | torch.device = "cpu",
+    **options: Any,
+) -> Volume | list[Volume]:
+    """Reconstruct a scan on a grid, in HU (water reads 0).
+
+    Args:
+        scan: one scan, or several realisations of one scan (same geometry, window and exposure).
+        grid: ``(z, y, x)`` grid inside the field of view.
+        method: ``"fbp"`` (FDK; option ``kernel``) or ``"pwls"`` (penalised weighted least squares with a q-GGMRF
+            prior, to convergence; options of :func:`recon.roi.reconstruct_pwls`).
+        progress: called with the finished fraction, 0…1.
+        device: where the returned volumes lie.
+        options: of the method.
+
+    Returns:
+        A :class:`torchpcct.Volume` (a list of them for a sequence of scans), float32 HU; its ``report`` says how it was
+        made: method, options, seconds, and for iterative methods iterations and residual.
+
+    Raises:
+        ValueError: an unknown method, kernel or option value, a grid outside the field of view, a starved scan.
+        TypeError: ``scan`` is no :class:`torchpcct.Scan`, or an option does not exist.
+    """
+    scans = [scan] if isinstance(scan, Scan) else list(scan)
+    if not scans or not all(isinstance(s, Scan) for s in scans):
+        raise TypeError(f"scan must be a Scan or a non-empty sequence of scans, got {type(scan).__name__}")
+    if not isinstance(grid, VolumeGrid) or grid.ndim != 3:
+        raise ValueError(f"grid must be a (z, y, x) VolumeGrid, got {grid!r}")
+    for s in scans:
+        if s.zero_fraction > _STARVED:
+            raise ValueError(
+                f"{100 * s.zero_fraction:.0f} % of the readings are zero: too few photons for a line-integral method; "
+                "raise the exposure or bin the readings"
+            )
+    if method == "fbp":
+        volumes = _fbp(scans, grid, progress, **options)
+    elif method == "pwls":
+        from recon.roi import reconstruct_pwls
+
+        volumes = reconstruct_pwls(scans, grid, progress=progress, **options)
+    else:
+        raise ValueError(f"unknown method {method!r}: use one of {', '.join(METHODS)}")
+    volumes = [replace(v, data=v.data.to(device)) for v in volumes]
+    return volumes[0] if isinstance(scan, Scan) else volumes
+
+
+def _fbp(scans: Sequence[Scan], grid: VolumeGrid, progress: Progress | None, kernel: str = "standard") -> list[Volume]:
+    if not isinstance(kernel, str):
+        raise TypeError(f"kernel must be one name, got {kernel!r}; recon.inset.InsetFbp takes several at once")
+    start = time.perf_counter()
+    run = InsetFbp(scans[0], [grid], [kernel])
+    volumes = []
+    for i, s in enumerate(scans):
+        data = run(s)[0][0].to(torch.float32)
+        seconds = time.perf_counter() - start
+        volumes.append(Volume(data, grid, {"method": "fbp", "kernel": kernel, "seconds": round(seconds, 3)}))
+        start = time.perf_counter()
+        if progress is not None:
+            progress((i + 1) / len(scans))
+    return volumes

@@ -1,0 +1,99 @@
+"""What every study leaves behind: ``report.json``, ``report.md`` and figures, each written whole."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchpcct.volume import written_whole
+
+__all__ = ["Report", "environment", "markdown_table"]
+
+
+def environment() -> dict[str, Any]:
+    """Versions and machine that made a result."""
+    import numba
+    import scipy
+    import torch
+
+    import torchpcct
+
+    return {
+        "torchpcct": torchpcct.__version__,
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "numpy": np.__version__,
+        "scipy": scipy.__version__,
+        "numba": numba.__version__,
+        "machine": platform.machine(),
+        "cores": os.cpu_count(),
+    }
+
+
+def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A Markdown table, first column left, the others right aligned, padded so that it reads well as plain text."""
+    cells = [list(header), *[list(map(str, r)) for r in rows]]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(header))]
+
+    def line(row: Sequence[str]) -> str:
+        padded = [c.ljust(w) if i == 0 else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True))]
+        return "| " + " | ".join(padded) + " |"
+
+    rule = "|" + "|".join((":" if i == 0 else "") + "-" * (w + 1) + (":" if i else "") for i, w in enumerate(widths))
+    return "\n".join([line(cells[0]), rule + "|", *map(line, cells[1:])])
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, np.generic):
+        return value.item()
+    if hasattr(value, "_asdict"):
+        return value._asdict()
+    return str(value)
+
+
+@dataclass
+class Report:
+    """A study's result.
+
+    Args:
+        name: of the study.
+        data: JSON values (NumPy arrays and scalars are converted).
+        text: Markdown.
+        figures: file name → matplotlib figure.
+    """
+
+    name: str
+    data: dict[str, Any]
+    text: str
+    figures: dict[str, Any] = field(default_factory=dict)
+
+    def save(self, folder: str | os.PathLike[str]) -> list[Path]:
+        """Write ``report.json``, ``report.md`` and the figures into ``folder`` (made if need be).
+
+        Returns:
+            The files written.
+        """
+        out = Path(folder)
+        out.mkdir(parents=True, exist_ok=True)
+        files = []
+        for name, content in (
+            ("report.json", json.dumps(self.data, indent=1, default=_plain)),
+            ("report.md", self.text),
+        ):
+            with written_whole(out / name) as part:
+                part.write_text(content + "\n", encoding="utf-8")
+            files.append(out / name)
+        for name, figure in self.figures.items():
+            with written_whole(out / name) as part:
+                figure.savefig(part)
+            files.append(out / name)
+        return files

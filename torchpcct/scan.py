@@ -1,0 +1,255 @@
+"""A scan: what the detector read, what it reads in air, and how to turn the two into line integrals."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchpcct import noise
+from torchpcct.geometry import ConeBeam
+from torchpcct.scanner.linearisation import WaterLinearisation
+from torchpcct.volume import written_whole
+from torchpcct.window import DetectorWindow
+
+__all__ = ["NOISE_FREE_EXPOSURE_S", "Scan"]
+
+NOISE_FREE_EXPOSURE_S = 1.0
+"""The exposure that the expected readings of a noise-free scan stand for."""
+
+_FORMAT = "torchpcct-scan"
+_VERSION = 1
+# Compress in blocks of whole views: fast to write, and a window of views can be read without the rest.
+_HDF5_COMPRESSION = {"compression": "lzf", "shuffle": True}
+
+
+@dataclass(frozen=True)
+class Scan:
+    """Readings of one scan.
+
+    Args:
+        counts: ``(views, rows, columns)``, spectral ``(bins, views, rows, columns)``, float32. Counts if noisy
+            (``exposure_s`` given); else expected counts for :data:`NOISE_FREE_EXPOSURE_S`. With a window, only its
+            cells: ``(..., views, window.rows, window.columns)``.
+        air: ``(rows, columns)`` or ``(bins, rows, columns)`` expected readings without the object, same exposure.
+        geometry: the scan geometry of the WHOLE detector.
+        linearisation: water beam-hardening correction of the scanner.
+        exposure_s: duration of the scan in s; None: noise free.
+        seed: seed of the noise; None: noise free.
+        window: the part of the detector that was kept; None: all of it.
+        surround: ``air``-shaped expected readings of every cell outside the window, the same in all views; given if
+            and only if ``window`` is.
+        signal_variance: ``air``-shaped variance of a reading per unit expected reading: 1 for counts.
+        info: provenance (scanner, plan, versions), JSON values.
+
+    Raises:
+        ValueError: NaN, Inf or negative counts, no counts at all, air readings ≤ 0, an exposure ≤ 0, shapes that do
+            not fit the geometry.
+    """
+
+    counts: Tensor
+    air: Tensor
+    geometry: ConeBeam
+    linearisation: WaterLinearisation
+    exposure_s: float | None = None
+    seed: int | None = None
+    window: DetectorWindow | None = None
+    surround: Tensor | None = None
+    info: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        g, w = self.geometry, self.window
+        cells = g.shape if w is None else (w.views, w.rows, w.columns)
+        if tuple(self.counts.shape[-3:]) != tuple(cells) or self.counts.ndim not in (3, 4):
+            raise ValueError(f"counts have shape {tuple(self.counts.shape)}, expected (…, {cells})")
+        expected_air = (*self.counts.shape[:-3], g.rows, g.columns)
+        if tuple(self.air.shape) != expected_air:
+            raise ValueError(f"air has shape {tuple(self.air.shape)}, expected {expected_air}")
+        if (w is None) != (self.surround is None):
+            raise ValueError("a windowed scan needs the readings of its surround, a full scan has none")
+        if w is not None and w.views != g.views:
+            raise ValueError(f"the window has {w.views} views, the geometry {g.views}")
+        if self.surround is not None and self.surround.shape != self.air.shape:
+            raise ValueError(f"surround has shape {tuple(self.surround.shape)}, air {tuple(self.air.shape)}")
+        check_exposure(self.exposure_s)
+        low, high = (float(v) for v in torch.aminmax(self.counts)) if self.counts.numel() else (0.0, 0.0)
+        if not (np.isfinite(low) and np.isfinite(high)):  # aminmax propagates NaN
+            bad = int((~torch.isfinite(self.counts)).sum())
+            raise ValueError(f"{bad} readings are NaN or Inf: mask dead cells and interpolate them before")
+        if low < 0:
+            raise ValueError(f"counts must not be negative, the lowest is {low}: give raw counts, not line integrals")
+        if high == 0:
+            raise ValueError("all counts are zero: the scan holds no signal (exposure too low, or beam blocked)")
+        if not bool((self.air > 0).all()):
+            raise ValueError("air readings must be greater than 0 in every cell: mask dead cells before")
+
+    @property
+    def noise_free(self) -> bool:
+        """Whether the readings are expectations."""
+        return self.exposure_s is None
+
+    @property
+    def zero_fraction(self) -> float:
+        """Share of readings that counted nothing."""
+        return float((self.counts == 0).float().mean())
+
+    def with_noise(self, exposure_s: float, seed: int) -> Scan:
+        """A noisy realisation of a noise-free scan.
+
+        The noise of a reading depends only on ``seed`` and the reading's place on the full detector, so a windowed
+        scan carries the same noise as the full one.
+
+        Raises:
+            ValueError: the scan is noisy already; ``exposure_s`` ≤ 0; a negative seed.
+        """
+        if not self.noise_free:
+            raise ValueError("with_noise needs a noise-free scan (acquire with exposure_s=None), this one is noisy")
+        check_exposure(exposure_s)
+        scale = exposure_s / NOISE_FREE_EXPOSURE_S
+        return replace(
+            self,
+            counts=noise.poisson(self.counts, self._first_index(), seed, scale),
+            air=self.air * scale,
+            surround=None if self.surround is None else self.surround * scale,
+            exposure_s=float(exposure_s),
+            seed=int(seed),
+        )
+
+    def _first_index(self) -> Any:
+        """Global index of the first reading of every detector row held in ``counts``."""
+        g, w = self.geometry, self.window
+        first_row, rows = (0, g.rows) if w is None else (w.first_row, w.rows)
+        first_column = np.zeros(g.views, np.int64) if w is None else w.first_column
+        line = np.arange(g.views)[:, None] * g.rows + first_row + np.arange(rows)
+        index = line * g.columns + first_column[:, None]
+        bins = self.counts.shape[0] if self.counts.ndim == 4 else 1
+        return (np.arange(bins)[:, None, None] * (g.views * g.rows * g.columns) + index).reshape(-1)
+
+    def _at_window(self, cells: Tensor) -> Tensor:
+        """``(..., rows, columns)`` values of the cells as seen by the stored readings, ``(..., views | 1, r, c)``."""
+        if self.window is None:
+            return cells.unsqueeze(-3)
+        w = self.window
+        columns = torch.from_numpy(w.column_indices)
+        return cells[..., w.first_row : w.first_row + w.rows, :][..., columns].movedim(-2, -3)
+
+    def line_integrals(self) -> Tensor:
+        """Water-linearised line integrals of the stored readings, shape and dtype of ``counts``, dimensionless.
+
+        ``ln(air) − ln(counts + ½)`` for counts (½ removes the bias of the logarithm to second order in 1 / counts
+        and keeps zero counts finite), ``ln(air) − ln(counts)`` for expectations; then the scanner's water correction,
+        so that a path through t mm of water reads ``mu_ref · t``.
+        """
+        shift = 0.0 if self.noise_free else 0.5
+        p = (self.counts + shift).log_().neg_().add_(self._at_window(self.air.log()))
+        return self.linearisation.apply(p, self.window)
+
+    def surround_line_integrals(self) -> Tensor:
+        """Water-linearised line integrals of the surround (noise free), ``(..., rows, columns)``.
+
+        Raises:
+            ValueError: the scan is not windowed.
+        """
+        if self.surround is None:
+            raise ValueError("a full scan has no surround: use line_integrals()")
+        return self.linearisation.apply(torch.log(self.air) - torch.log(self.surround))
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write HDF5; the file appears under its name only when it is complete."""
+        import h5py
+
+        from torchpcct import __version__
+
+        g = self.geometry
+        with written_whole(path) as part, h5py.File(part, "w") as file:
+            file.attrs.update(format=_FORMAT, version=_VERSION, software=f"torchpcct {__version__}")
+            file.attrs["info"] = json.dumps(dict(self.info), default=str)
+            if self.exposure_s is not None:
+                file.attrs["exposure_s"] = self.exposure_s
+            if self.seed is not None:
+                file.attrs["seed"] = self.seed
+            chunk = (*(1,) * (self.counts.ndim - 2), *self.counts.shape[-2:])
+            # Counts are whole numbers: as integers they compress, and they stay exact.
+            whole = not self.noise_free and float(self.counts.max()) < 2**31
+            data = self.counts.to(torch.int32) if whole else self.counts
+            file.create_dataset("counts", data=data.numpy(), chunks=chunk, **_HDF5_COMPRESSION)
+            file.create_dataset("air", data=self.air.numpy())
+            geometry = file.create_group("geometry")
+            geometry["angles_rad"] = g.angles
+            geometry.attrs.update(
+                sod_mm=g.sod, sdd_mm=g.sdd, columns=g.columns, rows=g.rows, pitch_mm=g.pitch, offset_mm=g.offset
+            )
+            geometry.attrs["detector"] = g.detector
+            self.linearisation.save(file.create_group("linearisation"))
+            if self.window is not None and self.surround is not None:
+                window = file.create_group("window")
+                window["first_column"] = self.window.first_column
+                window["surround"] = self.surround.numpy()
+                window.attrs.update(columns=self.window.columns, first_row=self.window.first_row, rows=self.window.rows)
+            # Written last: a file without it was cut off.
+            file.attrs["complete"] = True
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Scan:
+        """Read a scan written by :meth:`save`.
+
+        Raises:
+            FileNotFoundError: no such file.
+            ValueError: the file is truncated, is no torchpcct scan, or is of a newer format.
+        """
+        import h5py
+
+        try:
+            with h5py.File(path, "r") as file:
+                if file.attrs.get("format") != _FORMAT:
+                    raise ValueError(f"{path} is an HDF5 file, but not a torchpcct scan")
+                if int(file.attrs["version"]) > _VERSION:
+                    raise ValueError(
+                        f"{path} has format version {file.attrs['version']}, this software reads up to {_VERSION}: "
+                        "update torchpcct"
+                    )
+                if not file.attrs.get("complete", False):
+                    raise ValueError(f"{path} was not written to its end: simulate it again")
+                return cls._from_file(file)
+        except (OSError, KeyError, RuntimeError) as error:
+            if isinstance(error, FileNotFoundError):
+                raise
+            raise ValueError(f"{path} cannot be read as a torchpcct scan (truncated or foreign): {error}") from error
+
+    @classmethod
+    def _from_file(cls, file: Any) -> Scan:
+        a = file["geometry"].attrs
+        geometry = ConeBeam(
+            file["geometry/angles_rad"][()], float(a["sod_mm"]), float(a["sdd_mm"]), int(a["columns"]),
+            int(a["rows"]), tuple(a["pitch_mm"]), tuple(a["offset_mm"]), str(a["detector"]),
+        )  # fmt: skip
+        window = surround = None
+        if "window" in file:
+            w = file["window"]
+            window = DetectorWindow(
+                w["first_column"][()], int(w.attrs["columns"]), int(w.attrs["first_row"]), int(w.attrs["rows"])
+            )
+            surround = torch.from_numpy(w["surround"][()])
+        return cls(
+            counts=torch.from_numpy(file["counts"][()]).to(torch.float32),
+            air=torch.from_numpy(file["air"][()]),
+            geometry=geometry,
+            linearisation=WaterLinearisation.load(file["linearisation"]),
+            exposure_s=float(file.attrs["exposure_s"]) if "exposure_s" in file.attrs else None,
+            seed=int(file.attrs["seed"]) if "seed" in file.attrs else None,
+            window=window,
+            surround=surround,
+            info=json.loads(file.attrs["info"]),
+        )
+
+
+def check_exposure(exposure_s: float | None) -> None:
+    """Raise ``ValueError`` unless the exposure is None (noise free) or a finite time > 0 s."""
+    if exposure_s is not None and not (np.isfinite(exposure_s) and exposure_s > 0):
+        raise ValueError(f"exposure_s must be greater than 0 s (or None for a noise-free scan), got {exposure_s}")
