@@ -46,7 +46,7 @@ def test_pairs_of_opposite_rays_share_one(half_fan, extra, where, ray):
         float(parker_share(np.array(x), np.array(g), virtual))
         for x, g in ((beta, gamma), (opposite, -gamma), (opposite - 2 * math.pi, -gamma))
     ]
-    assert 0 <= min(shares)
+    assert min(shares) >= 0
     assert sum(shares) == pytest.approx(1, abs=1e-12)
 
 
