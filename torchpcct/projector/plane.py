@@ -115,8 +115,8 @@ class PlanePasses:
         width = self.lanes(y.shape[0])
         step = max(1, width // self.operations)
         values = np.zeros((self.entries, width), dtype=y.dtype)
-        by_row = np.empty((ny, nx * width), dtype=y.dtype)
-        by_column = np.empty((nx, ny * width), dtype=y.dtype)
+        by_row = np.empty((width, ny, nx), dtype=y.dtype)
+        by_column = np.empty((width, nx, ny), dtype=y.dtype)
         for n in range(0, y.shape[0], step):
             part = y[n : n + step]
             orbits = self.orbits
@@ -124,10 +124,7 @@ class PlanePasses:
             kernels.backproject(
                 (0,) * width, self.segments, self.offset, t.p, t.q, t.weight, values.reshape(-1), by_row, by_column
             )
-            kernels.collect(
-                by_row.reshape(ny, nx, width), by_column.reshape(nx, ny, width), self.inverse, self.operations,
-                x[n : n + step],
-            )  # fmt: skip
+            kernels.collect(by_row, by_column, self.inverse, self.operations, x[n : n + step])
         return x
 
     def _lane_table(self, first: int, count: int, width: int, axis: int) -> NDArray[np.int64]:

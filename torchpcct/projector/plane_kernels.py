@@ -178,37 +178,45 @@ def _spread_block(lanes, segments, offset, axis, r0, r1, top, p, q, weight, valu
 
 
 @_small
-def _reverse_sums(out, slabs, knots, width, total, lines):
-    """Knot values to voxels: ``Σ_{k > m} out[k]``, into ``lines``, ``(slabs, (knots - 2) * lanes)``."""
-    for r in range(slabs):
-        line = lines[r]
-        base = r * knots * width
+def _reverse_sums(out, r0, r1, knots, width, total, planes):
+    """Knot values to voxels, ``Σ_{k > m} out[k]``, into ``planes``, ``(lanes, slabs, knots - 2)``."""
+    for r in range(r0, r1):
+        base = (r - r0) * knots * width
         for l in range(width):
             total[l] = out[base + (knots - 1) * width + l]
         for k in range(knots - 2, 0, -1):
             for l in range(width):
                 total[l] += out[base + k * width + l]
-                line[(k - 1) * width + l] = total[l]
+                planes[l, r, k - 1] = total[l]
 
 
 @njit(parallel=True, cache=True)
 def backproject(lanes, segments, offset, p, q, weight, values, by_row, by_column):
-    """Transpose of :func:`project`: cell values ``(entries * lanes,)`` to ``(slabs, width * lanes)`` per axis."""
+    """Transpose of :func:`project`: cell values ``(entries * lanes,)`` to ``(lanes, slabs, width)`` per axis."""
     width = len(lanes)
     real = by_row.dtype.type
-    row_tasks = (by_row.shape[0] + BLOCK - 1) // BLOCK
-    tasks = row_tasks + (by_column.shape[0] + BLOCK - 1) // BLOCK
+    row_tasks = (by_row.shape[1] + BLOCK - 1) // BLOCK
+    tasks = row_tasks + (by_column.shape[1] + BLOCK - 1) // BLOCK
     for task in prange(tasks):
         axis = 0 if task < row_tasks else 1
-        lines, r0 = (by_row, task * BLOCK) if axis == 0 else (by_column, (task - row_tasks) * BLOCK)
-        r1 = min(r0 + BLOCK, lines.shape[0])
-        knots = lines.shape[1] // width + 2
+        planes, r0 = (by_row, task * BLOCK) if axis == 0 else (by_column, (task - row_tasks) * BLOCK)
+        r1 = min(r0 + BLOCK, planes.shape[1])
+        knots = planes.shape[2] + 2
         out = np.zeros((r1 - r0) * knots * width, dtype=by_row.dtype)
         total = np.empty(width, dtype=by_row.dtype)
         _spread_block(
             lanes, segments, offset, axis, r0, r1, real(knots - 2), p, q, weight, values, out, knots * width
         )  # fmt: skip
-        _reverse_sums(out, r1 - r0, knots, width, total, lines[r0:r1])
+        _reverse_sums(out, r0, r1, knots, width, total, planes)
+
+
+@_small
+def _collect_tile(plane, at, y0, y1, x0, x1, swap, image):
+    for y in range(y0, y1):
+        for x in range(x0, x1):
+            a = at[0] + at[1] * y + at[2] * x
+            b = at[3] + at[4] * y + at[5] * x
+            image[y, x] += plane[b, a] if swap else plane[a, b]
 
 
 @njit(parallel=True, cache=True)
@@ -216,16 +224,15 @@ def collect(by_row, by_column, inverse, operations, image):
     """Sum the lanes back onto ``image``, ``(batch, ny, nx)``; transpose of ``load_image`` for both axes.
 
     ``inverse``: ``(operations, 6)``: row and column of the operated image read at pixel (y, x), each as
-    base, per y, per x.
+    base, per y, per x. Tiles, since half of the lanes are read across their rows.
     """
     batch, ny, nx = image.shape
-    for y in prange(ny):
+    for tile in prange((ny + 31) // 32):
+        y0, y1 = tile * 32, min(tile * 32 + 32, ny)
         for n in range(batch):
-            for x in range(nx):
-                total = image.dtype.type(0)
+            image[n, y0:y1] = 0
+            for x0 in range(0, nx, 32):
                 for g in range(operations):
-                    a = inverse[g, 0] + inverse[g, 1] * y + inverse[g, 2] * x
-                    b = inverse[g, 3] + inverse[g, 4] * y + inverse[g, 5] * x
                     l = n * operations + g
-                    total += by_row[a, b, l] + by_column[b, a, l]
-                image[n, y, x] = total
+                    _collect_tile(by_row[l], inverse[g], y0, y1, x0, min(x0 + 32, nx), False, image[n])
+                    _collect_tile(by_column[l], inverse[g], y0, y1, x0, min(x0 + 32, nx), True, image[n])

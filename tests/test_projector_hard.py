@@ -1,0 +1,318 @@
+"""Hard cases: degenerate sizes, extreme numbers, odd view orders, threads, and what PyTorch asks of an operator."""
+
+from __future__ import annotations
+
+import math
+import tracemalloc
+
+import numba
+import numpy as np
+import pytest
+import torch
+from geometries import REGISTRY
+
+from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
+from torchpcct.projector import Projector
+from torchpcct.projector.analytic import Gaussian, line_integrals, rasterize
+from torchpcct.window import DetectorWindow, shadow
+
+NAMES = sorted(REGISTRY)
+SOME = ["parallel_half_turn", "fan_flat", "fan_flat_offset_shifted_grid", "cone_curved_offset", "cone_window"]
+
+
+def _projector(name):
+    return Projector(*REGISTRY[name]())
+
+
+def _random(shape, dtype=torch.float64, seed=0):
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
+
+
+# --- geometry -------------------------------------------------------------------------------------------------------
+
+
+def test_far_source_is_the_parallel_limit():
+    grid = VolumeGrid((17, 15), 1.3, (2.0, -1.0))
+    angles = full_turn(7, 0.3)
+    near = Projector(ParallelBeam(angles, 31, 1.1, 0.2), grid)
+    far = Projector(FanBeam(angles, 1e6, 2e6, 31, 2.2, 0.4), grid)
+    x = _random(grid.shape)
+    torch.testing.assert_close(far(x), near(x), rtol=0, atol=5e-4 * float(near(x).abs().max()))
+
+
+@pytest.mark.parametrize("scale", [1e-3, 7.0, 1e4])
+def test_scaling_every_length_scales_the_line_integrals(scale):
+    def build(s):
+        geometry = ConeBeam(full_turn(4, 0.1), 60 * s, 110 * s, 14, 9, (1.8 * s, 2.5 * s), (0.2 * s, 0.5 * s))
+        return Projector(geometry, VolumeGrid((5, 7, 6), (1.5 * s, 2 * s, 2.2 * s), (0.4 * s, s, -2 * s)))
+
+    x = _random((5, 7, 6))
+    torch.testing.assert_close(build(scale)(x), build(1.0)(x) * scale, rtol=1e-9, atol=1e-9 * scale)
+
+
+def test_turning_the_scanner_a_quarter_is_turning_the_image_back():
+    grid = VolumeGrid((9, 9), 2.0)
+    angles = np.array([0.1, 0.9, 2.2])  # no symmetry, so that neither side uses lanes
+    x = _random(grid.shape)
+    here = Projector(FanBeam(angles + math.pi / 2, 60.0, 110.0, 21, 2.1), grid)(x)
+    there = Projector(FanBeam(angles, 60.0, 110.0, 21, 2.1), grid)(torch.rot90(x, 1, (0, 1)))
+    torch.testing.assert_close(here, there, rtol=1e-12, atol=1e-12)
+
+
+def test_a_displaced_object_is_a_displaced_grid():
+    geometry = FanBeam(full_turn(5, 0.1), 60.0, 110.0, 25, 2.1)
+    x = _random((9, 9))
+    still = Projector(geometry, VolumeGrid((9, 9), 2.0))._engine
+    still.rays = still.rays.moved(np.tile([-2.5, 1.5], (5, 1)))
+    displaced = Projector(geometry, VolumeGrid((9, 9), 2.0, (1.5, -2.5)))
+    np.testing.assert_allclose(still.forward(x.numpy()[None])[0], displaced(x).numpy(), rtol=1e-10, atol=1e-10)
+
+
+def test_source_inside_the_grid_is_refused():
+    with pytest.raises(ValueError, match=r"source of view 0 .* lies inside the grid"):
+        Projector(FanBeam(full_turn(4), 60.0, 110.0, 20, 2.0), VolumeGrid((64, 64), 2.0))
+
+
+def test_source_inside_the_circumscribed_circle_is_right():
+    grid = VolumeGrid((30, 100), 1.0)  # reaches 52 mm; the source passes 40 mm above its middle
+    geometry = FanBeam([math.pi / 2, math.pi / 2 + 0.2], 40.0, 110.0, 80, 2.0)
+    body = Gaussian((1.0, 3.0), (3.0, 4.0))
+    exact = line_integrals(geometry, [body], sub=5)
+    found = Projector(geometry, grid)(torch.as_tensor(rasterize(grid, [body]))).numpy()
+    assert np.linalg.norm(found - exact) < 1e-2 * np.linalg.norm(exact)
+
+
+@pytest.mark.parametrize("name", ["parallel_half_turn", "fan_flat", "cone_flat"])
+def test_views_in_any_order_and_repeated(name):
+    geometry, grid, _ = REGISTRY[name]()
+    order = np.array([3, 1, 3, 0, 2, 1])
+    x = _random(grid.shape)
+    whole = Projector(geometry, grid)(x)
+    torch.testing.assert_close(Projector(geometry.select(order), grid)(x), whole[order], rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["fan_window", "cone_window"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_window_is_exactly_the_crop(name, dtype):
+    geometry, grid, window = REGISTRY[name]()
+    x = _random(grid.shape, dtype)
+    whole = Projector(geometry, grid)(x)
+    rows = slice(window.first_row, window.first_row + window.rows)
+    columns = torch.as_tensor(window.column_indices)
+    if whole.dim() == 2:
+        crop = whole.gather(1, columns)
+    else:
+        crop = whole[:, rows].gather(2, columns[:, None].expand(-1, window.rows, -1))
+    tolerance = 1e-6 if dtype == torch.float32 else 1e-14
+    torch.testing.assert_close(
+        Projector(geometry, grid, window)(x), crop, rtol=0, atol=tolerance * float(crop.abs().max())
+    )
+
+
+def test_a_ray_through_a_corner_and_cells_on_voxel_edges_lose_nothing():
+    grid = VolumeGrid((4, 4), 1.0)
+    geometry = ParallelBeam([math.pi / 4, 0.0, math.pi / 2], 40, math.sqrt(2) / 8)
+    mass = Projector(geometry, grid)(torch.ones(4, 4, dtype=torch.float64)).sum(-1) * geometry.pitch
+    assert mass.numpy() == pytest.approx(16.0, rel=1e-12)
+
+
+def test_cells_much_larger_than_the_grid_conserve_mass():
+    geometry = ParallelBeam([0.0, 0.5, 2.0], 3, 1e4)
+    x = torch.rand(6, 5, dtype=torch.float64)
+    y = Projector(geometry, VolumeGrid((6, 5), 1.0))(x)
+    assert (y.sum(-1) * 1e4).numpy() == pytest.approx(float(x.sum()), rel=1e-9)
+
+
+def test_cells_of_a_tenth_of_a_micrometre_add_up_to_a_larger_cell():
+    x = torch.rand(6, 5, dtype=torch.float64)
+    grid = VolumeGrid((6, 5), 1.0)
+    fine = Projector(ParallelBeam([0.0, 0.5, 2.0], 40, 1e-4, 0.3), grid)(x)
+    coarse = Projector(ParallelBeam([0.0, 0.5, 2.0], 1, 40e-4, 0.3), grid)(x)
+    torch.testing.assert_close(fine.mean(-1), coarse[:, 0], rtol=1e-9, atol=0)
+
+
+# --- numbers --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", SOME)
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_nan_and_inf_reach_every_reading_that_sees_them(name, bad):
+    A = _projector(name)
+    x = torch.zeros(A.domain_shape)
+    voxel = tuple(n // 2 for n in A.domain_shape)
+    x[voxel] = 1.0
+    seen = A(x) > 1e-3
+    assert seen.any()
+    x[voxel] = bad
+    assert not torch.isfinite(A(x)[seen]).any()
+    y = torch.zeros(A.range_shape)
+    cell = tuple(int(i[0]) for i in seen.nonzero(as_tuple=True))
+    y[cell] = 1.0
+    touched = A.T(y) > 1e-3
+    y[cell] = bad
+    assert not torch.isfinite(A.T(y)[touched]).any()
+
+
+@pytest.mark.parametrize("name", SOME)
+@pytest.mark.parametrize("scale", [1e30, 1e-30, 1e-41])
+def test_extreme_magnitudes(name, scale):
+    A = _projector(name)
+    x = torch.rand(A.domain_shape, generator=torch.Generator().manual_seed(1))
+    expect, found = A(x).double(), A(x * scale).double() / scale
+    tolerance = 1e-5 if scale > 1e-35 else 5e-2  # a subnormal has few digits
+    torch.testing.assert_close(found, expect, rtol=0, atol=tolerance * float(expect.abs().max()))
+
+
+# --- operator -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_one_thread_or_two_give_the_same_bits(name):
+    A = _projector(name)
+    x, y = _random((2, *A.domain_shape), torch.float32), _random((2, *A.range_shape), torch.float32)
+    threads = numba.get_num_threads()
+    results = []
+    try:
+        for n in (1, min(2, numba.config.NUMBA_NUM_THREADS), 1):
+            numba.set_num_threads(n)
+            results.append((A(x), A.T(y)))
+    finally:
+        numba.set_num_threads(threads)
+    for other in results[1:]:
+        assert torch.equal(results[0][0], other[0])
+        assert torch.equal(results[0][1], other[1])
+
+
+@pytest.mark.parametrize("name", SOME)
+def test_batches_of_any_size_and_layout(name):
+    A = _projector(name)
+    x = _random((11, *A.domain_shape))
+    whole = A(x)
+    for n in (0, 1, 2, 3, 9):
+        torch.testing.assert_close(A(x[:n]), whole[:n], rtol=1e-11, atol=1e-11)
+        assert A(x[:n]).shape == (n, *A.range_shape)
+    assert A(x[:0].reshape(0, 3, *A.domain_shape)).shape == (0, 3, *A.range_shape)
+    assert A.T(A(x[:0])).shape == (0, *A.domain_shape)
+    torch.testing.assert_close(A(x[:6].reshape(2, 3, *A.domain_shape)).flatten(0, 1), whole[:6])
+    flipped = x.transpose(-1, -2).contiguous().transpose(-1, -2)
+    assert not flipped.is_contiguous() or min(A.domain_shape[-2:]) == 1
+    torch.testing.assert_close(A(flipped), whole)
+    for n, one in enumerate(A.T(whole)):
+        torch.testing.assert_close(A.T(whole[n]), one, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("name", SOME)
+def test_calls_do_not_share_buffers(name):
+    A = _projector(name)
+    x = _random(A.domain_shape)
+    first = A(x)
+    copy = first.clone()
+    second = A(2 * x)
+    assert torch.equal(first, copy)
+    assert first.data_ptr() != second.data_ptr()
+    back = A.T(first)
+    copy = back.clone()
+    A.T(second)
+    assert torch.equal(back, copy)
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script.*:DeprecationWarning")  # raised inside torch.func.jvp
+@pytest.mark.parametrize("name", ["fan_flat", "cone_window"])
+def test_modes_and_torch_func(name):
+    A = _projector(name)
+    assert A.T.T is A
+    assert A.T.domain_shape == A.range_shape
+    x, t = _random((3, *A.domain_shape)), _random((3, *A.domain_shape), seed=1)
+    with torch.inference_mode():
+        inferred = A(x)
+    with torch.no_grad():
+        assert not A(x.clone().requires_grad_()).requires_grad
+    torch.testing.assert_close(inferred.clone(), A(x))
+    torch.testing.assert_close(torch.func.vmap(A)(x), A(x))
+    torch.testing.assert_close(torch.func.vmap(A, in_dims=1)(x.transpose(0, 1).contiguous()), A(x))
+    value, tangent = torch.func.jvp(A, (x,), (t,))
+    torch.testing.assert_close(value, A(x))
+    torch.testing.assert_close(tangent, A(t))
+    _, pull = torch.func.vjp(A, x)
+    y = A(t)
+    torch.testing.assert_close(pull(y)[0], A.T(y))
+    gradient = torch.func.grad(lambda z: (A(z) ** 2).sum())(x)
+    torch.testing.assert_close(gradient, 2 * A.T(A(x)))
+
+
+def test_gradient_of_an_unrolled_scheme_equals_the_dense_matrix():
+    A = _projector("fan_window")
+    n = math.prod(A.domain_shape)
+    matrix = A(torch.eye(n, dtype=torch.float64).reshape(n, *A.domain_shape)).reshape(n, -1).T
+    y = _random(A.range_shape)
+
+    def unroll(forward, adjoint, step):
+        x = torch.zeros(n, dtype=torch.float64)
+        for _ in range(3):
+            x = torch.tanh(x - step * adjoint(forward(x) - y.reshape(-1)))
+        return (x**2).sum()
+
+    gradients = []
+    for forward, adjoint in (
+        (lambda x: A(x.reshape(A.domain_shape)).reshape(-1), lambda r: A.T(r.reshape(A.range_shape)).reshape(-1)),
+        (lambda x: matrix @ x, lambda r: matrix.T @ r),
+    ):
+        step = torch.tensor(0.01, dtype=torch.float64, requires_grad=True)
+        gradients.append(torch.autograd.grad(unroll(forward, adjoint, step), step)[0])
+    torch.testing.assert_close(*gradients, rtol=1e-10, atol=0)
+
+
+def test_bad_arguments_are_named():
+    fan = FanBeam(full_turn(4), 60.0, 110.0, 20, 2.0)
+    cone = ConeBeam(full_turn(4), 60.0, 110.0, 20, 3, 2.0)
+    plane, volume = VolumeGrid((5, 5), 1.0), VolumeGrid((4, 5, 5), 1.0)
+    with pytest.raises(ValueError, match="FanBeam needs a 2-D grid"):
+        Projector(fan, volume)
+    with pytest.raises(ValueError, match="ConeBeam needs a 3-D grid"):
+        Projector(cone, plane)
+    with pytest.raises(TypeError, match="geometry must be"):
+        Projector("fan", plane)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="grid must be a VolumeGrid"):
+        Projector(fan, (5, 5))  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="window must be"):
+        Projector(fan, plane, 3)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="window has 3 views, the geometry 4"):
+        Projector(fan, plane, DetectorWindow([0, 0, 0], 5))
+    with pytest.raises(ValueError, match="columns 0…19"):
+        Projector(fan, plane, DetectorWindow([0, 0, 0, 16], 5))
+    with pytest.raises(ValueError, match="rows 0…2"):
+        Projector(cone, volume, DetectorWindow([0, 0, 0, 0], 5, 1, 3))
+    A = Projector(fan, plane)
+    with pytest.raises(ValueError, match=r"shape \(\.\.\., 5, 5\), got \(5, 4\)"):
+        A(torch.zeros(5, 4))
+    with pytest.raises(ValueError, match=r"A\.T\(y\)"):
+        A.T(torch.zeros(5, 5))
+    with pytest.raises(ValueError, match="got \\(5,\\)"):
+        A(torch.zeros(5))
+    for dtype in (torch.float16, torch.bfloat16, torch.int32, torch.complex64):
+        with pytest.raises(TypeError, match="float32 or float64"):
+            A(torch.zeros(5, 5, dtype=dtype))
+    with pytest.raises(TypeError, match=r"torch\.Tensor"):
+        A(np.zeros((5, 5)))
+    with pytest.raises(ValueError, match="batch"):
+        A.memory_estimate(-1)
+    with pytest.raises(TypeError, match="dtype"):
+        A.memory_estimate(1, torch.float16)
+
+
+@pytest.mark.parametrize("batch", [1, 3])
+def test_memory_estimate_is_an_upper_bound_and_not_far_off(batch):
+    geometry = ConeBeam(full_turn(60), 626.0, 1098.0, 400, 40, (0.5, 0.35), detector="curved")
+    grid = VolumeGrid((56, 45, 45), 0.2)
+    A = Projector(geometry, grid, shadow(geometry, grid))
+    x = _random((batch, *A.domain_shape), torch.float32)
+    A.T(A(x))
+    peaks = []
+    for operator, given in ((A, x), (A.T, A(x))):
+        tracemalloc.start()
+        operator(given)
+        peaks.append(tracemalloc.get_traced_memory()[1] + given.numel() * 4)
+        tracemalloc.stop()
+    assert max(peaks) <= A.memory_estimate(batch) <= 2.5 * max(peaks)
+    assert A.memory_estimate(batch, torch.float64) > 1.5 * A.memory_estimate(batch)
+    assert A.memory_estimate(0) == 0
