@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
 import time
@@ -211,6 +212,7 @@ def run(
     Raises:
         ValueError: settings out of range; ROIs that come out empty; an inset outside the field of view.
     """
+    from recon.exact_noise import roi_covariance
     from recon.inset import InsetFbp
     from torchpcct.acquire import acquire
     from torchpcct.scanner import presets
@@ -243,6 +245,11 @@ def run(
         for kernel, volume in zip(settings.kernels, volumes, strict=True):
             noise_free.append(_means("fbp", kernel, grid.spacing[0], pair, volume))
     clock.lap("noise-free FBP")
+    report("exact noise of FBP", 0.0)
+    covariances = roi_covariance(clean, fbp, pairs, 1.0)
+    for entry, matrix in zip(noise_free[1:], itertools.chain.from_iterable(covariances), strict=True):
+        entry["covariance_hu2_s"] = matrix.tolist()
+    clock.lap("exact noise of FBP")
 
     collected: dict[tuple[str, str, float, float], list[tuple[float, float]]] = {}
     pwls_reports: list[dict[str, Any]] = []

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-__all__ = ["Interval", "cnr", "cnr_from_moments", "cnr_interval", "mean_interval", "sd_interval"]
+__all__ = ["Interval", "cnr", "cnr_from_moments", "cnr_interval", "cnr_range", "mean_interval", "sd_interval"]
 
 Floats = NDArray[np.float64]
 
@@ -91,7 +91,6 @@ def cnr_interval(
     level: float = 0.95,
     draws: int = 20_000,
     seed: int = 0,
-    future: int | None = None,
 ) -> Interval:
     """Generalised confidence interval for the CNR of correlated, jointly normal ROI means.
 
@@ -103,8 +102,6 @@ def cnr_interval(
         level: coverage.
         draws: Monte Carlo size of the pivot.
         seed: seed of the pivot's random numbers.
-        future: None: interval for the true CNR; else prediction interval for the CNR that another experiment with so
-            many realisations measures.
     """
     fg, bg = _means("foreground_means", foreground_means), _means("background_means", background_means)
     if fg.ndim != 1 or fg.shape != bg.shape or fg.size < 3:
@@ -119,13 +116,36 @@ def cnr_interval(
     # S = L Lᵀ ~ Wishart(Σ, n-1) and B Bᵀ ~ Wishart(I, n-1) (Bartlett, B lower): the pivot for Σ is (L B⁻¹)(L B⁻¹)ᵀ.
     root = lower @ np.linalg.inv(_bartlett(rng, draws, n - 1))
     mean = data.mean(1) - np.einsum("dij,dj->di", root, rng.standard_normal((draws, 2))) / np.sqrt(n)
-    if future is not None:
-        # A new experiment under the drawn means and covariance: its mean, and its Wishart scatter root C Cᵀ rootᵀ.
-        mean = mean + np.einsum("dij,dj->di", root, rng.standard_normal((draws, 2))) / np.sqrt(future)
-        root = root @ _bartlett(rng, draws, future - 1) / np.sqrt(future - 1)
     variance = np.einsum("dij,dij->di", root, root)
     pivot = (mean[:, 1] - mean[:, 0]) / np.sqrt(variance.sum(1))
     low, high = np.quantile(pivot, [0.5 - level / 2, 0.5 + level / 2])
+    return Interval(float(low), float(high))
+
+
+def cnr_range(
+    means: Any, covariance: Any, realizations: int, level: float = 0.95, draws: int = 20_000, seed: int = 0
+) -> Interval:
+    """Range of the CNR that an experiment of a few realisations measures when mean and covariance are known exactly.
+
+    Args:
+        means: ``(foreground, background)`` expectations in HU.
+        covariance: ``(2, 2)`` covariance of the two ROI means in HU².
+        realizations: size of the experiment, at least 3.
+
+    Raises:
+        ValueError: fewer than 3 realisations, or a covariance that is not positive definite.
+    """
+    if realizations < 3:
+        raise ValueError(f"realizations must be at least 3, got {realizations}")
+    try:
+        root = np.linalg.cholesky(np.asarray(covariance, dtype=np.float64))
+    except np.linalg.LinAlgError:
+        raise ValueError("covariance must be positive definite: the ROI means must vary independently") from None
+    rng = np.random.default_rng(seed)
+    mean = np.asarray(means, dtype=np.float64) + rng.standard_normal((draws, 2)) @ root.T / np.sqrt(realizations)
+    scatter = root @ _bartlett(rng, draws, realizations - 1) / np.sqrt(realizations - 1)
+    estimates = (mean[:, 1] - mean[:, 0]) / np.sqrt(np.einsum("dij,dij->d", scatter, scatter))
+    low, high = np.quantile(estimates, [0.5 - level / 2, 0.5 + level / 2])
     return Interval(float(low), float(high))
 
 
