@@ -32,6 +32,10 @@ noise beyond 128 columns adds less than 1 % to the spectrum of the filtered nois
 1 mm ROI can tell from zero."""
 
 
+_ENDLESS_MM = 1e5
+"""Where an endless body is cut for the bookkeeping of windows: far beyond any scanner."""
+
+
 class _Builder:
     """Packs a scene's bodies for the kernel: those that differ between views first, the rotationally symmetric last."""
 
@@ -47,15 +51,15 @@ class _Builder:
         self.varying = int((~symmetric).sum())
         self.kinds, self.params = pack([shapes[i] for i in order])
         boxes = np.array([shapes[i].bounding_box for i in order])  # (bodies, 2, 3)
-        boxes = boxes[: self.varying] if self.varying else boxes
+        boxes = np.clip(boxes[: self.varying] if self.varying else boxes, -_ENDLESS_MM, _ENDLESS_MM)
         self.low, self.high = boxes[:, 0].min(0), boxes[:, 1].max(0)
         self.moving = bool(np.any(moving))
         if self.moving and rotation_s is None:
             raise ValueError("the scene moves: give rotation_s, the time of one turn in s (or exposure_s)")
         mixed = self.moving and not all(moving[i] for i in order[: self.varying])
         size = np.linalg.norm((self.high - self.low)[:2]) / 2
-        # Bodies that move beside bodies that do not have no common circle, and endless ones have none at all.
-        self.circle = (*((self.low + self.high) / 2)[:2], np.inf if mixed or size > 1000 else size)
+        # Bodies that move beside bodies that do not have no common circle.
+        self.circle = (*((self.low + self.high) / 2)[:2], np.inf if mixed else size)
         if self.moving:
             travel = np.abs(scene.offsets(np.linspace(0, float(rotation_s or 0), 256))).max((0, 1))
             self.low, self.high = self.low - travel, self.high + travel

@@ -111,7 +111,6 @@ def _hu_cost(difference: Any, mask: Any, chord: Any, mu_water: float) -> float:
 
 def active_window(geometry: ConeBeam, low: Any, high: Any) -> DetectorWindow:
     """Window of the readings that see the box ``low … high`` (x, y, z) mm; the whole detector if it is too large."""
-    low, high = np.maximum(low, -1e5), np.minimum(high, 1e5)
     whole = DetectorWindow(np.zeros(geometry.views, np.int64), geometry.columns, 0, geometry.rows)
     extent = np.maximum(high - low, 1e-3)[::-1]
     box = VolumeGrid((1, 1, 1), tuple(extent), tuple(((low + high) / 2)[::-1]))
@@ -195,7 +194,7 @@ def make_plan(
     mask = np.abs(inset) > 1e-3 * peak
     mu_water = scanner.water_linearisation().mu_ref
     # The rms error is spread over half the diagonal of the bodies' box: a chord typical of the inset.
-    span = float(np.linalg.norm((np.minimum(box[1], 1e4) - np.maximum(box[0], -1e4))[:2])) / 2
+    span = float(np.linalg.norm((box[1] - box[0])[:2])) / 2
     chord = np.full(reference.shape, max(span, 1.0))
 
     effects = []
