@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,9 @@ from torchpcct.geometry import Geometry, VolumeGrid
 from torchpcct.projector.plane import PlanePasses
 from torchpcct.projector.rays import Rays, Segments, check_pair, check_source, rays_of, split
 from torchpcct.window import DetectorWindow
+
+if TYPE_CHECKING:
+    from torchpcct.projector.gpu import GpuPasses
 
 __all__ = ["Engine"]
 
@@ -42,6 +46,16 @@ class Engine:
         hy, hx = grid.spacing[-2:]
         y, x = grid.axes[-2:]
         self.lattice = np.array([y[0], hy, x[0] - hx / 2, hx, x[0], hx, y[0] - hy / 2, hy])
+
+        self._devices: dict[Any, GpuPasses] = {}
+
+    def on(self, device: Any) -> GpuPasses:
+        """The CUDA passes of this engine, with their tables on ``device``."""
+        if device not in self._devices:
+            from torchpcct.projector.gpu import GpuPasses
+
+            self._devices[device] = GpuPasses(self, device)
+        return self._devices[device]
 
     @property
     def domain_shape(self) -> tuple[int, ...]:

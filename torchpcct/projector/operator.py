@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from torchpcct.geometry import Geometry, VolumeGrid
+from torchpcct.projector import gpu
 from torchpcct.projector.engine import Engine
 from torchpcct.window import DetectorWindow
 
@@ -55,6 +56,10 @@ def _run(x: Tensor, engine: Engine, transposed: bool) -> Tensor:
     batch = math.prod(lead)
     if batch == 0:
         return x.new_zeros((*lead, *outer))
+    if x.device.type == "cuda" and gpu.available() and gpu.trusted(engine, x.device, x.dtype):
+        passes = engine.on(x.device)
+        flat = x.detach().reshape(batch, *inner)
+        return (passes.adjoint(flat) if transposed else passes.forward(flat)).reshape(*lead, *outer)
     array = x.detach().reshape(batch, *inner).cpu().contiguous().numpy()
     result = engine.adjoint(array) if transposed else engine.forward(array)
     return torch.from_numpy(np.ascontiguousarray(result)).reshape(*lead, *outer).to(x.device)
@@ -75,7 +80,8 @@ class Projector(nn.Module):
     In and out have one dtype (float32 or float64) and one device. Units: ``x`` in mm⁻¹ gives line integrals without
     unit. Both directions are differentiable any number of times and work under ``torch.func``. NaN and Inf in the
     input reach the output (a NaN may also reach readings that share a grid line with it). The module has no
-    parameters and no state.
+    parameters and no state. On CUDA the Triton kernels are used if Triton is installed and their first-use check
+    against the CPU passes; otherwise the data travel to the CPU and back.
 
     Args:
         geometry: ``ParallelBeam`` or ``FanBeam`` with a 2-D grid, ``ConeBeam`` with a 3-D grid.

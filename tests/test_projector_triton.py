@@ -1,0 +1,53 @@
+"""The Triton kernels against the CPU kernels, run by Triton's interpreter."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+import pytest
+import torch
+
+if "triton" not in sys.modules:
+    os.environ.setdefault("TRITON_INTERPRET", "1")
+pytest.importorskip("triton")
+from triton import knobs
+
+from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid
+from torchpcct.projector import Projector, gpu
+from torchpcct.window import DetectorWindow
+
+pytestmark = [
+    pytest.mark.skipif(not knobs.runtime.interpret, reason="triton was imported without TRITON_INTERPRET=1"),
+    pytest.mark.filterwarnings("ignore::DeprecationWarning"),  # NumPy's, from inside the interpreter
+]
+CPU = torch.device("cpu")
+_PLANE, _VOLUME = VolumeGrid((4, 3), (2.0, 1.7), (1.0, -0.5)), VolumeGrid((3, 2, 3), (1.5, 2.0, 2.2), (0.4, 1.0, -1.0))
+CASES = {
+    "parallel": (ParallelBeam([0.1, 2.0], 5, 1.7, 0.4), _PLANE, None),
+    "fan": (FanBeam([0.3, 0.8], 30.0, 60.0, 6, 3.0, 0.5), _PLANE, None),
+    "fan window": (FanBeam([4.0], 30.0, 60.0, 20, 1.0, detector="curved"), _PLANE, DetectorWindow([7], 5)),
+    "cone": (ConeBeam([0.7], 60.0, 110.0, 4, 3, (1.7, 2.5), (0.6, -0.6)), _VOLUME, None),
+    # So far from the source that slabs share depth layers.
+    "cone layered": (ConeBeam([2.4], 600.0, 1100.0, 4, 3, (1.7, 2.5), detector="curved"), _VOLUME, None),
+}
+
+
+@pytest.mark.parametrize("name", sorted(CASES))
+def test_same_weights_as_the_cpu(name):
+    A = Projector(*CASES[name])
+    passes = gpu.GpuPasses(A._engine, CPU)
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn((1, *A.domain_shape), generator=generator, dtype=torch.float64)
+    y = torch.randn((1, *A.range_shape), generator=generator, dtype=torch.float64)
+    torch.testing.assert_close(passes.forward(x), A(x), rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(passes.adjoint(y), A.T(y), rtol=1e-10, atol=1e-10)
+
+
+def test_a_deviating_kernel_is_refused(monkeypatch):
+    engine = Projector(*(FanBeam([0.0], 60.0, 110.0, 1, 1.0), VolumeGrid((1, 1), 3.0)))._engine
+    assert gpu.agrees(engine, CPU, torch.float32)
+    forward = gpu.GpuPasses.forward
+    monkeypatch.setattr(gpu.GpuPasses, "forward", lambda self, x: 1.001 * forward(self, x))
+    with pytest.warns(RuntimeWarning, match=r"differs from the CPU's by 1\.0e-03"):
+        assert not gpu.agrees(engine, CPU, torch.float32)
