@@ -179,20 +179,21 @@ def _add_by_kink(near, far, left, right, z, tau, step, total):
 
 
 @njit(**_INLINE)
-def _add_by_index(near, far, slab, i, j, z, step, origin, column, total):
+def _add_by_index(near, far, left, right, z, step, origin, column, lower, upper, total):
     """One voxel column, any magnification: interpolate the columns first, then look the rows up."""
     number = z.dtype.type
-    rows = slab.shape[0]
+    rows = left.size
     for r in range(rows):
-        column[r] = near * slab[r, i] + far * slab[r, j]
+        column[r] = near * left[r] + far * right[r]
     column[rows] = number(0)
     zero, last = number(0), number(rows - 1)
-    for k in range(z.size):
+    for k in range(z.size):  # apart from the look-ups, so that it vectorises
         row = min(max(z[k] * step + origin, zero), last)
-        lower = np.int32(row)
-        f = row - number(lower)
-        n = np.uint32(lower)
-        total[k] += (number(1) - f) * column[n] + f * column[n + np.uint32(1)]
+        lower[k] = np.int32(row)
+        upper[k] = row - number(lower[k])
+    for k in range(z.size):
+        m = np.uint32(lower[k])
+        total[k] += column[m] + upper[k] * (column[m + np.uint32(1)] - column[m])
 
 
 @njit(**_OPTIONS)
@@ -226,6 +227,8 @@ def backproject_3d(
         tau = np.zeros(padded, data.dtype)
         table = np.zeros((columns + 1, 3, padded), data.dtype)
         column = np.empty(rows + 1, data.dtype)
+        turned = np.empty((columns + 1, rows), data.dtype)
+        lower, upper = np.empty(padded, np.int32), np.empty(padded, data.dtype)
         for v in range(views):
             _positions_3d(kind, px, py, cosines[v], sines[v], sod, sdd, scale, starts[v], atan, index, weight, height)
             low, high, left, right = height[0], height[0], index[0], index[0]
@@ -247,18 +250,24 @@ def backproject_3d(
                         table[i - first, 0, k] = here[j]
                         table[i - first, 1, k] = here[j] - below[j]
                         table[i - first, 2, k] = above[j] - here[j]
+            else:
+                for r in range(rows):
+                    for i in range(first, end):
+                        turned[i - first, r] = slab[r, min(i, columns - 1)]
             for p in range(n):
                 position = min(max(index[p], 0.0), last)
                 i = int(position)
                 fraction = (position - i) * weight[p]
                 near, far = number(weight[p] - fraction), number(fraction)
                 step = number(height[p] * row_scale)
+                m = np.uint64(i - first)
                 if kink:
-                    m = np.uint64(i - first)
                     _add_by_kink(near, far, table[m], table[m + np.uint64(1)], heights, tau, step, total[p])
                 else:
-                    j = min(i + 1, columns - 1)
-                    _add_by_index(near, far, slab, i, j, heights, step, number(row_start), column, total[p])
+                    beside = turned[m + np.uint64(1)]
+                    _add_by_index(
+                        near, far, turned[m], beside, heights, step, number(row_start), column, lower, upper, total[p]
+                    )
         for k in range(nz):
             for p in range(n):
                 out[b, k, y0 + p // width, x0 + p % width] = total[p, k]

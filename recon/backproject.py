@@ -19,7 +19,7 @@ __all__ = ["BackprojectionPlan", "backproject", "check_data", "data_shape"]
 
 _KIND = {"parallel": 0, "flat": 1, "curved": 2}
 #: Voxel columns of one task of the 3-D backprojection: small enough for the caches, large enough to share look-ups.
-_TILE = (12, 24)
+_TILES = ((12, 24), (8, 12))
 #: Polynomial lengths of the arc tangent, for usual fans and for half-fans near 90°: one compiled variant each.
 _ATAN_TERMS = {torch.float32: (7, 20), torch.float64: (12, 20)}
 #: Errors of the fan angle, in columns, at which the longer polynomial takes over: far below rounding.
@@ -162,15 +162,15 @@ class BackprojectionPlan:
         return [*common, _atan_polynomial(reach, self.sdd * self.scale, dtype)]
 
     def _tile(self) -> tuple[int, int]:
-        """Tile of voxel columns over which heights on the detector change by about a row at most."""
+        """The largest tile over which heights on the detector change by about a row at most, if one will do."""
         _, dy, dx = self.grid.spacing
         reach = float(np.abs(self.grid.axes[0]).max()) * self.row_scale
         near = max(self.sod - math.hypot(*self.grid.center[1:]), 0.1 * self.sod)
         diagonal = near**2 / (self.sdd * max(reach, 1e-9))
-        y, x = _TILE
-        while math.hypot(y * dy, x * dx) > diagonal and max(y, x) > 4:
-            y, x = max(y // 2, 4), max(x // 2, 4)
-        return y, x
+        for y, x in _TILES:
+            if math.hypot(y * dy, x * dx) <= diagonal:
+                return y, x
+        return _TILES[0]
 
     def forward(self, data: Tensor) -> Tensor:
         """``(..., views, [rows,] columns)`` to ``(..., [z,] y, x)``."""
