@@ -13,7 +13,8 @@ from torch import Tensor
 from torchpcct.geometry import ConeBeam, VolumeGrid
 from torchpcct.plan import Plan, active_window, make_plan
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan, check_exposure
-from torchpcct.transmission import Beam, BodySet, expected_readings
+from torchpcct.transmission import SUB_RAY_COUNTS, Beam, BodySet, expected_readings
+from torchpcct.transmission import sub_rays as sub_rays_of
 from torchpcct.window import DetectorWindow, shadow
 
 if TYPE_CHECKING:
@@ -191,7 +192,9 @@ def acquire(
         surround = np.broadcast_to(air, air.shape)
     else:
         symmetric = build(energies, one, symmetric=True)
-        surround = expected_readings(one, whole, symmetric, beam, step[:1]).numpy()[:, 0]
+        # One view for all: the densest sampling of every effect costs nothing here.
+        dense = beam._replace(points=sub_rays_of(SUB_RAY_COUNTS[-1]))
+        surround = expected_readings(one, whole, symmetric, dense, step[:1]).numpy()[:, 0]
     counts = _readings(plan_, g, build, energies, beam, step, surround, progress)
     squeeze = scanner.detector.bins == 1
 
