@@ -4,7 +4,8 @@
 
 Peers take part where they are installed: ASTRA (``pip install astra-toolbox``) and the distance-driven C projector of
 XCIST, from the library that ships in ``gecatsim`` or the one named by ``--xcist``. Both use one core. Errors are
-relative L2 against exact, cell-averaged line integrals. The medians depend on what else the machine does; the ratios within a run less so.
+relative L2 against exact, cell-averaged line integrals. The medians
+depend on what else the machine does; the ratios within a run less.
 """
 
 from __future__ import annotations
