@@ -95,10 +95,7 @@ def cases() -> list[Callable[[], Case]]:
         ),
         lambda: Case("inset 128², 1968 × 1500", plane, inset, shadow(plane, inset)),
         lambda: Case(
-            "cone 128³, 360 × 192²",
-            ConeBeam(full_turn(360), 600.0, 1200.0, 192, 192, 1.5),
-            VolumeGrid((128,) * 3, 1.0),
-            sub=3,
+            "cone 128³, 360 × 192²", ConeBeam(full_turn(360), 600.0, 1200.0, 192, 192, 1.5), VolumeGrid((128,) * 3, 1.0)
         ),
         lambda: Case("inset 45² × 56, 0.2 mm", paper, plaque[0], shadow(paper, plaque[0]), soft),
         lambda: Case("inset 90² × 113, 0.1 mm", paper, plaque[1], shadow(paper, plaque[1]), soft),
@@ -295,17 +292,22 @@ def main() -> None:
     if library is None and (spec := importlib.util.find_spec("gecatsim")) and spec.origin:
         candidate = Path(spec.origin).parent / "lib" / "libcatsim.so"
         library = str(candidate) if candidate.exists() else None
-    rows = []
+    options.out.mkdir(parents=True, exist_ok=True)
+    rows: list[dict[str, Any]] = []
     for make in cases():
         rows += measure(make(), options.repeats, library)
-        print(table(rows).splitlines()[-1], flush=True)
-    grown = growth(options.repeats)
-    options.out.mkdir(parents=True, exist_ok=True)
-    report = f"{platform.processor() or platform.machine()}, torch {torch.__version__}\n\n{table(rows)}\n\n{grown}\n"
-    (options.out / "projectors.md").write_text(report)
-    (options.out / "projectors.json").write_text(json.dumps({"rows": rows, "growth": grown}, indent=1))
-    picture(rows, options.out / "projectors.png")
-    print(report)
+        _write(rows, None, options.out)  # a run cut short keeps what it measured
+    print(_write(rows, growth(options.repeats), options.out))
+
+
+def _write(rows: list[dict[str, Any]], grown: dict[str, Any] | None, out: Path) -> str:
+    report = f"{platform.processor() or platform.machine()}, torch {torch.__version__}\n\n{table(rows)}\n"
+    if grown is not None:
+        report += f"\nTime against size: {grown}\n"
+    (out / "projectors.md").write_text(report)
+    (out / "projectors.json").write_text(json.dumps({"rows": rows, "growth": grown}, indent=1))
+    picture(rows, out / "projectors.png")
+    return report
 
 
 if __name__ == "__main__":

@@ -19,17 +19,18 @@ from torchpcct.projector.volume_kernels import _FLAGS, _depth_line, _edge_line
 __all__ = ["backproject", "cell_values", "collect", "deal", "load_image", "project", "tabulate"]
 
 BLOCK = 16  # slabs per block: their knots fit the second-level cache
+# Light steps stay serial: a parallel kernel costs a second to compile and they take a millisecond.
 _small = njit(cache=True, fastmath=_FLAGS, error_model="numpy")
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@_small
 def tabulate(segments, offset, pose, edges, centers, first, lattice, slabs, parallel, p, q, gain, weight):
     """Edge lines ``p, q`` and cell gains of every segment (at ``offset[s]``), and the slab weights ``(segments, …)``.
 
     Cell width on slab r: divergent ``(q1 - q0) (r - r_source)``, parallel ``p1 - p0``.
     """
     real = p.dtype.type
-    for s in prange(segments.shape[0]):
+    for s in range(segments.shape[0]):
         v, axis, start, count = segments[s]
         at = pose[v]
         here = offset[s]
@@ -131,7 +132,7 @@ def project(lanes, segments, offset, start, by_row, by_column, p, q, gain, weigh
             )  # fmt: skip
 
 
-@njit(parallel=True, cache=True)
+@_small
 def deal(out, target, reverse, batch, data):
     """Lane readings ``(views, columns, lanes)`` to ``data``, ``(batch, views, columns)``.
 
@@ -139,7 +140,7 @@ def deal(out, target, reverse, batch, data):
     """
     operations = target.shape[1]
     columns = out.shape[1]
-    for v in prange(out.shape[0]):
+    for v in range(out.shape[0]):
         for g in range(operations):
             to = target[v, g]
             if to >= 0:
@@ -149,12 +150,12 @@ def deal(out, target, reverse, batch, data):
                         data[n, to, i] = out[v, j, n * operations + g]
 
 
-@njit(parallel=True, cache=True)
+@_small
 def cell_values(data, target, reverse, segments, offset, gain, values):
     """Transpose of ``deal``: readings times their gain as ``values``, ``(entries, lanes)``, overwritten."""
     operations = target.shape[1]
     batch, _, columns = data.shape
-    for s in prange(segments.shape[0]):
+    for s in range(segments.shape[0]):
         v, start, count, here = segments[s, 0], segments[s, 2], segments[s, 3], offset[s]
         values[here : here + count + 1] = 0
         for g in range(operations):
