@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchpcct.acquire import acquire, plan
+from torchpcct.acquisition import acquire, plan
 from torchpcct.geometry import ConeBeam, VolumeGrid, full_turn
 from torchpcct.scanner import presets
 from torchpcct.scene import Body, Ellipsoid, EllipticCylinder, Scene, SinusoidalMotion, chord_lengths

@@ -1,3 +1,43 @@
-"""Photon-counting CT in PyTorch."""
+"""Photon-counting CT in PyTorch: scenes, scanners, scans, projectors, metrics."""
+
+from typing import TYPE_CHECKING, Any
+
+from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
+
+if TYPE_CHECKING:
+    from torchpcct.acquisition import acquire
+    from torchpcct.projector import Projector
+    from torchpcct.scan import Scan
+    from torchpcct.volume import Volume
 
 __version__ = "0.1.0"
+
+__all__ = [
+    "ConeBeam",
+    "FanBeam",
+    "ParallelBeam",
+    "Projector",
+    "Scan",
+    "Volume",
+    "VolumeGrid",
+    "acquire",
+    "full_turn",
+]
+
+_LAZY = {
+    "Projector": "torchpcct.projector",
+    "Scan": "torchpcct.scan",
+    "Volume": "torchpcct.volume",
+    "acquire": "torchpcct.acquisition",
+}
+
+
+def __getattr__(name: str) -> Any:
+    # Kernels compile and torch loads on first use: ``import torchpcct`` stays quick.
+    if name in _LAZY:
+        import importlib
+
+        value = getattr(importlib.import_module(_LAZY[name]), name)
+        globals()[name] = value  # also takes the place of a submodule of the same name
+        return value
+    raise AttributeError(f"module 'torchpcct' has no attribute {name!r}")

@@ -214,7 +214,7 @@ def run(
     """
     from recon.exact_noise import roi_covariance
     from recon.inset import InsetFbp
-    from torchpcct.acquire import acquire
+    from torchpcct.acquisition import acquire
     from torchpcct.scanner import presets
     from torchpcct.scene.plaque import plaque_scene
 

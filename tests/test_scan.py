@@ -1,0 +1,209 @@
+"""Scans: files, logarithms, refusals."""
+
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+import torch
+
+from recon import reconstruct
+from recon.inset import InsetFbp
+from torchpcct import Scan, VolumeGrid, acquire, full_turn
+from torchpcct.scanner import presets
+from torchpcct.scene.plaque import plaque_scene
+
+INSET = VolumeGrid((6, 36, 36), 0.25, (0.0, -30.38, -29.63))
+
+
+def scanner(views=60):
+    s = presets.pcct(views=views)
+    return s.replace(geometry=replace(s.geometry, rows=8))
+
+
+SCENE, _ = plaque_scene(vessel_length=6.2)
+REGION = VolumeGrid((1, 1, 1), (6.4, 9.0, 9.0), INSET.center)
+
+
+@pytest.fixture(scope="module")
+def clean():
+    return acquire(SCENE, scanner(), region=REGION, duty=0.03, sub_rays=16)
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return acquire(SCENE, scanner(), duty=0.03, sub_rays=16)
+
+
+@pytest.mark.parametrize("noisy", [False, True])
+def test_round_trip(tmp_path, clean, noisy):
+    scan = clean.with_noise(0.35, 7) if noisy else clean
+    scan.save(tmp_path / "scan.h5")
+    back = Scan.load(tmp_path / "scan.h5")
+    assert torch.equal(back.counts, scan.counts)
+    assert torch.equal(back.air, scan.air)
+    assert torch.equal(back.surround, scan.surround)
+    assert back.window == scan.window
+    assert back.geometry == scan.geometry
+    assert (back.exposure_s, back.seed) == (scan.exposure_s, scan.seed)
+    assert back.info["scanner"] == scan.info["scanner"]
+    assert torch.equal(back.line_integrals(), scan.line_integrals())
+
+
+def test_whole_scan_round_trip(tmp_path, whole):
+    whole.save(tmp_path / "scan.h5")
+    back = Scan.load(tmp_path / "scan.h5")
+    assert back.window is None
+    assert torch.equal(back.counts, whole.counts)
+
+
+def test_truncated_foreign_and_newer_files(tmp_path, clean):
+    clean.save(tmp_path / "scan.h5")
+    content = (tmp_path / "scan.h5").read_bytes()
+    for share in (0.1, 0.5, 0.99):
+        (tmp_path / "cut.h5").write_bytes(content[: int(share * len(content))])
+        with pytest.raises(ValueError, match=r"cut\.h5"):
+            Scan.load(tmp_path / "cut.h5")
+    with h5py.File(tmp_path / "foreign.h5", "w") as file:
+        file["counts"] = np.zeros(3)
+    with pytest.raises(ValueError, match="not a torchpcct scan"):
+        Scan.load(tmp_path / "foreign.h5")
+    with h5py.File(tmp_path / "scan.h5", "a") as file:
+        file.attrs["version"] = 99
+    with pytest.raises(ValueError, match="update torchpcct"):
+        Scan.load(tmp_path / "scan.h5")
+    with pytest.raises(FileNotFoundError):
+        Scan.load(tmp_path / "none.h5")
+
+
+def test_nothing_is_half_written(tmp_path, clean, monkeypatch):
+    def fail(self, group):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(type(clean.linearisation), "save", fail)
+    with pytest.raises(KeyboardInterrupt):
+        clean.save(tmp_path / "scan.h5")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (lambda s: {"counts": s.counts * 0}, "all counts are zero"),
+        (lambda s: {"counts": s.counts * float("nan")}, "NaN or Inf"),
+        (lambda s: {"counts": -s.counts}, "negative"),
+        (lambda s: {"counts": s.counts[1:]}, "shape"),
+        (lambda s: {"air": s.air * 0}, "air readings"),
+        (lambda s: {"exposure_s": 0.0}, "exposure_s"),
+        (lambda s: {"surround": None}, "surround"),
+    ],
+)
+def test_bad_scans_are_refused(clean, change, match):
+    with pytest.raises(ValueError, match=match):
+        replace(clean, **change(clean))
+
+
+def test_noise_on_noise_is_refused(clean):
+    with pytest.raises(ValueError, match="noisy"):
+        clean.with_noise(0.35, 0).with_noise(0.35, 1)
+
+
+def test_the_logarithm_of_counts_is_finite_and_unbiased(clean):
+    """E[ln(N + ½)] − ln λ falls as λ⁻²: below 1e-3 from λ = 20 on; zero counts stay finite."""
+    flat = replace(
+        clean,
+        counts=torch.full_like(clean.counts, 20.0),
+        linearisation=replace(
+            clean.linearisation,
+            coefficients=np.ones((clean.geometry.columns, 1)),
+            scale=np.full(clean.geometry.columns, 10.0),
+        ),
+    )
+    truth = float((flat._at_window(flat.air.log()) - np.log(20.0)).double().mean())
+    noisy = flat.with_noise(1.0, 0)
+    measured = noisy.line_integrals().double()
+    standard_error = float(measured.sub(noisy._at_window(noisy.air.log())).std()) / np.sqrt(measured.numel())
+    assert abs(float(measured.mean()) - truth) < 1e-4 + 1 / (24 * 400) + 4 * standard_error
+    starved = flat.with_noise(1e-3, 0)
+    assert (starved.counts == 0).float().mean() > 0.9
+    assert torch.isfinite(starved.line_integrals()).all()
+
+
+def test_inset_from_the_window_equals_the_fbp_of_whole_rows(clean, whole):
+    for kernel in ("soft", "bone"):
+        a = reconstruct(clean, INSET, "fbp", kernel=kernel)
+        b = reconstruct(whole, INSET, "fbp", kernel=kernel)
+        torch.testing.assert_close(a.data, b.data, atol=0.05, rtol=0)
+        assert a.report["kernel"] == kernel
+
+
+def test_noise_beyond_the_window_does_not_matter(clean, whole):
+    """Noise is drawn around the inset's shadow only: the inset's noise is the same to a few per mille."""
+    noise_a = (
+        InsetFbp(clean, [INSET], ["soft"])(clean.with_noise(2.0, 3))[0] - InsetFbp(clean, [INSET], ["soft"])(clean)[0]
+    )
+    noise_b = (
+        InsetFbp(whole, [INSET], ["soft"])(whole.with_noise(2.0, 3))[0] - InsetFbp(whole, [INSET], ["soft"])(whole)[0]
+    )
+    assert float((noise_a - noise_b).square().mean() / noise_b.square().mean()) < 2e-3
+
+
+def test_refusals_of_reconstruct(clean):
+    with pytest.raises(ValueError, match="unknown method"):
+        reconstruct(clean, INSET, "magic")
+    with pytest.raises(ValueError, match="kernel"):
+        reconstruct(clean, INSET, "fbp", kernel="hard")
+    with pytest.raises(ValueError, match=r"field of view|region"):
+        reconstruct(clean, VolumeGrid((4, 4, 4), 0.2, (0, 0, 400.0)), "fbp")
+    with pytest.raises(ValueError, match="region"):
+        reconstruct(clean, VolumeGrid((4, 4, 4), 0.2, (0, 0, 60.0)), "fbp")
+    with pytest.raises(ValueError, match="too few photons"):
+        reconstruct(clean.with_noise(1e-5, 0), INSET, "fbp")
+    with pytest.raises(TypeError, match="Scan"):
+        reconstruct("scan.h5", INSET)
+
+
+def test_noise_falls_with_the_square_root_of_dose():
+    """log σ against log exposure over the inset's voxels: slope −0.50 ± 0.015 from 0.35 to 2.8 s."""
+    clean = acquire(SCENE, scanner(240), region=REGION, duty=0.1, sub_rays=16)
+    fbp = InsetFbp(clean, [INSET], ["soft"])
+    truth = fbp(clean)[0]
+    exposures = np.array([0.35, 0.7, 2.0, 2.8])
+    sd = [np.sqrt(np.mean([float((fbp(clean.with_noise(e, s))[0] - truth).square().mean()) for s in range(4)]))
+          for e in exposures]  # fmt: skip
+    assert np.polyfit(np.log(exposures), np.log(sd), 1)[0] == pytest.approx(-0.5, abs=0.015)
+
+
+def test_exact_roi_covariance_matches_monte_carlo():
+    from recon.exact_noise import roi_covariance
+    from torchpcct.metrics.roi import RoiMean, axial_grid
+
+    clean = acquire(SCENE, scanner(120), region=REGION, duty=0.05, sub_rays=16)
+    fbp = InsetFbp(clean, [INSET], ["soft", "bone"])
+    image = axial_grid(INSET.center)
+    y, x = np.meshgrid(image.axes[1] - INSET.center[1], image.axes[2] - INSET.center[2], indexing="ij")
+    rois = [RoiMean(INSET, image, np.hypot(y, x - c) < 0.5) for c in (1.5, 0.0)]
+    exact = roi_covariance(clean, fbp, [rois], 2.0)[0]
+    runs = []
+    for seed in range(60):
+        volumes = fbp(clean.with_noise(2.0, seed))[0]
+        runs.append([[float(roi(v)) for roi in rois] for v in volumes])
+    runs = np.array(runs)
+    expected = np.array([[float(roi(v)) for roi in rois] for v in fbp(clean)[0]])
+    for k in range(2):
+        sd = np.sqrt(np.diag(exact[k]))
+        # Four standard errors of a mean and of an SD from 60 runs.
+        assert (np.abs(runs[:, k].mean(0) - expected[k]) < 4 * sd / np.sqrt(60)).all()
+        np.testing.assert_allclose(runs[:, k].std(0, ddof=1), sd, rtol=4 / np.sqrt(120))
+        correlation = exact[k, 0, 1] / sd.prod()
+        assert np.corrcoef(runs[:, k].T)[0, 1] == pytest.approx(correlation, abs=0.5)
+
+
+def test_views_in_any_order_give_the_same_volume(clean):
+    g = clean.geometry
+    order = np.random.default_rng(0).permutation(g.views)
+    window = replace(clean.window, first_column=clean.window.first_column[order])
+    shuffled = replace(clean, geometry=g.select(order), counts=clean.counts[order], window=window)
+    a, b = reconstruct(clean, INSET, "fbp").data, reconstruct(shuffled, INSET, "fbp").data
+    torch.testing.assert_close(a, b, atol=0.02, rtol=0)
+    assert full_turn(g.views).shape == (g.views,)
