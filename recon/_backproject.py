@@ -159,41 +159,44 @@ def _positions_3d(kind, x, y, c, s, sod, sdd, scale, start, atan, index, weight,
             weight[p] = sod * sod / square
 
 
-@njit(**_INLINE)
-def _add_by_kink(near, far, left, right, z, tau, step, total):
-    """One voxel column: ``total += row interpolation``, three rows of each neighbour for every voxel.
+# These two take whole arrays and indices: a row as an array of its own costs more (reference counts) than its loop.
+
+
+@njit(inline="always", **_INLINE)
+def _add_by_kink(near, far, table, m, z, tau, step, total, p):
+    """One voxel column: ``total[p] += row interpolation``, three rows of each neighbour for every voxel.
 
     Where the heights of a voxel on the detector stay within one row of row κ for the whole tile, interpolation is
     ``g(κ) + min(t, 0) · (g(κ) − g(κ−1)) + max(t, 0) · (g(κ+1) − g(κ))`` with t the distance from κ: no index depends
     on the voxel column, and the loop along z vectorises.
     """
-    zero = z.dtype.type(0)
-    g0, d0, e0 = left[0], left[1], left[2]
-    g1, d1, e1 = right[0], right[1], right[2]
-    for k in range(total.size):
+    zero, n = z.dtype.type(0), m + np.uint64(1)
+    for k in range(np.uint64(z.size)):
         t = z[k] * step + tau[k]
         below, above = min(t, zero), max(t, zero)
-        total[k] += (
-            (near * g0[k] + far * g1[k]) + below * (near * d0[k] + far * d1[k]) + above * (near * e0[k] + far * e1[k])
+        total[p, k] += (
+            (near * table[m, 0, k] + far * table[n, 0, k])
+            + below * (near * table[m, 1, k] + far * table[n, 1, k])
+            + above * (near * table[m, 2, k] + far * table[n, 2, k])
         )
 
 
-@njit(**_INLINE)
-def _add_by_index(near, far, left, right, z, step, origin, column, lower, upper, total):
+@njit(inline="always", **_INLINE)
+def _add_by_index(near, far, turned, m, z, step, origin, column, lower, upper, total, p):
     """One voxel column, any magnification: interpolate the columns first, then look the rows up."""
-    number = z.dtype.type
-    rows = left.size
-    for r in range(rows):
-        column[r] = near * left[r] + far * right[r]
-    column[rows] = number(0)
+    number, n = z.dtype.type, m + np.uint64(1)
+    rows = turned.shape[1] - 2
+    for r in range(np.uint64(rows + 1)):
+        column[r] = near * turned[m, r + np.uint64(1)] + far * turned[n, r + np.uint64(1)]
     zero, last = number(0), number(rows - 1)
     for k in range(z.size):  # apart from the look-ups, so that it vectorises
         row = min(max(z[k] * step + origin, zero), last)
         lower[k] = np.int32(row)
         upper[k] = row - number(lower[k])
-    for k in range(z.size):
-        m = np.uint32(lower[k])
-        total[k] += column[m] + upper[k] * (column[m + np.uint32(1)] - column[m])
+    for k in range(np.uint64(z.size)):
+        near_row = np.uint32(lower[k])
+        a = column[near_row]
+        total[p, k] += a + upper[k] * (column[near_row + np.uint32(1)] - a)
 
 
 @njit(**_OPTIONS)
@@ -209,6 +212,7 @@ def backproject_3d(
     padded = (nz + 7) // 8 * 8
     last = columns - 1.0
     reach = max(abs(z[0]), abs(z[nz - 1])) * row_scale
+    origin = number(row_start)
     for task in prange(batch * tiles):
         b = task // tiles
         iy, ix = (task % tiles) // tiles_x, task % tiles_x
@@ -227,7 +231,7 @@ def backproject_3d(
         tau = np.zeros(padded, data.dtype)
         table = np.zeros((columns + 1, 3, padded), data.dtype)
         column = np.empty(rows + 1, data.dtype)
-        turned = np.empty((columns + 1, rows), data.dtype)
+        turned = np.empty((columns + 1, rows + 2), data.dtype)
         lower, upper = np.empty(padded, np.int32), np.empty(padded, data.dtype)
         for v in range(views):
             _positions_3d(kind, px, py, cosines[v], sines[v], sod, sdd, scale, starts[v], atan, index, weight, height)
@@ -238,22 +242,27 @@ def backproject_3d(
             first = int(min(max(left, 0.0), last))
             end = int(min(max(right, 0.0), last)) + 2
             slab = data[b, v]
+            # columns become contiguous; the outermost rows are repeated
+            for r in range(rows):
+                for i in range(first, end):
+                    turned[i - first, r + 1] = slab[r, min(i, columns - 1)]
+            for i in range(end - first):
+                turned[i, 0], turned[i, rows + 1] = turned[i, 1], turned[i, rows]
             kink = reach * (high - low) <= 1.0
             if kink:
                 for k in range(nz):
                     r = max(z[k] * low, z[k] * high) * row_scale + row_start
-                    middle = int(min(max(math.floor(r), 0.0), rows - 1.0))
+                    middle = min(max(math.floor(r), 0.0), rows - 1.0)
                     tau[k] = number(row_start - middle)
-                    below, here, above = slab[max(middle - 1, 0)], slab[middle], slab[min(middle + 1, rows - 1)]
-                    for i in range(first, end):
-                        j = min(i, columns - 1)
-                        table[i - first, 0, k] = here[j]
-                        table[i - first, 1, k] = here[j] - below[j]
-                        table[i - first, 2, k] = above[j] - here[j]
-            else:
-                for r in range(rows):
-                    for i in range(first, end):
-                        turned[i - first, r] = slab[r, min(i, columns - 1)]
+                    lower[k] = np.int32(middle)
+                for i in range(end - first):
+                    source, g, d, e = turned[i], table[i, 0], table[i, 1], table[i, 2]
+                    for k in range(nz):
+                        j = np.uint32(lower[k])
+                        here = source[j + np.uint32(1)]
+                        g[k] = here
+                        d[k] = here - source[j]
+                        e[k] = source[j + np.uint32(2)] - here
             for p in range(n):
                 position = min(max(index[p], 0.0), last)
                 i = int(position)
@@ -261,13 +270,11 @@ def backproject_3d(
                 near, far = number(weight[p] - fraction), number(fraction)
                 step = number(height[p] * row_scale)
                 m = np.uint64(i - first)
+                q = np.uint64(p)
                 if kink:
-                    _add_by_kink(near, far, table[m], table[m + np.uint64(1)], heights, tau, step, total[p])
+                    _add_by_kink(near, far, table, m, heights, tau, step, total, q)
                 else:
-                    beside = turned[m + np.uint64(1)]
-                    _add_by_index(
-                        near, far, turned[m], beside, heights, step, number(row_start), column, lower, upper, total[p]
-                    )
+                    _add_by_index(near, far, turned, m, heights, step, origin, column, lower, upper, total, q)
         for k in range(nz):
             for p in range(n):
                 out[b, k, y0 + p // width, x0 + p % width] = total[p, k]
@@ -288,6 +295,7 @@ def spread_3d(kind, volume, cosines, sines, starts, x, y, z, sod, sdd, scale, ro
         column = np.empty(rows + 1, volume.dtype)
         slab = np.zeros((columns + 1, rows), volume.dtype)
         heights = np.empty(nz, volume.dtype)
+        lower, upper = np.empty(nz, np.int32), np.empty(nz, volume.dtype)
         for k in range(nz):
             heights[k] = number(z[k])
         for iy in range(ny):
@@ -300,20 +308,22 @@ def spread_3d(kind, volume, cosines, sines, starts, x, y, z, sod, sdd, scale, ro
                 fraction = (position - int(position)) * weight[ix]
                 near, far = number(weight[ix] - fraction), number(fraction)
                 step = number(height[ix] * row_scale)
-                for r in range(rows + 1):
+                for r in range(np.uint64(rows + 1)):
                     column[r] = zero
-                values = volume[b, iy, ix]
                 for k in range(nz):
                     row = min(max(heights[k] * step + origin, zero), last_row)
-                    lower = np.int32(row)
-                    f = row - number(lower)
-                    part = f * values[k]
-                    m = np.uint32(lower)
-                    column[m] += values[k] - part
+                    lower[k] = np.int32(row)
+                    upper[k] = row - number(lower[k])
+                for k in range(np.uint64(nz)):
+                    m = np.uint32(lower[k])
+                    value = volume[b, iy, ix, k]
+                    part = upper[k] * value
+                    column[m] += value - part
                     column[m + np.uint32(1)] += part
-                for r in range(rows):
+                right = left + np.uint64(1)
+                for r in range(np.uint64(rows)):
                     slab[left, r] += near * column[r]
-                    slab[left + np.uint64(1), r] += far * column[r]
+                    slab[right, r] += far * column[r]
         for r in range(rows):
             for i in range(columns):
                 out[b, v, r, i] = slab[i, r]
