@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpcct.geometry import Geometry, VolumeGrid
+from torchpcct.projector.layers import layer_spacing, running_sums
 from torchpcct.projector.plane import PlanePasses
 from torchpcct.projector.rays import Rays, Segments, check_pair, check_source, rays_of, split
 from torchpcct.window import DetectorWindow
@@ -102,11 +103,9 @@ class Engine:
 
     @cached_property
     def _layer(self) -> float:
-        from torchpcct.projector import volume_kernels
-
         r = self.rays
         _, _, row0, row_pitch = self._heights()
-        return volume_kernels.layer_spacing(self._poses, self.grid, row0, row_pitch, r.rows)
+        return layer_spacing(self._poses, self.grid, row0, row_pitch, r.rows)
 
     def _heights(self) -> tuple[float, float, float, float]:
         z, dz = self.grid.axes[0][0], self.grid.spacing[0]
@@ -119,7 +118,7 @@ class Engine:
         _, ny, nx = self.grid.shape
         y = np.empty((x.shape[0], *self.range_shape), dtype=x.dtype)
         volume_kernels.project(
-            volume_kernels.running_sums(x), ny, nx, self._poses, r.edges, r.centers, r.first,
+            running_sums(x), ny, nx, self._poses, r.edges, r.centers, r.first,
             seg.table, seg.start, self.lattice, *self._heights(), self._layer, y,
         )  # fmt: skip
         return y
