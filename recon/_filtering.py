@@ -114,8 +114,19 @@ class FilterPlan:
     @property
     def chunk(self) -> int:
         """Views whose intermediate results in float64 stay near :data:`CHUNK_BYTES`."""
-        width = self._length if self.by_matrix else self._length + 4 * self._fft_size
+        width = self._length if self.by_matrix else self._length + 6 * self._fft_size
         return max(1, min(self.window_in.views, CHUNK_BYTES // (8 * self.window_out.rows * width)))
+
+    def buffer_bytes(self, itemsize: int) -> int:
+        """Memory of :meth:`forward` beside its input and output: frame, spectra, responses and weights."""
+        width, kernels, rows = self._length, len(self.kernels), self.window_out.rows
+        if self.by_matrix:
+            responses = width * self.window_out.columns * kernels * (itemsize + 16)
+        else:
+            width += 6 * self._fft_size
+            responses = 4 * 8 * self._fft_size * kernels
+        weights = (self.angular.size + rows * self.geometry.columns) * (8 + itemsize)
+        return self.chunk * rows * width * itemsize + responses + weights
 
     def _responses(self, like: Tensor) -> Tensor:
         """Matrices ``(K, length, width_out)``, or frequency responses ``(K, size // 2 + 1)``."""

@@ -18,7 +18,7 @@ from recon.backproject import BackprojectionPlan, backproject, check_data, data_
 from torchpcct.geometry import ConeBeam, Geometry, VolumeGrid
 from torchpcct.window import DetectorWindow, shadow
 
-__all__ = ["backproject", "fbp", "filter_sinogram", "filter_windowed", "interleave"]
+__all__ = ["backproject", "fbp", "filter_sinogram", "filter_windowed", "interleave", "memory_estimate"]
 
 G = TypeVar("G", bound=Geometry)
 
@@ -171,13 +171,41 @@ def fbp(
     Raises:
         ValueError, TypeError: as :func:`filter_sinogram` and :func:`backproject`.
     """
-    whole = full_window(geometry)
-    check_data("sinogram", sinogram, data_shape(geometry, whole))
+    check_data("sinogram", sinogram, data_shape(geometry, full_window(geometry)))
     if window is None:
-        try:
-            window = shadow(geometry, grid, margin=1)
-        except ValueError:
-            window = whole  # larger than the field of view: BackprojectionPlan decides
+        window = _shadow_or_whole(geometry, grid)
     plan = BackprojectionPlan(geometry, grid, window)
     filtered = filter_sinogram(sinogram, geometry, kernel, window, weights=weights)
     return apply_linear(filtered, plan.forward, plan.transpose)
+
+
+def _shadow_or_whole(geometry: Geometry, grid: VolumeGrid) -> DetectorWindow:
+    try:
+        return shadow(geometry, grid, margin=1)
+    except ValueError:
+        return full_window(geometry)  # a grid larger than the field of view: the backprojection decides
+
+
+def memory_estimate(
+    geometry: Geometry, grid: VolumeGrid, *, kernels: int = 1, batch: int = 1, dtype: torch.dtype = torch.float32
+) -> int:
+    """Memory in bytes that :func:`fbp` needs beside the sinogram, at its peak and without gradients.
+
+    Args:
+        geometry, grid: as for :func:`fbp`.
+        kernels: number of reconstruction kernels.
+        batch: number of sinograms (product of the leading dimensions).
+        dtype: ``torch.float32`` or ``torch.float64``.
+
+    Returns:
+        Bytes of the filtered data, the volumes, and the buffers of one chunk of views.
+
+    Raises:
+        ValueError: views that do not suffice for the geometry, a grid outside the field of view.
+    """
+    window = _shadow_or_whole(geometry, grid)
+    BackprojectionPlan(geometry, grid, window)
+    plan = FilterPlan(geometry, ("ram-lak",) * kernels, angular_weights(geometry), full_window(geometry), window)
+    filtered = batch * kernels * window.views * window.rows * window.columns
+    volumes = batch * kernels * grid.voxels
+    return (filtered + volumes) * dtype.itemsize + plan.buffer_bytes(dtype.itemsize)

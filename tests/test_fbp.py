@@ -346,3 +346,40 @@ def test_bad_input_is_named():
         filter_windowed(torch.zeros(9, 4, 19), cone, low, "soft", high)
     with pytest.raises(ValueError, match=r"rows 4…7 do not cover the grid"):
         backproject(torch.zeros(9, 4, 19), cone, VolumeGrid((3, 3, 3), 1.0), high)
+
+
+_PEAK = """
+import numpy as np, torch
+from recon.fbp import fbp, memory_estimate
+from torchpcct.geometry import ConeBeam, FanBeam, VolumeGrid, full_turn
+torch.set_num_threads(1)
+def peak():
+    return int(next(l for l in open("/proc/self/status") if l.startswith("VmHWM")).split()[1]) * 1024
+inset = {inset}
+if inset:
+    geometry = ConeBeam(full_turn(600), 626, 1098, 1500, 40, (0.5, 0.35), detector="curved")
+    grid = VolumeGrid((56, 45, 45), 0.2, (0.0, -30.38, -29.63))
+else:
+    geometry, grid = FanBeam(full_turn(6000), 626, 1098, 2500, 0.25), VolumeGrid((64, 64), 1.0)
+small = geometry.select(slice(None, None, 20))
+fbp(torch.zeros(small.shape), small, grid)  # compile
+data = torch.zeros(geometry.shape) + 1.0
+with open("/proc/self/clear_refs", "w") as f:
+    f.write("5")
+before = peak()
+fbp(data, geometry, grid, ("soft", "bone"))
+print(peak() - before, memory_estimate(geometry, grid, kernels=2))
+"""
+
+
+@pytest.mark.parametrize("inset", [True, False])
+def test_memory_is_predicted(inset):
+    import subprocess
+    import sys
+    from pathlib import Path
+
+    if not Path("/proc/self/clear_refs").exists():
+        pytest.skip("the peak of a process can be reset on Linux only")
+    out = subprocess.run([sys.executable, "-c", _PEAK.format(inset=inset)], capture_output=True, text=True, check=True)
+    measured, predicted = map(int, out.stdout.split())
+    assert 0.4 * predicted < measured < 1.15 * predicted + 8e6
