@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, Literal, overload
+from typing import Any, overload
 
 import torch
 
@@ -16,8 +16,7 @@ from torchpcct.volume import Volume
 
 __all__ = ["METHODS", "reconstruct"]
 
-Method = Literal["fbp", "pwls"]
-METHODS: tuple[str, ...] = ("fbp", "pwls")
+METHODS: tuple[str, ...] = ("fbp", "pwls", "mbir")
 
 Progress = Callable[[float], None]
 
@@ -46,7 +45,8 @@ def reconstruct(
         scan: one scan, or several realisations of one scan (same geometry, window and exposure).
         grid: ``(z, y, x)`` grid inside the field of view.
         method: ``"fbp"`` (FDK; option ``kernel``) or ``"pwls"`` (penalised weighted least squares with a q-GGMRF
-            prior, to convergence; options of :func:`recon.roi.reconstruct_pwls`).
+            prior, to convergence; options of :func:`recon.roi.reconstruct_pwls`). ``"mbir"`` stands for the package's
+            best model-based method, today that PWLS; ``report["method"]`` names what ran.
         progress: called with the finished fraction, 0…1.
         device: where the returned volumes lie.
         options: of the method.
@@ -72,7 +72,7 @@ def reconstruct(
             )
     if method == "fbp":
         volumes = _fbp(scans, grid, progress, **options)
-    elif method == "pwls":
+    elif method in ("pwls", "mbir"):
         from recon.roi import reconstruct_pwls
 
         volumes = reconstruct_pwls(scans, grid, progress=progress, **options)

@@ -53,7 +53,7 @@ class _Progress:
 
 def _common(parser: argparse.ArgumentParser, out_help: str, out_default: str | None) -> None:
     parser.add_argument("--seed", type=int, default=0, help="first seed of the noise, ≥ 0 (default 0)")
-    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to reconstruct (default cpu)")
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where volumes are kept (default cpu)")
     parser.add_argument(
         "--out", type=Path, default=out_default, required=out_default is None, metavar="PATH", help=out_help
     )
@@ -105,7 +105,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     reconstruct.add_argument("scan", type=Path, help="scan file written by simulate")
     _common(reconstruct, "volume to write: .nii, .nii.gz or .h5", None)
-    reconstruct.add_argument("--method", default="fbp", help="fbp or pwls (default fbp)")
+    reconstruct.add_argument("--method", default="fbp", help="fbp, pwls or mbir (default fbp)")
     reconstruct.add_argument("--kernel", default=None, help="FBP kernel: soft, standard, detail, bone, ram-lak")
     reconstruct.add_argument("--voxel", type=float, default=0.25, metavar="MM", help="voxel size (default 0.25)")
     reconstruct.add_argument(
