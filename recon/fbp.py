@@ -61,7 +61,8 @@ def filter_sinogram(
     The result carries the cosine, angular and redundancy weights, ready for :func:`backproject`.
 
     Args:
-        sinogram: line integrals ``(..., views, [rows,] columns)``, float32 or float64, any device.
+        sinogram: line integrals ``(..., views, [rows,] columns)``, float32 or float64. Data of another device are
+            filtered on the CPU and sent back.
         geometry: parallel, fan or cone beam.
         kernel: reconstruction kernel (:data:`recon.windows.KERNELS`) or a sequence of them.
         window: return only these readings of every view (rows and columns); default: all.
