@@ -17,10 +17,8 @@ from numba import njit, prange
 __all__ = ["backproject_2d", "backproject_3d", "spread_2d", "spread_3d"]
 
 PARALLEL, FLAT, CURVED = 0, 1, 2
-#: Lines of pixels of one task of the 2-D backprojection.
-BLOCK = 16
 
-# The loops over tasks only call a task: numba compiles serial code faster than the bodies of parallel loops.
+# Inside the parallel loops no slice is assigned to: numba 0.68 miscompiles some (`column[:] = 0` left an element out).
 # No "nnan" or "ninf": NaN and Inf of the data must reach the image.
 _FAST = {"contract", "nsz", "arcp"}
 _OPTIONS: Any = {"parallel": True, "cache": True, "error_model": "numpy", "fastmath": _FAST}
@@ -64,72 +62,78 @@ def _positions_2d(kind, x, y, c, s, sod, sdd, scale, start, last, atan, index, n
         far[i] = fraction
 
 
-@njit(**_INLINE)
-def _backproject_2d_task(task, kind, data, cosines, sines, starts, x, y, sod, sdd, scale, atan, out):
-    views, columns = data.shape[1:]
-    ny, nx = out.shape[1], out.shape[2]
-    number = data.dtype.type
-    blocks = (ny + BLOCK - 1) // BLOCK
-    b, first = task // blocks, (task % blocks) * BLOCK
-    end = min(first + BLOCK, ny)
-    total = np.zeros((BLOCK, nx), data.dtype)
-    index = np.empty(nx, np.int32)
-    near, far = np.empty(nx, data.dtype), np.empty(nx, data.dtype)
-    row = np.empty(columns + 1, data.dtype)
-    xs = np.empty(nx, data.dtype)
-    for i in range(nx):
-        xs[i] = number(x[i])
-    for v in range(views):
-        for i in range(columns):
-            row[i] = data[b, v, i]
-        row[columns] = number(0)  # read with weight 0 at the last column's centre
-        c, s, start = cosines[v], sines[v], starts[v]
-        for iy in range(first, end):
-            _positions_2d(kind, xs, y[iy], c, s, sod, sdd, scale, start, columns - 1, atan, index, near, far)
-            line = total[iy - first]
-            for i in range(nx):
-                k = np.uint32(index[i])
-                line[i] += near[i] * row[k] + far[i] * row[k + np.uint32(1)]
-    for iy in range(first, end):
-        for i in range(nx):
-            out[b, iy, i] = total[iy - first, i]
-
-
 @njit(**_OPTIONS)
 def backproject_2d(kind, data, cosines, sines, starts, x, y, sod, sdd, scale, atan, out):
     """``data (B, V, columns)`` into ``out (B, Y, X)``."""
-    for task in prange(data.shape[0] * ((out.shape[1] + BLOCK - 1) // BLOCK)):
-        _backproject_2d_task(task, kind, data, cosines, sines, starts, x, y, sod, sdd, scale, atan, out)
-
-
-@njit(**_INLINE)
-def _spread_2d_task(task, kind, volume, cosines, sines, starts, x, y, sod, sdd, scale, atan, out):
-    views, columns = out.shape[1:]
-    ny, nx = volume.shape[1], volume.shape[2]
-    number = volume.dtype.type
-    b, v = task // views, task % views
-    index = np.empty(nx, np.int32)
-    near, far = np.empty(nx, volume.dtype), np.empty(nx, volume.dtype)
-    row = np.zeros(columns + 1, volume.dtype)
-    xs = np.empty(nx, volume.dtype)
-    for i in range(nx):
-        xs[i] = number(x[i])
-    c, s, start = cosines[v], sines[v], starts[v]
-    for iy in range(ny):
-        _positions_2d(kind, xs, y[iy], c, s, sod, sdd, scale, start, columns - 1, atan, index, near, far)
+    batch, views, columns = data.shape
+    ny, nx = out.shape[1], out.shape[2]
+    number = data.dtype.type
+    block = 16
+    blocks = (ny + block - 1) // block
+    for task in prange(batch * blocks):
+        b, first = task // blocks, (task % blocks) * block
+        end = min(first + block, ny)
+        total = np.zeros((block, nx), data.dtype)
+        index = np.empty(nx, np.int32)
+        near, far = np.empty(nx, data.dtype), np.empty(nx, data.dtype)
+        row = np.empty(columns + 1, data.dtype)
+        xs = np.empty(nx, data.dtype)
         for i in range(nx):
-            k = np.uint32(index[i])
-            row[k] += near[i] * volume[b, iy, i]
-            row[k + np.uint32(1)] += far[i] * volume[b, iy, i]
-    for i in range(columns):
-        out[b, v, i] = row[i]
+            xs[i] = number(x[i])
+        for v in range(views):
+            for i in range(columns):
+                row[i] = data[b, v, i]
+            row[columns] = number(0)  # read with weight 0 at the last column's centre
+            for iy in range(first, end):
+                _positions_2d(
+                    kind,
+                    xs,
+                    y[iy],
+                    cosines[v],
+                    sines[v],
+                    sod,
+                    sdd,
+                    scale,
+                    starts[v],
+                    columns - 1,
+                    atan,
+                    index,
+                    near,
+                    far,
+                )
+                line = total[iy - first]
+                for i in range(nx):
+                    k = np.uint32(index[i])
+                    line[i] += near[i] * row[k] + far[i] * row[k + np.uint32(1)]
+        for iy in range(first, end):
+            for i in range(nx):
+                out[b, iy, i] = total[iy - first, i]
 
 
 @njit(**_OPTIONS)
 def spread_2d(kind, volume, cosines, sines, starts, x, y, sod, sdd, scale, atan, out):
     """Transpose of :func:`backproject_2d`: ``volume (B, Y, X)`` into ``out (B, V, columns)``."""
-    for task in prange(out.shape[0] * out.shape[1]):
-        _spread_2d_task(task, kind, volume, cosines, sines, starts, x, y, sod, sdd, scale, atan, out)
+    batch, views, columns = out.shape
+    ny, nx = volume.shape[1], volume.shape[2]
+    number = volume.dtype.type
+    for task in prange(batch * views):
+        b, v = task // views, task % views
+        index = np.empty(nx, np.int32)
+        near, far = np.empty(nx, volume.dtype), np.empty(nx, volume.dtype)
+        row = np.zeros(columns + 1, volume.dtype)
+        xs = np.empty(nx, volume.dtype)
+        for i in range(nx):
+            xs[i] = number(x[i])
+        for iy in range(ny):
+            _positions_2d(
+                kind, xs, y[iy], cosines[v], sines[v], sod, sdd, scale, starts[v], columns - 1, atan, index, near, far
+            )
+            for i in range(nx):
+                k = np.uint32(index[i])
+                row[k] += near[i] * volume[b, iy, i]
+                row[k + np.uint32(1)] += far[i] * volume[b, iy, i]
+        for i in range(columns):
+            out[b, v, i] = row[i]
 
 
 @njit(**_INLINE)
@@ -196,11 +200,12 @@ def _add_by_index(near, far, turned, m, z, step, origin, column, lower, upper, t
         total[p, k] += a + upper[k] * (column[near_row + np.uint32(1)] - a)
 
 
-@njit(**_INLINE)
-def _backproject_3d_task(
-    task, kind, data, cosines, sines, starts, x, y, z, sod, sdd, scale, row_scale, row_start, atan, tile_y, tile_x, out
+@njit(**_OPTIONS)
+def backproject_3d(
+    kind, data, cosines, sines, starts, x, y, z, sod, sdd, scale, row_scale, row_start, atan, tile_y, tile_x, out
 ):
-    views, rows, columns = data.shape[1:]
+    """``data (B, V, rows, columns)`` into ``out (B, Z, Y, X)``, tile by tile of ``tile_y × tile_x`` voxel columns."""
+    batch, views, rows, columns = data.shape
     nz, ny, nx = out.shape[1], out.shape[2], out.shape[3]
     number = data.dtype.type
     tiles_y, tiles_x = (ny + tile_y - 1) // tile_y, (nx + tile_x - 1) // tile_x
@@ -209,154 +214,117 @@ def _backproject_3d_task(
     last = columns - 1.0
     reach = max(abs(z[0]), abs(z[nz - 1])) * row_scale
     origin = number(row_start)
-    b = task // tiles
-    iy, ix = (task % tiles) // tiles_x, task % tiles_x
-    y0, y1 = iy * ny // tiles_y, (iy + 1) * ny // tiles_y
-    x0, x1 = ix * nx // tiles_x, (ix + 1) * nx // tiles_x
-    width = x1 - x0
-    n = (y1 - y0) * width
-    px, py = np.empty(n), np.empty(n)
-    for p in range(n):
-        px[p], py[p] = x[x0 + p % width], y[y0 + p // width]
-    index, weight, height = np.empty(n), np.empty(n), np.empty(n)
-    total = np.zeros((n, padded), data.dtype)
-    heights = np.zeros(padded, data.dtype)
-    for k in range(nz):
-        heights[k] = number(z[k])
-    tau = np.zeros(padded, data.dtype)
-    table = np.zeros((columns + 1, 3, padded), data.dtype)
-    column = np.empty(rows + 1, data.dtype)
-    turned = np.empty((columns + 1, rows + 2), data.dtype)
-    lower, upper = np.empty(padded, np.int32), np.empty(padded, data.dtype)
-    for v in range(views):
-        _positions_3d(kind, px, py, cosines[v], sines[v], sod, sdd, scale, starts[v], atan, index, weight, height)
-        low, high, left, right = height[0], height[0], index[0], index[0]
+    for task in prange(batch * tiles):
+        b = task // tiles
+        iy, ix = (task % tiles) // tiles_x, task % tiles_x
+        y0, y1 = iy * ny // tiles_y, (iy + 1) * ny // tiles_y
+        x0, x1 = ix * nx // tiles_x, (ix + 1) * nx // tiles_x
+        width = x1 - x0
+        n = (y1 - y0) * width
+        px, py = np.empty(n), np.empty(n)
         for p in range(n):
-            low, high = min(low, height[p]), max(high, height[p])
-            left, right = min(left, index[p]), max(right, index[p])
-        first = int(min(max(left, 0.0), last))
-        end = int(min(max(right, 0.0), last)) + 2
-        slab = data[b, v]
-        # columns become contiguous; the outermost rows are repeated
-        for r in range(rows):
-            for i in range(first, end):
-                turned[i - first, r + 1] = slab[r, min(i, columns - 1)]
-        for i in range(end - first):
-            turned[i, 0], turned[i, rows + 1] = turned[i, 1], turned[i, rows]
-        kink = reach * (high - low) <= 1.0
-        if kink:
-            for k in range(nz):
-                r = max(z[k] * low, z[k] * high) * row_scale + row_start
-                middle = min(max(math.floor(r), 0.0), rows - 1.0)
-                tau[k] = number(row_start - middle)
-                lower[k] = np.int32(middle)
+            px[p], py[p] = x[x0 + p % width], y[y0 + p // width]
+        index, weight, height = np.empty(n), np.empty(n), np.empty(n)
+        total = np.zeros((n, padded), data.dtype)
+        heights = np.zeros(padded, data.dtype)
+        for k in range(nz):
+            heights[k] = number(z[k])
+        tau = np.zeros(padded, data.dtype)
+        table = np.zeros((columns + 1, 3, padded), data.dtype)
+        column = np.empty(rows + 1, data.dtype)
+        turned = np.empty((columns + 1, rows + 2), data.dtype)
+        lower, upper = np.empty(padded, np.int32), np.empty(padded, data.dtype)
+        for v in range(views):
+            _positions_3d(kind, px, py, cosines[v], sines[v], sod, sdd, scale, starts[v], atan, index, weight, height)
+            low, high, left, right = height[0], height[0], index[0], index[0]
+            for p in range(n):
+                low, high = min(low, height[p]), max(high, height[p])
+                left, right = min(left, index[p]), max(right, index[p])
+            first = int(min(max(left, 0.0), last))
+            end = int(min(max(right, 0.0), last)) + 2
+            slab = data[b, v]
+            # columns become contiguous; the outermost rows are repeated
+            for r in range(rows):
+                for i in range(first, end):
+                    turned[i - first, r + 1] = slab[r, min(i, columns - 1)]
             for i in range(end - first):
-                source, g, d, e = turned[i], table[i, 0], table[i, 1], table[i, 2]
-                for k in range(nz):
-                    j = np.uint32(lower[k])
-                    here = source[j + np.uint32(1)]
-                    g[k] = here
-                    d[k] = here - source[j]
-                    e[k] = source[j + np.uint32(2)] - here
-        for p in range(n):
-            position = min(max(index[p], 0.0), last)
-            i = int(position)
-            fraction = (position - i) * weight[p]
-            near, far = number(weight[p] - fraction), number(fraction)
-            step = number(height[p] * row_scale)
-            m = np.uint64(i - first)
-            q = np.uint64(p)
+                turned[i, 0], turned[i, rows + 1] = turned[i, 1], turned[i, rows]
+            kink = reach * (high - low) <= 1.0
             if kink:
-                _add_by_kink(near, far, table, m, heights, tau, step, total, q)
-            else:
-                _add_by_index(near, far, turned, m, heights, step, origin, column, lower, upper, total, q)
-    for k in range(nz):
-        for p in range(n):
-            out[b, k, y0 + p // width, x0 + p % width] = total[p, k]
-
-
-@njit(**_OPTIONS)
-def backproject_3d(
-    kind, data, cosines, sines, starts, x, y, z, sod, sdd, scale, row_scale, row_start, atan, tile_y, tile_x, out
-):
-    """``data (B, V, rows, columns)`` into ``out (B, Z, Y, X)``, tile by tile of ``tile_y × tile_x`` voxel columns."""
-    tiles = ((out.shape[2] + tile_y - 1) // tile_y) * ((out.shape[3] + tile_x - 1) // tile_x)
-    for task in prange(data.shape[0] * tiles):
-        _backproject_3d_task(
-            task,
-            kind,
-            data,
-            cosines,
-            sines,
-            starts,
-            x,
-            y,
-            z,
-            sod,
-            sdd,
-            scale,
-            row_scale,
-            row_start,
-            atan,
-            tile_y,
-            tile_x,
-            out,
-        )
-
-
-@njit(**_INLINE)
-def _spread_3d_task(
-    task, kind, volume, cosines, sines, starts, x, y, z, sod, sdd, scale, row_scale, row_start, atan, out
-):
-    views, rows, columns = out.shape[1:]
-    ny, nx, nz = volume.shape[1], volume.shape[2], volume.shape[3]
-    number = volume.dtype.type
-    zero, last = number(0), columns - 1.0
-    last_row, origin = number(rows - 1), number(row_start)
-    b, v = task // views, task % views
-    index, weight, height = np.empty(nx), np.empty(nx), np.empty(nx)
-    line = np.empty(nx)
-    column = np.empty(rows + 1, volume.dtype)
-    slab = np.zeros((columns + 1, rows), volume.dtype)
-    heights = np.empty(nz, volume.dtype)
-    lower, upper = np.empty(nz, np.int32), np.empty(nz, volume.dtype)
-    for k in range(nz):
-        heights[k] = number(z[k])
-    for iy in range(ny):
-        for ix in range(nx):
-            line[ix] = y[iy]
-        _positions_3d(kind, x, line, cosines[v], sines[v], sod, sdd, scale, starts[v], atan, index, weight, height)
-        for ix in range(nx):
-            position = min(max(index[ix], 0.0), last)
-            left = np.uint64(int(position))
-            fraction = (position - int(position)) * weight[ix]
-            near, far = number(weight[ix] - fraction), number(fraction)
-            step = number(height[ix] * row_scale)
-            for r in range(np.uint64(rows + 1)):
-                column[r] = zero
-            for k in range(nz):
-                row = min(max(heights[k] * step + origin, zero), last_row)
-                lower[k] = np.int32(row)
-                upper[k] = row - number(lower[k])
-            for k in range(np.uint64(nz)):
-                m = np.uint32(lower[k])
-                value = volume[b, iy, ix, k]
-                part = upper[k] * value
-                column[m] += value - part
-                column[m + np.uint32(1)] += part
-            right = left + np.uint64(1)
-            for r in range(np.uint64(rows)):
-                slab[left, r] += near * column[r]
-                slab[right, r] += far * column[r]
-    for r in range(rows):
-        for i in range(columns):
-            out[b, v, r, i] = slab[i, r]
+                for k in range(nz):
+                    r = max(z[k] * low, z[k] * high) * row_scale + row_start
+                    middle = min(max(math.floor(r), 0.0), rows - 1.0)
+                    tau[k] = number(row_start - middle)
+                    lower[k] = np.int32(middle)
+                for i in range(end - first):
+                    source, g, d, e = turned[i], table[i, 0], table[i, 1], table[i, 2]
+                    for k in range(nz):
+                        j = np.uint32(lower[k])
+                        here = source[j + np.uint32(1)]
+                        g[k] = here
+                        d[k] = here - source[j]
+                        e[k] = source[j + np.uint32(2)] - here
+            for p in range(n):
+                position = min(max(index[p], 0.0), last)
+                i = int(position)
+                fraction = (position - i) * weight[p]
+                near, far = number(weight[p] - fraction), number(fraction)
+                step = number(height[p] * row_scale)
+                m = np.uint64(i - first)
+                q = np.uint64(p)
+                if kink:
+                    _add_by_kink(near, far, table, m, heights, tau, step, total, q)
+                else:
+                    _add_by_index(near, far, turned, m, heights, step, origin, column, lower, upper, total, q)
+        for k in range(nz):
+            for p in range(n):
+                out[b, k, y0 + p // width, x0 + p % width] = total[p, k]
 
 
 @njit(**_OPTIONS)
 def spread_3d(kind, volume, cosines, sines, starts, x, y, z, sod, sdd, scale, row_scale, row_start, atan, out):
     """Transpose of :func:`backproject_3d`: ``volume (B, Y, X, Z)`` into ``out (B, V, rows, columns)``."""
-    for task in prange(out.shape[0] * out.shape[1]):
-        _spread_3d_task(
-            task, kind, volume, cosines, sines, starts, x, y, z, sod, sdd, scale, row_scale, row_start, atan, out
-        )
+    batch, views, rows, columns = out.shape
+    ny, nx, nz = volume.shape[1], volume.shape[2], volume.shape[3]
+    number = volume.dtype.type
+    zero, last = number(0), columns - 1.0
+    last_row, origin = number(rows - 1), number(row_start)
+    for task in prange(batch * views):
+        b, v = task // views, task % views
+        index, weight, height = np.empty(nx), np.empty(nx), np.empty(nx)
+        line = np.empty(nx)
+        column = np.empty(rows + 1, volume.dtype)
+        slab = np.zeros((columns + 1, rows), volume.dtype)
+        heights = np.empty(nz, volume.dtype)
+        lower, upper = np.empty(nz, np.int32), np.empty(nz, volume.dtype)
+        for k in range(nz):
+            heights[k] = number(z[k])
+        for iy in range(ny):
+            for ix in range(nx):
+                line[ix] = y[iy]
+            _positions_3d(kind, x, line, cosines[v], sines[v], sod, sdd, scale, starts[v], atan, index, weight, height)
+            for ix in range(nx):
+                position = min(max(index[ix], 0.0), last)
+                left = np.uint64(int(position))
+                fraction = (position - int(position)) * weight[ix]
+                near, far = number(weight[ix] - fraction), number(fraction)
+                step = number(height[ix] * row_scale)
+                for r in range(np.uint64(rows + 1)):
+                    column[r] = zero
+                for k in range(nz):
+                    row = min(max(heights[k] * step + origin, zero), last_row)
+                    lower[k] = np.int32(row)
+                    upper[k] = row - number(lower[k])
+                for k in range(np.uint64(nz)):
+                    m = np.uint32(lower[k])
+                    value = volume[b, iy, ix, k]
+                    part = upper[k] * value
+                    column[m] += value - part
+                    column[m + np.uint32(1)] += part
+                right = left + np.uint64(1)
+                for r in range(np.uint64(rows)):
+                    slab[left, r] += near * column[r]
+                    slab[right, r] += far * column[r]
+        for r in range(rows):
+            for i in range(columns):
+                out[b, v, r, i] = slab[i, r]
