@@ -95,10 +95,11 @@ def parker_share(beta: Floats, gamma: Floats, half_fan: float) -> Floats:
     rise = 2.0 * (half_fan + gamma)  # the line at β < rise is measured again at the end of the scan
     fall = math.pi + 2.0 * gamma
     end = math.pi + 2.0 * half_fan
-    with np.errstate(divide="ignore", invalid="ignore"):
-        up = np.sin(0.5 * math.pi * np.clip(beta / rise, 0.0, 1.0)) ** 2
-        down = np.sin(0.5 * math.pi * np.clip((end - beta) / (end - fall), 0.0, 1.0)) ** 2
-    share = np.where(beta < rise, up, np.where(beta <= fall, 1.0, down))
+    # A ray at the fan's edge in a minimal scan meets its opposite at the very ends: one of the two, the first, counts.
+    tiny = np.finfo(np.float64).tiny
+    up = np.sin(0.5 * math.pi * np.clip(beta / np.maximum(rise, tiny), 0.0, 1.0)) ** 2
+    down = np.sin(0.5 * math.pi * np.clip((end - beta) / np.maximum(end - fall, tiny), 0.0, 1.0)) ** 2
+    share = np.where(beta < rise, up, np.where(beta < fall, 1.0, down))
     return np.where((beta < 0.0) | (beta > end), 0.0, share)
 
 

@@ -30,7 +30,7 @@ def line_of_ray(beta: float, gamma: float) -> tuple[float, float]:
     half_fan=st.floats(0.05, 1.5),
     extra=st.floats(0, 1),
     where=st.floats(0, 1),
-    ray=st.floats(-1, 1),
+    ray=st.floats(-0.999, 0.999),
 )
 def test_pairs_of_opposite_rays_share_one(half_fan, extra, where, ray):
     """w(β, γ) + w(β′, −γ) = 1 on minimal (extra 0), over- and nearly full (extra 1) scans."""
@@ -48,6 +48,11 @@ def test_pairs_of_opposite_rays_share_one(half_fan, extra, where, ray):
     ]
     assert min(shares) >= 0
     assert sum(shares) == pytest.approx(1, abs=1e-12)
+
+
+def test_the_outermost_ray_of_a_minimal_scan_counts_once():
+    ends = np.array([0.0, math.pi + 2.0])
+    assert parker_share(ends, np.array([-1.0, 1.0]), 1.0).tolist() == [1.0, 0.0]
 
 
 def test_parker_is_smooth_and_not_all_ones():
