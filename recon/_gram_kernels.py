@@ -1,0 +1,138 @@
+"""CPU kernels of the Gram operator: Hermitian banded matrices along z, one per in-plane frequency."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+__all__ = ["banded_add", "banded_cholesky", "stiffen"]
+
+
+@njit(parallel=True, cache=True, fastmath={"contract", "reassoc", "nsz"})
+def banded_add(kernel, x, scale, out):
+    """out += scale · K x for every frequency.
+
+    Args:
+        kernel: ``(reach + 1, nz, fy, fx)`` lower bands; the main diagonal is real.
+        x, out: ``(batch, nz, fy, fx)`` complex, contiguous.
+        scale: real, in the precision of x.
+    """
+    bands, nz, fy, fx = kernel.shape
+    batch = x.shape[0]
+    for y in prange(fy):
+        for n in range(batch):
+            for z in range(nz):
+                to = out[n, z, y]
+                here, diagonal = x[n, z, y], kernel[0, z, y]
+                for i in range(fx):
+                    to[i] += (scale * diagonal[i].real) * here[i]
+                for b in range(1, bands):
+                    if z >= b:
+                        lower, below = kernel[b, z - b, y], x[n, z - b, y]
+                        for i in range(fx):
+                            to[i] += scale * (lower[i] * below[i])
+                    if z + b < nz:
+                        upper, above = kernel[b, z, y], x[n, z + b, y]
+                        for i in range(fx):
+                            to[i] += scale * (upper[i].conjugate() * above[i])
+
+
+@njit(parallel=True, cache=True)
+def banded_cholesky(kernel, least, lower, definite):
+    """L with L Lᴴ = K for every frequency, and whether K is positive definite there.
+
+    Args:
+        kernel: ``(reach + 1, nz, frequencies)`` complex128 lower bands.
+        least: smallest pivot that counts as positive, as a share of the main diagonal.
+        lower: like kernel; filled up to the first pivot that fails.
+        definite: ``(frequencies,)`` bool.
+    """
+    bands, nz, count = kernel.shape
+    for f in prange(count):
+        good = True
+        for j in range(nz):
+            for b in range(min(bands, nz - j)):
+                value = kernel[b, j, f]
+                for i in range(max(0, j + b - bands + 1), j):
+                    value -= lower[j + b - i, i, f] * lower[j - i, i, f].conjugate()
+                if b == 0:
+                    diagonal = kernel[0, j, f].real
+                    if not (diagonal > 0.0 and value.real > least * diagonal):
+                        good = False
+                        break
+                    lower[0, j, f] = math.sqrt(value.real)
+                else:
+                    lower[b, j, f] = value / lower[0, j, f].real
+            if not good:
+                break
+        definite[f] = good
+
+
+@njit(inline="always")
+def _first_failure(matrix, least, lower):
+    """Slice at which the banded Cholesky factorisation meets a pivot ≤ least · diagonal; −1 if none."""
+    bands, nz = matrix.shape
+    for j in range(nz):
+        for b in range(min(bands, nz - j)):
+            value = matrix[b, j]
+            for i in range(max(0, j + b - bands + 1), j):
+                value -= lower[j + b - i, i] * lower[j - i, i].conjugate()
+            if b == 0:
+                diagonal = matrix[0, j].real
+                if not (diagonal > 0.0 and value.real > least * diagonal):
+                    return j
+                lower[0, j] = math.sqrt(value.real)
+            else:
+                lower[b, j] = value / lower[0, j].real
+    return -1
+
+
+@njit(parallel=True, cache=True)
+def stiffen(terms, points, least, step, most, definite):
+    """Tie neighbouring slices together, just where and as much as the matrices Σ_c points[k, c] terms[c] need it.
+
+    Args:
+        terms: ``(terms, reach + 1, nz, frequencies)`` complex128 lower bands; ``terms[0]`` is changed in place.
+        points: ``(points, terms)``.
+        least: smallest pivot, as a share of the diagonal.
+        step: stiffness added at a time, as a share of the mean diagonal.
+        most: largest number of additions per frequency.
+        definite: ``(frequencies,)`` bool, whether it succeeded.
+    """
+    count, bands, nz, frequencies = terms.shape
+    for f in prange(frequencies):
+        matrix = np.empty((bands, nz), dtype=np.complex128)
+        lower = np.empty((bands, nz), dtype=np.complex128)
+        level = 0.0
+        for z in range(nz):
+            level += abs(terms[0, 0, z, f].real) / nz
+        added = 0
+        good = True
+        k = 0
+        passed = 0
+        while passed < points.shape[0]:
+            for b in range(bands):
+                for z in range(nz):
+                    value = terms[0, b, z, f]
+                    for c in range(1, count):
+                        value += points[k, c] * terms[c, b, z, f]
+                    matrix[b, z] = value
+            j = _first_failure(matrix, least, lower)
+            if j < 0:
+                passed += 1
+                k = (k + 1) % points.shape[0]
+                continue
+            passed = 0
+            if added >= most or bands < 2 or nz < 2:
+                good = False
+                break
+            added += 1
+            upper = max(j, 1)
+            # Larger doses where many were needed.
+            stiffness = step * level * (1.0 + 0.05 * added)
+            terms[0, 0, upper, f] += stiffness
+            terms[0, 0, upper - 1, f] += stiffness
+            terms[0, 1, upper - 1, f] -= stiffness
+        definite[f] = good

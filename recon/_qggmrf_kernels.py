@@ -1,0 +1,146 @@
+"""CPU kernels of the q-GGMRF: the passes of :class:`recon.qggmrf.BoundPrior`, fused over all neighbours.
+
+The curvature formula is that of ``BoundPrior.curvature``, to which the tests compare these kernels. Rows of voxels are
+independent of each other in every pass, so results do not depend on the number of threads. Inner loops run over slices
+with unsigned indices and without branches (one loop for each kind of potential), so that they vectorise.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit, prange
+
+__all__ = ["along", "majorize"]
+
+_FLAGS = {"contract", "reassoc", "arcp", "nsz"}
+
+
+@njit(inline="always")
+def _general(t: Any, form: Any) -> Any:
+    """ρ'(t) / t for any 1 ≤ q ≤ p ≤ 2."""
+    r = abs(t) * form[0]
+    one = form[0] / form[0]
+    if form[3] != 0:
+        r = np.sqrt(r * r + form[4] * form[4])
+    bend = r ** form[1]
+    d = one + bend
+    c = (one + form[2] * bend) / (d * d)
+    return c * r ** form[3] if form[3] != 0 else c
+
+
+@njit(inline="always")
+def _add_pull(x0, x1, v0, v1, scale, factor, kind, form, to):
+    """to += factor · ρ'(t)/t · (v0 − v1), t = scale · (x0 − x1)."""
+    n = x0.size
+    one = form[0] / form[0]
+    if kind == 0:
+        for j in range(n):
+            i = np.uint64(j)
+            to[i] += factor * (v0[i] - v1[i])
+    elif kind == 1:
+        reach, ratio = scale * form[0], form[2]
+        for j in range(n):
+            i = np.uint64(j)
+            r = abs(x0[i] - x1[i]) * reach
+            d = one + r
+            to[i] += factor * (one + ratio * r) / (d * d) * (v0[i] - v1[i])
+    else:
+        for j in range(n):
+            i = np.uint64(j)
+            to[i] += factor * _general((x0[i] - x1[i]) * scale, form) * (v0[i] - v1[i])
+
+
+@njit(inline="always")
+def _two_sums(x0, x1, u0, u1, v0, v1, scale, kind, form):
+    """Sums of ρ'(t)/t · (x0 − x1)(v0 − v1) and ρ'(t)/t · (u0 − u1)(v0 − v1)."""
+    n = x0.size
+    one = form[0] / form[0]
+    a = b = one - one
+    if kind == 0:
+        for j in range(n):
+            i = np.uint64(j)
+            a += (x0[i] - x1[i]) * (v0[i] - v1[i])
+            b += (u0[i] - u1[i]) * (v0[i] - v1[i])
+    elif kind == 1:
+        reach, ratio = scale * form[0], form[2]
+        for j in range(n):
+            i = np.uint64(j)
+            t = x0[i] - x1[i]
+            r = abs(t) * reach
+            d = one + r
+            c = (one + ratio * r) / (d * d) * (v0[i] - v1[i])
+            a += c * t
+            b += c * (u0[i] - u1[i])
+    else:
+        for j in range(n):
+            i = np.uint64(j)
+            t = x0[i] - x1[i]
+            c = _general(t * scale, form) * (v0[i] - v1[i])
+            a += c * t
+            b += c * (u0[i] - u1[i])
+    return a, b
+
+
+@njit(parallel=True, cache=True, fastmath=_FLAGS, error_model="numpy")
+def majorize(x: Any, v: Any, steps: Any, scales: Any, factors: Any, kind: int, form: Any, out: Any) -> None:
+    """out = Σ_neighbours factor · ρ'(t)/t · (v_j − v_k), t = scale · (x_j − x_k).
+
+    Args:
+        x, v: ``(batch, nz, ny, nx)`` contiguous.
+        steps: ``(neighbours, 3)`` int64, ALL neighbours (both signs).
+        scales, factors: ``(neighbours,)`` in the dtype of x: 1 / (hu d) and λ V ω / (hu d)².
+        kind: 0 quadratic, 1 p = 2 and q = 1 (no powers), 2 general.
+        form: ``(5,)`` in the dtype of x: 1 / T, p − q, q / p, p − 2, ε / T.
+        out: like x.
+    """
+    batch, nz, ny, nx = x.shape
+    for row in prange(batch * nz * ny):
+        n = row // (nz * ny)
+        z = (row // ny) % nz
+        y = row % ny
+        to = out[n, z, y]
+        to[:] = 0
+        for k in range(steps.shape[0]):
+            z1, y1, dx = z + steps[k, 0], y + steps[k, 1], steps[k, 2]
+            if z1 < 0 or z1 >= nz or y1 < 0 or y1 >= ny:
+                continue
+            low, high = max(0, -dx), nx - max(0, dx)
+            _add_pull(
+                x[n, z, y, low:high], x[n, z1, y1, low + dx : high + dx],
+                v[n, z, y, low:high], v[n, z1, y1, low + dx : high + dx],
+                scales[k], factors[k], kind, form, to[low:high],
+            )  # fmt: skip
+
+
+@njit(parallel=True, cache=True, fastmath=_FLAGS, error_model="numpy")
+def along(x: Any, u: Any, v: Any, steps: Any, scales: Any, factors: Any, kind: int, form: Any, out: Any) -> None:
+    """Row sums of the two inner products ⟨v, M(x) x⟩ and ⟨v, M(x) u⟩, M the matrix of :func:`majorize`.
+
+    Args:
+        steps, scales, factors: HALF of the neighbours.
+        out: ``(batch, nz, ny, 2)`` float64.
+        x, u, v, kind, form: as in :func:`majorize`.
+    """
+    batch, nz, ny, nx = x.shape
+    for row in prange(batch * nz * ny):
+        n = row // (nz * ny)
+        z = (row // ny) % nz
+        y = row % ny
+        first = second = 0.0
+        for k in range(steps.shape[0]):
+            z1, y1, dx = z + steps[k, 0], y + steps[k, 1], steps[k, 2]
+            if z1 < 0 or z1 >= nz or y1 < 0 or y1 >= ny:
+                continue
+            low, high = max(0, -dx), nx - max(0, dx)
+            a, b = _two_sums(
+                x[n, z, y, low:high], x[n, z1, y1, low + dx : high + dx],
+                u[n, z, y, low:high], u[n, z1, y1, low + dx : high + dx],
+                v[n, z, y, low:high], v[n, z1, y1, low + dx : high + dx],
+                scales[k], kind, form,
+            )  # fmt: skip
+            first += factors[k] * a
+            second += factors[k] * b
+        out[n, z, y, 0] = first
+        out[n, z, y, 1] = second

@@ -1,0 +1,314 @@
+"""AᵀWA of a small inset by FFT: fast enough for hundreds of applications, close enough to correct exactly.
+
+For an inset much smaller than its distance to the source, AᵀWA is nearly shift invariant in the plane: FFT in (y, x),
+a banded matrix along z for every frequency (see :mod:`recon._local_kernels`). Its slow change across the inset (path
+lengths, bowtie, magnification) is taken to first or second order in position at the midpoint of the two voxels:
+
+    G x = K₀x + ½ Σ_c [ b_c · (K_c x) + K_c (b_c · x) ],      b = y, x (, y², yx, x²),
+
+with the K_c fitted to exact impulse responses at a few nodes. The form is self-adjoint, and its local spectra are
+kept positive definite (:mod:`recon._definite`). What it cannot hold is the
+irregular beat of the voxel lattice with the detector's cells: 2–3 % on white noise at 0.2 mm voxels, 0.1 % on tissue
+shapes. It is a model: :func:`recon.pwls.pwls` removes its error with exact projections.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from recon._definite import cholesky, make_definite
+from recon._local_kernels import Nodes, kernel_at, node_positions, slice_reach
+
+__all__ = ["Gram", "check_weights"]
+
+# Bands along z whose energy is below this share of the kernel's are dropped (float32 rounding).
+BAND_ENERGY = 1e-13
+# Reference frequency of `information`, line pairs per mm.
+REFERENCE_FREQUENCY = 0.5
+
+
+class Gram:
+    """A fast, self-adjoint model of x ↦ AᵀW A x on an inset.
+
+    Args:
+        projector: the exact operator A (:class:`torchpcct.projector.Projector`) of the inset, usually with a window.
+        weights: W, inverse variances of the line integrals, ``range_shape``, finite and ≥ 0 (zeros are dead readings).
+        nodes: positions at which the exact impulse response is taken: 1 (shift invariant, fastest), 5 (linear in
+            position) or 9 (quadratic, most accurate). Each costs about one pass of the projector; the result can be
+            kept for all noise realisations of a scan and, with :meth:`scaled`, for all its exposures.
+
+    Raises:
+        ValueError: weights of a wrong shape, negative, not finite or all zero; an unknown ``nodes``.
+        TypeError: weights that are not a float tensor.
+    """
+
+    def __init__(self, projector: Any, weights: Tensor, nodes: int = 9) -> None:
+        check_weights(weights, projector.range_shape)
+        self.projector = projector
+        self.weights = weights
+        self.grid = projector.grid
+        self.factor = 1.0
+        self._flat = self.grid.ndim == 2
+        ny, nx = self.grid.shape[-2:]
+        self.padded = (_fast(2 * ny - 1), _fast(2 * nx - 1))
+        positions = node_positions(nodes if min(ny, nx) > 4 else 1)
+        kernels = self._fit(positions)
+        self._periodic = _periodic_mean(kernels[0])
+        self._spectra = make_definite(_spectra(kernels, self.padded))
+        self._basis = self._polynomials(len(self._spectra)).to(weights.dtype)
+        self._factor: Tensor | None = None
+
+    # -- construction ---------------------------------------------------------------------------------------------
+
+    def _fit(self, positions: Nodes) -> Tensor:
+        """Kernels K_c, ``(terms, bands, nz, 2·ny − 1, 2·nx − 1)``."""
+        ny, nx = self.grid.shape[-2:]
+        reach = slice_reach(self.projector.geometry, self.grid)
+        weights = self.weights.detach().cpu()
+        at, found = [], []
+        for y, x in positions:
+            node = (round((ny - 1) / 2 * (1 + y)), round((nx - 1) / 2 * (1 + x)))
+            at.append((2 * node[0] / max(ny - 1, 1) - 1, 2 * node[1] / max(nx - 1, 1) - 1))
+            found.append(kernel_at(self.projector, weights, node, reach))
+        energy = torch.stack([(k.double() ** 2).sum(dim=(1, 2, 3)) for k in found]).sum(0)
+        keep = int(torch.nonzero(energy > BAND_ENERGY * energy.sum()).abs().sub(reach).abs().max())
+        stack = torch.stack(found)[:, reach - keep : reach + keep + 1]
+        terms = {1: 1, 5: 3, 9: 6}[len(positions)]
+        u = torch.tensor(at, dtype=torch.float64)
+        fit = torch.linalg.pinv(_monomials(u[:, 0], u[:, 1], terms)).to(stack.dtype)
+        return torch.einsum("cn,n...->c...", fit, stack)
+
+    def _polynomials(self, terms: int) -> Tensor:
+        ny, nx = self.grid.shape[-2:]
+        y = torch.linspace(-1, 1, ny, dtype=torch.float64) if ny > 1 else torch.zeros(1, dtype=torch.float64)
+        x = torch.linspace(-1, 1, nx, dtype=torch.float64) if nx > 1 else torch.zeros(1, dtype=torch.float64)
+        yy, xx = torch.meshgrid(y, x, indexing="ij")
+        return _monomials(yy, xx, terms).movedim(-1, 0).contiguous()
+
+    def scaled(self, factor: float) -> Gram:
+        """The Gram operator of ``factor`` · W (another exposure); shares the kernels."""
+        if not (math.isfinite(factor) and factor > 0):
+            raise ValueError(f"factor must be finite and greater than 0, got {factor}")
+        other = copy.copy(self)
+        other.factor = self.factor * factor
+        other.weights = self.weights * factor
+        return other
+
+    def to(self, device: torch.device | str) -> Gram:
+        """The same operator with its kernels on ``device``."""
+        other = copy.copy(self)
+        other._spectra, other._basis = self._spectra.to(device), self._basis.to(device)
+        other._periodic = self._periodic.to(device)
+        other._factor = None if self._factor is None else self._factor.to(device)
+        return other
+
+    # -- application ----------------------------------------------------------------------------------------------
+
+    def apply(self, x: Tensor) -> Tensor:
+        """G x, ``(..., *grid.shape)``, any leading batch dimensions, differentiable; dtype and device of x.
+
+        Raises:
+            ValueError: a wrong shape.
+        """
+        if tuple(x.shape[-self.grid.ndim :]) != self.grid.shape:
+            raise ValueError(f"x must have shape (..., {', '.join(map(str, self.grid.shape))}), got {tuple(x.shape)}")
+        out: Tensor = _SelfAdjoint.apply(x, self)
+        return out
+
+    __call__ = apply
+
+    def _apply(self, x: Tensor) -> Tensor:
+        x3 = x.unsqueeze(-3) if self._flat else x
+        spectra = self._spectra.to(torch.complex128) if x.dtype == torch.float64 else self._spectra
+        basis = self._basis.to(x.dtype)
+        plain = self._transform(x3)
+        total = torch.zeros_like(plain)
+        _banded_add(spectra[0], plain, self.factor, total)
+        out: Any = 0.0
+        for b, kernel in zip(basis[1:], spectra[1:], strict=True):
+            _banded_add(kernel, self._transform(b * x3), 0.5 * self.factor, total)
+            part = torch.zeros_like(plain)
+            _banded_add(kernel, plain, 0.5 * self.factor, part)
+            out = out + b * self._inverse(part)
+        out = out + self._inverse(total)
+        return out.squeeze(-3) if self._flat else out
+
+    def _transform(self, x: Tensor) -> Tensor:
+        """Zero-padded in-plane spectra."""
+        return torch.fft.rfft2(x, s=self.padded).contiguous()
+
+    def _inverse(self, spectrum: Tensor) -> Tensor:
+        ny, nx = self.grid.shape[-2:]
+        # Only the rows that are kept are transformed along x.
+        rows = torch.fft.ifft(spectrum, dim=-2)[..., :ny, :]
+        return torch.fft.irfft(rows, n=self.padded[1], dim=-1)[..., :nx]
+
+    def exact(self, x: Tensor) -> Tensor:
+        """Aᵀ W A x with the exact operator (one projection pair)."""
+        out: Tensor = self.projector.T(self.weights.to(x.dtype) * self.projector(x))
+        return out
+
+    def error(self, x: Tensor) -> Tensor:
+        """‖G x − AᵀWA x‖ / ‖AᵀWA x‖ of each volume, ``(...)`` float64."""
+        exact = self.exact(x)
+        axes = tuple(range(-self.grid.ndim, 0))
+        norm = torch.linalg.vector_norm(exact, dim=axes, dtype=torch.float64)
+        return torch.linalg.vector_norm(self.apply(x) - exact, dim=axes, dtype=torch.float64) / norm
+
+    # -- what solvers, priors and training need -------------------------------------------------------------------
+
+    def periodic_spectrum(self) -> Tensor:
+        """Eigenvalues of the best circulant approximation (T. Chan 1988), ``rfftn`` layout of the grid, ≥ 0."""
+        spectrum = self._periodic * self.factor
+        return spectrum[0] if self._flat else spectrum
+
+    def information(self, hu: float) -> float:
+        """The data's information on a 0.5 lp/mm in-plane wave, in 1/(HU² mm³) (2-D: 1/(HU² mm²)).
+
+        Its inverse is the noise power that unregularised least squares has there, in HU² mm³. It is proportional to
+        the exposure and does not depend on the voxel size (as long as voxels are below 1 mm).
+
+        Args:
+            hu: 1 HU in mm⁻¹ (μ_ref / 1000).
+        """
+        py, px = self.padded
+        hy, hx = self.grid.spacing[-2:]
+        f = torch.hypot(torch.fft.fftfreq(py, hy)[:, None], torch.fft.rfftfreq(px, hx)[None, :])
+        distance = (f - REFERENCE_FREQUENCY).abs() + torch.where(f == 0, math.inf, 0.0)
+        ring = distance <= max(0.1, float(distance.min()) * 1.001)
+        kernel = self._spectra[0]
+        # A wave that is constant along z sees the sum over the bands.
+        summed = (kernel[:1].real + 2 * kernel[1:].real.sum(0, keepdim=True)).sum(0)
+        # S ∝ 1/f: refer every frequency of the ring to the reference.
+        per_slice = (summed[:, ring.to(summed.device)] * (f[ring] / REFERENCE_FREQUENCY).to(summed)).mean(1)
+        return float(per_slice.median()) * self.factor * hu**2 / math.prod(self.grid.spacing)
+
+    def noise(self, batch: tuple[int, ...] = (), *, generator: torch.Generator) -> Tensor:
+        """Draw AᵀW n for counting noise n ~ N(0, W⁻¹) without a projector: covariance G (stationary part).
+
+        So ``apply(x) + noise(...)`` is a draw of the sufficient statistic AᵀW y of a noisy scan of x.
+
+        Args:
+            batch: leading shape of the result.
+            generator: source of randomness, on the device of the kernels.
+
+        Returns:
+            ``(*batch, *grid.shape)`` in the dtype of the weights.
+        """
+        if self._factor is None:
+            self._factor = cholesky(self._spectra[0])[0]
+        nz = 1 if self._flat else self.grid.shape[0]
+        ny, nx = self.grid.shape[-2:]
+        device = self._factor.device
+        white = torch.randn((*batch, nz, *self.padded), generator=generator, dtype=self.weights.dtype, device=device)
+        spectrum = torch.fft.rfft2(white)
+        lower = self._factor
+        mixed = torch.zeros_like(spectrum)
+        for b in range(lower.shape[0]):
+            mixed[..., b:, :, :] += lower[b, : nz - b] * spectrum[..., : nz - b, :, :]
+        out = torch.fft.irfft2(mixed, s=self.padded)[..., :ny, :nx] * math.sqrt(self.factor)
+        return out.squeeze(-3) if self._flat else out
+
+
+class _SelfAdjoint(torch.autograd.Function):
+    """G is its own adjoint, so nothing is kept for the backward pass."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, gram: Gram) -> Tensor:
+        ctx.gram = gram
+        return gram._apply(x)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Any) -> tuple[Tensor, None]:
+        return ctx.gram.apply(grads[0]), None
+
+
+def check_weights(weights: Any, shape: tuple[int, ...]) -> None:
+    """Refuse weights that are not finite, ≥ 0 and of the given shape, or all 0 (TypeError, ValueError)."""
+    if not isinstance(weights, Tensor) or weights.dtype not in (torch.float32, torch.float64):
+        raise TypeError(f"weights must be a float32 or float64 tensor, got {getattr(weights, 'dtype', type(weights))}")
+    if tuple(weights.shape) != tuple(shape):
+        raise ValueError(f"weights must have the shape of the projector's range {tuple(shape)}, got "
+                         f"{tuple(weights.shape)}")  # fmt: skip
+    if not torch.isfinite(weights).all():
+        raise ValueError("weights must be finite: give readings without information the weight 0")
+    if weights.min() < 0:
+        raise ValueError(f"weights must be at least 0 (inverse variances), got {float(weights.min())}")
+    if weights.max() == 0:
+        raise ValueError("all weights are 0: no reading carries information")
+
+
+def _fast(n: int) -> int:
+    from scipy.fft import next_fast_len
+
+    return int(next_fast_len(n, real=True))
+
+
+def _monomials(y: Tensor, x: Tensor, terms: int) -> Tensor:
+    return torch.stack([torch.ones_like(y), y, x, y * y, y * x, x * x][:terms], dim=-1)
+
+
+def _spectra(kernels: Tensor, padded: tuple[int, int]) -> Tensor:
+    """Lower bands of the in-plane spectra, ``(terms, reach + 1, nz, py, px // 2 + 1)`` complex."""
+    reach = kernels.shape[1] // 2
+    lower = kernels[:, reach:]
+    for axis in (-2, -1):
+        lower = _wrap(lower, padded[axis], axis)
+    out = torch.fft.rfft2(lower)
+    out[:, 0].imag.zero_()
+    return out
+
+
+def _wrap(kernel: Tensor, period: int, axis: int) -> Tensor:
+    """Lags −(n−1)…n−1 on a ring of ``period``; the lags beyond, which nothing reads, join both ends linearly."""
+    kernel = kernel.movedim(axis, -1)
+    n = (kernel.shape[-1] + 1) // 2
+    positive, negative = kernel[..., n - 1 :], kernel[..., : n - 1]
+    gap = period - (2 * n - 1)
+    if gap:
+        t = torch.arange(1, gap + 1, dtype=kernel.dtype) / (gap + 1)
+        bridge = (1 - t) * kernel[..., -1:] + t * kernel[..., :1]
+        ring = torch.cat([positive, bridge, negative], dim=-1)
+    else:
+        ring = torch.cat([positive, negative], dim=-1)
+    return ring.movedim(-1, axis)
+
+
+def _banded_add(kernel: Tensor, x: Tensor, scale: float, out: Tensor) -> None:
+    """out += scale · K x, K Hermitian and banded along z: lower bands ``(reach + 1, nz, fy, fx)``."""
+    nz = x.shape[-3]
+    if x.device.type == "cpu":
+        from recon._gram_kernels import banded_add
+
+        real = kernel.real.numpy().dtype.type
+        shape = (-1, *x.shape[-3:])
+        banded_add(kernel.numpy(), x.reshape(shape).numpy(), real(scale), out.view(shape).numpy())
+        return
+    out += (scale * kernel[0].real) * x
+    for b in range(1, kernel.shape[0]):
+        band = scale * kernel[b, : nz - b]
+        out[..., b:, :, :] += band * x[..., : nz - b, :, :]
+        out[..., : nz - b, :, :] += band.conj() * x[..., b:, :, :]
+
+
+def _periodic_mean(kernel: Tensor) -> Tensor:
+    """Spectrum of the circulant matrix nearest to the kernel's Toeplitz matrix, floored at 1e-6 of its maximum."""
+    bands, nz, wy, wx = kernel.shape
+    ny, nx = (wy + 1) // 2, (wx + 1) // 2
+    ring = torch.zeros(nz, ny, nx, dtype=torch.float64)
+    index_y = torch.arange(-(ny - 1), ny) % ny
+    index_x = torch.arange(-(nx - 1), nx) % nx
+    share_y = 1 - torch.arange(-(ny - 1), ny).abs() / ny
+    share_x = 1 - torch.arange(-(nx - 1), nx).abs() / nx
+    mean = kernel.double().sum(1) / nz * share_y[:, None] * share_x
+    folded = torch.zeros(bands, ny, wx, dtype=torch.float64).index_add_(1, index_y, mean)
+    folded = torch.zeros(bands, ny, nx, dtype=torch.float64).index_add_(2, index_x, folded)
+    for b in range(bands):
+        ring[(b - bands // 2) % nz] += folded[b]
+    spectrum = torch.fft.rfftn(ring).real
+    return spectrum.clamp_min(1e-6 * float(spectrum.max())).to(kernel.dtype)

@@ -1,0 +1,156 @@
+"""The FFT model of AᵀWA against the exact operator."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from recon.gram import Gram
+from torchpcct import ConeBeam, FanBeam, Projector, VolumeGrid
+from torchpcct.geometry import full_turn
+from torchpcct.window import shadow
+
+HU = 2e-5
+CENTER = (0.0, -30.38, -29.63)
+
+
+def problem(views=240, shape=(8, 13, 13), voxel=0.4, rows=10, dtype=torch.float32, window=True):
+    """An off-centre inset of the deep-silicon scanner, with weights that change smoothly over views and columns."""
+    geometry = ConeBeam(full_turn(views), 626.0, 1098.0, 1500, rows, (0.5, 0.35), detector="curved")
+    grid = VolumeGrid(shape, voxel, CENTER)
+    part = shadow(geometry, grid, margin=1)
+    A = Projector(geometry, grid, part if window else None)
+    gamma = geometry.fan_angles[part.column_indices] if window else geometry.fan_angles[None].repeat(views, 0)
+    path = 2 * np.sqrt(120.0**2 - (626.0 * np.sin(np.clip(gamma, -0.17, 0.17))) ** 2)
+    w = torch.from_numpy(115 * np.exp(0.0185 * (240 - path)))[:, None]
+    return A, w.expand(A.range_shape).to(dtype).contiguous()
+
+
+def matrix(operator, shape, dtype=torch.float64):
+    n = math.prod(shape)
+    return operator(torch.eye(n, dtype=dtype).reshape(n, *shape)).reshape(n, n)
+
+
+@pytest.fixture(scope="module")
+def inset():
+    A, w = problem(shape=(6, 11, 11), rows=8)
+    return A, w, Gram(A, w)
+
+
+def tissue(grid):
+    _, y, x = np.meshgrid(*(a - c for a, c in zip(grid.axes, grid.center, strict=True)), indexing="ij")
+    tube = 160.0 * (np.hypot(y, x - 0.3) < 1.7) + 400.0 * (np.hypot(y, x + 0.4) < 1.0)
+    return torch.from_numpy(tube * HU).float()
+
+
+def test_error_on_tissue_and_on_noise(inset):
+    A, _, gram = inset
+    noise = torch.randn(A.domain_shape, generator=torch.Generator().manual_seed(0))
+    error = gram.error(torch.stack([tissue(A.grid), noise]))
+    assert float(error[0]) <= 0.003
+    assert float(error[1]) <= 0.04
+
+
+def test_more_nodes_are_more_accurate():
+    A, w = problem(shape=(6, 25, 25))
+    shape = tissue(A.grid)
+    errors = [float(Gram(A, w, nodes).error(shape)) for nodes in (1, 9)]
+    assert errors[1] < 0.5 * errors[0]
+
+
+def test_self_adjoint_and_positive(inset):
+    A, _, gram = inset
+    m = matrix(gram.apply, A.domain_shape)
+    assert float((m - m.T).abs().max()) <= 1e-9 * float(m.abs().max())
+    eigenvalues = torch.linalg.eigvalsh(m)
+    assert float(eigenvalues[0]) > -1e-6 * float(eigenvalues[-1])
+
+
+def test_row_phase_is_kept_slice_by_slice():
+    """0.2 mm slices under 0.5 mm rows: the response of a slice depends on where it sits under the rows."""
+    A, w = problem(views=120, shape=(12, 9, 9), voxel=0.2, rows=10)
+    spikes = torch.zeros(12, *A.domain_shape)
+    spikes[torch.arange(12), torch.arange(12), 4, 4] = 1.0
+    exact = Gram(A, w).exact(spikes)[torch.arange(12), torch.arange(12), 4, 4]
+    assert float(exact.max() / exact.min()) > 1.2  # the effect is there
+    model = Gram(A, w).apply(spikes)[torch.arange(12), torch.arange(12), 4, 4]
+    assert torch.allclose(model, exact, rtol=0.08)
+
+
+def test_without_a_window_and_in_a_plane():
+    A, w = problem(views=60, shape=(4, 7, 7), window=False)
+    windowed, w2 = problem(views=60, shape=(4, 7, 7))
+    x = tissue(A.grid)
+    assert torch.allclose(Gram(A, w).apply(x), Gram(windowed, w2).apply(x), rtol=1e-3, atol=1e-3 * float(w.max()) * HU)
+    fan = FanBeam(full_turn(200), 626.0, 1098.0, 700, 0.7, detector="curved")
+    grid = VolumeGrid((15, 15), 0.5, CENTER[1:])
+    B = Projector(fan, grid, shadow(fan, grid))
+    gram = Gram(B, torch.ones(B.range_shape))
+    y, x2 = (torch.from_numpy(a - c) for a, c in zip(grid.axes, grid.center, strict=True))
+    disc = (torch.hypot(y[:, None], x2[None]) < 2).float()
+    assert float(gram.error(disc)) < 0.02
+
+
+def test_scaled_batched_and_differentiable(inset):
+    A, w, gram = inset
+    x = torch.randn(2, 3, *A.domain_shape, generator=torch.Generator().manual_seed(1))
+    y = gram.apply(x)
+    assert torch.allclose(y[1, 2], gram.apply(x[1, 2]), rtol=1e-4, atol=1e-5 * float(y.abs().max()))
+    assert torch.allclose(gram.scaled(4.0).apply(x), 4 * y, rtol=1e-5, atol=1e-5 * float(y.abs().max()))
+    assert torch.equal(gram.scaled(4.0).weights, 4 * w)
+    leaf = x[0, 0].clone().requires_grad_()
+    probe = x[1, 1]
+    (gram.apply(leaf) * probe).sum().backward()
+    assert torch.allclose(leaf.grad, gram.apply(probe), rtol=1e-4, atol=1e-5 * float(leaf.grad.abs().max()))
+    assert gram.apply(x.double()).dtype == torch.float64
+
+
+def test_information_follows_exposure_not_voxel_size(inset):
+    _, _, gram = inset
+    assert gram.scaled(2.0).information(HU) == pytest.approx(2 * gram.information(HU))
+    fine, w = problem(shape=(12, 33, 33), voxel=0.25)
+    coarse, w2 = problem(shape=(8, 21, 21), voxel=0.4)
+    assert Gram(fine, w, 1).information(HU) == pytest.approx(Gram(coarse, w2, 1).information(HU), rel=0.15)
+
+
+def test_noise_has_the_covariance_of_the_data(inset):
+    A, w, gram = inset
+    n = 4000
+    draws = gram.noise((n,), generator=torch.Generator().manual_seed(3)).reshape(n, -1).double()
+    assert torch.equal(gram.noise((2,), generator=torch.Generator().manual_seed(5)),
+                       gram.noise((2,), generator=torch.Generator().manual_seed(5)))  # fmt: skip
+    probes = torch.stack([tissue(A.grid), torch.randn(A.domain_shape, generator=torch.Generator().manual_seed(4))])
+    for probe in probes.double():
+        variance = float((draws @ probe.flatten()).var())
+        expected = float((A(probe).square() * w).sum())
+        assert variance == pytest.approx(expected, rel=5 * math.sqrt(2 / n) + 0.03)
+
+
+def test_nearly_zero_weights():
+    """Weights of 1e-12: the same operator, scaled; single precision does not underflow."""
+    A, w = problem(views=60, shape=(4, 9, 9))
+    x = tissue(A.grid)
+    a, b = Gram(A, w).apply(x), Gram(A, w * 1e-12).apply(x) * 1e12
+    assert torch.allclose(a, b, rtol=1e-3, atol=1e-4 * float(a.abs().max()))
+
+
+def test_refusals():
+    A, w = problem(views=12, shape=(2, 5, 5))
+    with pytest.raises(ValueError, match="shape of the projector's range"):
+        Gram(A, w[:-1])
+    with pytest.raises(ValueError, match="at least 0"):
+        Gram(A, -w)
+    with pytest.raises(ValueError, match="finite"):
+        Gram(A, w / 0)
+    with pytest.raises(ValueError, match="all weights are 0"):
+        Gram(A, w * 0)
+    with pytest.raises(TypeError, match="float"):
+        Gram(A, w.int())
+    with pytest.raises(ValueError, match="nodes"):
+        Gram(A, w, nodes=3)
+    gram = Gram(A, w, nodes=1)
+    with pytest.raises(ValueError, match="x must have shape"):
+        gram.apply(torch.zeros(2, 5, 4))
+    with pytest.raises(ValueError, match="factor"):
+        gram.scaled(0.0)
