@@ -21,9 +21,9 @@ from torchpcct.window import DetectorWindow, shadow
 
 __all__ = ["DEFAULT_PRIOR", "InsetProblem", "reconstruct_pwls"]
 
-DEFAULT_PRIOR = QGGMRF(strength=0.15, threshold=100.0)
+DEFAULT_PRIOR = QGGMRF(strength=0.15, threshold=300.0)
 """Noise-normalised q-GGMRF: the curvature of data and prior are equal at 0.94 line pairs per mm; edges steeper than
-100 HU/mm (lumen, fat) pass."""
+300 HU/mm (lumen, fat) pass."""
 
 
 class InsetProblem:
@@ -99,7 +99,8 @@ def reconstruct_pwls(
     progress: Callable[[float], None] | None = None,
     prior: QGGMRF | None = None,
     problem: InsetProblem | None = None,
-    batch: int = 10,
+    batch: int = 1,
+    tolerance: float = 1.0,
     **options: Any,
 ) -> list[Volume]:
     """PWLS with a q-GGMRF prior, to convergence.
@@ -110,8 +111,9 @@ def reconstruct_pwls(
         progress: called with the finished fraction.
         prior: None: :data:`DEFAULT_PRIOR`.
         problem: kept from an earlier call with the same scan and grid; None: made here.
-        batch: volumes solved at a time (memory).
-        options: ``tolerance``, ``max_exact`` of :func:`recon.pwls.pwls`.
+        batch: volumes solved at a time; they iterate until the slowest has converged.
+        tolerance: stop within so many HU (root mean square) of the exact minimum.
+        options: ``max_exact``, ``callback`` of :func:`recon.pwls.pwls`.
 
     Returns:
         Volumes in HU with the solver's report.
@@ -123,7 +125,7 @@ def reconstruct_pwls(
     problem = problem or InsetProblem(scans[0], grid)
     volumes: list[Volume] = []
     for i in range(0, len(scans), batch):
-        data, report = problem.solve(scans[i : i + batch], prior or DEFAULT_PRIOR, **options)
+        data, report = problem.solve(scans[i : i + batch], prior or DEFAULT_PRIOR, tolerance=tolerance, **options)
         report["seconds"] = round((time.perf_counter() - start) / len(data), 3)
         volumes += [Volume(v.to(torch.float32), grid, report) for v in data]
         start = time.perf_counter()

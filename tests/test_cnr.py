@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchpcct.metrics import cnr, cnr_from_moments, cnr_interval, mean_interval, sd_interval
 from recon.study import paper
+from torchpcct.metrics import cnr, cnr_from_moments, cnr_interval, mean_interval, sd_interval
 
 
 def test_paper_table_from_its_own_moments():

@@ -1,6 +1,11 @@
 """Photon-counting CT in PyTorch: scenes, scanners, scans, projectors, metrics."""
 
+import os
 from typing import TYPE_CHECKING, Any
+
+# numba's and torch's thread pools take turns here. By default an idle OpenMP thread spins for a while and steals the
+# core from the other pool: several times slower. OpenMP reads it when torch loads, so it stands before anything else.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
 

@@ -296,7 +296,9 @@ def _run_pwls(
     shown_dose: float, report: Progress,
 ) -> None:  # fmt: skip
     from recon import reconstruct
+    from recon.roi import InsetProblem
 
+    problems: dict[float, InsetProblem] = {}
     jobs = [
         (exposure, grid, pair)
         for exposure in settings.doses.values()
@@ -306,14 +308,27 @@ def _run_pwls(
     for done, (exposure, grid, pair) in enumerate(jobs):
         voxel = grid.spacing[0]
         scans = [clean.with_noise(exposure, seed) for e, seed in _runs(settings) if e == exposure]
-        volumes = reconstruct(scans, grid, "pwls")
+        if voxel not in problems:
+            problems[voxel] = InsetProblem(clean, grid)
+
+        def inner(fraction: float, done: int = done) -> None:
+            report("PWLS", (done + fraction) / len(jobs))
+
+        volumes = reconstruct(scans, grid, "pwls", problem=problems[voxel], progress=inner)
         collected["pwls", "q-GGMRF", voxel, exposure] = [
             (float(pair[0](v.data)), float(pair[1](v.data))) for v in volumes
         ]
-        reports.append({"voxel_mm": voxel, "exposure_s": exposure, **volumes[0].report})
+        reports.append(
+            {
+                "voxel_mm": voxel,
+                "exposure_s": exposure,
+                "largest_rmsd_hu": max(v.report["rmsd_hu"][-1] for v in volumes),
+                "seconds_per_volume": float(np.mean([v.report["seconds"] for v in volumes])),
+                **volumes[0].report,
+            }
+        )
         if exposure == shown_dose:
             images["pwls", "q-GGMRF", voxel] = volumes[0].data
-        report("PWLS", (done + 1) / len(jobs))
 
 
 def _table_exposure(settings: Settings) -> float:

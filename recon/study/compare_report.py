@@ -27,6 +27,7 @@ def build_report(result: Compared) -> Report:
         _noise_free_table(result),
         *(_tables(result, name, exposure) for name, exposure in result.settings.doses.items()),
         _noise_table(result),
+        _pwls_table(result),
         _check_table(checks),
         _footer(result),
     ]
@@ -152,6 +153,25 @@ def _noise_table(result: Compared) -> str:
         "Slope of log σ (voxel noise over the inset) against log exposure; −0.5 for counting noise."
     )
     return f"{text}\n\n{markdown_table(['method', 'voxel, mm', 'slope'], rows)}"
+
+
+def _pwls_table(result: Compared) -> str:
+    if not result.pwls:
+        return ""
+    rows = [
+        [
+            f"{e['exposure_s']:.2f} s, {e['voxel_mm']:.2f} mm",
+            str(e["exact_pairs"]),
+            str(sum(e["inner_iterations"])),
+            f"{e['gradient'][-1]:.1e}",
+            f"{e['largest_rmsd_hu']:.2f}",
+            f"{e['seconds_per_volume']:.1f}",
+        ]
+        for e in result.pwls
+    ]
+    header = ["PWLS", "exact pairs", "inner steps", "gradient left", "HU from minimum", "s / volume"]
+    text = "## PWLS, convergence\n\nFirst realisation; “HU from minimum” is the worst of all, rms over the volume."
+    return f"{text}\n\n{markdown_table(header, rows)}"
 
 
 def _within(value: float, low: float, high: float) -> bool:
