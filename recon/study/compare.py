@@ -50,6 +50,7 @@ class Settings:
         views: views per rotation (paper: 1968). Fewer views keep the tube load of the whole scan.
         kernels, voxels_mm, doses: the axes of the tables.
         pwls: whether to run PWLS.
+        pwls_everywhere: PWLS at the tables' dose for all voxel sizes and at every dose for one; False: one of each.
     """
 
     realizations: int = paper.REALIZATIONS
@@ -59,6 +60,7 @@ class Settings:
     voxels_mm: tuple[float, ...] = paper.VOXELS_MM
     doses: dict[str, float] = field(default_factory=lambda: dict(paper.DOSES))
     pwls: bool = True
+    pwls_everywhere: bool = True
 
     def __post_init__(self) -> None:
         if self.realizations < 3:
@@ -75,6 +77,7 @@ class Settings:
             "kernels": ("soft", "standard"),
             "voxels_mm": (0.25, 0.40),
             "doses": {"1x": 0.35, "5.7x": 2.00},
+            "pwls_everywhere": False,
         }
         return cls(**{**values, **changes})
 
@@ -303,7 +306,7 @@ def _run_pwls(
         (exposure, grid, pair)
         for exposure in settings.doses.values()
         for grid, pair in zip(grids, pairs, strict=True)
-        if exposure == shown_dose or grid.spacing[0] == PWLS_VOXEL_MM
+        if (exposure == shown_dose) + (grid.spacing[0] == PWLS_VOXEL_MM) >= (1 if settings.pwls_everywhere else 2)
     ]
     for done, (exposure, grid, pair) in enumerate(jobs):
         voxel = grid.spacing[0]
