@@ -22,9 +22,9 @@ from torchpcct.window import DetectorWindow, shadow
 __all__ = ["DEFAULT_PRIOR", "InsetProblem", "reconstruct_pwls"]
 
 DEFAULT_PRIOR = QGGMRF(strength=0.3, threshold=300.0)
-"""Noise-normalised q-GGMRF, chosen for about the resolution of FBP's soft kernel: the curvatures of data and prior are
-equal at 0.75 line pairs per mm, edges steeper than 300 HU/mm (lumen, fat) pass. A stronger prior lowers the noise of ROI
-means further, but shrinks the contrast of a millimetre-sized core by more: look at means and slope, not at CNR alone."""
+"""Noise-normalised q-GGMRF, chosen for about the resolution of FBP's soft kernel: the curvatures of data and prior
+are equal at 0.75 line pairs per mm, edges steeper than 300 HU/mm (lumen, fat) pass. A stronger prior lowers the noise
+of ROI means further, but shrinks the contrast of a millimetre-sized core: look at means and slope, not at CNR alone."""
 
 
 class InsetProblem:

@@ -211,3 +211,14 @@ def test_water_reads_zero(changes, voxel):
     limit = 1.0 if not changes else 2.0
     for volumes in InsetFbp(scan, grids, ("soft", "standard", "detail", "bone"))(scan):
         assert volumes.abs().max() < limit
+
+
+def test_no_poisson_noise_on_an_energy_integrating_signal():
+    eid = presets.eid(views=16)
+    eid = eid.replace(geometry=replace(eid.geometry, rows=2))
+    with pytest.raises(ValueError, match="photon-counting"):
+        acquire(water_cylinder(200.0), eid, exposure_s=0.35)
+    scan = acquire(water_cylinder(200.0), eid)
+    assert not scan.counting
+    with pytest.raises(ValueError, match="photon-counting"):
+        scan.with_noise(0.35, 0)

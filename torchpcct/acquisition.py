@@ -170,11 +170,15 @@ def acquire(
 
     Raises:
         ValueError: ``exposure_s`` ≤ 0, a bad seed, bodies outside ``region``, a region outside the field of view, a
-            moving scene without ``rotation_s``.
+            moving scene without ``rotation_s``, noise from an energy-integrating detector.
     """
     check_exposure(exposure_s)
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
         raise ValueError(f"seed must be a whole number ≥ 0, got {seed!r}")
+    if exposure_s is not None and scanner.detector.energy_integrating:
+        raise ValueError(
+            f"noise is modelled for photon-counting detectors, {scanner.name!r} integrates energy: use exposure_s=None"
+        )
     start = time.perf_counter()
     build, plan_, view_step = _prepare(
         scene, scanner, region, rotation_s if rotation_s is not None else exposure_s, duty, tolerance_hu, sub_rays
@@ -209,6 +213,7 @@ def acquire(
         linearisation=scanner.water_linearisation(),
         window=plan_.kept,
         surround=None if plan_.kept is None else tensor(surround),
+        counting=not scanner.detector.energy_integrating,
         info={
             "scanner": scanner.name,
             "scene": list(scene.names),

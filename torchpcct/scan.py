@@ -45,7 +45,7 @@ class Scan:
         window: the part of the detector that was kept; None: all of it.
         surround: ``air``-shaped expected readings of every cell outside the window, the same in all views; given if
             and only if ``window`` is.
-        signal_variance: ``air``-shaped variance of a reading per unit expected reading: 1 for counts.
+        counting: True: readings are photon counts with Poisson noise. False: an energy-integrating detector's signal.
         info: provenance (scanner, plan, versions), JSON values.
 
     Raises:
@@ -61,6 +61,7 @@ class Scan:
     seed: int | None = None
     window: DetectorWindow | None = None
     surround: Tensor | None = None
+    counting: bool = True
     info: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -106,10 +107,15 @@ class Scan:
         scan carries the same noise as the full one.
 
         Raises:
-            ValueError: the scan is noisy already; ``exposure_s`` ≤ 0; a negative seed.
+            ValueError: the scan is noisy already; ``exposure_s`` ≤ 0; a negative seed; the detector integrates energy
+                (its signal is no count, and Poisson noise would be wrong).
         """
         if not self.noise_free:
             raise ValueError("with_noise needs a noise-free scan (acquire with exposure_s=None), this one is noisy")
+        if not self.counting:
+            raise ValueError(
+                "noise is modelled for photon-counting detectors; keep this scan noise free (exposure_s=None)"
+            )
         check_exposure(exposure_s)
         scale = exposure_s / NOISE_FREE_EXPOSURE_S
         return replace(
@@ -169,6 +175,7 @@ class Scan:
         g = self.geometry
         with written_whole(path) as part, h5py.File(part, "w") as file:
             file.attrs.update(format=_FORMAT, version=_VERSION, software=f"torchpcct {__version__}")
+            file.attrs["counting"] = self.counting
             file.attrs["info"] = json.dumps(dict(self.info), default=str)
             if self.exposure_s is not None:
                 file.attrs["exposure_s"] = self.exposure_s
@@ -245,6 +252,7 @@ class Scan:
             seed=int(file.attrs["seed"]) if "seed" in file.attrs else None,
             window=window,
             surround=surround,
+            counting=bool(file.attrs["counting"]),
             info=json.loads(file.attrs["info"]),
         )
 
