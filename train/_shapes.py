@@ -150,6 +150,36 @@ def _distances(
 
 
 @numba.njit(cache=True, fastmath=True)
+def _reach(
+    y: float, z: float, bodies: Any, tables: Any, tubes: Any, quadrics: Any, z_first: float, z_step: float
+) -> Any:
+    """Interval of x outside of which no body touches the row at ``(y, z)``."""
+    low, high = FAR, -FAR
+    for v in range(tables.shape[0]):
+        f = min(max((z - z_first) / z_step, 0.0), tables.shape[2] - 1.001)
+        k = int(f)
+        f -= k
+        x0 = tables[v, 0, k] + f * (tables[v, 0, k + 1] - tables[v, 0, k])
+        y0 = tables[v, 1, k] + f * (tables[v, 1, k + 1] - tables[v, 1, k])
+        square = tubes[v, 6] ** 2 - (y - y0) ** 2
+        if square > 0.0:
+            low, high = min(low, x0 - np.sqrt(square)), max(high, x0 + np.sqrt(square))
+    for m in range(bodies.shape[0]):
+        if bodies[m, 0] != 5:
+            continue
+        row = quadrics[bodies[m, 2]]
+        half_x, half_y, half_z = 0.0, 0.0, 0.0
+        for i in range(3):
+            a = row[12 + i] + row[17]
+            half_x += abs(row[3 + 3 * i]) * a
+            half_y += abs(row[4 + 3 * i]) * a
+            half_z += abs(row[5 + 3 * i]) * a
+        if abs(y - row[1]) <= half_y and abs(z - row[2]) <= half_z:
+            low, high = min(low, row[0] - half_x), max(high, row[0] + half_x)
+    return low, high
+
+
+@numba.njit(cache=True, fastmath=True)
 def _mix(d: Any, cell: float, fraction: Any) -> None:
     """Fractions of the background and the bodies, painted in order, from their distances."""
     fraction[0] = 1.0
@@ -190,7 +220,13 @@ def _fill(
         z = (k - 0.5 * (nz - 1)) * dz
         for j in range(ny):
             y = (j - 0.5 * (ny - 1)) * dy
-            for i in range(nx):
+            low, high = _reach(y, z, bodies, tables, tubes, quadrics, z_first, z_step)
+            first = min(max(int(np.ceil(low / dx + 0.5 * (nx - 1))), 0), nx)
+            last = min(max(int(np.floor(high / dx + 0.5 * (nx - 1))) + 1, first), nx)
+            for c in range(maps):
+                out[c, k, j, :first] = weights[c, 0]
+                out[c, k, j, last:] = weights[c, 0]
+            for i in range(first, last):
                 x = (i - 0.5 * (nx - 1)) * dx
                 touched = _distances(x, y, z, voxel, bodies, tables, tubes, quadrics, z_first, z_step, local, d)
                 if not touched:

@@ -83,7 +83,7 @@ class SceneConfig:
     muscle: Range = (0.0, 60.0)
     muscle_probability: float = 0.15
     free_probability: float = 0.15
-    free_count: tuple[int, int] = (1, 4)
+    free_count: tuple[int, int] = (2, 6)
     free_contrast: Range = (-150.0, 300.0)
     free_size: Range = (0.3, 3.0)
     second_vessel: float = 0.25
@@ -284,7 +284,8 @@ class SceneBatch:
         core: likewise, volume fraction of all cores, of the virtual ones too (then ``has_core`` is false, contrast 0).
         surround: likewise, volume fraction of the fibrous layer of the vessels that hold these cores.
         has_core: ``(batch,)`` bool: a core of a contrast other than 0, at least 0.05 mm³ of it inside the grid.
-        contrast: ``(batch,)`` float32, HU: of the first core to its fibrous layer, 0 without one.
+        contrast: ``(batch,)`` float32, HU: of the first core to its fibrous layer, 0 without one; also where the core
+            lies outside the grid.
         scenes: parameters, one object per scene; HU of every body are in there.
     """
 
@@ -372,8 +373,8 @@ class _Draw:
 def draw_scene(seed: int, extent_mm: Triple, config: SceneConfig | None = None) -> Scene:
     """A random scene for an inset of ``extent_mm`` = ``(z, y, x)``, outside the paper's family.
 
-    Depends on the seed and on the extent only, not on voxels. Positions are uniform in the inset, so bodies may be cut
-    by its border.
+    Depends on the seed and on the extent only, not on voxels. Positions are uniform in the inset (vessel axes in its
+    inner 84 %), so bodies may be cut by its border.
     """
     config = config if config is not None else SceneConfig()
     draw = _Draw(seed)
@@ -446,7 +447,7 @@ def _draw_vessel(draw: _Draw, extent: Triple, config: SceneConfig, cores: bool |
     unenhanced = draw.chance(config.unenhanced_probability)
     fibrous = draw(config.fibrous_hu)
     vessel = Vessel(
-        position=(draw((-0.5 * extent[2], 0.5 * extent[2])), draw((-0.5 * extent[1], 0.5 * extent[1]))),
+        position=(draw((-0.42 * extent[2], 0.42 * extent[2])), draw((-0.42 * extent[1], 0.42 * extent[1]))),
         slope=(tilt * math.cos(towards), tilt * math.sin(towards)),
         diameter=diameter,
         aspect=aspect,
@@ -529,7 +530,7 @@ def _draw_core(draw: _Draw, extent: Triple, config: SceneConfig, vessel: Vessel,
         axes[1] = max(low, draw((0.8, 1.1)) * inner)
     elif shape == "rod":
         axes[1] = min(axes[1], 1.5 * axes[0])
-        axes[2] = draw.log((max(low, 0.7 * high), 2.0 * high))
+        axes[2] = draw.log((max(low, 0.6 * high), high))
     c, s = math.cos(direction), math.sin(direction)
     rotation: tuple[float, ...] = (c, s, 0.0, -s, c, 0.0, 0.0, 0.0, 1.0)
     if shape in ("ellipsoid", "superquadric") and draw.chance(0.5):
@@ -554,7 +555,7 @@ def rasterise(scene: Scene, shape: tuple[int, int, int], spacing_mm: Triple) -> 
     # A foot lies at most reach · sin(tilt) above or below its point
     pad = 4.0 if scene.vessels else 0.0
     count = math.ceil(2 * (half + pad) / TABLE_STEP) + 1
-    z = (np.arange(count) - 0.5 * (count - 1)) * TABLE_STEP
+    z: NDArray[np.float64] = (np.arange(count, dtype=np.float64) - 0.5 * (count - 1)) * TABLE_STEP
     bodies: list[tuple[int, int, int]] = []
     values: list[float] = [scene.background]
     roles: list[str] = [""]
@@ -600,7 +601,7 @@ def rasterise(scene: Scene, shape: tuple[int, int, int], spacing_mm: Triple) -> 
             add(volume, index)
     for volume in scene.free:
         add(volume, -1)
-    groups = [("core",), ("surround",)]
+    groups: list[tuple[str, ...]] = [("core",), ("surround",)]
     if scene.textures:
         groups += [("", "free"), ("wall", "fibrous", "surround", "core")]
     weights = np.array([values] + [[float(role in group) for role in roles] for group in groups])
@@ -745,8 +746,8 @@ def _validation_scene(draw: _Draw, extent: Triple, *, large: bool, crescent: boo
     z = draw((-0.1, 0.1)) * extent[0]
     if crescent:
         # Tangentially wide, hollowed out by the lumen's cap; the wall side stays fibrous.
-        axes = (0.38 * thickness, 0.62 * inner, 0.9 if large else 0.8)
-        r, exponent = edge + 0.42 * thickness, 2.0
+        axes = (0.45 * thickness, 0.8 * inner, 0.9 if large else 0.8)
+        r, exponent = edge + 0.3 * thickness, 2.0
     else:
         axes = (0.27 * thickness, 0.4 * inner, 0.9 if large else 0.75)
         r, exponent = edge + cap + 0.27 * thickness, 4.0
