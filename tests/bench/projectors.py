@@ -12,15 +12,18 @@ from __future__ import annotations
 
 import argparse
 import ctypes
+import datetime
 import importlib.util
 import json
 import math
+import os
 import platform
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numba
 import numpy as np
 import torch
 
@@ -30,6 +33,18 @@ from torchpcct.projector.analytic import Ellipsoid, Gaussian, line_integrals, ra
 from torchpcct.window import shadow
 
 Pass = Callable[[], Any]
+
+
+class Peer(NamedTuple):
+    """One projector on one case: the passes to time, a forward projection to check, and which views it takes.
+
+    ``adjoint`` is None where the library has none. Views ``0, every, 2 every, …`` are taken, the times multiplied.
+    """
+
+    forward: Pass
+    adjoint: Pass | None
+    check: Callable[[np.ndarray], np.ndarray]
+    every: int = 1
 
 
 class Case:
@@ -46,11 +61,13 @@ class Case:
             self.images["ellipses"] = rasterize(grid, ellipses, 8)
             self.exact["ellipses"] = line_integrals(geometry, ellipses, window, 4)
 
-    def errors(self, forward: Callable[[np.ndarray], np.ndarray]) -> dict[str, float]:
-        return {
-            name: float(np.linalg.norm(forward(image) - self.exact[name]) / np.linalg.norm(self.exact[name]))
-            for name, image in self.images.items()
-        }
+    def errors(self, peer: Peer) -> dict[str, float]:
+        """Relative L2 error of the forward projection per image."""
+        errors = {}
+        for name, image in self.images.items():
+            exact = self.exact[name][:: peer.every]
+            errors[name] = float(np.linalg.norm(peer.check(image) - exact) / np.linalg.norm(exact))
+        return errors
 
 
 def _spread(grid: VolumeGrid, seed: int, count: int) -> list[tuple[Any, Any, float, float]]:
@@ -84,7 +101,7 @@ def cases() -> list[Callable[[], Case]]:
     inset = VolumeGrid((128, 128), 0.1, (-30.38, -29.63))
     plaque = [VolumeGrid((n, m, m), s, (0.0, -30.38, -29.63)) for n, m, s in ((56, 45, 0.2), (113, 90, 0.1))]
     soft = [Gaussian((0.5, -30.0, -30.0), (1.2, 1.0, 0.9), 0.4), Gaussian((-1.5, -31.5, -28.5), 0.8, value=-0.5)]
-    plane = paper.central_fan
+    flat = FanBeam(full_turn(1968), 626.0, 1098.0, 1500, 0.35)  # ASTRA knows no curved detector
     return [
         lambda: Case("fan 512² × 984 × 888", fan, VolumeGrid((512, 512), 250 / 512)),
         lambda: Case("fan, shifted grid", fan, VolumeGrid((512, 512), 250 / 512, (1.0, 2.0))),
@@ -93,7 +110,7 @@ def cases() -> list[Callable[[], Case]]:
             ParallelBeam(np.arange(720) * math.pi / 720, 729, 1.0),
             VolumeGrid((512, 512), 1.0),
         ),
-        lambda: Case("inset 128², 1968 × 1500", plane, inset, shadow(plane, inset)),
+        lambda: Case("inset 128², 1968 × 1500", flat, inset, shadow(flat, inset)),
         lambda: Case(
             "cone 128³, 360 × 192²", ConeBeam(full_turn(360), 600.0, 1200.0, 192, 192, 1.5), VolumeGrid((128,) * 3, 1.0)
         ),
@@ -102,14 +119,26 @@ def cases() -> list[Callable[[], Case]]:
     ]
 
 
-def ours(case: Case, dtype: torch.dtype) -> tuple[Pass, Pass, Callable[[np.ndarray], np.ndarray]]:
+def ours(case: Case, dtype: torch.dtype, threads: int) -> Peer:
     A = Projector(case.geometry, case.grid, case.window)
     x = torch.as_tensor(case.images["gaussians"], dtype=dtype)
-    y = A(x)
-    return (lambda: A(x)), (lambda: A.T(y)), lambda image: A(torch.as_tensor(image, dtype=dtype)).double().numpy()
+    y = torch.rand(A.range_shape, dtype=dtype)
+
+    def on_threads(work: Pass) -> Pass:
+        def run() -> Any:
+            numba.set_num_threads(threads)
+            return work()
+
+        return run
+
+    return Peer(
+        on_threads(lambda: A(x)),
+        on_threads(lambda: A.T(y)),
+        lambda image: A(torch.as_tensor(image, dtype=dtype)).double().numpy(),
+    )
 
 
-def astra_line(case: Case) -> tuple[Pass, Pass, Callable[[np.ndarray], np.ndarray]] | None:
+def astra_line(case: Case) -> Peer | None:
     """ASTRA's line projector on the whole detector, cropped to the window afterwards."""
     if importlib.util.find_spec("astra") is None or case.grid.ndim == 3:
         return None
@@ -146,80 +175,130 @@ def astra_line(case: Case) -> tuple[Pass, Pass, Callable[[np.ndarray], np.ndarra
     def forward(image: np.ndarray) -> np.ndarray:
         astra.data2d.store(image_id, np.ascontiguousarray(image[::-1], dtype=np.float32))
         astra.algorithm.run(fp)
-        return astra.data2d.get(data_id).astype(np.float64)
+        data = astra.data2d.get(data_id).astype(np.float64)
+        return data if case.window is None else np.take_along_axis(data, case.window.column_indices, axis=1)
 
-    return (lambda: astra.algorithm.run(fp)), (lambda: astra.algorithm.run(bp)), forward
+    return Peer(lambda: astra.algorithm.run(fp), lambda: astra.algorithm.run(bp), forward)
 
 
-def xcist(case: Case, path: str | None) -> tuple[Pass, Pass, Callable[[np.ndarray], np.ndarray]] | None:
-    """XCIST's 2-D distance-driven fan projector (``DD2FanProj``), whole detector."""
-    if path is None or not isinstance(case.geometry, FanBeam) or case.window is not None or any(case.grid.center):
+def xcist(case: Case, path: str | None) -> Peer | None:
+    """XCIST's distance-driven projectors on the whole detector: ``DD2FanProj``, ``DD2ParProj`` or ``DD3Proj``.
+
+    Lengths are in pixels. XCIST's axes and signs are not documented: the flips that fit the exact answer are taken,
+    found on a few views. On 3-D insets every twelfth view is projected and the time multiplied: XCIST has no window,
+    and the whole detector of all views would take minutes.
+    """
+    if path is None:
         return None
     library = ctypes.CDLL(path)
     g, grid = case.geometry, case.grid
-    pixel, (ny, nx) = grid.spacing[0], grid.shape
-    f = ctypes.c_float
+    pixel, solid = grid.spacing[-1], grid.ndim == 3
+    every = 12 if solid and case.window is not None else 1
+    angles = np.ascontiguousarray(g.angles[::every], dtype=np.float32)
     u = g.column_positions
-    xds, yds = (np.ascontiguousarray(v / pixel, dtype=np.float32) for v in (u, np.full(u.size, g.sod - g.sdd)))
-    angles = np.ascontiguousarray(g.angles, dtype=np.float32)
-    data = np.zeros((g.views, g.columns), dtype=np.float32)
-    image = np.zeros((ny, nx), dtype=np.float32)
+    sod = 0.0 if isinstance(g, ParallelBeam) else g.sod
+    back = 1.0 if isinstance(g, ParallelBeam) else g.sdd
+    if getattr(g, "detector", "flat") == "curved":
+        xds, yds = back * np.sin(u / back), sod - back * np.cos(u / back)
+    else:
+        xds, yds = u, np.full(u.size, sod - back)
+    xds, yds = (np.ascontiguousarray(v / pixel, dtype=np.float32) for v in (xds, yds))
+    rows = slice(0, 1)
+    if solid:
+        rows = slice(case.window.first_row, case.window.first_row + case.window.rows) if case.window else slice(None)
+        zds = np.ascontiguousarray(g.row_positions[rows] / pixel, dtype=np.float32)
+        shape: tuple[int, ...] = (angles.size, g.columns, zds.size)
+        image = np.zeros((*grid.shape[1:], grid.shape[0]), dtype=np.float32)
+        heights = np.zeros(angles.size, dtype=np.float32)
+    else:
+        shape, image = (angles.size, g.columns), np.zeros(grid.shape, dtype=np.float32)
+    data = np.zeros(shape, dtype=np.float32)
+    shift = np.array(grid.center[-2:]) / pixel
 
     def pointer(a: np.ndarray) -> Any:
-        return a.ctypes.data_as(ctypes.POINTER(f))
+        return a.ctypes.data_as(ctypes.POINTER(ctypes.c_float))
 
-    def run(name: str) -> None:
+    def run(signs: tuple[int, int, int], back: bool = False, views: np.ndarray = angles) -> None:
+        i, f = ctypes.c_int, ctypes.c_float
+        swap, sx, sy = signs
+        dx, dy = (float(s) * float(v) for s, v in zip((sx, sy), shift if swap else shift[::-1], strict=True))
+        n = i(views.size)
+        if solid:
+            library.DD3Proj(
+                f(0.0), f(sod / pixel), f(0.0), i(g.columns), i(zds.size), pointer(xds), pointer(yds), pointer(zds),
+                f(1.0), f(dx), f(dy), f(grid.center[0] / pixel), pointer(views), pointer(heights), n, pointer(data),
+                i(grid.shape[2]), i(grid.shape[1]), i(grid.shape[0]), pointer(image),
+            )  # fmt: skip
+            return
+        source = () if isinstance(g, ParallelBeam) else (f(dx), f(sod / pixel + dy))
+        x, y = (np.ascontiguousarray(v + np.float32(d)) for v, d in ((xds, dx), (yds, dy)))
+        name = "DD2ParProj" if isinstance(g, ParallelBeam) else "DD2FanBack" if back else "DD2FanProj"
         getattr(library, name)(
-            ctypes.c_int(g.columns), f(0.0), f(g.sod / pixel), pointer(xds), pointer(yds), f(0.0), f(0.0),
-            pointer(angles), ctypes.c_int(g.views), pointer(data), ctypes.c_int(nx), ctypes.c_int(ny), pointer(image),
+            i(g.columns), *source, pointer(x), pointer(y), f(dx), f(dy), pointer(views), n, pointer(data),
+            i(grid.shape[1]), i(grid.shape[0]), pointer(image),
         )  # fmt: skip
 
-    def settle() -> tuple[bool, ...]:
-        """XCIST's image axes: take the flips that fit the exact answer."""
-        best, choice = math.inf, (False, False, False, False)
-        reference = case.exact["gaussians"]
-        for flips in np.ndindex(2, 2, 2, 2):
-            error = np.linalg.norm(apply(case.images["gaussians"], flips) - reference)
-            if error < best:
-                best, choice = error, flips
-        return choice
+    def apply(x: np.ndarray, flips: Any, views: np.ndarray) -> np.ndarray:
+        planes = x.transpose(1, 2, 0) if solid else x
+        planes = planes.swapaxes(0, 1) if flips[0] else planes
+        planes = planes[::-1] if flips[1] else planes
+        image[:] = planes[:, ::-1] if flips[2] else planes
+        run((flips[0], 2 * flips[4] - 1, 2 * flips[5] - 1), views=views)
+        out = data[: views.size].astype(np.float64) * pixel
+        if solid:
+            out = out.swapaxes(1, 2)
+        return out[..., ::-1] if flips[3] else out
 
-    def apply(x: np.ndarray, flips: Any) -> np.ndarray:
-        x = x.T if flips[0] else x
-        x = x[::-1] if flips[1] else x
-        x = x[:, ::-1] if flips[2] else x
-        image[:] = x
-        run("DD2FanProj")
-        out = data.astype(np.float64) * pixel
-        return out[:, ::-1] if flips[3] else out
+    def crop(full: np.ndarray, views: np.ndarray) -> np.ndarray:
+        if case.window is None:
+            return full
+        columns = case.window.column_indices[views]
+        return np.stack([view[..., c] for view, c in zip(full, columns, strict=True)])
 
-    chosen = settle()
-    return (lambda: run("DD2FanProj")), (lambda: run("DD2FanBack")), lambda x: apply(x, chosen)
+    few = np.arange(angles.size)[3 :: max(1, angles.size // 9)]
+    indices = np.arange(g.views)[::every]
+    best, chosen = math.inf, (0,) * 6
+    for flips in np.ndindex(2, 2, 2, 2, *((2, 2) if shift.any() else (1, 1))):
+        found = crop(apply(case.images["gaussians"], flips, np.ascontiguousarray(angles[few])), indices[few])
+        error = float(np.linalg.norm(found - case.exact["gaussians"][indices[few]]))
+        if error < best:
+            best, chosen = error, flips
+    signs = (chosen[0], 2 * chosen[4] - 1, 2 * chosen[5] - 1)
+    return Peer(
+        lambda: run(signs),
+        (lambda: run(signs, back=True)) if isinstance(g, FanBeam) else None,
+        lambda x: crop(apply(x, chosen, angles), indices),
+        every,
+    )
 
 
 def measure(case: Case, repeats: int, library: str | None) -> list[dict[str, Any]]:
     """One table row per projector; the timed passes are interleaved."""
+    cores = numba.config.NUMBA_NUM_THREADS
     found = {
-        "torchpcct float32": ours(case, torch.float32),
-        "torchpcct float64": ours(case, torch.float64),
+        f"torchpcct float32, {cores} threads": ours(case, torch.float32, cores),
+        "torchpcct float32, 1 thread": ours(case, torch.float32, 1),
+        f"torchpcct float64, {cores} threads": ours(case, torch.float64, cores),
         "ASTRA line": astra_line(case),
         "XCIST distance-driven": xcist(case, library),
     }
-    present = {name: passes for name, passes in found.items() if passes is not None}
+    present = {name: peer for name, peer in found.items() if peer is not None}
     rows: list[dict[str, Any]] = []
-    for name, passes in present.items():
-        rows.append({"case": case.name, "projector": name, **case.errors(passes[2])})
+    for name, peer in present.items():
+        rows.append({"case": case.name, "projector": name, "every": peer.every, **case.errors(peer)})
     times: dict[tuple[str, int], list[float]] = {}
     for repeat in range(repeats + 1):
-        for name, passes in present.items():
-            for direction in (0, 1):
+        for name, peer in present.items():
+            for direction, work in enumerate((peer.forward, peer.adjoint)):
+                if work is None:
+                    continue
                 begin = time.perf_counter()
-                passes[direction]()
+                work()
                 if repeat:  # the first round warms caches
-                    times.setdefault((name, direction), []).append(time.perf_counter() - begin)
+                    times.setdefault((name, direction), []).append((time.perf_counter() - begin) * peer.every)
     for row in rows:
         for direction, key in ((0, "forward"), (1, "adjoint")):
-            values = times[row["projector"], direction]
+            values = times.get((row["projector"], direction), [math.nan])
             row[f"{key} median s"], row[f"{key} min s"] = float(np.median(values)), min(values)
     return rows
 
@@ -231,9 +310,13 @@ def table(rows: list[dict[str, Any]]) -> str:
     ]
     for r in rows:
         ellipses = f"{r['ellipses']:.2e}" if "ellipses" in r else "–"
+        forward, adjoint = (
+            "–" if math.isnan(r[f"{key} median s"]) else f"{r[f'{key} median s']:.3f} ({r[f'{key} min s']:.3f})"
+            for key in ("forward", "adjoint")
+        )
+        note = f" (one view in {r['every']}, × {r['every']})" if r["every"] > 1 else ""
         lines.append(
-            f"| {r['case']} | {r['projector']} | {r['forward median s']:.3f} ({r['forward min s']:.3f}) | "
-            f"{r['adjoint median s']:.3f} ({r['adjoint min s']:.3f}) | {r['gaussians']:.2e} | {ellipses} |"
+            f"| {r['case']} | {r['projector']}{note} | {forward} | {adjoint} | {r['gaussians']:.2e} | {ellipses} |"
         )
     return "\n".join(lines)
 
@@ -246,14 +329,14 @@ def picture(rows: list[dict[str, Any]], path: Path) -> None:
 
     names = list(dict.fromkeys(r["case"] for r in rows))
     figure, axes = plt.subplots(2, math.ceil(len(names) / 2), figsize=(3.6 * math.ceil(len(names) / 2), 6.4))
-    ours_marks = {"torchpcct float32": "C0o", "torchpcct float64": "C0s"}
-    marks = {**ours_marks, "ASTRA line": "C1^", "XCIST distance-driven": "C3v"}
+    marks = ["C0o", "C0<", "C0s", "C1^", "C3v"]
+    style = dict(zip(dict.fromkeys(r["projector"] for r in rows), marks, strict=False))
     for axis, name in zip(axes.flat, names, strict=False):
         for r in rows:
             if r["case"] == name:
-                axis.loglog(r["forward min s"], r["gaussians"], marks[r["projector"]], label=r["projector"])
+                axis.loglog(r["forward median s"], r["gaussians"], style[r["projector"]], label=r["projector"])
         axis.set_title(name, fontsize=9)
-        axis.set_xlabel("forward projection, s (best of run)", fontsize=8)
+        axis.set_xlabel("forward projection, s (median)", fontsize=8)
         axis.set_ylabel("relative L2 error", fontsize=8)
         axis.grid(alpha=0.3, which="both")
     axes.flat[0].legend(fontsize=7)
@@ -296,12 +379,25 @@ def main() -> None:
     rows: list[dict[str, Any]] = []
     for make in cases():
         rows += measure(make(), options.repeats, library)
-        _write(rows, None, options.out)  # a run cut short keeps what it measured
+        print(_write(rows, None, options.out).splitlines()[-1], flush=True)  # a run cut short keeps what it measured
     print(_write(rows, growth(options.repeats), options.out))
 
 
+def _machine() -> str:
+    """Processor and number of cores."""
+    info = Path("/proc/cpuinfo")
+    names = (
+        [x.split(":")[1].strip() for x in info.read_text().splitlines() if "model name" in x] if info.exists() else []
+    )
+    return f"{names[0] if names else platform.machine()}, {os.cpu_count()} cores"
+
+
 def _write(rows: list[dict[str, Any]], grown: dict[str, Any] | None, out: Path) -> str:
-    report = f"{platform.processor() or platform.machine()}, torch {torch.__version__}\n\n{table(rows)}\n"
+    now = datetime.datetime.now(datetime.UTC)
+    report = (
+        f"{_machine()}, torch {torch.__version__}, {now:%Y-%m-%d %H:%M} UTC, load {os.getloadavg()[0]:.1f} at the end"
+    )
+    report += f"\n\n{table(rows)}\n"
     if grown is not None:
         report += f"\nTime against size: {grown}\n"
     (out / "projectors.md").write_text(report)

@@ -21,7 +21,7 @@ _FUSED = ("contract", "nsz", "arcp", "reassoc")
 
 
 class _Code:
-    """Helpers to write the loops; ``real`` is the scalar type, ``wide`` the vector of all lanes."""
+    """Helpers to write the loops; ``real``: the scalar type, ``wide``: all lanes, ``double``: those of two knots."""
 
     def __init__(self, context: Any, builder: Any, signature: Any, args: Any) -> None:
         self.b = builder
@@ -29,9 +29,12 @@ class _Code:
         self.dtype = signature.args[1].dtype
         self.real = ir.FloatType() if self.dtype == types.float32 else ir.DoubleType()
         self.wide = ir.VectorType(self.real, self.width)
+        self.double = ir.VectorType(self.real, 2 * self.width)
         self.index = ir.IntType(64)
         self.values = [
-            context.make_array(t)(context, builder, a).data if isinstance(t, types.Array) else a
+            context.make_array(t)(context, builder, a).data
+            if isinstance(t, types.Array)
+            else a
             for t, a in zip(signature.args, args, strict=True)
         ]
 
@@ -40,10 +43,14 @@ class _Code:
         return self.b.bitcast(self.b.gep(typed, [index]), kind.as_pointer())
 
     def load(self, pointer: Any, index: Any, kind: Any) -> Any:
-        return self.b.load(self.at(pointer, index, kind), align=self.dtype.bitwidth // 8)
+        return self.b.load(
+            self.at(pointer, index, kind), align=self.dtype.bitwidth // 8
+        )
 
     def store(self, value: Any, pointer: Any, index: Any) -> None:
-        self.b.store(value, self.at(pointer, index, value.type), align=self.dtype.bitwidth // 8)
+        self.b.store(
+            value, self.at(pointer, index, value.type), align=self.dtype.bitwidth // 8
+        )
 
     def mul(self, a: Any, b: Any) -> Any:
         return self.b.fmul(a, b, flags=_FUSED)
@@ -54,80 +61,135 @@ class _Code:
     def sub(self, a: Any, b: Any) -> Any:
         return self.b.fsub(a, b, flags=_FUSED)
 
-    def splat(self, value: Any) -> Any:
-        undefined = ir.Constant(self.wide, ir.Undefined)
+    def splat(self, value: Any, count: int) -> Any:
+        """A scalar in all places of a vector."""
+        undefined = ir.Constant(ir.VectorType(value.type, count), ir.Undefined)
         one = self.b.insert_element(undefined, value, ir.Constant(ir.IntType(32), 0))
-        mask = ir.Constant(ir.VectorType(ir.IntType(32), self.width), [0] * self.width)
-        return self.b.shuffle_vector(one, undefined, mask)
+        return self.shuffle(one, undefined, [0] * count)
+
+    def shuffle(self, a: Any, b: Any, places: list[int]) -> Any:
+        return self.b.shuffle_vector(
+            a, b, ir.Constant(ir.VectorType(ir.IntType(32), len(places)), places)
+        )
 
     def clamp(self, value: Any, top: Any) -> Any:
-        zero = ir.Constant(self.real, 0.0)
+        zero = ir.Constant(value.type, None)
         value = self.b.select(self.b.fcmp_ordered(">", value, zero), value, zero)
         return self.b.select(self.b.fcmp_ordered("<", value, top), value, top)
 
     def times(self, index: Any, factor: int) -> Any:
         return self.b.mul(index, ir.Constant(self.index, factor), flags=("nsw", "nuw"))
 
-    def knot(self, p: Any, q: Any, r: Any, weight: Any, top: Any) -> tuple[Any, Any, Any]:
-        """Index of the lower knot of ``t = p + q r`` and the weights of the two knots; ``r`` is a real number."""
-        t = self.clamp(self.add(p, self.mul(q, r)), top)
-        k = self.b.fptosi(t, ir.IntType(32))
-        high = self.mul(weight, self.sub(t, self.b.sitofp(k, self.real)))
-        return self.b.zext(k, self.index), self.sub(weight, high), high
+    def knots(
+        self, p: Any, q: Any, first: Any, count: int, weight: Any, top: Any
+    ) -> list[tuple[Any, Any]]:
+        """Lower knot of ``t = p + q r`` and the weights of its lanes and the next knot's, slabs ``first … + count``.
+
+        Positions and weights of all slabs are one vector computation; ``weight`` points at the weight of slab 0.
+        """
+        reals, integers = (
+            ir.VectorType(self.real, count),
+            ir.VectorType(ir.IntType(32), count),
+        )
+        r = self.splat(self.b.sitofp(first, self.real), count)
+        r = self.add(
+            r,
+            ir.Constant(
+                reals, [ir.Constant(self.real, float(i)) for i in range(count)]
+            ),
+        )
+        t = self.add(self.splat(p, count), self.mul(self.splat(q, count), r))
+        t = self.clamp(t, self.splat(top, count))
+        k = self.b.fptosi(t, integers)
+        w = self.load(weight, first, reals)
+        high = self.mul(w, self.sub(t, self.b.sitofp(k, reals)))
+        low = self.sub(w, high)
+        return [
+            (
+                self.b.zext(
+                    self.b.extract_element(k, ir.Constant(ir.IntType(32), i)),
+                    self.index,
+                ),
+                self.shuffle(low, high, [i] * self.width + [count + i] * self.width),
+            )
+            for i in range(count)
+        ]
 
     def slabs(self, r0: Any, r1: Any, body: Any) -> None:
-        """Call ``body(indices, reals)`` for four slabs at a time, so that latencies overlap, then for the rest."""
-        four = ir.Constant(self.index, 4)
-        groups = self.b.sdiv(self.b.sub(r1, r0), four)
+        """Call ``body(first slab, how many)`` for groups of slabs, then for the rest one by one.
+
+        Eight slabs at once fill the registers of few lanes; with many lanes they would spill.
+        """
+        size = 8 if self.width <= 2 else 4
+        group = ir.Constant(self.index, size)
+        groups = self.b.sdiv(self.b.sub(r1, r0), group)
         with cgutils.for_range(self.b, groups) as loop:
-            first = self.b.add(r0, self.b.mul(loop.index, four))
-            real = self.b.sitofp(first, self.real)
-            body(
-                [self.b.add(first, ir.Constant(self.index, i)) for i in range(4)],
-                [self.add(real, ir.Constant(self.real, float(i))) for i in range(4)],
-            )
-        with cgutils.for_range(self.b, r1, start=self.b.add(r0, self.b.mul(groups, four))) as loop:
-            body([loop.index], [self.b.sitofp(loop.index, self.real)])
+            body(self.b.add(r0, self.b.mul(loop.index, group)), size)
+        with cgutils.for_range(
+            self.b, r1, start=self.b.add(r0, self.b.mul(groups, group))
+        ) as loop:
+            body(loop.index, 1)
 
 
 @intrinsic
-def sum_edges(typingctx, lanes, sums, stride, p, q, weight, gain, e0, e1, r0, r1, top, out):
+def sum_edges(
+    typingctx, lanes, sums, stride, p, q, weight, gain, e0, e1, r0, r1, top, out
+):
     """Sum slabs ``r0…r1`` at the edges ``e0…e1`` and add the differences of neighbouring edges to ``out``.
 
     ``lanes``: tuple of the vector's length W. ``sums``: running sums, slab r starts at ``r * stride`` (in elements),
     knots of W lanes each. ``p, q``: edge lines, ``weight``: per slab, ``gain``: per cell, ``out``: cells of W lanes.
     """
-    signature = types.void(lanes, sums, stride, p, q, weight, gain, e0, e1, r0, r1, top, out)
+    signature = types.void(
+        lanes, sums, stride, p, q, weight, gain, e0, e1, r0, r1, top, out
+    )
 
     def codegen(context, builder, signature, args):
         c = _Code(context, builder, signature, args)
         _, sums, stride, p, q, weight, gain, e0, e1, r0, r1, top, out = c.values
         before = cgutils.alloca_once(builder, c.wide)
-        totals = [cgutils.alloca_once(builder, c.wide) for _ in range(4)]
-        zero = ir.Constant(c.wide, [ir.Constant(c.real, 0.0)] * c.width)
-        builder.store(zero, before)
+        # Both knots of an interpolation lie side by side: one load, one product.
+        totals = [cgutils.alloca_once(builder, c.double) for _ in range(4)]
+        builder.store(ir.Constant(c.wide, None), before)
         with cgutils.for_range(builder, e1, start=e0) as edge:
             pe, qe = c.load(p, edge.index, c.real), c.load(q, edge.index, c.real)
             for total in totals:
-                builder.store(zero, total)
+                builder.store(ir.Constant(c.double, None), total)
 
-            def body(indices, reals):
-                knots = [c.knot(pe, qe, x, c.load(weight, r, c.real), top) for r, x in zip(indices, reals, strict=True)]
-                for r, (k, low, high), total in zip(indices, knots, totals, strict=False):
-                    base = builder.add(builder.mul(r, stride), c.times(k, c.width))
-                    a = c.load(sums, base, c.wide)
-                    b = c.load(sums, builder.add(base, ir.Constant(c.index, c.width)), c.wide)
-                    value = c.add(c.mul(c.splat(low), a), c.mul(c.splat(high), b))
-                    builder.store(c.add(builder.load(total), value), total)
+            def body(first, count):
+                for i, (k, weights) in enumerate(
+                    c.knots(pe, qe, first, count, weight, top)
+                ):
+                    r, total = (
+                        builder.add(first, ir.Constant(c.index, i)),
+                        totals[i % len(totals)],
+                    )
+                    values = c.load(
+                        sums,
+                        builder.add(builder.mul(r, stride), c.times(k, c.width)),
+                        c.double,
+                    )
+                    builder.store(
+                        c.add(builder.load(total), c.mul(weights, values)), total
+                    )
 
             c.slabs(r0, r1, body)
-            now = c.add(
+            both = c.add(
                 c.add(builder.load(totals[0]), builder.load(totals[1])),
                 c.add(builder.load(totals[2]), builder.load(totals[3])),
             )
+            now = c.add(
+                *(
+                    c.shuffle(both, both, list(range(i, i + c.width)))
+                    for i in (0, c.width)
+                )
+            )
             with builder.if_then(builder.icmp_signed(">", edge.index, e0)):
                 cell = builder.sub(edge.index, ir.Constant(c.index, 1))
-                change = c.mul(c.splat(c.load(gain, cell, c.real)), c.sub(now, builder.load(before)))
+                change = c.mul(
+                    c.splat(c.load(gain, cell, c.real), c.width),
+                    c.sub(now, builder.load(before)),
+                )
                 where = c.times(cell, c.width)
                 c.store(c.add(c.load(out, where, c.wide), change), out, where)
             builder.store(now, before)
@@ -142,29 +204,41 @@ def add_edges(typingctx, lanes, out, stride, p, q, weight, e0, e1, r0, r1, top, 
 
     ``values``: cells of W lanes, one more entry than cells. ``out``: slab r starts at ``(r - r0) * stride``.
     """
-    signature = types.void(lanes, out, stride, p, q, weight, e0, e1, r0, r1, top, values)
+    signature = types.void(
+        lanes, out, stride, p, q, weight, e0, e1, r0, r1, top, values
+    )
 
     def codegen(context, builder, signature, args):
         c = _Code(context, builder, signature, args)
         _, out, stride, p, q, weight, e0, e1, r0, r1, top, values = c.values
         before = cgutils.alloca_once(builder, c.wide)
-        zero = ir.Constant(c.wide, [ir.Constant(c.real, 0.0)] * c.width)
+        zero = ir.Constant(c.wide, None)
         builder.store(zero, before)
         last = builder.sub(e1, ir.Constant(c.index, 1))
         with cgutils.for_range(builder, e1, start=e0) as edge:
             pe, qe = c.load(p, edge.index, c.real), c.load(q, edge.index, c.real)
             cell = c.load(values, c.times(edge.index, c.width), c.wide)
-            cell = builder.select(builder.icmp_signed("==", edge.index, last), zero, cell)
+            cell = builder.select(
+                builder.icmp_signed("==", edge.index, last), zero, cell
+            )
             value = c.sub(builder.load(before), cell)
             builder.store(cell, before)
 
-            def body(indices, reals):
-                knots = [c.knot(pe, qe, x, c.load(weight, r, c.real), top) for r, x in zip(indices, reals, strict=True)]
-                for r, (k, low, high) in zip(indices, knots, strict=True):
-                    base = builder.add(builder.mul(builder.sub(r, r0), stride), c.times(k, c.width))
-                    above = builder.add(base, ir.Constant(c.index, c.width))
-                    c.store(c.add(c.load(out, base, c.wide), c.mul(c.splat(low), value)), out, base)
-                    c.store(c.add(c.load(out, above, c.wide), c.mul(c.splat(high), value)), out, above)
+            twice = c.shuffle(value, value, list(range(c.width)) * 2)
+
+            def body(first, count):
+                for i, (k, weights) in enumerate(
+                    c.knots(pe, qe, first, count, weight, top)
+                ):
+                    r = builder.add(first, ir.Constant(c.index, i))
+                    base = builder.add(
+                        builder.mul(builder.sub(r, r0), stride), c.times(k, c.width)
+                    )
+                    c.store(
+                        c.add(c.load(out, base, c.double), c.mul(weights, twice)),
+                        out,
+                        base,
+                    )
 
             c.slabs(r0, r1, body)
         return context.get_dummy_value()
