@@ -1,1 +1,1 @@
-"""Training of the learned prior."""
+"""Training of the learned prior: ``python -m train``, see :mod:`train.__main__` and :mod:`train.loop`."""

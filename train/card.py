@@ -1,0 +1,126 @@
+"""Shipped weights and their training card: how they were made, on what, and how good they were."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from train.checkpoint import WEIGHTS_FORMAT, digest, read_tensors, write_atomically, write_tensors
+from train.config import TrainConfig
+
+__all__ = ["export", "finite", "hardware", "load_weights", "versions"]
+
+PACKAGES = ("torchpcct", "torch", "numpy", "scipy", "numba", "safetensors")
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that the result depends on."""
+    found = {"python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def hardware() -> dict[str, Any]:
+    """CPU model, logical cores this process may use, and the system."""
+    model = platform.processor() or platform.machine()
+    try:
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                model = line.split(":", 1)[1].strip()
+                break
+    except OSError:
+        pass
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return {"cpu": model, "cores": cores, "system": f"{platform.system()} {platform.machine()}"}
+
+
+def finite(value: Any) -> Any:
+    """JSON values with the numbers that JSON does not know ('nan', 'inf') as text."""
+    if isinstance(value, Mapping):
+        return {k: finite(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    return value
+
+
+def export(folder: Path, weights: Mapping[str, Tensor], config: TrainConfig, state: Mapping[str, Any]) -> None:
+    """Write ``weights.safetensors``, ``card.json`` and ``card.md``.
+
+    Args:
+        folder: existing.
+        weights: state of the model.
+        config: of the run.
+        state: fields of :class:`train.loop.State` as of now; ``best`` describes the weights.
+    """
+    best = state["best"]
+    card = {
+        "validation": {"score": best["score"], **best["figures"]},
+        "step": best["step"],
+        "steps_done": state["step"],
+        "steps_skipped": state["skipped"],
+        "seconds_to_these_weights": round(best["seconds"], 1),
+        "seconds": round(state["seconds"], 1),
+        "parameters": sum(w.numel() for w in weights.values()),
+        "sha256_of_tensors": digest(weights),
+        "seed": config.seed,
+        "config": finite(config.as_dict()),
+        "sessions": state["sessions"],
+        "threads": state["machine"].get("threads"),
+        "processes": state["machine"].get("processes"),
+        "hardware": hardware(),
+        "versions": versions(),
+        "written": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+    # Enough to build the model that the weights belong to, without the card.
+    header = {"prior": card["config"]["prior"], "unroll": config.unroll, "step": best["step"], "score": best["score"]}
+    write_tensors(folder / "weights.safetensors", WEIGHTS_FORMAT, weights, header)
+    write_atomically(folder / "card.json", (json.dumps(card, indent=2, ensure_ascii=False) + "\n").encode())
+    write_atomically(folder / "card.md", _markdown(card, config).encode())
+
+
+def load_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Weights of :func:`export`, with ``prior``, ``unroll``, ``step`` and ``score``.
+
+    Raises:
+        CheckpointError: missing, damaged, or another kind of file.
+    """
+    return read_tensors(path, WEIGHTS_FORMAT)
+
+
+def _markdown(card: Mapping[str, Any], config: TrainConfig) -> str:
+    machine = card["hardware"]
+    rows = {
+        "Weights": f"`weights.safetensors`, {card['parameters']} values, sha256 of tensors "
+        f"`{card['sha256_of_tensors'][:16]}…`",
+        "Chosen at": f"step {card['step']} of {config.steps} ({card['steps_done']} done, {card['steps_skipped']} "
+        f"skipped), the best validation score, averaged weights",
+        "Time": f"{card['seconds_to_these_weights'] / 60:.1f} min to these weights, {card['seconds'] / 60:.1f} min in "
+        "all, validations included",
+        "Hardware": f"{machine['cpu']}, {machine['cores']} cores, {card['threads']} threads × {card['processes']} "
+        f"processes, {machine['system']}",
+        "Versions": ", ".join(f"{k} {v}" for k, v in card["versions"].items()),
+        "Seed": str(card["seed"]),
+        "Written": card["written"],
+    }
+    lines = ["# Training card", "", "| | |", "|---|---|", *(f"| {k} | {v} |" for k, v in rows.items())]
+    lines += ["", "## Validation", "", "| figure | value |", "|---|---|"]
+    lines += [f"| {k} | {v:.6g} |" if isinstance(v, float) else f"| {k} | {v} |" for k, v in card["validation"].items()]
+    lines += ["", "## Command", "", "```"]
+    lines += [f"{s['command']}  # from step {s['first_step']}" for s in card["sessions"]]
+    lines += ["```", "", "## Configuration", "", "```yaml", config.to_yaml().rstrip(), "```", ""]
+    return "\n".join(lines)

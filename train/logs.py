@@ -1,0 +1,241 @@
+"""What a run leaves to look at: CSV tables, TensorBoard events, validation pictures, a progress line."""
+
+from __future__ import annotations
+
+import csv
+import io
+import logging
+import math
+import os
+import re
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from train.checkpoint import write_atomically
+
+__all__ = ["Logs", "Table", "save_picture"]
+
+logger = logging.getLogger(__name__)
+
+CENTRE_HU, WIDTH_HU = 150.0, 600.0
+SMALLEST_PICTURE = 256
+"""Pictures are enlarged by a whole factor until their shorter side has this many pixels."""
+
+
+class Table:
+    """A CSV file that grows by rows; the first column is the step.
+
+    Numbers are written so that they read back exactly. A row with a new column rewrites the file.
+
+    Args:
+        path: file; an existing one is continued.
+        after: rows beyond this step, and a last row that was cut short, are dropped from an existing file.
+    """
+
+    def __init__(self, path: Path, after: int = 0) -> None:
+        self.path = path
+        self.columns: list[str] = []
+        self._rows: list[list[str]] = []
+        if path.exists():
+            self._read(after)
+        if self.columns:
+            self._rewrite()
+        else:
+            path.unlink(missing_ok=True)
+        self._file: Any = None
+
+    def _read(self, after: int) -> None:
+        text = self.path.read_text(encoding="utf-8")
+        # Without its line end the last row may be cut short anywhere, also within a number.
+        whole = text[: text.rfind("\n") + 1]
+        rows = [row for row in csv.reader(io.StringIO(whole)) if row]
+        if not rows:
+            return
+        for row in rows[1:]:
+            if len(row) == len(rows[0]) and row[0].isdigit() and int(row[0]) <= after:
+                self._rows.append(row)
+        self.columns = rows[0] if self._rows else []
+
+    @property
+    def steps(self) -> list[int]:
+        """First column."""
+        return [int(row[0]) for row in self._rows]
+
+    def append(self, step: int, values: Mapping[str, float]) -> None:
+        """Add a row, at once visible to other processes."""
+        names = ["step", *values]
+        fresh = [n for n in names if n not in self.columns]
+        cells = {"step": str(step), **{k: _number(v) for k, v in values.items()}}
+        if fresh:
+            self.close()
+            self.columns += fresh
+            self._rows = [row + [""] * (len(self.columns) - len(row)) for row in self._rows]
+        row = [cells.get(name, "") for name in self.columns]
+        self._rows.append(row)
+        if fresh:
+            self._rewrite()
+            return
+        if self._file is None:
+            self._file = open(self.path, "a", encoding="utf-8", newline="")  # noqa: SIM115 (stays open)
+        self._file.write(_lines([row]))
+        self._file.flush()
+
+    def sync(self) -> None:
+        """Onto the disk: a checkpoint must not be newer than the rows before it."""
+        if self._file is not None:
+            os.fsync(self._file.fileno())
+
+    def close(self) -> None:
+        """Close the file; another row opens it again."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def _rewrite(self) -> None:
+        write_atomically(self.path, _lines([self.columns, *self._rows]).encode())
+
+
+def _number(value: float) -> str:
+    value = float(value)
+    return str(int(value)) if value.is_integer() and abs(value) < 2**53 else repr(value)
+
+
+def _lines(rows: list[list[str]]) -> str:
+    buffer = io.StringIO(newline="")
+    csv.writer(buffer, lineterminator="\n").writerows(rows)
+    return buffer.getvalue()
+
+
+def save_picture(path: Path, image: NDArray[Any]) -> None:
+    """A section in the window C150/W600 (−150 HU black, 450 HU white) as PNG; not-a-number shows black.
+
+    Args:
+        path: file, in an existing folder.
+        image: 2-D, HU.
+
+    Raises:
+        ValueError: not a 2-D array with pixels.
+    """
+    from PIL import Image
+
+    image = np.asarray(image)
+    if image.ndim != 2 or image.size == 0:
+        raise ValueError(f"a picture must be a 2-D array, got shape {image.shape}")
+    with np.errstate(invalid="ignore"):
+        shade = (image.astype(np.float64) - (CENTRE_HU - 0.5 * WIDTH_HU)) / WIDTH_HU
+    grey = np.rint(255 * np.nan_to_num(shade.clip(0, 1))).astype(np.uint8)
+    factor = max(1, math.ceil(SMALLEST_PICTURE / min(grey.shape)))
+    grey = grey.repeat(factor, 0).repeat(factor, 1)
+    buffer = io.BytesIO()
+    Image.fromarray(grey).save(buffer, format="PNG")
+    write_atomically(path, buffer.getvalue())
+
+
+class Logs:
+    """Everything a run writes beside its checkpoints.
+
+    ``log.csv`` has a row per logged step, ``validation.csv`` one per validation, ``pictures/`` the sections of every
+    validation, ``tensorboard/`` the same figures as events, if tensorboard is installed.
+
+    Args:
+        folder: of the run, existing.
+        step: completed steps at the start; what an interrupted run wrote beyond them is dropped.
+        steps: of the whole run.
+        progress: show a progress line on the error stream.
+        tensorboard: write events.
+        validated: step of the last validation that counts.
+    """
+
+    def __init__(
+        self, folder: Path, step: int, steps: int, progress: bool = True, tensorboard: bool = True, validated: int = 0
+    ) -> None:
+        self.folder = folder
+        self.table = Table(folder / "log.csv", step)
+        self.validation = Table(folder / "validation.csv", validated)
+        self.pictures = folder / "pictures"
+        self.pictures.mkdir(exist_ok=True)
+        self._writer = _writer(folder / "tensorboard", step + 1) if tensorboard else None
+        from tqdm import tqdm
+
+        self._bar = tqdm(
+            total=steps,
+            initial=step,
+            desc="train",
+            unit="step",
+            disable=not progress,
+            dynamic_ncols=True,
+            # Over about 20 steps: they differ in their scenes, and some wait for a checkpoint.
+            smoothing=0.05,
+            # A log file needs no line a second.
+            mininterval=0.5 if sys.stderr.isatty() else 10.0,
+        )
+
+    def step(self, step: int, values: Mapping[str, float], logged: bool) -> None:
+        """A step is done.
+
+        Args:
+            step: number of steps done, from 1.
+            values: figures of the step; ``loss`` is shown in the progress line.
+            logged: give it a row.
+        """
+        if logged:
+            self.table.append(step, values)
+            self._events("train", step, values)
+        if "loss" in values:
+            self._bar.set_postfix_str(f"loss {values['loss']:.4g}", refresh=False)
+        self._bar.update(step - self._bar.n)
+
+    def validated(
+        self, step: int, score: float, figures: Mapping[str, float], pictures: Mapping[str, NDArray[Any]]
+    ) -> None:
+        """A validation is done."""
+        values = {"score": score, **figures}
+        self.validation.append(step, values)
+        self._events("validation", step, values)
+        for name, image in pictures.items():
+            save_picture(self.pictures / f"{_file_name(name)}_{step:06d}.png", image)
+        self.message(f"step {step}: validation score {score:.5g}")
+
+    def message(self, text: str) -> None:
+        """A line above the progress line; to the log if there is none."""
+        if self._bar.disable:
+            logger.info(text)
+        else:
+            self._bar.write(text, file=self._bar.fp)
+
+    def sync(self) -> None:
+        """Rows onto the disk."""
+        self.table.sync()
+        self.validation.sync()
+
+    def close(self) -> None:
+        """Close the files and the progress line."""
+        self.table.close()
+        self.validation.close()
+        if self._writer is not None:
+            self._writer.close()
+        self._bar.close()
+
+    def _events(self, group: str, step: int, values: Mapping[str, float]) -> None:
+        if self._writer is not None:
+            for name, value in values.items():
+                self._writer.add_scalar(f"{group}/{name}", value, step)
+
+
+def _file_name(name: str) -> str:
+    return re.sub(r"[^\w.-]+", "_", name).strip("._") or "picture"
+
+
+def _writer(folder: Path, purge_step: int) -> Any:
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        logger.info("tensorboard is not installed (extra 'train'): no events are written")
+        return None
+    # Events of the interrupted run from here on are hidden by TensorBoard.
+    return SummaryWriter(str(folder), purge_step=purge_step)
