@@ -34,7 +34,7 @@ from train.checkpoint import CheckpointError, Store
 from train.config import TrainConfig, differences
 from train.logs import Logs
 
-__all__ = ["DivergedError", "Group", "Outcome", "gradient", "learning_rate", "train"]
+__all__ = ["Adam", "DivergedError", "Group", "Outcome", "gradient", "learning_rate", "train"]
 
 logger = logging.getLogger(__name__)
 
@@ -116,6 +116,52 @@ class Group:
         out: list[Any] = [None] * self.size
         self._distributed.all_gather_object(out, dict(values))
         return out
+
+
+class Adam:
+    """Adam on all parameters as one vector (Kingma, Ba 2015, arXiv:1412.6980), β = (0.9, 0.99).
+
+    The vector is what the processes exchange anyhow, and two moments make a checkpoint that needs no pickling.
+
+    Args:
+        model: whose parameters it changes, all of one type.
+    """
+
+    BETAS = (0.9, 0.99)
+    EPSILON = 1e-8
+
+    def __init__(self, model: nn.Module) -> None:
+        self.parameters = list(model.parameters())
+        size = sum(p.numel() for p in self.parameters)
+        like = self.parameters[0].detach()
+        self.moments = {"first": like.new_zeros(size), "second": like.new_zeros(size)}
+        self.updates = 0
+
+    def load(self, moments: Mapping[str, Tensor], updates: int) -> None:
+        """Continue from a checkpoint.
+
+        Raises:
+            KeyError, RuntimeError: the moments are missing, or those of another model.
+        """
+        for name, value in self.moments.items():
+            if moments[name].shape != value.shape:
+                raise RuntimeError(f"{len(moments[name])} moments for {len(value)} parameters")
+            value.copy_(moments[name])
+        self.updates = updates
+
+    @torch.no_grad()
+    def step(self, gradient: Tensor, rate: float) -> None:
+        """One step against ``gradient`` (all parameters, in order) with a learning rate."""
+        self.updates += 1
+        first, second = self.moments["first"], self.moments["second"]
+        first.lerp_(gradient, 1 - self.BETAS[0])
+        second.lerp_(gradient.square(), 1 - self.BETAS[1])
+        scale = (second / (1 - self.BETAS[1] ** self.updates)).sqrt_().add_(self.EPSILON)
+        change = first / scale * (rate / (1 - self.BETAS[0] ** self.updates))
+        start = 0
+        for p in self.parameters:
+            p.sub_(change[start : start + p.numel()].view_as(p))
+            start += p.numel()
 
 
 @dataclass
@@ -294,7 +340,7 @@ class _Run:
         self.state = State()
         self.average = copy.deepcopy(model).requires_grad_(False).eval()
         self.best: dict[str, Tensor] | None = None
-        self.optimizer = torch.optim.Adam(model.parameters(), lr=config.learning_rate, betas=(0.9, 0.99))
+        self.adam = Adam(model)
         self.logs: Logs | None = None
         self.notes: list[str] = []
         self._begun = self._saved = time.monotonic()
@@ -339,12 +385,7 @@ class _Run:
             self.model.load_state_dict(_group(tensors, "model"))
             self.average.load_state_dict(_group(tensors, "average"))
             self.best = _group(tensors, "best") or None
-            moments: dict[int, dict[str, Tensor]] = {}
-            for name, value in _group(tensors, "adam").items():
-                index, key = name.split(".", 1)
-                moments.setdefault(int(index), {})[key] = value
-            groups = self.optimizer.state_dict()["param_groups"]
-            self.optimizer.load_state_dict({"state": moments, "param_groups": groups})
+            self.adam.load(_group(tensors, "adam"), self.state.step - self.state.skipped)
         except (RuntimeError, KeyError, ValueError) as error:
             raise CheckpointError(f"the checkpoint in {self.out} belongs to another model: {error}") from error
 
@@ -360,13 +401,7 @@ class _Run:
         if math.isfinite(norm):
             if norm > config.clip:
                 vector = vector * (config.clip / norm)
-            start = 0
-            for p in self.model.parameters():
-                p.grad = vector[start : start + p.numel()].view_as(p)
-                start += p.numel()
-            for options in self.optimizer.param_groups:
-                options["lr"] = rate
-            self.optimizer.step()
+            self.adam.step(vector, rate)
             self._average()
             state.bad = 0
         else:
@@ -436,8 +471,7 @@ class _Run:
         tensors = {f"model.{k}": v for k, v in self.model.state_dict().items()}
         tensors |= {f"average.{k}": v for k, v in self.average.state_dict().items()}
         tensors |= {f"best.{k}": v for k, v in (self.best or {}).items()}
-        for index, values in self.optimizer.state_dict()["state"].items():
-            tensors |= {f"adam.{index}.{k}": v for k, v in values.items()}
+        tensors |= {f"adam.{k}": v for k, v in self.adam.moments.items()}
         self.store.save(tensors, {"config": self.config.to_yaml(), "state": vars(self.state)})
 
     def export(self) -> None:
