@@ -1,5 +1,85 @@
-"""Figures of merit."""
+"""Figures of merit: CNR, the limit of the data, dose factor, observer, resolution, noise."""
 
+from torchpcct.metrics._bootstrap import Estimate
+from torchpcct.metrics.ceiling import Ceiling, ceiling, information_matrix, paper_cnr_ceiling
 from torchpcct.metrics.cnr import Interval, cnr, cnr_from_moments, cnr_interval, cnr_range, mean_interval, sd_interval
+from torchpcct.metrics.dose_factor import (
+    ContrastSlope,
+    DoseCurve,
+    DoseFactor,
+    MeasuredDoseCurve,
+    contrast_slope,
+    dose_factor,
+    efficiency,
+    roi_bias,
+)
+from torchpcct.metrics.noise_power import NoisePower, noise_power_spectrum
+from torchpcct.metrics.observer import (
+    ObserverResult,
+    auc,
+    auc_from_d_prime,
+    channel_responses,
+    d_prime,
+    dog_channels,
+    false_positive_difference,
+    false_positive_rate,
+    hotelling_scores,
+    observe,
+    template_channel,
+)
+from torchpcct.metrics.resolution import (
+    TransferFunction,
+    cap_thickness,
+    edge_profile,
+    edge_width,
+    ellipsoid_distance,
+    lumen_area,
+    match_edge_width,
+    task_transfer,
+    threshold_contour,
+)
 
-__all__ = ["Interval", "cnr", "cnr_from_moments", "cnr_interval", "cnr_range", "mean_interval", "sd_interval"]
+__all__ = [
+    "Ceiling",
+    "ContrastSlope",
+    "DoseCurve",
+    "DoseFactor",
+    "Estimate",
+    "Interval",
+    "MeasuredDoseCurve",
+    "NoisePower",
+    "ObserverResult",
+    "TransferFunction",
+    "auc",
+    "auc_from_d_prime",
+    "cap_thickness",
+    "ceiling",
+    "channel_responses",
+    "cnr",
+    "cnr_from_moments",
+    "cnr_interval",
+    "cnr_range",
+    "contrast_slope",
+    "d_prime",
+    "dog_channels",
+    "dose_factor",
+    "edge_profile",
+    "edge_width",
+    "efficiency",
+    "ellipsoid_distance",
+    "false_positive_difference",
+    "false_positive_rate",
+    "hotelling_scores",
+    "information_matrix",
+    "lumen_area",
+    "match_edge_width",
+    "mean_interval",
+    "noise_power_spectrum",
+    "observe",
+    "paper_cnr_ceiling",
+    "roi_bias",
+    "sd_interval",
+    "task_transfer",
+    "template_channel",
+    "threshold_contour",
+]

@@ -1,0 +1,96 @@
+"""Noise power spectra against filtered white noise, whose spectrum is known."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from torchpcct.metrics import noise_power_spectrum
+
+
+def coloured(shape, spacing, sigma, n, seed, sd=10.0):
+    """White noise of ``sd`` HU filtered by a Gaussian of ``sigma`` mm, and its exact NPS."""
+    f = np.meshgrid(*(np.fft.fftfreq(k, s) for k, s in zip(shape, spacing, strict=True)), indexing="ij")
+    gain = np.exp(-2 * (math.pi * sigma) ** 2 * sum(np.square(a) for a in f))
+    noise = sd * np.random.default_rng(seed).standard_normal((n, *shape))
+    axes = tuple(range(1, noise.ndim))
+    return np.fft.ifftn(np.fft.fftn(noise, axes=axes) * gain, axes=axes).real, sd**2 * math.prod(spacing) * gain**2
+
+
+@pytest.mark.parametrize(("shape", "spacing"), [((24, 30), (0.3, 0.2)), ((8, 12, 10), (0.4, 0.25, 0.2))])
+def test_filtered_white_noise(shape, spacing):
+    realizations, exact = coloured(shape, spacing, 0.25, 400, 1)
+    object_ = np.linspace(-500, 500, math.prod(shape)).reshape(shape)
+    spectrum = noise_power_spectrum(torch.from_numpy(realizations + object_), spacing)
+    assert spectrum.power.shape == shape
+    strong = exact > 1e-3 * exact.max()
+    ratio = spectrum.power[strong] / exact[strong]
+    # Each frequency has about 400 exponential samples: SD 5 %.
+    assert ratio.mean() == pytest.approx(1, abs=0.01)
+    assert ratio.std() == pytest.approx(0.05, rel=0.35)
+    volume = math.prod(shape) * math.prod(spacing)
+    assert spectrum.variance == pytest.approx(exact.sum() / volume, rel=0.02)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(2, 6), st.integers(0, 99), st.sampled_from([(7, 6), (4, 5, 6)]))
+def test_integral_is_the_unbiased_variance(n, seed, shape):
+    x = np.random.default_rng(seed).normal(40, 12, (n, *shape)) + np.arange(shape[-1])
+    spectrum = noise_power_spectrum(x, tuple(0.2 + 0.1 * k for k in range(len(shape))))
+    assert spectrum.variance == pytest.approx(x.var(0, ddof=1).mean(), rel=1e-12)
+    assert spectrum.realizations == n
+    assert spectrum.power.flat[0] >= 0
+
+
+def test_radial_mean_of_an_isotropic_spectrum():
+    realizations, _ = coloured((32, 32), (0.25, 0.25), 0.3, 300, 2)
+    f, power = noise_power_spectrum(realizations, 0.25).radial()
+    expected = 100 * 0.25**2 * np.exp(-4 * (math.pi * 0.3 * f) ** 2)
+    assert f[0] == 0
+    assert f[-1] <= 2.0
+    strong = expected > 0.02 * expected[0]
+    assert strong.sum() >= 5
+    np.testing.assert_allclose(power[strong][1:], expected[strong][1:], rtol=0.08)
+
+
+@pytest.mark.parametrize(("shape", "spacing"), [((64, 64), (0.2, 0.2)), ((20, 24, 24), (0.2, 0.2, 0.2))])
+def test_correlation_length_of_gaussian_noise_is_two_sigma(shape, spacing):
+    realizations, _ = coloured(shape, spacing, 0.35, 100, 3)
+    spectrum = noise_power_spectrum(realizations, spacing)
+    assert spectrum.autocorrelation.flat[0] == 1
+    assert spectrum.correlation_length() == pytest.approx(0.70, rel=0.05)
+    half = spectrum.correlation_length(0.5)
+    assert half == pytest.approx(2 * 0.35 * math.sqrt(math.log(2)), rel=0.05)
+
+
+def test_white_noise_is_shorter_than_a_voxel():
+    white = np.random.default_rng(4).standard_normal((50, 16, 16))
+    assert noise_power_spectrum(white, 0.2).correlation_length() < 0.2
+
+
+@pytest.mark.parametrize(
+    ("x", "spacing", "match"),
+    [
+        (np.zeros((1, 4, 4)), 0.2, "n ≥ 2"),
+        (np.zeros((5, 4)), 0.2, "n ≥ 2"),
+        (np.zeros((5, 4, 4)), (0.2,), "spacing"),
+        (np.zeros((5, 4, 4)), -0.2, "spacing"),
+        (np.full((5, 4, 4), np.nan), 0.2, "NaN"),
+    ],
+)
+def test_refusals(x, spacing, match):
+    with pytest.raises(ValueError, match=match):
+        noise_power_spectrum(x, spacing)
+
+
+def test_refuses_what_has_no_noise():
+    spectrum = noise_power_spectrum(np.ones((3, 4, 4)), 0.2)
+    with pytest.raises(ValueError, match="do not vary"):
+        spectrum.correlation_length()
+    with pytest.raises(ValueError, match="level"):
+        spectrum.correlation_length(1.0)
+    with pytest.raises(ValueError, match="width"):
+        spectrum.radial(0)

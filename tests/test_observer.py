@@ -1,0 +1,221 @@
+"""The channelised Hotelling observer against Gaussian closed forms."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from torchpcct import VolumeGrid
+from torchpcct.metrics import (
+    auc,
+    auc_from_d_prime,
+    channel_responses,
+    d_prime,
+    dog_channels,
+    false_positive_difference,
+    false_positive_rate,
+    hotelling_scores,
+    observe,
+    template_channel,
+)
+
+
+def pairs(n, channels=4, seed=0, correlation=0.0, separation=0.8):
+    """Gaussian channel responses of known covariance and their ideal d′."""
+    rng = np.random.default_rng((seed, n))
+    root = np.linalg.cholesky(0.5 * np.eye(channels) + 0.5)
+    difference = separation * np.linspace(1, 0.2, channels)
+    common = rng.standard_normal((n, channels))
+    a, b = (
+        math.sqrt(correlation) * common + math.sqrt(1 - correlation) * rng.standard_normal((n, channels))
+        for _ in range(2)
+    )
+    ideal = math.sqrt(difference @ np.linalg.solve(root @ root.T, difference))
+    return a @ root.T + difference, b @ root.T, difference, ideal
+
+
+@pytest.mark.parametrize("train", [None, 500])
+@pytest.mark.parametrize("known", [True, False])
+def test_hotelling_reaches_the_ideal_observer(train, known):
+    present, absent, difference, ideal = pairs(2000 if train else 1500, seed=1)
+    means = (difference, 0 * difference) if known else None
+    s1, s0 = hotelling_scores(present, absent, known_means=means, train=train)
+    assert s1.shape == (present.shape[0] - (train or 0),)
+    assert d_prime(s1, s0, draws=10).value == pytest.approx(ideal, rel=0.06)
+    assert auc(s1, s0).value == pytest.approx(auc_from_d_prime(ideal), abs=0.015)
+
+
+def test_leave_one_out_is_what_it_says():
+    present, absent, difference, _ = pairs(12, 3, seed=2)
+    for known in (None, (difference, 0 * difference)):
+        s1, s0 = hotelling_scores(present, absent, known_means=known)
+        for k in range(12):
+            a, b = np.delete(present, k, 0), np.delete(absent, k, 0)
+            ma, mb = (a.mean(0), b.mean(0)) if known is None else known
+            dof = 20 if known is None else 22
+            covariance = ((a - ma).T @ (a - ma) + (b - mb).T @ (b - mb)) / dof
+            w = np.linalg.solve(covariance, ma - mb)
+            middle = (ma + mb) / 2 if known is None else 0 * ma
+            assert s1[k] == pytest.approx((present[k] - middle) @ w, rel=1e-9)
+            assert s0[k] == pytest.approx((absent[k] - middle) @ w, rel=1e-9)
+
+
+def test_an_observer_without_signal_guesses():
+    """Scores of the pairs it was trained on would claim a core that is not there."""
+    honest, deceived = [], []
+    for seed in range(20):
+        present, absent, _, _ = pairs(30, 10, seed=seed, separation=0.0)
+        honest.append(auc(*hotelling_scores(present, absent)).value)
+        trained_on_all = np.linalg.solve(np.cov(present.T) + np.cov(absent.T), present.mean(0) - absent.mean(0))
+        deceived.append(auc(present @ trained_on_all, absent @ trained_on_all).value)
+    assert 0.4 < np.mean(honest) < 0.55
+    assert np.mean(deceived) > 0.7
+
+
+def test_units_of_the_channels_do_not_matter():
+    present, absent, _, _ = pairs(50, seed=4)
+    units = np.array([1e-6, 1.0, 1e3, 1e7])
+    for s, t in zip(hotelling_scores(present, absent), hotelling_scores(present * units, absent * units), strict=True):
+        np.testing.assert_allclose(s, t, rtol=1e-6, atol=1e-9)
+
+
+@given(st.floats(0, 5))
+def test_area_of_normal_scores(value):
+    assert auc_from_d_prime(value) == pytest.approx(0.5 * math.erfc(-value / 2), rel=1e-9)
+
+
+def test_area_by_hand_with_ties():
+    assert auc([1.0, 2.0, 2.0], [0.0, 1.0, 2.0]).value == pytest.approx((1.5 + 2.5 + 2.5) / 9)
+    swapped = auc([0.0, 1.0, 2.0], [1.0, 2.0, 2.0])
+    assert swapped.value == pytest.approx(1 - 6.5 / 9)
+
+
+@pytest.mark.parametrize(("correlation", "paired"), [(0.0, False), (0.0, True), (0.8, True)])
+def test_area_interval_coverage(correlation, paired):
+    truth = auc_from_d_prime(1.2)
+    rng = np.random.default_rng(5)
+    covered, widths = 0, []
+    for _ in range(600):
+        common, a, b = rng.standard_normal((3, 60))
+        a, b = (math.sqrt(correlation) * common + math.sqrt(1 - correlation) * x for x in (a, b))
+        result = auc(a + 1.2, b, paired=paired)
+        covered += result.low <= truth <= result.high
+        widths.append(result.high - result.low)
+    assert 0.925 <= covered / 600 <= 0.975
+    # Noise that both images share does not blur their order: the interval knows.
+    assert (np.mean(widths) < 0.12) == (correlation == 0.8)
+
+
+def test_perfect_parting_has_a_lower_bound():
+    result = auc(np.arange(10.0) + 20, np.arange(10.0))
+    assert result == (1.0, pytest.approx(0.025**0.1), 1.0)
+    assert auc(np.arange(10.0), np.arange(10.0) + 20) == (0.0, 0.0, pytest.approx(1 - 0.025**0.1))
+
+
+def test_d_prime_interval_coverage():
+    covered = 0
+    for seed in range(200):
+        a, b = np.random.default_rng(seed).standard_normal((2, 50))
+        result = d_prime(a + 1.5, b, draws=400, seed=seed)
+        covered += result.low <= 1.5 <= result.high
+    assert 0.90 <= covered / 200 <= 0.985
+
+
+@pytest.mark.parametrize("grid", [VolumeGrid((64, 80), 0.25), VolumeGrid((24, 28, 32), (0.3, 0.25, 0.2))])
+def test_channels_have_their_spectrum(grid):
+    """In the frequency domain a channel is the difference of two Gaussians, at any spacing, place and dimension."""
+    center = tuple(0.3 * s for s in grid.spacing)
+    channels = dog_channels(grid, center, count=2, lowest=0.2, ratio=1.5)
+    np.testing.assert_allclose(np.square(channels).sum(tuple(range(1, channels.ndim))), 1)
+    f = np.sqrt(sum(np.square(a) for a in np.meshgrid(*map(np.fft.fftfreq, grid.shape, grid.spacing), indexing="ij")))
+    for k, channel in enumerate(channels):
+        s = 0.2 * 1.5**k
+        expected = np.exp(-0.5 * (f / (1.67 * s)) ** 2) - np.exp(-0.5 * (f / s) ** 2)
+        spectrum = np.abs(np.fft.fftn(channel))
+        spectrum *= (spectrum * expected).sum() / np.square(spectrum).sum()
+        np.testing.assert_allclose(spectrum, expected, atol=0.01 * expected.max())
+
+
+def test_channels_follow_the_core():
+    grid = VolumeGrid((21, 21), 0.5, (10.0, -20.0))
+    centred = dog_channels(grid, (10.0, -20.0))
+    moved = dog_channels(grid, (11.0, -21.5))
+    assert centred.shape == (10, 21, 21)
+    # Norms differ by what leaves the grid; the narrowest channel lies well inside.
+    np.testing.assert_allclose(moved[-1, 2:, :-3], centred[-1, :-2, 3:], atol=1e-6)
+    assert np.unravel_index(moved[-1].argmax(), (21, 21)) == (12, 7)
+
+
+def test_observer_on_images():
+    """White noise and a known blob: with the blob as a channel the observer is the matched filter, d′ = |s| / σ."""
+    grid = VolumeGrid((16, 16), 0.5)
+    y, x = np.meshgrid(*grid.axes, indexing="ij")
+    blob = -60 * np.exp(-(x**2 + y**2) / 2)
+    noise = 120 * np.random.default_rng(6).standard_normal((2, 300, 16, 16))
+    ideal = float(np.linalg.norm(blob)) / 120
+    channels = np.concatenate([template_channel(blob), dog_channels(grid, (0.0, 0.0), 4)])
+    result = observe(torch.from_numpy(100 + blob + noise[0]), 100 + noise[1], channels)
+    assert result.present.shape == (300,)
+    assert result.d_prime.low < ideal < result.d_prime.high
+    assert result.auc.low < auc_from_d_prime(ideal) < result.auc.high
+    known = observe(100 + blob + noise[0], 100 + noise[1], channels[:1], known_means=(100 + blob, 100 + 0 * blob))
+    direct = [(image * blob).sum((1, 2)) for image in (100 + blob + noise[0], 100 + noise[1])]
+    assert known.auc.value == pytest.approx(auc(*direct).value, abs=0.01)
+
+
+def test_responses_are_inner_products():
+    images, channels = np.random.default_rng(7).standard_normal((2, 3, 4, 5))
+    expected = np.einsum("nij,cij->nc", images, channels)
+    np.testing.assert_allclose(channel_responses(torch.from_numpy(images), channels), expected, rtol=1e-12)
+
+
+def test_false_positives():
+    present, absent = np.arange(10.0), np.array([-1.0, 0.5, 1.0, 3.0, 8.0])
+    assert false_positive_rate(present, absent, 0.9) == pytest.approx(3 / 5)  # threshold 1
+    assert false_positive_rate(present, absent, 1.0) == pytest.approx(4 / 5)
+    assert false_positive_rate(present, absent, 0.1) == 0.0
+
+
+def test_false_positive_difference_of_equal_and_better_observers():
+    rng = np.random.default_rng(8)
+    a, b = rng.standard_normal((2, 400))
+    same = false_positive_difference((a + 1, b), (a + 1, b))
+    assert tuple(same) == (0, 0, 0)
+    better = false_positive_difference((a + 2.5, b), (a + 1, b), sensitivity=0.9)
+    gap = auc_from_d_prime(math.sqrt(2) * (1.2816 - 2.5)) - auc_from_d_prime(math.sqrt(2) * (1.2816 - 1))
+    assert better.low < gap < better.high < 0
+
+
+PRESENT, ABSENT, _, _ = pairs(20)
+
+
+@pytest.mark.parametrize(
+    ("call", "match"),
+    [
+        (lambda: hotelling_scores(PRESENT, ABSENT[:5]), "pairs"),
+        (lambda: hotelling_scores(PRESENT[:5], ABSENT[:5]), "too few"),
+        (lambda: hotelling_scores(PRESENT, ABSENT, train=20), "train"),
+        (lambda: hotelling_scores(PRESENT, ABSENT, known_means=([0.0], [0.0])), "known_means"),
+        (lambda: hotelling_scores(PRESENT[:, [0, 0]], ABSENT[:, [0, 0]]), "dependent"),
+        (lambda: hotelling_scores(PRESENT * [0, 1, 1, 1], ABSENT * [0, 1, 1, 1]), "does not vary"),
+        (lambda: dog_channels(VolumeGrid((4, 4), 1.0), (0.0,)), "center"),
+        (lambda: dog_channels(VolumeGrid((4, 4), 1.0), (0.0, 0.0), ratio=1.0), "ratio"),
+        (lambda: template_channel(np.zeros((3, 3))), "differ from 0"),
+        (lambda: channel_responses(np.zeros((3, 4, 4)), np.zeros((2, 4, 5))), "match"),
+        (lambda: channel_responses(np.full((3, 4, 4), np.nan), np.ones((2, 4, 4))), "NaN"),
+        (lambda: auc([1.0, 2.0], [1.0, 2.0, 3.0]), "paired"),
+        (lambda: auc([1.0], [1.0]), "at least 2"),
+        (lambda: auc([1.0, np.nan], [1.0, 2.0]), "NaN"),
+        (lambda: auc([1.0, 2.0], [1.0, 2.0], level=0.0), "level"),
+        (lambda: d_prime([1.0, 1.0, 1.0], [0.0, 0.0, 0.0]), "do not vary"),
+        (lambda: d_prime([1.0, 2.0], [0.0, 1.0]), "3 pairs"),
+        (lambda: false_positive_rate([1.0, 2.0], [0.0, 1.0], 0.0), "sensitivity"),
+        (lambda: false_positive_difference(([1, 2], [1, 2]), ([1, 2, 3], [1, 2, 3])), "same seeds"),
+    ],
+)
+def test_refusals(call, match):
+    with pytest.raises(ValueError, match=match):
+        call()

@@ -1,0 +1,206 @@
+"""Edges, transfer functions and segmentation against closed forms."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.special import erf
+
+from torchpcct import VolumeGrid
+from torchpcct.metrics import (
+    cap_thickness,
+    edge_profile,
+    edge_width,
+    ellipsoid_distance,
+    lumen_area,
+    match_edge_width,
+    task_transfer,
+    threshold_contour,
+)
+
+GRID = VolumeGrid((120, 120), 0.1, (3.0, -2.0))
+DISK = ellipsoid_distance(GRID, (3.03, -1.98), (4.0, 4.0))
+
+
+def blurred(distance, sigma, inside=40.0, outside=100.0):
+    """A straight edge blurred by a Gaussian; on a disk of 4 mm its curvature is negligible."""
+    return inside + (outside - inside) * 0.5 * (1 + erf(distance / (math.sqrt(2) * sigma)))
+
+
+@pytest.mark.parametrize("sigma", [0.15, 0.3])
+@pytest.mark.parametrize("contrast", [60.0, -400.0])
+def test_gaussian_disk(sigma, contrast):
+    image = blurred(DISK, sigma, 40.0, 40.0 + contrast)
+    edge = task_transfer(torch.from_numpy(image), DISK, (1.5, 1.5), 0.03)
+    f = edge.frequencies
+    expected = np.exp(-2 * (math.pi * sigma * f) ** 2)
+    use = expected > 0.02
+    np.testing.assert_allclose(edge.values[use], expected[use], atol=0.01)
+    assert edge.values[0] == pytest.approx(1)
+    assert edge.contrast == pytest.approx(contrast, rel=1e-6)
+    assert edge.f50 == pytest.approx(math.sqrt(math.log(2) / 2) / (math.pi * sigma), rel=0.01)
+    assert edge.f10 == pytest.approx(math.sqrt(math.log(10) / 2) / (math.pi * sigma), rel=0.02)
+    assert edge.edge_width == pytest.approx(2 * 1.28155 * sigma, rel=0.01)
+
+
+def test_true_convolution_of_a_disk():
+    """The same from pixels: a finely sampled disk, blurred by a Gaussian filter and read at every pixel."""
+    from scipy.ndimage import gaussian_filter
+
+    fine = VolumeGrid((400, 400), 0.03)
+    distance = ellipsoid_distance(fine, (0.0, 0.0), (4.0, 4.0))
+    disk = np.clip(0.5 - distance / 0.03, 0, 1) * -60 + 100
+    edge = task_transfer(gaussian_filter(disk, 0.25 / 0.03), distance, (1.2, 1.2), 0.02)
+    assert edge.f50 == pytest.approx(math.sqrt(math.log(2) / 2) / (math.pi * 0.25), rel=0.01)
+    assert edge.f10 == pytest.approx(math.sqrt(math.log(10) / 2) / (math.pi * 0.25), rel=0.02)
+
+
+def test_bins_do_not_blur():
+    f50 = [task_transfer(blurred(DISK, 0.2), DISK, (1.4, 1.4), width).f50 for width in (0.02, 0.1)]
+    assert f50[1] == pytest.approx(f50[0], rel=0.01)
+
+
+def test_part_of_a_surface():
+    """A neighbour with another contrast does not count where the mask leaves it out."""
+    image = blurred(DISK, 0.2)
+    y = GRID.axes[0][:, None] + np.zeros(GRID.shape)
+    spoilt = np.where(y > 5.0, 500.0, image)
+    part = task_transfer(spoilt, DISK, (1.5, 1.5), 0.03, mask=y < 5.0)
+    assert part.f50 == pytest.approx(task_transfer(image, DISK, (1.5, 1.5), 0.03).f50, rel=0.01)
+    assert task_transfer(spoilt, DISK, (1.5, 1.5), 0.03).profile[-1] > 110
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.floats(0.1, 0.4), st.floats(-200, 200), st.floats(5, 500))
+def test_edge_width_of_a_profile(sigma, offset, contrast):
+    r = np.linspace(-2, 2, 200)
+    width = edge_width(r, offset + contrast * blurred(r, sigma, 0, 1))
+    assert width == pytest.approx(2.56310 * sigma, rel=0.01)
+    assert edge_width(r, offset - contrast * blurred(r, sigma, 0, 1)) == pytest.approx(width, rel=1e-6)
+
+
+def test_matching_edge_widths():
+    def width(sigma):
+        return task_transfer(blurred(DISK, sigma), DISK, (1.5, 1.5), 0.03).edge_width
+
+    assert match_edge_width(width(0.23), width, 0.1, 0.4) == pytest.approx(0.23, rel=2e-3)
+    assert match_edge_width(1.0, lambda p: 5 - p, 1.0, 4.0) == 4.0
+    assert match_edge_width(2.5, lambda p: 5 - p, 0.0, 4.0, 1e-6) == pytest.approx(2.5, rel=1e-5)
+    with pytest.raises(ValueError, match="widen the range"):
+        match_edge_width(3.0, width, 0.1, 0.4)
+
+
+@pytest.mark.parametrize("axes", [(0.6, 0.985, 0.985), (1.0, 0.3, 2.0), (1.0, 1.0, 1.0), (math.inf, 0.5, 1.5)])
+def test_distance_from_an_ellipsoid(axes):
+    """Walking from surface points along the normal by a known distance."""
+    rng = np.random.default_rng(0)
+    bounded = np.isfinite(axes)
+    e = np.array(axes)[bounded]
+    n = rng.standard_normal((20, e.size))
+    n /= np.linalg.norm(n, axis=1, keepdims=True)
+    surface = e * n
+    normal = n / e
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    rotation = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+    for step in (-0.04, 0.0, 0.3, 2.0):
+        for point in surface + step * normal:
+            p = np.full(3, 7.0)
+            p[bounded] = point
+            place = rotation @ p + [1.0, 2.0, 3.0]
+            one = VolumeGrid((1, 1, 1), 1.0, tuple(place))
+            got = ellipsoid_distance(one, (1.0, 2.0, 3.0), axes, rotation)
+            assert got.item() == pytest.approx(step, abs=1e-9)
+
+
+def test_distance_at_the_centre_and_on_symmetry_planes():
+    line = VolumeGrid((1, 5), 0.25)
+    np.testing.assert_allclose(ellipsoid_distance(line, (0.0, 0.0), (1.0, 1.0)), [[-0.5, -0.75, -1, -0.75, -0.5]])
+    flat = ellipsoid_distance(line, (0.0, 0.0), (0.3, 1.0))
+    # The nearest point of a flat ellipse lies above the axis, at x = x₀ a² / (a² − b²).
+    x0 = np.array([-0.5, -0.25, 0, 0.25, 0.5])
+    x = x0 / (1 - 0.09)
+    np.testing.assert_allclose(flat[0], -np.hypot(x - x0, 0.3 * np.sqrt(1 - x**2)), atol=1e-9)
+
+
+# Segmentation.
+
+
+PIXELS = VolumeGrid((1, 200, 200), 0.035, (0.0, -30.0, -29.0))
+
+
+def vessel(lumen=1.0, core=0.5, cap=0.17, sigma=0.02):
+    """Blood disk about (-30, -29.5), a core disk ``cap`` to its right, in fibrous tissue."""
+    a = ellipsoid_distance(PIXELS.slice, (-30.0, -29.5), (lumen, lumen))
+    b = ellipsoid_distance(PIXELS.slice, (-30.0, -29.5 + lumen + cap + core), (core, core))
+    image = 100 + 400 * (1 - blurred(a, sigma, 0, 1)) - 60 * (1 - blurred(b, sigma, 0, 1))
+    return image[None]
+
+
+SEEDS = (-30.0, -29.5), (-30.0, -29.5 + 1.0 + 0.17 + 0.5)
+
+
+@pytest.mark.parametrize("radius", [0.4, 0.7, 1.1])
+def test_lumen_area(radius):
+    # The threshold halfway between blood and tissue lies on the surface of a straight edge.
+    area = lumen_area(torch.from_numpy(vessel(radius)), PIXELS, SEEDS[0], threshold=300.0)
+    assert math.sqrt(area / math.pi) == pytest.approx(radius, abs=1e-3)
+    higher = lumen_area(vessel(radius, sigma=0.1), PIXELS, SEEDS[0], threshold=400.0)
+    # A thirtieth of a pixel: what linear interpolation of a bent profile costs.
+    assert math.sqrt(higher / math.pi) == pytest.approx(radius - 0.1 * 0.6745, abs=1.2e-3)
+
+
+def test_area_is_in_square_millimetres_of_any_pixel():
+    grid = VolumeGrid((80, 150), (0.06, 0.03), (1.0, 2.0))
+    distance = ellipsoid_distance(grid, (1.01, 2.02), (0.9, 1.3))
+    assert lumen_area(500 - 500 * np.clip(0.5 + distance / 0.2, 0, 1), grid, (1.0, 2.0)) == pytest.approx(
+        math.pi * 0.9 * 1.3, rel=3e-3
+    )
+
+
+@pytest.mark.parametrize("cap", [0.1, 0.17, 0.4])
+def test_cap_thickness(cap):
+    seed = (-30.0, -29.5 + 1.0 + cap + 0.5)
+    thickness = cap_thickness(vessel(cap=cap), PIXELS, SEEDS[0], seed, 300.0, 70.0)
+    assert thickness == pytest.approx(cap, abs=0.004)
+
+
+def test_what_is_lost_is_nan():
+    image = vessel()
+    assert math.isnan(lumen_area(image, PIXELS, SEEDS[0], threshold=600.0))
+    assert math.isnan(cap_thickness(np.maximum(image, 90), PIXELS, *SEEDS))
+    assert threshold_contour(image, PIXELS, 250.0, (-33.0, -32.0)) is None
+    assert math.isfinite(cap_thickness(image, PIXELS, *SEEDS))
+
+
+def test_contour_is_closed_and_around_the_seed():
+    contour = threshold_contour(vessel(), PIXELS, 70.0, SEEDS[1])
+    np.testing.assert_array_equal(contour[0], contour[-1])
+    radius = np.hypot(contour[:, 0] - SEEDS[1][0], contour[:, 1] - SEEDS[1][1])
+    np.testing.assert_allclose(radius, 0.5, atol=0.005)
+
+
+@pytest.mark.parametrize(
+    ("call", "match"),
+    [
+        (lambda: edge_profile(DISK, DISK[:5], (1, 1), 0.1), "same shape"),
+        (lambda: edge_profile(DISK, DISK, (1, 1), 0.0), "bin_mm"),
+        (lambda: edge_profile(DISK, DISK, (0.1, 0.1), 0.1), "at least 8"),
+        (lambda: edge_profile(DISK * np.nan, DISK, (1, 1), 0.1), "NaN"),
+        (lambda: edge_profile(DISK, DISK, (1, 1), 0.1, mask=DISK > 5), "empty"),
+        (lambda: task_transfer(0 * DISK, DISK, (1, 1), 0.1), "no contrast"),
+        (lambda: edge_width(np.arange(20.0), np.ones(20)), "no step"),
+        (lambda: edge_width(np.arange(4.0), np.arange(4.0)), "at least 8"),
+        (lambda: edge_width(np.arange(20.0), np.arange(20.0), 0.9, 0.1), "levels"),
+        (lambda: task_transfer(DISK, DISK, (1, 1), 0.1).frequency(1.0), "level"),
+        (lambda: ellipsoid_distance(GRID, (0.0, 0.0, 0.0), (1.0, 1.0)), "one per axis"),
+        (lambda: ellipsoid_distance(GRID, (0.0, 0.0), (1.0, 0.0)), "positive"),
+        (lambda: lumen_area(np.zeros((3, 3)), PIXELS, (0, 0)), "shape"),
+        (lambda: lumen_area(vessel() * np.nan, PIXELS, (0, 0)), "NaN"),
+    ],
+)
+def test_refusals(call, match):
+    with pytest.raises(ValueError, match=match):
+        call()

@@ -1,0 +1,185 @@
+"""What the data can give: the generalised least-squares limit for tissues of known shape and unknown attenuation.
+
+With path-length maps ``a_i`` (one per tissue) and independent readings of variance ``1 / w`` the line integrals are
+``y = Σ_i c_i a_i + noise``. The Gauss-Markov theorem: no unbiased linear estimate of any functional ``h·c`` has a
+variance below ``hᵀ F⁻¹ h`` with the information ``F_ij = <a_i, w a_j>``; for normal noise this is the Cramér-Rao limit,
+which binds every unbiased method, linear or not. A reconstruction that must find the shapes knows less, so the limit
+holds for it as well; a figure beyond it is bias.
+
+All amplitudes of the information matrix count as unknown. A tissue whose value is taken as known (say, the patient's
+fat, pinned by the rest of the scan) is left out of the maps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+__all__ = ["Ceiling", "ceiling", "information_matrix", "paper_cnr_ceiling"]
+
+Floats = NDArray[np.float64]
+
+_CHUNK = 1 << 20
+_WORST_CONDITION = 1e12
+"""Of the information scaled to a unit diagonal. Beyond it the inverse has no digits left in float64."""
+
+
+def information_matrix(maps: Sequence[Any] | Any, inverse_variance: Any, *, scale: float = 1.0) -> Floats:
+    """Fisher information of the tissue amplitudes, ``F_ij = scale² Σ a_i w a_j``.
+
+    Args:
+        maps: one array or tensor per tissue, or a stack ``(tissues, ...)``: path lengths in mm, any float dtype.
+        inverse_variance: ``w``, the inverse variance of each line integral, shape of one map; 0 for a reading that is
+            not used.
+        scale: line integral per map unit and unit of amplitude: ``mu_ref / 1000`` for path lengths in mm and
+            amplitudes in HU (``mu_ref`` in mm⁻¹).
+
+    Returns:
+        ``(tissues, tissues)`` float64 in amplitude⁻², summed in float64 over chunks.
+
+    Raises:
+        ValueError: no maps, shapes that differ, a negative weight, NaN or Inf, a scale that is not positive.
+    """
+    if not (np.isfinite(scale) and scale > 0):
+        raise ValueError(f"scale must be a positive number, got {scale}")
+    if len(maps) == 0:
+        raise ValueError("maps is empty: give the path lengths of at least one tissue")
+    weight = torch.as_tensor(inverse_variance)
+    tensors = [torch.as_tensor(m) for m in maps]
+    for k, t in enumerate(tensors):
+        if t.shape != weight.shape:
+            raise ValueError(
+                f"maps[{k}] has the shape {tuple(t.shape)}, inverse_variance {tuple(weight.shape)}: "
+                "compute both on the same detector window"
+            )
+    flat = [t.reshape(-1) for t in tensors]
+    weight = weight.reshape(-1)
+    total = torch.zeros((len(flat), len(flat)), dtype=torch.float64)
+    for first in range(0, weight.numel(), _CHUNK):
+        part = slice(first, first + _CHUNK)
+        a = torch.stack([f[part].to(device="cpu", dtype=torch.float64) for f in flat])
+        w = weight[part].to(device="cpu", dtype=torch.float64)
+        if bool((w < 0).any()):
+            raise ValueError("inverse_variance must not be negative: use 0 for readings to leave out")
+        total += (a * w) @ a.T
+    if not bool(torch.isfinite(total).all()):
+        raise ValueError("maps or inverse_variance hold NaN or Inf: give readings without a variance the weight 0")
+    result: Floats = total.numpy() * scale**2
+    return (result + result.T) / 2
+
+
+@dataclass(frozen=True, eq=False)
+class Ceiling:
+    """Smallest covariance of any unbiased estimate.
+
+    Attributes:
+        covariance: ``(tissues, tissues)`` of the amplitudes, HU².
+        functionals: ``(m, tissues)`` rows h.
+        functional_covariance: ``(m, m)`` of ``h·c``, HU².
+    """
+
+    covariance: Floats
+    functionals: Floats
+    functional_covariance: Floats
+
+    @property
+    def amplitude_sd(self) -> Floats:
+        """SD of each amplitude, ``(tissues,)`` HU."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def functional_sd(self) -> Floats:
+        """SD of each functional, ``(m,)`` HU."""
+        return np.sqrt(np.diag(self.functional_covariance))
+
+    @property
+    def contrast_sd(self) -> float:
+        """SD of the only functional, HU.
+
+        Raises:
+            ValueError: there are several functionals.
+        """
+        if len(self.functionals) != 1:
+            raise ValueError(f"there are {len(self.functionals)} functionals: read functional_sd")
+        return float(self.functional_sd[0])
+
+
+def ceiling(information: Any, functionals: Any, dose: float = 1.0) -> Ceiling:
+    """Limit for linear functionals of the tissue amplitudes.
+
+    Args:
+        information: ``(tissues, tissues)`` of :func:`information_matrix`, at dose 1.
+        functionals: ``(tissues,)`` one functional (a contrast: +1 and −1 at two tissues), or ``(m, tissues)`` several
+            (an ROI inside one tissue: the unit vector of this tissue; across tissues: its area fractions).
+        dose: exposure relative to that of ``information``, which is proportional to it.
+
+    Raises:
+        ValueError: wrong shapes, an information that is not symmetric or that does not determine all amplitudes, a dose
+            that is not positive.
+    """
+    f = np.array(information, dtype=np.float64)
+    if f.ndim != 2 or f.shape[0] != f.shape[1] or f.size == 0:
+        raise ValueError(f"information must be a square matrix, got the shape {f.shape}")
+    if not np.isfinite(f).all() or not np.allclose(f, f.T, rtol=1e-9, atol=1e-12 * np.abs(f).max()):
+        raise ValueError("information must be finite and symmetric: compute it with information_matrix")
+    if not (np.isfinite(dose) and dose > 0):
+        raise ValueError(f"dose must be a positive number, got {dose}")
+    h = np.atleast_2d(np.array(functionals, dtype=np.float64))
+    if h.ndim != 2 or h.shape[1] != f.shape[0] or not np.isfinite(h).all():
+        raise ValueError(f"functionals must be finite and ({f.shape[0]},) or (m, {f.shape[0]}), got {h.shape}")
+    diagonal = np.diag(f)
+    if not (diagonal > 0).all():
+        raise ValueError(f"no reading sees tissue {int(np.argmin(diagonal))}: leave its map out or widen the window")
+    # Tissues differ in size by orders of magnitude: a unit diagonal keeps the digits.
+    root = 1.0 / np.sqrt(diagonal)
+    values, vectors = np.linalg.eigh(f * root[:, None] * root)
+    if values[0] <= values[-1] / _WORST_CONDITION:
+        worst = np.abs(vectors[:, 0] * root)
+        raise ValueError(
+            f"the readings cannot tell the tissues apart (least determined: {int(worst.argmax())}): merge or drop maps"
+        )
+    half = root[:, None] * vectors / np.sqrt(values * dose)
+    covariance = half @ half.T
+    spread = h @ half
+    return Ceiling(covariance, h, spread @ spread.T)
+
+
+def paper_cnr_ceiling(information: Any, amplitudes: Any, foreground: Any, background: Any, dose: float = 1.0) -> float:
+    """The paper's CNR of the best unbiased ROI means, ``(μ_bg − μ_fg) / sqrt(σ²_bg + σ²_fg)``.
+
+    Generalised least squares minimises both variances at once, so no unbiased method exceeds this.
+
+    Args:
+        information: as in :func:`ceiling`.
+        amplitudes: ``(tissues,)`` true values in HU.
+        foreground, background: index of the tissue that fills the ROI, or the ROI's ``(tissues,)`` area fractions.
+        dose: exposure relative to that of ``information``.
+
+    Raises:
+        ValueError: as in :func:`ceiling`; amplitudes of another length; an index out of range.
+    """
+    c = np.asarray(amplitudes, dtype=np.float64)
+    tissues = len(np.atleast_1d(information))
+    if c.shape != (tissues,):
+        raise ValueError(f"amplitudes must have the shape ({tissues},), one per tissue, got {c.shape}")
+    rows = np.stack([_functional("foreground", foreground, tissues), _functional("background", background, tissues)])
+    limit = ceiling(information, rows, dose)
+    fg, bg = rows @ c
+    return float((bg - fg) / np.sqrt(np.trace(limit.functional_covariance)))
+
+
+def _functional(name: str, value: Any, tissues: int) -> Floats:
+    h = np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value)
+    if h.ndim:
+        if h.shape != (tissues,):
+            raise ValueError(f"{name} must be a tissue's index or ({tissues},) area fractions, got shape {h.shape}")
+        return h.astype(np.float64)
+    if not np.issubdtype(h.dtype, np.integer) or not 0 <= int(h) < tissues:
+        raise ValueError(f"{name} must be an index 0…{tissues - 1} or area fractions, got {value!r}")
+    return np.eye(tissues)[int(h)]

@@ -1,0 +1,360 @@
+"""Channelised Hotelling observer: is the core there? A task figure that contrast shrinkage cannot improve.
+
+Each image is reduced to its responses to a few channels centred at the known place of the core; the observer is the
+best linear combination of them, ``w = K⁻¹ (v̄₁ − v̄₀)`` with the mean covariance K of both classes. Present and absent
+images with the same noise seed form a PAIR: they are left out together when the observer is trained, and the interval
+of the area under the ROC curve treats the pair as the sampling unit.
+
+Channels: dense difference of Gaussians (Abbey and Barrett, J. Opt. Soc. Am. A 18, 473 (2001)), radial in mm, so that
+they serve a plane or a volume of any spacing.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torchpcct.geometry import VolumeGrid
+from torchpcct.metrics._bootstrap import Estimate, bca_interval, evaluate, leave_one_out, resampling
+
+__all__ = [
+    "ObserverResult",
+    "auc",
+    "auc_from_d_prime",
+    "channel_responses",
+    "d_prime",
+    "dog_channels",
+    "false_positive_difference",
+    "false_positive_rate",
+    "hotelling_scores",
+    "observe",
+    "template_channel",
+]
+
+Floats = NDArray[np.float64]
+
+
+def dog_channels(
+    grid: VolumeGrid,
+    center: tuple[float, ...],
+    count: int = 10,
+    lowest: float | None = None,
+    ratio: float = 1.4,
+    width: float = 1.67,
+) -> Floats:
+    """Dense difference-of-Gaussians channels: ``exp(−f² / 2 (Q s_j)²) − exp(−f² / 2 s_j²)``, ``s_j = s₀ αʲ``.
+
+    Args:
+        grid: ``(y, x)`` axial plane or ``(z, y, x)`` volume.
+        center: of the channels in mm, in the order of the grid's axes (the core's known place).
+        count: channels.
+        lowest: s₀ in cycles per mm; None: 0.005 cycles per voxel of the finest axis, as in the source.
+        ratio, width: α and Q of the source.
+
+    Returns:
+        ``(count, *grid.shape)`` float64, each of unit norm.
+
+    Raises:
+        ValueError: a centre of other axes than the grid, a count < 1, parameters that do not give channels.
+    """
+    if len(center) != grid.ndim:
+        raise ValueError(f"center must have {grid.ndim} numbers in mm, one per axis of the grid, got {center!r}")
+    s0 = 0.005 / min(grid.spacing) if lowest is None else float(lowest)
+    if count < 1 or not s0 > 0 or not ratio > 1 or not width > 1:
+        raise ValueError(f"need count ≥ 1, lowest > 0, ratio > 1 and width > 1, got {count}, {s0}, {ratio}, {width}")
+    squares = np.zeros(grid.shape)
+    for axis, (positions, c) in enumerate(zip(grid.axes, center, strict=True)):
+        shape = [1] * grid.ndim
+        shape[axis] = -1
+        squares = squares + np.square(positions - c).reshape(shape)
+
+    def gaussian(s: float) -> Floats:
+        return s**grid.ndim * np.exp(-2.0 * (math.pi * s) ** 2 * squares)
+
+    channels = np.stack([gaussian(width * s) - gaussian(s) for s in s0 * ratio ** np.arange(count)])
+    return channels / np.sqrt(np.square(channels).sum(tuple(range(1, channels.ndim)), keepdims=True))
+
+
+def template_channel(expected_difference: Any) -> Floats:
+    """The known signal itself as a channel, ``(1, ...)`` of unit norm: to be stacked with the others.
+
+    Args:
+        expected_difference: mean image with the core minus mean image without it.
+
+    Raises:
+        ValueError: an image that is 0 everywhere, or NaN or Inf.
+    """
+    t = _array(expected_difference).astype(np.float64)
+    norm = float(np.sqrt(np.square(t).sum()))
+    if not (math.isfinite(norm) and norm > 0):
+        raise ValueError("expected_difference must be finite and differ from 0 somewhere")
+    return (t / norm)[None]
+
+
+def channel_responses(images: Any, channels: Any) -> Floats:
+    """Inner products of images ``(n, ...)`` with channels ``(c, ...)``, ``(n, c)`` float64.
+
+    Raises:
+        ValueError: images and channels of different shapes, NaN or Inf.
+    """
+    x, c = _array(images), _array(channels)
+    if x.ndim < 2 or x.shape[1:] != c.shape[1:]:
+        raise ValueError(f"images (n, ...) and channels (c, ...) must match, got {x.shape} and {c.shape}")
+    flat = c.reshape(c.shape[0], -1).astype(np.float64)
+    responses = np.stack([flat @ image.reshape(-1).astype(np.float64) for image in x])
+    if not np.isfinite(responses).all():
+        raise ValueError("images hold NaN or Inf: check the reconstruction before measuring it")
+    return responses
+
+
+def _array(value: Any) -> Any:
+    return value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
+
+
+def hotelling_scores(
+    present: Any, absent: Any, *, known_means: tuple[Any, Any] | None = None, train: int | None = None
+) -> tuple[Floats, Floats]:
+    """Decision variables of the Hotelling observer on pairs that it was not trained on.
+
+    Args:
+        present, absent: ``(n, channels)`` responses; pair k has one noise seed.
+        known_means: expected responses ``(present, absent)``, each ``(channels,)``; for FBP those of the noise-free
+            reconstructions. None: the means of the training pairs.
+        train: train on the first ``train`` pairs and score the others; None: leave each pair out in turn.
+
+    Returns:
+        scores of present and absent, ``(n,)`` each (``(n − train,)`` with a split), scaled to the observer's own
+        d′ units: the expected difference of a trained observer is its d′².
+
+    Raises:
+        ValueError: wrong shapes, too few training pairs for the channels, channels that are linearly dependent.
+    """
+    a, b = np.asarray(present, dtype=np.float64), np.asarray(absent, dtype=np.float64)
+    if a.ndim != 2 or a.shape != b.shape:
+        raise ValueError(f"present and absent must be (n, channels) pairs, got {a.shape} and {b.shape}")
+    n, c = a.shape
+    used = n - 1 if train is None else int(train)
+    if train is not None and not 0 < used < n - 1:
+        raise ValueError(f"train must leave at least 2 of the {n} pairs for testing, got {train}")
+    if 2 * used - 2 < 2 * c:
+        raise ValueError(f"{used} training pairs are too few for {c} channels: use at least {c + 1}, or fewer channels")
+    if known_means is not None:
+        means = [np.asarray(m, dtype=np.float64) for m in known_means]
+        if len(means) != 2 or any(m.shape != (c,) for m in means):
+            raise ValueError(f"known_means must be two arrays ({c},), got {[m.shape for m in means]}")
+        scores = _scores_known(a, b, means[0], means[1], used, train)
+    else:
+        scores = _scores_estimated(a, b, used, train)
+    return scores
+
+
+def _templates(scatter: Any, difference: Any) -> Floats:
+    """``K⁻¹ Δ`` for stacks, scaled by the channels' SDs so that their units do not matter."""
+    sd = np.sqrt(np.einsum("...ii->...i", scatter))
+    if not (sd > 0).all():
+        raise ValueError("a channel does not vary over the realisations: leave it out")
+    scaled = scatter / sd[..., :, None] / sd[..., None, :]
+    if np.linalg.cond(scaled).max() > 1e12:
+        raise ValueError("the channels are linearly dependent on these images: use fewer")
+    return np.linalg.solve(scaled, (difference / sd)[..., None])[..., 0] / sd
+
+
+def _scores_known(a: Floats, b: Floats, mean_a: Floats, mean_b: Floats, used: int, train: int | None) -> Any:
+    da, db = a - mean_a, b - mean_b
+    if train is not None:
+        scatter = (da[:used].T @ da[:used] + db[:used].T @ db[:used]) / (2 * used)
+        w = _templates(scatter, mean_a - mean_b)
+        return a[used:] @ w, b[used:] @ w
+    scatter = (da.T @ da + db.T @ db - da[:, :, None] * da[:, None] - db[:, :, None] * db[:, None]) / (2 * used)
+    w = _templates(scatter, np.broadcast_to(mean_a - mean_b, a.shape))
+    return (a * w).sum(1), (b * w).sum(1)
+
+
+def _scores_estimated(a: Floats, b: Floats, used: int, train: int | None) -> Any:
+    if train is not None:
+        ma, mb = a[:used].mean(0), b[:used].mean(0)
+        da, db = a[:used] - ma, b[:used] - mb
+        w = _templates((da.T @ da + db.T @ db) / (2 * used - 2), ma - mb)
+        # Scores from the middle of the two classes: the threshold 0 is that of the trained observer.
+        return (a[used:] - (ma + mb) / 2) @ w, (b[used:] - (ma + mb) / 2) @ w
+    n = a.shape[0]
+    da, db = a - a.mean(0), b - b.mean(0)
+    # Scatter about the mean of the others: S − n / (n − 1) d dᵀ.
+    total = da.T @ da + db.T @ db
+    scatter = total - (da[:, :, None] * da[:, None] + db[:, :, None] * db[:, None]) * n / (n - 1)
+    ma, mb = (a.sum(0) - a) / used, (b.sum(0) - b) / used
+    w = _templates(scatter / (2 * used - 2), ma - mb)
+    middle = (ma + mb) / 2
+    return ((a - middle) * w).sum(1), ((b - middle) * w).sum(1)
+
+
+def _pair(present: Any, absent: Any) -> tuple[Floats, Floats]:
+    a, b = np.asarray(present, dtype=np.float64), np.asarray(absent, dtype=np.float64)
+    if a.ndim != 1 or b.ndim != 1 or min(a.size, b.size) < 2:
+        raise ValueError(f"scores must be two 1-D arrays of at least 2, got {a.shape} and {b.shape}")
+    if not (np.isfinite(a).all() and np.isfinite(b).all()):
+        raise ValueError("scores hold NaN or Inf")
+    return a, b
+
+
+def auc(present: Any, absent: Any, *, paired: bool = True, level: float = 0.95) -> Estimate:
+    """Area under the ROC curve (Wilcoxon) with an interval on the logit scale.
+
+    The variance is DeLong's; with ``paired`` each pair of one noise seed is one sampling unit (Obuchowski 1997), which
+    counts the correlation between its two scores. Scores that are parted perfectly have no measured variance: then the
+    lower bound is that of n successes in n trials, (α / 2)^(1 / n).
+
+    Args:
+        present, absent: scores; equally many when paired.
+        paired: pair k of both has the same noise seed.
+        level: coverage.
+
+    Raises:
+        ValueError: fewer than 2 scores, NaN or Inf, unequal numbers when paired, a level outside (0, 1).
+    """
+    from scipy.special import expit, logit, ndtri
+
+    a, b = _pair(present, absent)
+    if paired and a.size != b.size:
+        raise ValueError(f"paired scores must be equally many, got {a.size} and {b.size}: set paired=False")
+    if not 0 < level < 1:
+        raise ValueError(f"level must lie in (0, 1), got {level}")
+
+    def beaten(scores: Floats, by: Floats) -> Floats:
+        ordered = np.sort(scores)
+        return (ordered.searchsorted(by) + ordered.searchsorted(by, "right")) / (2.0 * scores.size)
+
+    v10, v01 = beaten(b, a), 1.0 - beaten(a, b)
+    area = float(v10.mean())
+    if area in (0.0, 1.0):
+        bound = ((1 - level) / 2) ** (1.0 / min(a.size, b.size))
+        return Estimate(area, bound, 1.0) if area == 1.0 else Estimate(area, 0.0, 1.0 - bound)
+    if paired:
+        variance = float((v10 + v01).var(ddof=1)) / a.size
+    else:
+        variance = float(v10.var(ddof=1) / a.size + v01.var(ddof=1) / b.size)
+    half = ndtri(0.5 + level / 2) * math.sqrt(variance) / (area * (1 - area))
+    return Estimate(area, float(expit(logit(area) - half)), float(expit(logit(area) + half)))
+
+
+def d_prime(present: Any, absent: Any, level: float = 0.95, draws: int = 2000, seed: int = 0) -> Estimate:
+    """Detectability ``(s̄₁ − s̄₀) / sqrt((σ₁² + σ₀²) / 2)`` with a bootstrap interval over pairs.
+
+    Args:
+        present, absent: ``(n,)`` scores, n ≥ 3; pair k has one noise seed.
+        level, draws, seed: of the bootstrap.
+
+    Raises:
+        ValueError: fewer than 3 pairs, unequal numbers, scores that do not vary.
+    """
+    a, b = _pair(present, absent)
+    if a.size != b.size or a.size < 3:
+        raise ValueError(f"present and absent must be at least 3 pairs, got {a.size} and {b.size}")
+    if a.var() + b.var() == 0:
+        raise ValueError("the scores do not vary: d′ needs noisy realisations")
+
+    def statistic(index: Any) -> Floats:
+        x, y = a[index], b[index]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return (x.mean(-1) - y.mean(-1)) / np.sqrt((x.var(-1, ddof=1) + y.var(-1, ddof=1)) / 2)
+
+    value = float(statistic(np.arange(a.size)[None])[0])
+    resampled = evaluate(statistic, resampling(a.size, draws, seed))
+    return Estimate(value, *bca_interval(value, resampled, statistic(leave_one_out(a.size)), level))
+
+
+def auc_from_d_prime(value: Any) -> Any:
+    """Area of normal scores of equal variance, ``Φ(d′ / √2)``."""
+    from scipy.special import ndtr
+
+    area = ndtr(np.asarray(value, dtype=np.float64) / math.sqrt(2.0))
+    return float(area) if np.ndim(area) == 0 else area
+
+
+class ObserverResult(NamedTuple):
+    """What :func:`observe` found: area, detectability, and the scores ``(n,)`` they come from."""
+
+    auc: Estimate
+    d_prime: Estimate
+    present: Floats
+    absent: Floats
+
+
+def observe(
+    present: Any,
+    absent: Any,
+    channels: Any,
+    *,
+    known_means: tuple[Any, Any] | None = None,
+    train: int | None = None,
+    level: float = 0.95,
+    seed: int = 0,
+) -> ObserverResult:
+    """Channelised Hotelling observer on images.
+
+    Args:
+        present, absent: ``(n, ...)`` images or volumes in HU; pair k has one noise seed.
+        channels: ``(c, ...)``, e.g. of :func:`dog_channels`.
+        known_means: expected images ``(present, absent)``; None: estimated.
+        train, level, seed: as in :func:`hotelling_scores`, :func:`auc` and :func:`d_prime`.
+    """
+    responses = [channel_responses(x, channels) for x in (present, absent)]
+    means = None
+    if known_means is not None:
+        means = tuple(channel_responses(_array(m)[None], channels)[0] for m in known_means)
+    s1, s0 = hotelling_scores(*responses, known_means=means, train=train)
+    return ObserverResult(auc(s1, s0, level=level), d_prime(s1, s0, level=level, seed=seed), s1, s0)
+
+
+def false_positive_rate(present: Any, absent: Any, sensitivity: float = 0.9) -> float:
+    """Share of absent scores at or above the highest threshold that still finds ``sensitivity`` of the present ones.
+
+    Raises:
+        ValueError: a sensitivity outside (0, 1].
+    """
+    a, b = _pair(present, absent)
+    return float(_false_positives(a[None], b[None], sensitivity)[0])
+
+
+def _false_positives(a: Floats, b: Floats, sensitivity: float) -> Floats:
+    if not 0 < sensitivity <= 1:
+        raise ValueError(f"sensitivity must lie in (0, 1], got {sensitivity}")
+    n = a.shape[-1]
+    found = math.ceil(sensitivity * n - 1e-9)
+    threshold = np.partition(a, n - found, axis=-1)[..., n - found]
+    return (b >= threshold[..., None]).mean(-1)
+
+
+def false_positive_difference(
+    method: tuple[Any, Any],
+    reference: tuple[Any, Any],
+    sensitivity: float = 0.9,
+    level: float = 0.95,
+    draws: int = 2000,
+    seed: int = 0,
+) -> Estimate:
+    """False-positive rate of a method minus that of a reference at equal sensitivity, with a paired interval.
+
+    Args:
+        method, reference: ``(present, absent)`` scores, all ``(n,)`` on the same n noise seeds.
+        sensitivity: of both.
+        level, draws, seed: of the percentile bootstrap over seeds.
+
+    Raises:
+        ValueError: numbers of scores that differ.
+    """
+    (a, b), (c, d) = _pair(*method), _pair(*reference)
+    if len({a.size, b.size, c.size, d.size}) != 1:
+        raise ValueError(f"all scores must be on the same seeds, got {a.size}, {b.size}, {c.size} and {d.size}")
+
+    def statistic(i: Any) -> Floats:
+        return _false_positives(a[i], b[i], sensitivity) - _false_positives(c[i], d[i], sensitivity)
+
+    value = float(statistic(np.arange(a.size)[None])[0])
+    drawn = evaluate(statistic, resampling(a.size, draws, seed))
+    low, high = np.quantile(drawn, [0.5 - level / 2, 0.5 + level / 2])
+    return Estimate(value, float(low), float(high))
