@@ -316,3 +316,36 @@ def test_memory_estimate_is_an_upper_bound_and_not_far_off(batch):
     assert max(peaks) <= A.memory_estimate(batch) <= 2.5 * max(peaks)
     assert A.memory_estimate(batch, torch.float64) > 1.5 * A.memory_estimate(batch)
     assert A.memory_estimate(0) == 0
+
+
+@pytest.mark.parametrize("name", ["cone_window", "cone_flat", "cone_curved_offset", "fan_flat_offset_shifted_grid"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_batch_is_its_single_volumes(name, dtype):
+    A = Projector(*REGISTRY[name]())
+    exact = dict(rtol=0, atol=0) if len(A.domain_shape) == 3 else dict(rtol=1e-4, atol=1e-5)
+    x, y = _random((11, *A.domain_shape), dtype), _random((11, *A.range_shape), dtype)
+    torch.testing.assert_close(A(x), torch.stack([A(one) for one in x]), **exact)
+    torch.testing.assert_close(A.T(y), torch.stack([A.T(one) for one in y]), **exact)
+
+
+@pytest.mark.parametrize("name", ["cone_window", "fan_flat", "fan_window"])
+def test_working_memory_does_not_grow_with_the_batch(name):
+    A = Projector(*REGISTRY[name]())
+
+    def working(batch: int) -> int:
+        arrays = 4 * batch * (math.prod(A.domain_shape) + math.prod(A.range_shape))
+        return A.memory_estimate(batch) - arrays
+
+    assert working(8) == working(16) == working(1000)
+
+
+def test_nan_and_inf_do_not_leak_into_other_cells_of_slabs_far_apart():
+    # Slabs farther apart than the depth layers are interpolated one by one, through a buffer that cells share.
+    A = Projector(*REGISTRY["cone_flat"]())
+    x = torch.zeros(A.domain_shape, dtype=torch.float64)
+    x[:, 0, 0] = float("nan")
+    hit = torch.zeros(A.domain_shape, dtype=torch.float64)
+    hit[:, 0, 0] = 1.0
+    clean = A(hit).abs().amax(dim=-2, keepdim=True) == 0  # columns that miss the voxel in all rows
+    assert clean.any()
+    assert not A(x).isnan()[clean.expand(A.range_shape)].any()

@@ -91,10 +91,11 @@ class Engine:
             return self._plane.workspace(batch, itemsize)
         r, table = self.rays, 8 * (8 * self.rays.views + 4 * len(self.segments.table))
         nz, ny, nx = self.grid.shape
-        forward = batch * ny * nx * (nz + 16) + batch * r.columns * r.rows * _threads()
-        row_sums = batch * r.columns * (r.rows + 1)
+        # Volumes pass one by one, so that the batch does not matter.
+        forward = ny * nx * (nz + 16) + r.columns * r.rows * _threads()
+        row_sums = r.columns * (r.rows + 1)
         row_sums *= int(max(1, min(r.views, ROW_SUMS_BYTES // (row_sums * itemsize))))
-        adjoint = 3 * batch * ny * nx * (nz + 8) + row_sums
+        adjoint = 2 * ny * nx * (nz + 8) + row_sums
         return table + itemsize * max(forward, adjoint)
 
     @cached_property
@@ -109,7 +110,7 @@ class Engine:
 
     def _heights(self) -> tuple[float, float, float, float]:
         z, dz = self.grid.axes[0][0], self.grid.spacing[0]
-        return z - dz / 2, dz, self.rays.row_edge + self.rays.first_row * self.rays.row_pitch, self.rays.row_pitch
+        return (z - dz / 2, dz, self.rays.row_edge + self.rays.first_row * self.rays.row_pitch, self.rays.row_pitch)
 
     def _forward_volume(self, x: NDArray) -> NDArray:
         from torchpcct.projector import volume_kernels
@@ -117,20 +118,25 @@ class Engine:
         r, seg = self.rays, self.segments
         _, ny, nx = self.grid.shape
         y = np.empty((x.shape[0], *self.range_shape), dtype=x.dtype)
-        volume_kernels.project(
-            running_sums(x), ny, nx, self._poses, r.edges, r.centers, r.first,
-            seg.table, seg.start, self.lattice, *self._heights(), self._layer, y,
-        )  # fmt: skip
+        # One volume after the other: each stays in the cache, a batch of them would not.
+        for n in range(x.shape[0]):
+            volume_kernels.project(
+                running_sums(x[n]), ny, nx, self._poses, r.edges, r.centers, r.first,
+                seg.table, seg.start, self.lattice, *self._heights(), self._layer, y[n],
+            )  # fmt: skip
         return y
 
     def _adjoint_volume(self, y: NDArray) -> NDArray:
         from torchpcct.projector import volume_kernels
 
         r, seg = self.rays, self.segments
-        return volume_kernels.backproject(
-            y, self._poses, r.edges, r.centers, r.first, seg.table, seg.start, self.lattice, *self._heights(),
-            self._layer, self.grid.shape, ROW_SUMS_BYTES,
-        )  # fmt: skip
+        x = np.empty((y.shape[0], *self.grid.shape), dtype=y.dtype)
+        for n in range(y.shape[0]):
+            volume_kernels.backproject(
+                y[n], self._poses, r.edges, r.centers, r.first, seg.table, seg.start, self.lattice, *self._heights(),
+                self._layer, ROW_SUMS_BYTES, x[n],
+            )  # fmt: skip
+        return x
 
 
 def _threads() -> int:

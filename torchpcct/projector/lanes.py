@@ -1,8 +1,9 @@
-"""The two inner loops of the plane kernels as explicit SIMD, through LLVM vectors.
+"""The inner loops of the kernels as explicit SIMD, through LLVM vectors.
 
-A lane is an image that shares its geometry with the others: a rotated or mirrored copy, or another image of the batch.
-All lanes of an edge use one interpolation index, so that every load is contiguous. numba's own vectoriser does not
-find this reliably; LLVM vectors are portable all the same, LLVM splits or merges them for the machine it compiles for.
+In the plane kernels a lane is an image that shares its geometry with the others: a rotated or mirrored copy, or another
+image of the batch. All lanes of an edge use one interpolation index, so that every load is contiguous. In the volume
+kernels the lanes lie along z. numba's own vectoriser does not find these loops reliably; LLVM vectors are portable
+all the same, LLVM splits or merges them for the machine it compiles for.
 
 The vector width is the length of the tuple ``lanes``, so that numba compiles one version per width and caches each.
 """
@@ -15,7 +16,7 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
-__all__ = ["add_edges", "sum_edges"]
+__all__ = ["add_edges", "add_lines", "spread_lines", "sum_edges"]
 
 _FUSED = ("contract", "nsz", "arcp", "reassoc")
 
@@ -32,9 +33,7 @@ class _Code:
         self.double = ir.VectorType(self.real, 2 * self.width)
         self.index = ir.IntType(64)
         self.values = [
-            context.make_array(t)(context, builder, a).data
-            if isinstance(t, types.Array)
-            else a
+            context.make_array(t)(context, builder, a).data if isinstance(t, types.Array) else a
             for t, a in zip(signature.args, args, strict=True)
         ]
 
@@ -43,14 +42,10 @@ class _Code:
         return self.b.bitcast(self.b.gep(typed, [index]), kind.as_pointer())
 
     def load(self, pointer: Any, index: Any, kind: Any) -> Any:
-        return self.b.load(
-            self.at(pointer, index, kind), align=self.dtype.bitwidth // 8
-        )
+        return self.b.load(self.at(pointer, index, kind), align=self.dtype.bitwidth // 8)
 
     def store(self, value: Any, pointer: Any, index: Any) -> None:
-        self.b.store(
-            value, self.at(pointer, index, value.type), align=self.dtype.bitwidth // 8
-        )
+        self.b.store(value, self.at(pointer, index, value.type), align=self.dtype.bitwidth // 8)
 
     def mul(self, a: Any, b: Any) -> Any:
         return self.b.fmul(a, b, flags=_FUSED)
@@ -68,9 +63,7 @@ class _Code:
         return self.shuffle(one, undefined, [0] * count)
 
     def shuffle(self, a: Any, b: Any, places: list[int]) -> Any:
-        return self.b.shuffle_vector(
-            a, b, ir.Constant(ir.VectorType(ir.IntType(32), len(places)), places)
-        )
+        return self.b.shuffle_vector(a, b, ir.Constant(ir.VectorType(ir.IntType(32), len(places)), places))
 
     def clamp(self, value: Any, top: Any) -> Any:
         zero = ir.Constant(value.type, None)
@@ -80,24 +73,14 @@ class _Code:
     def times(self, index: Any, factor: int) -> Any:
         return self.b.mul(index, ir.Constant(self.index, factor), flags=("nsw", "nuw"))
 
-    def knots(
-        self, p: Any, q: Any, first: Any, count: int, weight: Any, top: Any
-    ) -> list[tuple[Any, Any]]:
+    def knots(self, p: Any, q: Any, first: Any, count: int, weight: Any, top: Any) -> list[tuple[Any, Any]]:
         """Lower knot of ``t = p + q r`` and the weights of its lanes and the next knot's, slabs ``first … + count``.
 
         Positions and weights of all slabs are one vector computation; ``weight`` points at the weight of slab 0.
         """
-        reals, integers = (
-            ir.VectorType(self.real, count),
-            ir.VectorType(ir.IntType(32), count),
-        )
+        reals, integers = (ir.VectorType(self.real, count), ir.VectorType(ir.IntType(32), count))
         r = self.splat(self.b.sitofp(first, self.real), count)
-        r = self.add(
-            r,
-            ir.Constant(
-                reals, [ir.Constant(self.real, float(i)) for i in range(count)]
-            ),
-        )
+        r = self.add(r, ir.Constant(reals, [ir.Constant(self.real, float(i)) for i in range(count)]))
         t = self.add(self.splat(p, count), self.mul(self.splat(q, count), r))
         t = self.clamp(t, self.splat(top, count))
         k = self.b.fptosi(t, integers)
@@ -106,10 +89,7 @@ class _Code:
         low = self.sub(w, high)
         return [
             (
-                self.b.zext(
-                    self.b.extract_element(k, ir.Constant(ir.IntType(32), i)),
-                    self.index,
-                ),
+                self.b.zext(self.b.extract_element(k, ir.Constant(ir.IntType(32), i)), self.index),
                 self.shuffle(low, high, [i] * self.width + [count + i] * self.width),
             )
             for i in range(count)
@@ -125,24 +105,18 @@ class _Code:
         groups = self.b.sdiv(self.b.sub(r1, r0), group)
         with cgutils.for_range(self.b, groups) as loop:
             body(self.b.add(r0, self.b.mul(loop.index, group)), size)
-        with cgutils.for_range(
-            self.b, r1, start=self.b.add(r0, self.b.mul(groups, group))
-        ) as loop:
+        with cgutils.for_range(self.b, r1, start=self.b.add(r0, self.b.mul(groups, group))) as loop:
             body(loop.index, 1)
 
 
 @intrinsic
-def sum_edges(
-    typingctx, lanes, sums, stride, p, q, weight, gain, e0, e1, r0, r1, top, out
-):
+def sum_edges(typingctx, lanes, sums, stride, p, q, weight, gain, e0, e1, r0, r1, top, out):
     """Sum slabs ``r0…r1`` at the edges ``e0…e1`` and add the differences of neighbouring edges to ``out``.
 
     ``lanes``: tuple of the vector's length W. ``sums``: running sums, slab r starts at ``r * stride`` (in elements),
     knots of W lanes each. ``p, q``: edge lines, ``weight``: per slab, ``gain``: per cell, ``out``: cells of W lanes.
     """
-    signature = types.void(
-        lanes, sums, stride, p, q, weight, gain, e0, e1, r0, r1, top, out
-    )
+    signature = types.void(lanes, sums, stride, p, q, weight, gain, e0, e1, r0, r1, top, out)
 
     def codegen(context, builder, signature, args):
         c = _Code(context, builder, signature, args)
@@ -157,39 +131,20 @@ def sum_edges(
                 builder.store(ir.Constant(c.double, None), total)
 
             def body(first, count):
-                for i, (k, weights) in enumerate(
-                    c.knots(pe, qe, first, count, weight, top)
-                ):
-                    r, total = (
-                        builder.add(first, ir.Constant(c.index, i)),
-                        totals[i % len(totals)],
-                    )
-                    values = c.load(
-                        sums,
-                        builder.add(builder.mul(r, stride), c.times(k, c.width)),
-                        c.double,
-                    )
-                    builder.store(
-                        c.add(builder.load(total), c.mul(weights, values)), total
-                    )
+                for i, (k, weights) in enumerate(c.knots(pe, qe, first, count, weight, top)):
+                    r, total = (builder.add(first, ir.Constant(c.index, i)), totals[i % len(totals)])
+                    values = c.load(sums, builder.add(builder.mul(r, stride), c.times(k, c.width)), c.double)
+                    builder.store(c.add(builder.load(total), c.mul(weights, values)), total)
 
             c.slabs(r0, r1, body)
             both = c.add(
                 c.add(builder.load(totals[0]), builder.load(totals[1])),
                 c.add(builder.load(totals[2]), builder.load(totals[3])),
             )
-            now = c.add(
-                *(
-                    c.shuffle(both, both, list(range(i, i + c.width)))
-                    for i in (0, c.width)
-                )
-            )
+            now = c.add(*(c.shuffle(both, both, list(range(i, i + c.width))) for i in (0, c.width)))
             with builder.if_then(builder.icmp_signed(">", edge.index, e0)):
                 cell = builder.sub(edge.index, ir.Constant(c.index, 1))
-                change = c.mul(
-                    c.splat(c.load(gain, cell, c.real), c.width),
-                    c.sub(now, builder.load(before)),
-                )
+                change = c.mul(c.splat(c.load(gain, cell, c.real), c.width), c.sub(now, builder.load(before)))
                 where = c.times(cell, c.width)
                 c.store(c.add(c.load(out, where, c.wide), change), out, where)
             builder.store(now, before)
@@ -204,9 +159,7 @@ def add_edges(typingctx, lanes, out, stride, p, q, weight, e0, e1, r0, r1, top, 
 
     ``values``: cells of W lanes, one more entry than cells. ``out``: slab r starts at ``(r - r0) * stride``.
     """
-    signature = types.void(
-        lanes, out, stride, p, q, weight, e0, e1, r0, r1, top, values
-    )
+    signature = types.void(lanes, out, stride, p, q, weight, e0, e1, r0, r1, top, values)
 
     def codegen(context, builder, signature, args):
         c = _Code(context, builder, signature, args)
@@ -218,29 +171,92 @@ def add_edges(typingctx, lanes, out, stride, p, q, weight, e0, e1, r0, r1, top, 
         with cgutils.for_range(builder, e1, start=e0) as edge:
             pe, qe = c.load(p, edge.index, c.real), c.load(q, edge.index, c.real)
             cell = c.load(values, c.times(edge.index, c.width), c.wide)
-            cell = builder.select(
-                builder.icmp_signed("==", edge.index, last), zero, cell
-            )
+            cell = builder.select(builder.icmp_signed("==", edge.index, last), zero, cell)
             value = c.sub(builder.load(before), cell)
             builder.store(cell, before)
 
             twice = c.shuffle(value, value, list(range(c.width)) * 2)
 
             def body(first, count):
-                for i, (k, weights) in enumerate(
-                    c.knots(pe, qe, first, count, weight, top)
-                ):
+                for i, (k, weights) in enumerate(c.knots(pe, qe, first, count, weight, top)):
                     r = builder.add(first, ir.Constant(c.index, i))
-                    base = builder.add(
-                        builder.mul(builder.sub(r, r0), stride), c.times(k, c.width)
-                    )
-                    c.store(
-                        c.add(c.load(out, base, c.double), c.mul(weights, twice)),
-                        out,
-                        base,
-                    )
+                    base = builder.add(builder.mul(builder.sub(r, r0), stride), c.times(k, c.width))
+                    c.store(c.add(c.load(out, base, c.double), c.mul(weights, twice)), out, base)
 
             c.slabs(r0, r1, body)
+        return context.get_dummy_value()
+
+    return signature, codegen
+
+
+def _columns(c: Any, size: Any, body: Any) -> None:
+    """Call ``body(first, vectors)`` for stretches of four vectors of W lanes along z, then of one."""
+    long = 4 * c.width
+    groups = c.b.sdiv(size, ir.Constant(c.index, long))
+    with cgutils.for_range(c.b, groups) as loop:
+        body(c.times(loop.index, long), 4)
+    rest = c.times(groups, long)
+    ones = c.b.sdiv(c.b.sub(size, rest), ir.Constant(c.index, c.width))
+    with cgutils.for_range(c.b, ones) as loop:
+        body(c.b.add(rest, c.times(loop.index, c.width)), 1)
+
+
+@intrinsic
+def add_lines(typingctx, lanes, lines, offset, low, high, e0, e1, size, below, above):
+    """``below += Σ_e low[e] lines[offset[e]:]`` and ``above += Σ_e high[e] lines[offset[e]:]``, e from e0 to e1.
+
+    ``size``: elements of a line, a multiple of the vector's length W. The sums stay in registers.
+    """
+    signature = types.void(lanes, lines, offset, low, high, e0, e1, size, below, above)
+
+    def codegen(context, builder, signature, args):
+        c = _Code(context, builder, signature, args)
+        _, lines, offset, low, high, e0, e1, size, below, above = c.values
+        sums = [[cgutils.alloca_once(builder, c.wide) for _ in range(4)] for _ in range(2)]
+
+        def body(first, vectors):
+            places = [builder.add(first, ir.Constant(c.index, i * c.width)) for i in range(vectors)]
+            for target, total in zip((below, above), sums, strict=True):
+                for place, part in zip(places, total, strict=False):
+                    builder.store(c.load(target, place, c.wide), part)
+            with cgutils.for_range(builder, e1, start=e0) as entry:
+                start = builder.load(builder.gep(offset, [entry.index]))
+                weights = [c.splat(c.load(w, entry.index, c.real), c.width) for w in (low, high)]
+                for i, place in enumerate(places):
+                    value = c.load(lines, builder.add(start, place), c.wide)
+                    for weight, total in zip(weights, sums, strict=True):
+                        builder.store(c.add(builder.load(total[i]), c.mul(weight, value)), total[i])
+            for target, total in zip((below, above), sums, strict=True):
+                for place, part in zip(places, total, strict=False):
+                    c.store(builder.load(part), target, place)
+
+        _columns(c, size, body)
+        return context.get_dummy_value()
+
+    return signature, codegen
+
+
+@intrinsic
+def spread_lines(typingctx, lanes, lines, offset, low, high, e0, e1, size, below, above):
+    """Transpose of ``add_lines``: ``lines[offset[e]:] += low[e] below + high[e] above`` for e from e0 to e1."""
+    signature = types.void(lanes, lines, offset, low, high, e0, e1, size, below, above)
+
+    def codegen(context, builder, signature, args):
+        c = _Code(context, builder, signature, args)
+        _, lines, offset, low, high, e0, e1, size, below, above = c.values
+
+        def body(first, vectors):
+            places = [builder.add(first, ir.Constant(c.index, i * c.width)) for i in range(vectors)]
+            given = [[c.load(source, place, c.wide) for place in places] for source in (below, above)]
+            with cgutils.for_range(builder, e1, start=e0) as entry:
+                start = builder.load(builder.gep(offset, [entry.index]))
+                weights = [c.splat(c.load(w, entry.index, c.real), c.width) for w in (low, high)]
+                for i, place in enumerate(places):
+                    where = builder.add(start, place)
+                    value = c.add(c.load(lines, where, c.wide), c.mul(weights[0], given[0][i]))
+                    c.store(c.add(value, c.mul(weights[1], given[1][i])), lines, where)
+
+        _columns(c, size, body)
         return context.get_dummy_value()
 
     return signature, codegen

@@ -17,12 +17,12 @@ LAYER_SHIFT = 0.04
 
 
 def running_sums(x: NDArray[Any]) -> NDArray[Any]:
-    """``(batch, nz, ny, nx)`` to the ``lines`` of ``volume_kernels.project``."""
-    batch, nz, ny, nx = x.shape
-    lines = np.empty((batch, ny * nx, (nz + 7) // 8 * 8 + 8), dtype=x.dtype)
-    lines[..., 0] = 0
-    np.cumsum(x.reshape(batch, nz, ny * nx).transpose(0, 2, 1), axis=-1, out=lines[..., 1 : nz + 1])
-    lines[..., nz + 1 :] = lines[..., nz, None]
+    """``(nz, ny, nx)`` to the ``lines`` of ``volume_kernels.project``."""
+    nz, ny, nx = x.shape
+    lines = np.empty((ny * nx, (nz + 7) // 8 * 8 + 8), dtype=x.dtype)
+    lines[:, 0] = 0
+    np.cumsum(x.reshape(nz, ny * nx).T, axis=-1, out=lines[:, 1 : nz + 1])
+    lines[:, nz + 1 :] = lines[:, nz, None]
     return lines
 
 

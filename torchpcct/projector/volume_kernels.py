@@ -1,4 +1,4 @@
-# mypy: disable-error-code="assignment"
+# mypy: disable-error-code="assignment, call-arg"
 """CPU kernels of the cone beam: distance-driven overlaps, followed slab by slab, z innermost.
 
 Model (De Man and Basu 2004, Phys. Med. Biol. 49:2463, in its separable form). In each slab of voxels (a grid row or
@@ -18,6 +18,8 @@ import math
 import numpy as np
 from numba import njit, prange
 
+from torchpcct.projector.lanes import add_lines, spread_lines
+
 __all__ = ["backproject", "padded", "project"]
 
 # NaN and Inf must survive, so only the flags that leave them alone.
@@ -27,7 +29,7 @@ MAX_LAYERS_PER_SLAB = 0.4
 # Slabs closer to the source than this part of the source-detector distance are behind it.
 NEAREST = 1e-6
 # Slabs of one task of the adjoint: enough to reuse a layer, few enough to share the work. Fixed, for determinism.
-SLAB_BLOCK = 12
+SLAB_BLOCK = 24
 # Ray geometry in float64, called per cell and not per voxel.
 _small = njit(cache=True, fastmath=_FLAGS, error_model="numpy")
 
@@ -66,8 +68,8 @@ def _depth_line(pose, table, j, axis, lattice, parallel):
         dx, dy = a * pose[3] + b * pose[5], a * pose[4] + b * pose[6]
     square = dx * dx + dy * dy
     if axis == 0:
-        return (lattice[0] - pose[1]) / dy, lattice[1] / dy, lattice[1] * math.sqrt(square) / abs(dy), square
-    return (lattice[4] - pose[0]) / dx, lattice[5] / dx, lattice[5] * math.sqrt(square) / abs(dx), square
+        return ((lattice[0] - pose[1]) / dy, lattice[1] / dy, lattice[1] * math.sqrt(square) / abs(dy), square)
+    return ((lattice[4] - pose[0]) / dx, lattice[5] / dx, lattice[5] * math.sqrt(square) / abs(dx), square)
 
 
 @_small
@@ -91,40 +93,64 @@ def _read(line, index, part, read):
 
 
 @_small
-def _blend(lines, base, stride, k0, k1, lo, hi, scale, out):
-    """``out = scale * Σ_k overlap(k) lines[base + k * stride]`` over the voxels that the interval [lo, hi] touches."""
-    real = out.dtype.type
-    n = out.size
-    first = lines[base + k0 * stride]
-    w0 = real(scale * (min(hi, k0 + 1.0) - lo))
-    if k1 - k0 == 1:
-        for z in range(n):
-            out[z] = w0 * first[z]
-        return
-    second = lines[base + (k0 + 1) * stride]
-    w1 = real(scale * (min(hi, k0 + 2.0) - (k0 + 1.0)))
-    if k1 - k0 == 2:
-        for z in range(n):
-            out[z] = w0 * first[z] + w1 * second[z]
-        return
-    third = lines[base + (k0 + 2) * stride]
-    w2 = real(scale * (min(hi, k0 + 3.0) - (k0 + 2.0)))
-    for z in range(n):
-        out[z] = w0 * first[z] + w1 * second[z] + w2 * third[z]
-    for k in range(k0 + 3, k1):
-        w = real(scale * (min(hi, k + 1.0) - k))
-        line = lines[base + k * stride]
-        for z in range(n):
-            out[z] += w * line[z]
+def _clear(line):
+    for z in range(line.size):
+        line[z] = 0
 
 
 @_small
-def _share(values, part, low, high):
-    """Share a slab between the two layers it lies between."""
-    keep = values.dtype.type(1) - part
-    for z in range(values.size):
-        low[z] += keep * values[z]
-        high[z] += part * values[z]
+def _room(p0, q0, p1, q1, r0, r1, width):
+    """Entries that ``_plan`` may need: the cell's width is largest in the first or the last slab."""
+    widest = max(abs(p1 - p0 + (q1 - q0) * r0), abs(p1 - p0 + (q1 - q0) * (r1 - 1)))
+    return (r1 - r0) * (int(min(widest, float(width))) + 2)
+
+
+@_small
+def _plan(p0, q0, p1, q1, l0, l1, path, layer, layered, r0, r1, width, across, along, table, offset, low, high):
+    """What one cell reads of the slabs ``r0 … r1``: runs of slabs between the same two layers, and their lines.
+
+    Entry e adds line ``offset[e]`` with the weight ``low[e]`` to the run's lower layer and ``high[e]`` to the upper.
+    ``table`` receives per run: lower layer, end of its entries. Where slabs are interpolated one by one
+    (``layered`` false) a slab is a run, its row is the slab, and all its weight is ``low``.
+
+    Returns:
+        the number of runs.
+    """
+    real = low.dtype.type
+    runs, e, now = 0, 0, -1
+    inverse = 1.0 / layer
+    for r in range(r0, r1):
+        ta, tb = p0 + q0 * r, p1 + q1 * r
+        lo, hi = max(min(ta, tb), 0.0), min(max(ta, tb), float(width))
+        depth = l0 + l1 * r
+        if hi <= lo or depth <= NEAREST:
+            continue
+        scale = path / abs(tb - ta)
+        share = 0.0
+        if layered:
+            at = depth * inverse
+            here = int(at)
+            share = at - here
+        else:
+            here = r
+        if here != now:
+            now = here
+            table[runs, 0] = now
+            runs += 1
+        start = r * across
+        k = int(lo)
+        left = lo
+        while left < hi:
+            right = min(hi, k + 1.0)
+            w = scale * (right - left)
+            offset[e] = start + k * along
+            high[e] = real(w * share)
+            low[e] = real(w - w * share)
+            e += 1
+            k += 1
+            left = float(k)
+        table[runs - 1, 1] = e
+    return runs
 
 
 @_small
@@ -141,125 +167,113 @@ def _add_rows(line, at, depth, z0, dz, row0, row_pitch, index, part, read, out):
 
 @_small
 def _project_view(
-    lines, ny, nx, at, edges, centers, first, segments, s0, s1, lattice, z0, dz, row0, row_pitch, layer, acc, data
+    lanes, lines, ny, nx, at, edges, centers, first, segments, s0, s1, lattice, z0, dz, row0, row_pitch, layer, data
 ):
-    """All segments of one view; ``lines``: ``(batch, ny * nx, knots)``, ``data``: ``(batch, rows, columns)``."""
-    batch, _, knots = lines.shape
-    columns, rows = acc.shape[1:]
+    """All segments of one view; ``lines``: ``(ny * nx, knots)``, ``data``: ``(rows, columns)``."""
+    knots = lines.shape[1]
+    rows, columns = data.shape
     real = lines.dtype.type
-    blend = np.empty(knots, dtype=lines.dtype)
-    pair = np.zeros((2, batch, knots), dtype=lines.dtype)
+    flat = lines.reshape(-1)
+    pair = np.zeros((2, knots), dtype=lines.dtype)
     index = np.zeros(padded(rows + 1), dtype=np.uint32)
     part = np.zeros(index.size, dtype=lines.dtype)
     read = np.zeros(index.size, dtype=lines.dtype)
-    acc[:] = 0
+    sums = np.zeros((columns, rows), dtype=lines.dtype)
+    table = np.empty((max(ny, nx), 2), dtype=np.int64)
+    offset = np.empty(0, dtype=np.int64)
+    low, high = np.empty(0, dtype=lines.dtype), np.empty(0, dtype=lines.dtype)
     for s in range(s0, s1):
         axis = segments[s, 1]
         slabs, width = (ny, nx) if axis == 0 else (nx, ny)
-        across, along = (nx, 1) if axis == 0 else (1, nx)
+        across, along = (nx * knots, knots) if axis == 0 else (knots, nx * knots)
         for j in range(segments[s, 2], segments[s, 2] + segments[s, 3]):
             p0, q0 = _edge_line(at, edges, first + j, axis, lattice, False)
             p1, q1 = _edge_line(at, edges, first + j + 1, axis, lattice, False)
             l0, l1, path, square = _depth_line(at, centers, first + j, axis, lattice, False)
             layered = abs(l1) < MAX_LAYERS_PER_SLAB * layer
-            low = -1  # the pair holds layers ``low`` (at pair[low % 2]) and ``low + 1``
-            for r in range(slabs):
-                ta, tb = p0 + q0 * r, p1 + q1 * r
-                lo, hi = max(min(ta, tb), 0.0), min(max(ta, tb), float(width))
-                depth = l0 + l1 * r
-                if hi <= lo or depth <= NEAREST:
+            room = _room(p0, q0, p1, q1, 0, slabs, width)
+            if room > offset.size:
+                offset = np.empty(room, dtype=np.int64)
+                low, high = (np.empty(room, dtype=lines.dtype), np.empty(room, dtype=lines.dtype))
+            runs = _plan(
+                p0, q0, p1, q1, l0, l1, path, layer, layered, 0, slabs, width, across, along, table, offset, low,
+                high,
+            )  # fmt: skip
+            e0 = 0
+            for n in range(runs):
+                now, e1 = table[n, 0], table[n, 1]
+                lower, upper = now % 2, (now + 1) % 2
+                add_lines(lanes, flat, offset, low, high, e0, e1, knots, pair[lower], pair[upper])
+                e0 = e1
+                if not layered:
+                    _add_rows(pair[lower], at, l0 + l1 * now, z0, dz, row0, row_pitch, index, part, read, sums[j])
+                    _clear(pair[lower])
+                    _clear(pair[upper])  # zero weights of NaN or Inf
                     continue
-                k0, k1 = int(lo), min(math.ceil(hi), width)
-                scale = path / abs(tb - ta)
-                now = int(depth / layer) if layered else -1
-                if layered and now != low:
-                    for m in range(low, low + 2):
-                        if low >= 0 and m != now and m != now + 1:
-                            for n in range(batch):
-                                line = pair[m % 2, n]
-                                _add_rows(
-                                    line, at, m * layer, z0, dz, row0, row_pitch, index, part, read, acc[n, j]
-                                )  # fmt: skip
-                                line[:] = 0
-                    low = now
-                for n in range(batch):
-                    _blend(lines[n], r * across, along, k0, k1, lo, hi, scale, blend)
-                    if layered:
-                        _share(blend, real(depth / layer - now), pair[now % 2, n], pair[(now + 1) % 2, n])
-                    else:
-                        _add_rows(blend, at, depth, z0, dz, row0, row_pitch, index, part, read, acc[n, j])
-            if low >= 0:
-                for m in range(low, low + 2):
-                    for n in range(batch):
-                        line = pair[m % 2, n]
-                        _add_rows(line, at, m * layer, z0, dz, row0, row_pitch, index, part, read, acc[n, j])
-                        line[:] = 0
+                after = table[n + 1, 0] if n + 1 < runs else -9
+                for m in range(now, now + 2):
+                    if m != after and m != after + 1:
+                        line = pair[m % 2]
+                        _add_rows(line, at, m * layer, z0, dz, row0, row_pitch, index, part, read, sums[j])
+                        _clear(line)
             for i in range(rows):
                 rise = row0 + (i + 0.5) * row_pitch + at[7] - at[2]
-                slant = real(math.sqrt(1.0 + rise * rise / square))
-                for n in range(batch):
-                    acc[n, j, i] *= slant
-    for n in range(batch):
-        for i in range(rows):
-            for j in range(columns):
-                data[n, i, j] = acc[n, j, i]
+                sums[j, i] *= real(math.sqrt(1.0 + rise * rise / square))
+    for i in range(rows):
+        for j in range(columns):
+            data[i, j] = sums[j, i]
 
 
 @njit(parallel=True, cache=True)
+def _project(
+    lanes, lines, ny, nx, pose, edges, centers, first, segments, start, lattice, z0, dz, row0, row_pitch, layer, data
+):
+    for v in prange(data.shape[0]):
+        _project_view(
+            lanes, lines, ny, nx, pose[v], edges, centers, first[v], segments, start[v], start[v + 1], lattice,
+            z0, dz, row0, row_pitch, layer, data[v],
+        )  # fmt: skip
+
+
 def project(lines, ny, nx, pose, edges, centers, first, segments, start, lattice, z0, dz, row0, row_pitch, layer, data):
-    """Cone-beam line integrals.
+    """Cone-beam line integrals of one volume.
 
     Args:
-        lines: ``(batch, ny * nx, padded(nz) + 8)`` running sums of the volume along z: 0 first, the total repeated.
+        lines: ``(ny * nx, padded(nz) + 8)`` running sums of the volume along z: 0 first, the total repeated.
         pose, edges, centers, first: see ``rays.Rays``.
         segments, start: see ``rays.Segments``.
         lattice: ``(8,)`` slab positions, see ``_edge_line``.
         z0, dz: lower edge of the grid along z and its pitch (mm).
         row0, row_pitch: lower edge of the first row kept, and the pitch (mm on the detector).
         layer: spacing of the depth layers in the ray parameter, see ``layer_spacing``.
-        data: ``(batch, views, rows, columns)`` output, overwritten.
+        data: ``(views, rows, columns)`` output, overwritten.
     """
-    batch, views, rows, columns = data.shape
-    for v in prange(views):
-        acc = np.empty((batch, columns, rows), dtype=lines.dtype)
-        _project_view(
-            lines, ny, nx, pose[v], edges, centers, first[v], segments, start[v], start[v + 1], lattice,
-            z0, dz, row0, row_pitch, layer, acc, data[:, v],
-        )  # fmt: skip
+    lanes = (0,) * (32 // lines.dtype.itemsize)
+    _project(
+        lanes, lines, ny, nx, pose, edges, centers, first, segments, start, lattice, z0, dz, row0, row_pitch, layer,
+        data,
+    )  # fmt: skip
 
 
 @_small
 def _row_sums_view(data, at, centers, first, row0, row_pitch, sums):
-    batch, columns, edges = sums.shape
+    columns, edges = sums.shape
     for j in range(columns):
         a, b = centers[first + j, 0], centers[first + j, 1]
         dx, dy = a * at[3] + b * at[5], a * at[4] + b * at[6]
         square = dx * dx + dy * dy
-        for n in range(batch):
-            sums[n, j, 0] = 0
+        sums[j, 0] = 0
         for i in range(edges - 1):
             rise = row0 + (i + 0.5) * row_pitch + at[7] - at[2]
             slant = data.dtype.type(math.sqrt(1.0 + rise * rise / square))
-            for n in range(batch):
-                sums[n, j, i + 1] = sums[n, j, i] + slant * data[n, i, j]
+            sums[j, i + 1] = sums[j, i] + slant * data[i, j]
 
 
 @njit(parallel=True, cache=True)
 def _row_sums(data, pose, centers, first, row0, row_pitch, begin, sums):
-    """Readings times their slant, summed along the rows: ``(batch, views, columns, rows + 1)``."""
-    for v in prange(sums.shape[1]):
-        _row_sums_view(data[:, begin + v], pose[begin + v], centers, first[begin + v], row0, row_pitch, sums[:, v])
-
-
-@_small
-def _spread(target, k0, k1, lo, hi, scale, values):
-    """Transpose of ``_blend`` on one slab: ``target``, ``(width, nz)``."""
-    real = values.dtype.type
-    for k in range(k0, k1):
-        w = real(scale * (min(hi, k + 1.0) - max(lo, float(k))))
-        line = target[k]
-        for z in range(values.size):
-            line[z] += w * values[z]
+    """Readings times their slant, summed along the rows: ``(views, columns, rows + 1)``."""
+    for v in prange(sums.shape[0]):
+        _row_sums_view(data[begin + v], pose[begin + v], centers, first[begin + v], row0, row_pitch, sums[v])
 
 
 @_small
@@ -275,17 +289,19 @@ def _layer_values(sums, at, depth, z0, dz, row0, row_pitch, index, part, read, v
 
 @_small
 def _gather_slabs(
-    sums, pose, edges, centers, first, segments, seg0, seg1, begin, axis, lattice, z0, dz, row0, row_pitch, layer,
-    r0, r1, out,
+    lanes, sums, pose, edges, centers, first, segments, seg0, seg1, begin, axis, lattice, z0, dz, row0, row_pitch,
+    layer, r0, r1, out,
 ):  # fmt: skip
-    """Slabs ``r0 … r1`` of ``_gather``; ``out``: ``(batch, slabs, width, padded(nz))``."""
-    batch, _, width, nz = out.shape
-    real = sums.dtype.type
+    """Slabs ``r0 … r1`` of ``_gather``; ``out``: ``(slabs, width, padded(nz))``."""
+    _, width, nz = out.shape
+    flat = out.reshape(-1)
     index = np.empty(nz + 8, dtype=np.uint32)
     part = np.empty(nz + 8, dtype=sums.dtype)
     read = np.empty(nz + 8, dtype=sums.dtype)
-    pair = np.empty((2, batch, nz), dtype=sums.dtype)
-    mixed = np.empty(nz, dtype=sums.dtype)
+    pair = np.empty((2, nz), dtype=sums.dtype)
+    table = np.empty((r1 - r0, 2), dtype=np.int64)
+    offset = np.empty(0, dtype=np.int64)
+    low, high = np.empty(0, dtype=sums.dtype), np.empty(0, dtype=sums.dtype)
     for s in range(seg0, seg1):
         if segments[s, 1] != axis:
             continue
@@ -296,83 +312,75 @@ def _gather_slabs(
             p1, q1 = _edge_line(at, edges, first[v] + j + 1, axis, lattice, False)
             l0, l1, path, _ = _depth_line(at, centers, first[v] + j, axis, lattice, False)
             layered = abs(l1) < MAX_LAYERS_PER_SLAB * layer
-            low = -1
-            for r in range(r0, r1):
-                ta, tb = p0 + q0 * r, p1 + q1 * r
-                lo, hi = max(min(ta, tb), 0.0), min(max(ta, tb), float(width))
-                depth = l0 + l1 * r
-                if hi <= lo or depth <= NEAREST:
-                    continue
-                k0, k1 = int(lo), min(math.ceil(hi), width)
-                scale = path / abs(tb - ta)
-                now = int(depth / layer) if layered else -1
-                if layered and now != low:
+            room = _room(p0, q0, p1, q1, r0, r1, width)
+            if room > offset.size:
+                offset = np.empty(room, dtype=np.int64)
+                low, high = (np.empty(room, dtype=sums.dtype), np.empty(room, dtype=sums.dtype))
+            runs = _plan(
+                p0, q0, p1, q1, l0, l1, path, layer, layered, r0, r1, width, width * nz, nz, table, offset, low, high
+            )
+            e0, before = 0, -9
+            for n in range(runs):
+                now, e1 = table[n, 0], table[n, 1]
+                lower, upper = now % 2, (now + 1) % 2
+                if layered:
                     for m in range(now, now + 2):
-                        if low < 0 or (m != low and m != low + 1):
-                            for n in range(batch):
-                                _layer_values(
-                                    sums[n, v - begin, j], at, m * layer, z0, dz, row0, row_pitch,
-                                    index, part, read, pair[m % 2, n],
-                                )  # fmt: skip
-                    low = now
-                for n in range(batch):
-                    if layered:
-                        high = real(depth / layer - now)
-                        keep = real(1) - high
-                        a, b = pair[now % 2, n], pair[(now + 1) % 2, n]
-                        for z in range(nz):
-                            mixed[z] = keep * a[z] + high * b[z]
-                    else:
-                        _layer_values(
-                            sums[n, v - begin, j], at, depth, z0, dz, row0, row_pitch, index, part, read, mixed
-                        )  # fmt: skip
-                    _spread(out[n, r], k0, k1, lo, hi, scale, mixed)
+                        if m != before and m != before + 1:
+                            _layer_values(
+                                sums[v - begin, j], at, m * layer, z0, dz, row0, row_pitch, index, part, read,
+                                pair[m % 2],
+                            )  # fmt: skip
+                    before = now
+                else:
+                    upper = lower  # its weight is zero
+                    _layer_values(
+                        sums[v - begin, j], at, l0 + l1 * now, z0, dz, row0, row_pitch, index, part, read, pair[lower]
+                    )
+                spread_lines(lanes, flat, offset, low, high, e0, e1, nz, pair[lower], pair[upper])
+                e0 = e1
 
 
 @njit(parallel=True, cache=True)
 def _gather(
-    sums, pose, edges, centers, first, segments, seg0, seg1, begin, lattice, z0, dz, row0, row_pitch, layer,
+    lanes, sums, pose, edges, centers, first, segments, seg0, seg1, begin, lattice, z0, dz, row0, row_pitch, layer,
     by_row, by_column,
 ):  # fmt: skip
-    """Add a chunk of views to ``by_row``, ``(batch, ny, nx, padded(nz))``, and ``by_column``, its transpose."""
-    ny, nx = by_row.shape[1:3]
+    """Add a chunk of views to ``by_row``, ``(ny, nx, padded(nz))``, and ``by_column``, its transpose."""
+    ny, nx = by_row.shape[:2]
     row_tasks = (ny + SLAB_BLOCK - 1) // SLAB_BLOCK
     tasks = row_tasks + (nx + SLAB_BLOCK - 1) // SLAB_BLOCK
     for task in prange(tasks):
         axis = 0 if task < row_tasks else 1
         out, r0 = (by_row, task * SLAB_BLOCK) if axis == 0 else (by_column, (task - row_tasks) * SLAB_BLOCK)
         _gather_slabs(
-            sums, pose, edges, centers, first, segments, seg0, seg1, begin, axis, lattice,
-            z0, dz, row0, row_pitch, layer, r0, min(r0 + SLAB_BLOCK, out.shape[1]), out,
+            lanes, sums, pose, edges, centers, first, segments, seg0, seg1, begin, axis, lattice,
+            z0, dz, row0, row_pitch, layer, r0, min(r0 + SLAB_BLOCK, out.shape[0]), out,
         )  # fmt: skip
 
 
 def backproject(
-    data, pose, edges, centers, first, segments, start, lattice, z0, dz, row0, row_pitch, layer, shape, memory
+    data, pose, edges, centers, first, segments, start, lattice, z0, dz, row0, row_pitch, layer, memory, volume
 ):
     """The exact transpose of :func:`project`.
 
     Args:
-        data: ``(batch, views, rows, columns)``.
-        shape: ``(nz, ny, nx)``.
+        data: ``(views, rows, columns)``.
         memory: bytes allowed for the row sums; the views are taken in chunks that fit.
-
-    Returns:
-        ``(batch, nz, ny, nx)``, dtype of ``data``.
+        volume: ``(nz, ny, nx)`` output, overwritten; dtype of ``data``.
     """
-    batch, views, rows, columns = data.shape
-    nz, ny, nx = shape
-    by_row = np.zeros((batch, ny, nx, padded(nz)), dtype=data.dtype)
-    by_column = np.zeros((batch, nx, ny, padded(nz)), dtype=data.dtype)
-    per_view = batch * columns * (rows + 1) * data.itemsize
-    chunk = int(max(1, min(views, memory // per_view)))
+    views, rows, columns = data.shape
+    nz, ny, nx = volume.shape
+    lanes = (0,) * (32 // data.dtype.itemsize)
+    by_row = np.zeros((ny, nx, padded(nz)), dtype=data.dtype)
+    by_column = np.zeros((nx, ny, padded(nz)), dtype=data.dtype)
+    chunk = int(max(1, min(views, memory // (columns * (rows + 1) * data.itemsize))))
     for begin in range(0, views, chunk):
         stop = min(begin + chunk, views)
-        sums = np.empty((batch, stop - begin, columns, rows + 1), dtype=data.dtype)
+        sums = np.empty((stop - begin, columns, rows + 1), dtype=data.dtype)
         _row_sums(data, pose, centers, first, row0, row_pitch, begin, sums)
         _gather(
-            sums, pose, edges, centers, first, segments, start[begin], start[stop], begin, lattice,
+            lanes, sums, pose, edges, centers, first, segments, start[begin], start[stop], begin, lattice,
             z0, dz, row0, row_pitch, layer, by_row, by_column,
         )  # fmt: skip
-    by_row += by_column.transpose(0, 2, 1, 3)
-    return np.ascontiguousarray(by_row[..., :nz].transpose(0, 3, 1, 2))
+    by_row += by_column.transpose(1, 0, 2)
+    volume[...] = by_row[..., :nz].transpose(2, 0, 1)
