@@ -104,8 +104,8 @@ def _invert(doses: Floats, values: Floats, figure: Floats) -> Floats:
     """Dose at which rising curves ``values (..., m)`` reach ``figure (...)``; 0 below and Inf above their range."""
     with np.errstate(divide="ignore", invalid="ignore"):
         v, t = np.log(np.maximum(values, 0.0)), np.log(np.maximum(figure, 0.0))
-    t = np.where(np.abs(t - v[..., -1]) <= _EDGE, v[..., -1], t)
-    t = np.where(np.abs(t - v[..., 0]) <= _EDGE, v[..., 0], t)
+        t = np.where(np.abs(t - v[..., -1]) <= _EDGE, v[..., -1], t)
+        t = np.where(np.abs(t - v[..., 0]) <= _EDGE, v[..., 0], t)
     m = doses.size
     # −Inf marks a figure that is not positive: it lies below every curve, also below one that starts at 0.
     k = np.where(np.isneginf(t), 0, (v <= t[..., None]).sum(-1))
@@ -353,12 +353,15 @@ def contrast_slope(
 
 def _slopes(slope: float | ContrastSlope, n: int, draws: int, seed: int) -> tuple[float, Any, Any]:
     """Slope of the sample, of every draw and with each realisation left out."""
+    value = slope.value if isinstance(slope, ContrastSlope) else float(slope)
+    if not (math.isfinite(value) and value > 0):
+        raise ValueError(
+            f"slope must be a positive number, got {value}: contrast of the wrong sign cannot be corrected"
+        )
     if isinstance(slope, ContrastSlope):
         slope._paired(n, draws, seed)
-        return slope.value, slope.draws, slope.jackknife
-    if not (math.isfinite(slope) and slope > 0):
-        raise ValueError(f"slope must be a positive number, got {slope}: contrast of the wrong sign has no dose factor")
-    return float(slope), float(slope), float(slope)
+        return value, slope.draws, slope.jackknife
+    return value, value, value
 
 
 def dose_factor(
