@@ -15,6 +15,7 @@ from torchpcct.metrics import (
     efficiency,
     roi_bias,
 )
+from torchpcct.metrics._bootstrap import bca_interval, leave_one_out, resampling
 from torchpcct.metrics.dose_factor import DOSES, FIGURES
 
 MEANS, COVARIANCE = (40.0, 100.0), np.array([[100.0, 40.0], [40.0, 300.0]])
@@ -218,6 +219,20 @@ def test_hardly_any_contrast_is_below_every_curve(figure):
     result = dose_factor(noise[4], curve, figure, draws=300)
     assert 0 <= result.low <= result.high
     assert all(d in (0.0, math.inf) or 0.5 <= d <= 4 for d in result[:3])
+
+
+def test_the_parts_of_the_bootstrap():
+    np.testing.assert_array_equal(leave_one_out(5), [np.delete(np.arange(5), k) for k in range(5)])
+    np.testing.assert_array_equal(resampling(7, 3, 2), resampling(7, 3, 2))
+    # Without bias and skewness the interval is that of the percentiles.
+    draws = np.arange(1001.0)
+    low, high = bca_interval(500.0, draws, np.array([-1.0, 0.0, 1.0]), 0.9)
+    assert (low, high) == (pytest.approx(50, abs=1), pytest.approx(950, abs=1))
+    # Efron 1987: 55 % of the draws below the figure shift both ends up, and so does a positive acceleration.
+    assert bca_interval(550.0, draws, np.zeros(3), 0.9)[0] > 65
+    skewed = bca_interval(500.0, draws, -np.array([0.0, 0.0, 0.0, 1.0]), 0.9)
+    assert skewed[0] > low
+    assert skewed[1] > high
 
 
 CURVE = DoseCurve.paper_cnr(MEANS, COVARIANCE)
