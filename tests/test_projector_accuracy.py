@@ -65,7 +65,7 @@ def test_gaussians_in_any_fan_beam(start, sod, ratio, offset, curved, cy, cx, sp
     geometry = FanBeam(full_turn(7, start), sod, sod * ratio, 120, 0.9 * ratio, offset, detector)
     grid = VolumeGrid((64, 60), (1.0, spacing), (cy, cx))
     body = Gaussian((cy + 1.3, cx - 2.1), (4.0, 5.5), 0.4, 0.02)
-    assert _error(geometry, grid, [body]) < 4e-3
+    assert _error(geometry, grid, [body]) < 6e-3  # blur by voxels up to 1.2 mm; 4.9e-3 is the worst of 150 random scans
 
 
 @settings(max_examples=10, deadline=None)
