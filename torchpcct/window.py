@@ -69,24 +69,29 @@ class DetectorWindow:
         return self.views * self.rows * self.columns / math.prod(geometry.shape)
 
 
-def shadow(geometry: Geometry, grid: VolumeGrid, margin: int = 0) -> DetectorWindow:
+def shadow(geometry: Geometry, grid: VolumeGrid, margin: int = 0, motion: Any = None) -> DetectorWindow:
     """The smallest window that sees every voxel corner of ``grid`` in every view.
 
     Args:
         geometry: parallel, fan or cone beam.
         grid: 2-D grid for a 2-D geometry, 3-D grid for a cone beam.
         margin: columns added on either side (clipped at the detector's edge).
+        motion: displacement of the grid per view as for ``Projector``, or None.
 
     Raises:
-        ValueError: the grid leaves the field of view, or the source's orbit crosses it.
+        ValueError: a motion of the wrong shape, the grid leaves the field of view, or the source's orbit crosses it.
     """
     gz = grid.extent[0] / 2 if grid.ndim == 3 else 0.0
     cy, cx = grid.center[-2:]
     hy, hx = grid.extent[-2] / 2, grid.extent[-1] / 2
     corners = np.array([(cx + sx * hx, cy + sy * hy) for sx in (-1, 1) for sy in (-1, 1)])
     beta = geometry.angles[:, None]
-    along = corners[:, 0] * np.cos(beta) + corners[:, 1] * np.sin(beta)  # (views, 4), towards the source
-    across = -corners[:, 0] * np.sin(beta) + corners[:, 1] * np.cos(beta)
+    shift = np.zeros((geometry.views, grid.ndim)) if motion is None else np.asarray(motion, dtype=np.float64)
+    if shift.shape != (geometry.views, grid.ndim):
+        raise ValueError(f"motion needs the shape ({geometry.views}, {grid.ndim}), got {shift.shape}")
+    x, y = corners[:, 0] + shift[:, -1:], corners[:, 1] + shift[:, -2:-1]  # (views, 4)
+    along = x * np.cos(beta) + y * np.sin(beta)  # (views, 4), towards the source
+    across = -x * np.sin(beta) + y * np.cos(beta)
     first_row, rows = 0, 1
     if isinstance(geometry, ParallelBeam):
         position, pitch = across, geometry.pitch
@@ -106,7 +111,7 @@ def shadow(geometry: Geometry, grid: VolumeGrid, margin: int = 0) -> DetectorWin
             reach = np.array([grid.center[0] - gz, grid.center[0] + gz]) if grid.ndim == 3 else np.zeros(2)
             # On a curved detector the height follows the slant in-plane distance, on a flat one the depth.
             distance = np.hypot(across, depth) if geometry.detector == "curved" else depth
-            v = geometry.sdd * reach[:, None, None] / distance
+            v = geometry.sdd * (reach[:, None, None] + (shift[:, :1] if grid.ndim == 3 else 0.0)) / distance
             row0 = (v.min() - geometry.row_positions[0]) / geometry.pitch[0] - 0.5
             row1 = (v.max() - geometry.row_positions[0]) / geometry.pitch[0] + 0.5
             first_row = int(np.clip(math.floor(row0), 0, geometry.rows - 1))

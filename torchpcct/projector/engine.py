@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torchpcct.geometry import Geometry, VolumeGrid
 from torchpcct.projector.layers import layer_spacing, running_sums
 from torchpcct.projector.plane import PlanePasses
-from torchpcct.projector.rays import Rays, Segments, check_pair, check_source, rays_of, split
+from torchpcct.projector.rays import Rays, Segments, check_motion, check_pair, check_source, rays_of, split
 from torchpcct.window import DetectorWindow
 
 if TYPE_CHECKING:
@@ -33,16 +33,19 @@ class Engine:
     """Forward and adjoint passes on NumPy arrays with exactly one leading batch axis.
 
     Args:
-        geometry, grid, window: as for ``Projector``.
+        geometry, grid, window, motion: as for ``Projector``.
 
     Raises:
         TypeError, ValueError: see ``rays.check_pair`` and ``rays.check_source``.
     """
 
-    def __init__(self, geometry: Geometry, grid: VolumeGrid, window: DetectorWindow | None) -> None:
+    def __init__(self, geometry: Geometry, grid: VolumeGrid, window: DetectorWindow | None, motion: Any = None) -> None:
         check_pair(geometry, grid, window)
-        self.geometry, self.grid, self.windowed = geometry, grid, window is not None
+        # Symmetric views share their work only if all of the detector is read and nothing moves.
+        self.geometry, self.grid, self.windowed = geometry, grid, window is not None or motion is not None
         self.rays: Rays = rays_of(geometry, window)
+        if motion is not None:
+            self.rays = self.rays.moved(check_motion(motion, geometry.views, grid.ndim))
         check_source(self.rays, grid)
         hy, hx = grid.spacing[-2:]
         y, x = grid.axes[-2:]

@@ -87,19 +87,23 @@ class Projector(nn.Module):
         geometry: ``ParallelBeam`` or ``FanBeam`` with a 2-D grid, ``ConeBeam`` with a 3-D grid.
         grid: the voxel grid.
         window: the part of the detector to compute (``torchpcct.window.shadow``), or None for all of it.
+        motion: displacement of the grid in every view, ``(views, 2)`` (y, x) or ``(views, 3)`` (z, y, x) mm, or None:
+            a volume that moves rigidly with its object is projected and reconstructed at rest.
 
     Raises:
         TypeError: an argument of the wrong kind, an input that is not float32 or float64.
-        ValueError: geometry, grid and window that do not fit together, a source inside the grid, an input of the
-            wrong shape.
+        ValueError: geometry, grid, window and motion that do not fit together, a source inside the grid, an input
+            of the wrong shape.
     """
 
-    def __init__(self, geometry: Geometry, grid: VolumeGrid, window: DetectorWindow | None = None) -> None:
+    def __init__(
+        self, geometry: Geometry, grid: VolumeGrid, window: DetectorWindow | None = None, motion: Any = None
+    ) -> None:
         super().__init__()
         self.geometry = geometry
         self.grid = grid
         self.window = window
-        self._engine = Engine(geometry, grid, window)
+        self._engine = Engine(geometry, grid, window, motion)
         self._adjoint: list[_Adjoint] = []  # in a list: a submodule that holds its parent would recurse
 
     @property

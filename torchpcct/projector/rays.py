@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
 from torchpcct.window import DetectorWindow
 
-__all__ = ["Rays", "Segments", "check_pair", "check_source", "rays_of", "split"]
+__all__ = ["Rays", "Segments", "check_motion", "check_pair", "check_source", "rays_of", "split"]
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -68,10 +68,13 @@ class Rays:
         )
 
     def moved(self, shift: Floats) -> Rays:
-        """The rays seen from an object displaced by ``shift``, ``(views, 2)`` mm (x, y) per view."""
+        """The rays seen from an object displaced by ``shift``, ``(views, 2)`` (y, x) or ``(views, 3)`` (z, y, x) mm."""
         source = self.source.copy()
-        source[:, :2] -= shift
-        return replace(self, source=source)
+        source[:, :2] -= shift[:, :-3:-1]
+        if shift.shape[1] == 2:
+            return replace(self, source=source)
+        source[:, 2] -= shift[:, 0]
+        return replace(self, source=source, foot_z=self.foot_z - shift[:, 0])
 
 
 def check_pair(geometry: Any, grid: Any, window: Any) -> None:
@@ -108,6 +111,20 @@ def check_pair(geometry: Any, grid: Any, window: Any) -> None:
             f"window reaches row {window.first_row + window.rows - 1}, the detector has rows 0…{rows - 1}: "
             "reduce first_row or rows"
         )
+
+
+def check_motion(motion: Any, views: int, axes: int) -> Floats:
+    """Displacements of the grid per view as ``(views, axes)`` float64.
+
+    Raises:
+        ValueError: a wrong shape, values that are not finite.
+    """
+    shift = np.array(motion, dtype=np.float64)
+    if shift.shape != (views, axes):
+        raise ValueError(f"motion needs the shape ({views}, {axes}): views and the grid's axes, got {shift.shape}")
+    if not np.isfinite(shift).all():
+        raise ValueError("motion has values that are not finite")
+    return shift
 
 
 def rays_of(geometry: Geometry, window: DetectorWindow | None = None) -> Rays:

@@ -13,19 +13,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam
+from torchpcct.projector.rays import check_motion
 
 __all__ = ["from_vectors", "to_vectors"]
 
 
-def to_vectors(geometry: Geometry) -> NDArray[np.float64]:
+def to_vectors(geometry: Geometry, motion: Any = None) -> NDArray[np.float64]:
     """ASTRA's vectors of a scan with a flat detector, ``(views, 6)`` or, for a cone beam, ``(views, 12)`` float64.
 
+    Args:
+        geometry: the scan.
+        motion: displacement of the grid per view as for ``Projector``, or None: source and detector are moved the
+            other way, so that ASTRA's volume may stand still.
+
     Raises:
-        ValueError: a curved detector, which ASTRA's vectors cannot describe.
+        ValueError: a curved detector, which ASTRA's vectors cannot describe; a motion of the wrong shape.
         TypeError: not a geometry.
     """
     if not isinstance(geometry, ParallelBeam | FanBeam | ConeBeam):
         raise TypeError(f"geometry must be ParallelBeam, FanBeam or ConeBeam, got {type(geometry).__name__}")
+    if motion is not None:
+        axes = 3 if isinstance(geometry, ConeBeam) else 2
+        back = check_motion(motion, geometry.views, axes)[:, ::-1]
+        vectors = to_vectors(geometry)
+        if not isinstance(geometry, ParallelBeam):
+            vectors[:, :axes] -= back
+        vectors[:, axes : 2 * axes] -= back
+        return vectors
     radial = np.stack([np.cos(geometry.angles), np.sin(geometry.angles)], axis=1)
     tangent = np.stack([-radial[:, 1], radial[:, 0]], axis=1)
     if isinstance(geometry, ParallelBeam):
