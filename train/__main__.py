@@ -136,6 +136,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error("--config and --quick exclude each other")
     if arguments.weights is not None and arguments.resume:
         parser.error("--weights starts a new run; --resume continues one")
+    # Before torch loads: OpenMP threads that wait should sleep, on machines shared with others by far the faster way.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     if arguments.threads is not None:
         if arguments.threads < 1:
             parser.error(f"--threads must be at least 1, got {arguments.threads}")
