@@ -5,7 +5,7 @@
 Peers take part where they are installed: ASTRA (``pip install astra-toolbox``) and the distance-driven C projector of
 XCIST, from the library that ships in ``gecatsim`` or the one named by ``--xcist``. Both use one core. Errors are
 relative L2 against exact, cell-averaged line integrals. The medians
-depend on what else the machine does; the ratios within a run less.
+depend on what else the machine does; the ratios within a run less: the load average stands above the table.
 """
 
 from __future__ import annotations
@@ -111,11 +111,14 @@ def cases() -> list[Callable[[], Case]]:
             VolumeGrid((512, 512), 1.0),
         ),
         lambda: Case("inset 128², 1968 × 1500", flat, inset, shadow(flat, inset)),
-        lambda: Case(
-            "cone 128³, 360 × 192²", ConeBeam(full_turn(360), 600.0, 1200.0, 192, 192, 1.5), VolumeGrid((128,) * 3, 1.0)
-        ),
         lambda: Case("inset 45² × 56, 0.2 mm", paper, plaque[0], shadow(paper, plaque[0]), soft),
         lambda: Case("inset 90² × 113, 0.1 mm", paper, plaque[1], shadow(paper, plaque[1]), soft),
+        lambda: Case(  # fewer bodies: the exact integrals of 13 million readings take a minute
+            "cone 128³, 360 × 192²",
+            ConeBeam(full_turn(360), 600.0, 1200.0, 192, 192, 1.5),
+            VolumeGrid((128,) * 3, 1.0),
+            bodies=_gaussians(VolumeGrid((128,) * 3, 1.0))[:3],
+        ),
     ]
 
 
@@ -184,7 +187,9 @@ def astra_line(case: Case) -> Peer | None:
 def xcist(case: Case, path: str | None) -> Peer | None:
     """XCIST's distance-driven projectors on the whole detector: ``DD2FanProj``, ``DD2ParProj`` or ``DD3Proj``.
 
-    Lengths are in pixels. XCIST's axes and signs are not documented: the flips that fit the exact answer are taken,
+    Lengths are in pixels. On the far off-centre 2-D inset its error is larger than the pixels explain (3e-2 on small
+    Gaussians); the cause was not found, so quote that row with care. XCIST's axes and signs are not documented: the flips
+    that fit the exact answer are taken,
     found on a few views. On 3-D insets every twelfth view is projected and the time multiplied: XCIST has no window,
     and the whole detector of all views would take minutes.
     """
@@ -326,6 +331,7 @@ def picture(rows: list[dict[str, Any]], path: Path) -> None:
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
     names = list(dict.fromkeys(r["case"] for r in rows))
     figure, axes = plt.subplots(2, math.ceil(len(names) / 2), figsize=(3.6 * math.ceil(len(names) / 2), 6.4))
@@ -338,6 +344,11 @@ def picture(rows: list[dict[str, Any]], path: Path) -> None:
         axis.set_title(name, fontsize=9)
         axis.set_xlabel("forward projection, s (median)", fontsize=8)
         axis.set_ylabel("relative L2 error", fontsize=8)
+        for scale in (axis.xaxis, axis.yaxis):
+            scale.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            scale.set_major_formatter(FormatStrFormatter("%.0e" if scale is axis.yaxis else "%g"))
+            scale.set_minor_formatter(NullFormatter())
+        axis.margins(0.2, 0.2)
         axis.grid(alpha=0.3, which="both")
     axes.flat[0].legend(fontsize=7)
     for axis in axes.flat[len(names) :]:
@@ -377,10 +388,10 @@ def main() -> None:
         library = str(candidate) if candidate.exists() else None
     options.out.mkdir(parents=True, exist_ok=True)
     rows: list[dict[str, Any]] = []
+    grown = growth(options.repeats)
     for make in cases():
         rows += measure(make(), options.repeats, library)
-        print(_write(rows, None, options.out).splitlines()[-1], flush=True)  # a run cut short keeps what it measured
-    print(_write(rows, growth(options.repeats), options.out))
+        print(_write(rows, grown, options.out).splitlines()[-3], flush=True)  # a run cut short keeps what it measured
 
 
 def _machine() -> str:
@@ -392,14 +403,13 @@ def _machine() -> str:
     return f"{names[0] if names else platform.machine()}, {os.cpu_count()} cores"
 
 
-def _write(rows: list[dict[str, Any]], grown: dict[str, Any] | None, out: Path) -> str:
+def _write(rows: list[dict[str, Any]], grown: dict[str, Any], out: Path) -> str:
     now = datetime.datetime.now(datetime.UTC)
     report = (
         f"{_machine()}, torch {torch.__version__}, {now:%Y-%m-%d %H:%M} UTC, load {os.getloadavg()[0]:.1f} at the end"
     )
     report += f"\n\n{table(rows)}\n"
-    if grown is not None:
-        report += f"\nTime against size: {grown}\n"
+    report += f"\nTime against size: {grown}\n"
     (out / "projectors.md").write_text(report)
     (out / "projectors.json").write_text(json.dumps({"rows": rows, "growth": grown}, indent=1))
     picture(rows, out / "projectors.png")
