@@ -517,6 +517,18 @@ def test_two_processes_give_the_gradients_of_one(tmp_path, launcher):
     assert_same_run(tmp_path / "two", tmp_path / "whole")
 
 
+@pytest.mark.slow
+def test_command_line_under_torchrun(tmp_path):
+    torchrun = ["-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2", __file__, "command"]
+    process = script(*torchrun, str(tmp_path / "x"), stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    out, errors = process.communicate(timeout=180)
+    assert process.returncode == 0, errors
+    assert out.count("weights and card in") == 1
+    card = json.loads((tmp_path / "x" / "card.json").read_text())
+    assert card["processes"] == 2
+    assert card["steps_done"] == 20
+
+
 def test_more_processes_than_scenes_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr("train.loop.Group", lambda: type("G", (), {"rank": 0, "size": 8})())
     with pytest.raises(ValueError, match=r"batch \(4\)"):
@@ -689,6 +701,22 @@ def test_command_line(tmp_path, main, capsys):
     assert "card.md is damaged or not a safetensors file" in capsys.readouterr().err
 
 
+def test_second_interrupt_stops_at_once(tmp_path, main, capsys):
+    def twice(total):
+        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), signal.SIGINT)
+        return total
+
+    common = ["--out", str(tmp_path / "x"), "--no-progress", "--no-tensorboard"]
+    main.__globals__["objective"].at = {9: twice}
+    assert main(["--quick", "--steps", "30", *common]) == 130
+    assert "stopped at once" in capsys.readouterr().err
+    main.__globals__["objective"].at = {}
+    assert main(["--resume", *common]) == 0
+    main(["--quick", "--steps", "30", "--out", str(tmp_path / "y"), *common[2:]])
+    assert_same_run(tmp_path / "x", tmp_path / "y")
+
+
 def test_command_line_refusals(tmp_path, main, capsys):
     for words in (["--quick", "--config", "x.yaml"], ["--threads", "0"], ["--resume", "--weights", "x"]):
         with pytest.raises(SystemExit):
@@ -728,5 +756,12 @@ def _gradients(out):
     distributed.destroy_process_group()
 
 
+def _command(out):
+    from train import __main__ as module
+
+    module.build = lambda config: (stub_model(config.seed), StubData(), StubObjective())
+    assert module.main(["--quick", "--out", out, "--threads", "1", "--no-tensorboard"]) == 0
+
+
 if __name__ == "__main__":
-    {"slow": _slow, "gradients": _gradients}[sys.argv[1]](sys.argv[2])
+    {"slow": _slow, "gradients": _gradients, "command": _command}[sys.argv[1]](sys.argv[2])

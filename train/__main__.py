@@ -152,6 +152,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (ValueError, OSError, CheckpointError, DivergedError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:
+        # The second Ctrl-C, or one before the first step.
+        print(f"stopped at once; --resume continues from the last checkpoint in {arguments.out}", file=sys.stderr)
+        return 130
 
 
 if __name__ == "__main__":
