@@ -187,11 +187,10 @@ def astra_line(case: Case) -> Peer | None:
 def xcist(case: Case, path: str | None) -> Peer | None:
     """XCIST's distance-driven projectors on the whole detector: ``DD2FanProj``, ``DD2ParProj`` or ``DD3Proj``.
 
-    Lengths are in pixels. On the far off-centre 2-D inset its error is larger than the pixels explain (3e-2 on small
-    Gaussians); the cause was not found, so quote that row with care. XCIST's axes and signs are not documented: the flips
-    that fit the exact answer are taken,
+    Lengths are in pixels. XCIST's axes and signs are not documented: the flips that fit the exact answer are taken,
     found on a few views. On 3-D insets every twelfth view is projected and the time multiplied: XCIST has no window,
-    and the whole detector of all views would take minutes.
+    and the whole detector of all views would take minutes. On the far off-centre 2-D inset its error is larger than
+    the pixels explain (3e-2 on small Gaussians); the cause was not found, so quote that row with care.
     """
     if path is None:
         return None
