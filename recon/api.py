@@ -45,8 +45,8 @@ def reconstruct(
         scan: one scan, or several realisations of one scan (same geometry, window and exposure).
         grid: ``(z, y, x)`` grid inside the field of view.
         method: ``"fbp"`` (FDK; option ``kernel``) or ``"pwls"`` (penalised weighted least squares with a q-GGMRF
-            prior, to convergence; options of :func:`recon.roi.reconstruct_pwls`). ``"mbir"`` stands for the package's
-            best model-based method, today that PWLS; ``report["method"]`` names what ran.
+            prior, to convergence; options of :func:`recon.roi.reconstruct_pwls`) or ``"mbir"`` (unrolled steps with the
+            learned prior that ships with the package; options of :func:`recon.mbir.reconstruct_mbir`).
         progress: called with the finished fraction, 0…1.
         device: where the returned volumes lie.
         options: of the method.
@@ -72,7 +72,11 @@ def reconstruct(
             )
     if method == "fbp":
         volumes = _fbp(scans, grid, progress, **options)
-    elif method in ("pwls", "mbir"):
+    elif method == "mbir":
+        from recon.mbir import reconstruct_mbir
+
+        volumes = reconstruct_mbir(scans, grid, progress=progress, **options)
+    elif method == "pwls":
         from recon.roi import reconstruct_pwls
 
         volumes = reconstruct_pwls(scans, grid, progress=progress, **options)

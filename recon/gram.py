@@ -99,6 +99,12 @@ class Gram:
         other.weights = self.weights * factor
         return other
 
+    def without_projector(self) -> Gram:
+        """The same operator without the projector and the weights (megabytes each); ``exact`` and ``error`` go too."""
+        other = copy.copy(self)
+        other.projector, other.weights = None, self.weights[:0]
+        return other
+
     def to(self, device: torch.device | str) -> Gram:
         """The same operator with its kernels on ``device``."""
         other = copy.copy(self)
@@ -150,6 +156,8 @@ class Gram:
 
     def exact(self, x: Tensor) -> Tensor:
         """Aᵀ W A x with the exact operator (one projection pair)."""
+        if self.projector is None:
+            raise ValueError("this Gram operator was separated from its projector (without_projector): keep the first")
         out: Tensor = self.projector.T(self.weights.to(x.dtype) * self.projector(x))
         return out
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -15,16 +16,31 @@ from recon.pwls import pwls
 from recon.qggmrf import QGGMRF
 from torchpcct.geometry import VolumeGrid
 from torchpcct.projector import Projector
-from torchpcct.scan import Scan
+from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
 from torchpcct.volume import Volume
 from torchpcct.window import DetectorWindow, shadow
 
-__all__ = ["DEFAULT_PRIOR", "InsetProblem", "reconstruct_pwls"]
+__all__ = ["DEFAULT_PRIOR", "InsetProblem", "Statistic", "reconstruct_pwls"]
 
 DEFAULT_PRIOR = QGGMRF(strength=0.3, threshold=300.0)
 """Noise-normalised q-GGMRF, chosen for about the resolution of FBP's soft kernel: the curvatures of data and prior
 are equal at 0.75 line pairs per mm, edges steeper than 300 HU/mm (lumen, fat) pass. A stronger prior lowers the noise
 of ROI means further, but shrinks the contrast of a millimetre-sized core: look at means and slope, not at CNR alone."""
+
+
+@dataclass(frozen=True)
+class Statistic:
+    """All that a scan says about an inset, given the weights W.
+
+    Args:
+        b: AᵀW y, ``grid.shape``, y with the background taken off.
+        energy: yᵀW y.
+        readings: number of readings in the inset's shadow.
+    """
+
+    b: Tensor
+    energy: float
+    readings: int
 
 
 class InsetProblem:
@@ -33,6 +49,8 @@ class InsetProblem:
     Args:
         scan: a counting-mode scan of the family; its noise does not matter.
         grid: ``(z, y, x)`` grid that holds everything the background does not.
+        nodes: of the Gram operator. Linear in position (5) is enough for solvers: what the model lacks, the exact
+            pairs repair, and each step costs half of that with 9.
 
     The weights are the inverse variances of the line integrals expected from the BACKGROUND: weights from the noisy
     readings themselves would bias the result, and a small inset changes the counts behind it by a few per cent only.
@@ -41,7 +59,7 @@ class InsetProblem:
         ValueError: a grid outside the field of view or the scan's region; a spectral scan.
     """
 
-    def __init__(self, scan: Scan, grid: VolumeGrid) -> None:
+    def __init__(self, scan: Scan, grid: VolumeGrid, nodes: int = 5) -> None:
         if scan.counts.ndim != 3:
             raise ValueError("PWLS in HU needs a counting-mode scan; decompose or sum the energy bins before")
         if scan.surround is None or scan.window is None:
@@ -58,12 +76,11 @@ class InsetProblem:
         self.level = float(backproject(fbp.surround[0], scan.geometry, grid, fbp.shadow).mean())
         polychromatic = scan.air.log() - scan.surround.log()
         slope = scan.linearisation.slope(polychromatic)
-        exposure = scan.exposure_s or 1.0
+        exposure = scan.exposure_s or NOISE_FREE_EXPOSURE_S
         # Per second of exposure: the Gram of one exposure serves all by a factor.
         self._weights = _at(scan.surround / slope.square() / exposure, self.window)
         self.projector = Projector(scan.geometry, grid, self.window)
-        # Linear in position is enough: what the model lacks, the exact pairs repair, and each step costs half.
-        self.gram = Gram(self.projector, self._weights, nodes=5)
+        self.gram = Gram(self.projector, self._weights, nodes=nodes)
 
     def data(self, scan: Scan) -> Tensor:
         """Line integrals of a scan on the grid's shadow, background taken off, ``(views, rows, columns)``."""
@@ -75,12 +92,28 @@ class InsetProblem:
         rows = lines[:, w.first_row - self.outer.first_row :][:, : w.rows]
         return rows.gather(-1, columns[:, None].expand(-1, w.rows, -1)) - _at(self.background, w)
 
-    def solve(self, scans: Sequence[Scan], prior: QGGMRF, **options: Any) -> tuple[Tensor, dict[str, Any]]:
-        """PWLS of several realisations of one exposure: ``(scans, z, y, x)`` HU, and the solver's report."""
-        exposures = {s.exposure_s or 1.0 for s in scans}
+    def statistic(self, scan: Scan) -> Statistic:
+        """What the solvers need of a scan, with the weights of its exposure (noise free: of 1 s)."""
+        y = self.data(scan)
+        weighted = self._weights * (scan.exposure_s or NOISE_FREE_EXPOSURE_S) * y
+        energy = float((weighted * y).sum((-1, -2), dtype=torch.float64).sum())
+        return Statistic(self.projector.T(weighted), energy, y.numel())
+
+    @staticmethod
+    def exposure(scans: Sequence[Scan]) -> float:
+        """The one exposure of several scans, in s; 1 for noise-free ones.
+
+        Raises:
+            ValueError: they have several.
+        """
+        exposures = {s.exposure_s or NOISE_FREE_EXPOSURE_S for s in scans}
         if len(exposures) != 1:
             raise ValueError(f"the scans of one batch must have one exposure, got {sorted(exposures)} s")
-        exposure = exposures.pop()
+        return float(exposures.pop())
+
+    def solve(self, scans: Sequence[Scan], prior: QGGMRF, **options: Any) -> tuple[Tensor, dict[str, Any]]:
+        """PWLS of several realisations of one exposure: ``(scans, z, y, x)`` HU, and the solver's report."""
+        exposure = self.exposure(scans)
         result = pwls(
             torch.stack([self.data(s) for s in scans]), self._weights * exposure, self.projector, prior,
             hu=self.mu_ref / 1000.0, gram=self.gram.scaled(exposure), **options,

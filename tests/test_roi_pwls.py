@@ -75,7 +75,7 @@ def test_prior_lowers_the_noise(clean, problem):
         return float(difference[2:-2, 4:-4, 4:-4].std())
 
     fbp = noise("fbp", kernel="standard")
-    strong, stronger = (noise("mbir", prior=QGGMRF(s, 300.0), problem=problem) for s in (0.5, 4.0))
+    strong, stronger = (noise("pwls", prior=QGGMRF(s, 300.0), problem=problem) for s in (0.5, 4.0))
     assert stronger < strong < fbp
 
 

@@ -1,0 +1,258 @@
+"""Model-based reconstruction with the learned prior: from the scan's statistic AᵀW y to a volume in HU.
+
+The network works on cubic voxels of one size (the one it was trained at); other grids are reconstructed on such voxels
+over the same extent and averaged onto the grid that was asked for. Weights and their training card ship in
+``recon/weights``.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import time
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from recon.inset import to_hu
+from recon.prior import PriorConfig
+from recon.roi import InsetProblem
+from recon.unrolled import NormalProblem, Unrolled, minimise, residual
+from torchpcct.geometry import VolumeGrid
+from torchpcct.scan import Scan
+from torchpcct.volume import Volume
+
+__all__ = ["Mbir", "average_onto", "reconstruct_mbir", "working_grid"]
+
+_LOG = logging.getLogger(__name__)
+
+SHIPPED = "mbir.safetensors"
+FORMAT = "torchpcct unrolled weights 1"
+CHI2_RANGE = (0.85, 1.2)
+"""Weighted squared residual per reading that a scan of the stated noise level can have; 1 is perfect."""
+
+
+class Mbir:
+    """The unrolled reconstruction with trained weights.
+
+    Args:
+        model: with its weights.
+    """
+
+    name = "mbir"
+
+    def __init__(self, model: Unrolled) -> None:
+        self.model = model.eval().requires_grad_(False)
+        self.voxel_mm = model.prior.config.voxel_mm
+
+    @classmethod
+    def load(cls, path: str | Path | None = None) -> Mbir:
+        """From a weights file; None: the weights that ship with the package.
+
+        Raises:
+            FileNotFoundError: no such file.
+            ValueError: a file that holds no weights of this model.
+        """
+        source = Path(path) if path is not None else Path(str(resources.files("recon") / "weights" / SHIPPED))
+        if not source.is_file():
+            raise FileNotFoundError(f"no weights at {source}: train them (python -m train) or name a file")
+        from safetensors import SafetensorError, safe_open
+
+        try:
+            with safe_open(str(source), framework="pt") as file:
+                header = file.metadata() or {}
+                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            if header.get("format") != FORMAT:
+                raise ValueError(f"{source} holds {header.get('format', 'something else')!r}, not {FORMAT!r}")
+            config = json.loads(header["metadata"])
+            model = Unrolled(PriorConfig(**config["prior"]), steps=config["unroll"])
+            model.load_state_dict(tensors)
+        except (SafetensorError, KeyError, TypeError, RuntimeError, json.JSONDecodeError) as error:
+            raise ValueError(f"{source} holds no weights of this unrolled reconstruction: {error}") from error
+        return cls(model)
+
+    def problem(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> NormalProblem:
+        """The normalised problem of ``b`` ``(batch, z, y, x)``, AᵀW y with the weights of the exposure."""
+        spacing = problem.grid.spacing
+        if max(abs(s / self.voxel_mm - 1.0) for s in spacing) > 0.01:
+            raise ValueError(
+                f"the network works on cubic voxels of {self.voxel_mm:g} mm, got {spacing}: make the problem on "
+                "recon.mbir.working_grid and average the result onto the grid"
+            )
+        exposure = torch.full((b.shape[0],), float(exposure_s))
+        return NormalProblem.from_statistic(problem.gram, b, exposure, problem.mu_ref / 1000.0, self.voxel_mm)
+
+    @torch.no_grad()
+    def __call__(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> Tensor:
+        """Volumes in HU, ``(batch, z, y, x)``.
+
+        Args:
+            problem: of the scan, on voxels of ``voxel_mm``.
+            b: ``(batch, z, y, x)``, :meth:`recon.roi.InsetProblem.statistic` of each scan.
+            exposure_s: of the scans.
+        """
+        normal = self.problem(problem, b, exposure_s)
+        return self._hu(problem, self.model(normal), normal)
+
+    def _hu(self, problem: InsetProblem, u: Tensor, normal: NormalProblem) -> Tensor:
+        scale = normal.scale_hu.reshape(-1, 1, 1, 1) * (problem.mu_ref / 1000.0)
+        return to_hu(u * scale + problem.level, problem.mu_ref)
+
+    @torch.no_grad()
+    def converged(
+        self, problem: InsetProblem, b: Tensor, exposure_s: float, tolerance: float = 1e-3, most: int = 400
+    ) -> tuple[Tensor, dict[str, Any]]:
+        """The stationary point of the same energy, and its certificate.
+
+        Args:
+            problem, b, exposure_s: as for a call.
+            tolerance: stop when the preconditioned gradient has fallen to this share of that of the zero volume.
+            most: largest number of iterations.
+
+        Returns:
+            Volumes in HU; ``iterations``, ``residual`` (one per volume), ``converged``.
+        """
+        normal = self.problem(problem, b, exposure_s)
+        u, report = minimise(self.model, normal, self.model(normal), tolerance, most)
+        return self._hu(problem, u, normal), report
+
+    @torch.no_grad()
+    def noise_map(self, problem: InsetProblem, b: Tensor, exposure_s: float, draws: int = 8, seed: int = 0) -> Tensor:
+        """Standard deviation of each voxel in HU, ``(z, y, x)``, of one statistic ``b`` ``(z, y, x)``.
+
+        The scan is perturbed by fresh noise of its own covariance; the network's response, root mean square over
+        ``draws`` and averaged over 3 × 3 × 3 voxels, estimates the noise that the volume holds already.
+        """
+        generator = torch.Generator().manual_seed(seed)
+        noise = problem.gram.noise((draws,), generator=generator) * math.sqrt(exposure_s)
+        # Half of the noise in either direction: the response is the local one, and the reference is their mean.
+        both = torch.cat([b + noise / 2, b - noise / 2])
+        volumes = self(problem, both, exposure_s)
+        square = (volumes[:draws] - volumes[draws:]).square().mean(0)
+        return torch.nn.functional.avg_pool3d(square[None, None], 3, 1, 1, count_include_pad=False)[0, 0].sqrt()
+
+    def check(self, problem: InsetProblem, exposure_s: float, chi2: float) -> list[str]:
+        """What speaks against trusting the network on these data; also logged as warnings."""
+        found = []
+        scale = (problem.gram.information(problem.mu_ref / 1000.0) * exposure_s * self.voxel_mm**3) ** -0.5
+        low, high = self.model.seen_scale_hu.tolist()
+        if not 0.98 * low <= scale <= 1.02 * high:
+            found.append(
+                f"the noise scale of the scan, {scale:.0f} HU, lies outside of the {low:.0f}…{high:.0f} HU of the "
+                "training: the contrast of small structures may be wrong"
+            )
+        if not CHI2_RANGE[0] <= chi2 <= CHI2_RANGE[1]:
+            found.append(
+                f"the data differ from the volume by {chi2:.3g} times their stated noise variance: exposure, geometry "
+                "or surround are not those of the scan, or something outside of the grid was left out"
+            )
+        for text in found:
+            _LOG.warning("%s", text)
+        return found
+
+    @cached_property
+    def parameters_count(self) -> int:
+        """Trained values."""
+        return sum(p.numel() for p in self.model.parameters())
+
+
+def working_grid(grid: VolumeGrid, voxel_mm: float) -> VolumeGrid:
+    """The grid of cubic voxels that covers ``grid``; ``grid`` itself if its voxels have that size already."""
+    if max(abs(s / voxel_mm - 1.0) for s in grid.spacing) <= 0.01:
+        return grid
+    shape = tuple(max(1, math.ceil(e / voxel_mm - 1e-6)) for e in grid.extent)
+    return VolumeGrid(shape, voxel_mm, grid.center)
+
+
+def average_onto(volume: Tensor, source: VolumeGrid, target: VolumeGrid) -> Tensor:
+    """Averages of a volume over the voxels of another grid that lies inside of it, ``(..., *target.shape)``."""
+    for axis in range(3):
+        matrix = torch.from_numpy(
+            _overlap(source.axes[axis], source.spacing[axis], target.axes[axis], target.spacing[axis])
+        )
+        volume = torch.movedim(torch.movedim(volume, axis - 3, -1) @ matrix.to(volume).T, -1, axis - 3)
+    return volume
+
+
+def _overlap(source: Any, step: float, target: Any, width: float) -> np.ndarray[Any, Any]:
+    """Share of each source voxel in each target voxel, rows add up to 1."""
+    low, high = target[:, None] - width / 2, target[:, None] + width / 2
+    shared = np.minimum(high, source + step / 2) - np.maximum(low, source - step / 2)
+    shared = np.clip(shared, 0.0, None)
+    return shared / shared.sum(axis=1, keepdims=True)
+
+
+def reconstruct_mbir(
+    scans: Sequence[Scan],
+    grid: VolumeGrid,
+    *,
+    progress: Callable[[float], None] | None = None,
+    prior: Mbir | None = None,
+    problem: InsetProblem | None = None,
+    batch: int = 4,
+    noise_map: bool = False,
+    converge: bool = False,
+) -> list[Volume]:
+    """Unrolled MBIR with the learned prior.
+
+    Args:
+        scans: realisations of one windowed scan.
+        grid: the inset.
+        progress: called with the finished fraction.
+        prior: loaded weights; None: those of the package.
+        problem: kept from an earlier call with the same scan and (working) grid; None: made here.
+        batch: volumes at a time.
+        noise_map: add an estimate of each voxel's standard deviation, ``report["noise_sd_hu"]``.
+        converge: run the energy to its stationary point instead of the unrolled steps alone.
+
+    Returns:
+        Volumes in HU. Report: ``iterations``, ``residual`` (norm of the energy's preconditioned gradient over that of
+        the zero volume), ``chi2`` (weighted squared residual per reading), ``warnings``, ``seconds``.
+
+    Raises:
+        ValueError, TypeError: see :class:`recon.roi.InsetProblem`; a problem that was made for another grid.
+        FileNotFoundError: the package has no weights.
+    """
+    start = time.perf_counter()
+    prior = prior or Mbir.load()
+    work = working_grid(grid, prior.voxel_mm)
+    problem = problem or InsetProblem(scans[0], work)
+    if problem.grid != work:
+        raise ValueError(f"the problem was made for another grid: make it on {work} (recon.mbir.working_grid)")
+    volumes: list[Volume] = []
+    for i in range(0, len(scans), batch):
+        part = scans[i : i + batch]
+        exposure = problem.exposure(part)
+        statistics = [problem.statistic(s) for s in part]
+        b = torch.stack([s.b for s in statistics])
+        normal = prior.problem(problem, b, exposure)
+        with torch.no_grad():
+            u = prior.model(normal)
+            report: dict[str, Any] = {"method": "mbir", "iterations": prior.model.steps}
+            if converge:
+                u, extra = minimise(prior.model, normal, u)
+                report["iterations"] += extra["iterations"]
+            residuals = residual(prior.model, normal, u)
+            hu = prior._hu(problem, u, normal)
+            misfit = (u * (normal.apply(u) - 2.0 * normal.beta)).sum(dim=(1, 2, 3))
+        seconds = (time.perf_counter() - start) / len(part)
+        for k, (volume, statistic) in enumerate(zip(hu, statistics, strict=True)):
+            chi2 = (statistic.energy + float(misfit[k])) / statistic.readings
+            info = {**report, "residual": float(residuals[k]), "chi2": chi2, "seconds": round(seconds, 3)}
+            info["warnings"] = prior.check(problem, exposure, chi2)
+            if noise_map:
+                sd = prior.noise_map(problem, statistic.b, exposure)
+                info["noise_sd_hu"] = sd if work is grid else average_onto(sd, work, grid)
+            data = volume if work is grid else average_onto(volume, work, grid)
+            volumes.append(Volume(data.to(torch.float32), grid, info))
+        start = time.perf_counter()
+        if progress is not None:
+            progress(min(i + batch, len(scans)) / len(scans))
+    return volumes

@@ -1,0 +1,122 @@
+"""Model-based reconstruction with the learned prior, from a scan to HU."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from test_roi_pwls import CENTER, GRID, clean, problem, scanner  # noqa: F401
+
+from recon import reconstruct
+from recon.mbir import Mbir, average_onto, working_grid
+from recon.prior import PriorConfig
+from recon.roi import InsetProblem
+from recon.unrolled import Unrolled
+from torchpcct import VolumeGrid
+
+
+@pytest.fixture(scope="module")
+def prior():
+    """An untrained network for voxels of 0.4 mm that has seen the scans of these tests."""
+    torch.manual_seed(0)
+    model = Unrolled(PriorConfig(levels=2, filters=12, units=4, voxel_mm=0.4), 6)
+    model.seen_scale_hu = torch.tensor([10.0, 2000.0])
+    return Mbir(model)
+
+
+def test_values_and_report(clean, problem, prior):  # noqa: F811
+    noisy = clean.with_noise(4.0, 3)
+    volume = reconstruct(noisy, GRID, "mbir", prior=prior, problem=problem, noise_map=True)
+    report = volume.report
+    ball, fat = float(volume.data[3:5, 8:10, 8:10].mean()), float(volume.data[3:5, :2, :2].mean())
+    assert ball == pytest.approx(97.0, abs=25)
+    assert fat == pytest.approx(-93.0, abs=25)
+    assert report["method"] == "mbir"
+    assert report["iterations"] == 6
+    assert 0 < report["residual"] < 1
+    assert report["chi2"] == pytest.approx(1.0, abs=0.05)
+    assert report["warnings"] == []
+    assert report["noise_sd_hu"].shape == GRID.shape
+    assert 1 < float(report["noise_sd_hu"].mean()) < 200
+
+
+def test_noise_map_is_the_noise(clean, problem, prior):  # noqa: F811
+    """Against the standard deviation over realisations."""
+    scans = [clean.with_noise(2.0, s) for s in range(24)]
+    volumes = reconstruct(scans, GRID, "mbir", prior=prior, problem=problem)
+    measured = torch.stack([v.data for v in volumes]).var(0).mean().sqrt()
+    estimated = prior.noise_map(problem, problem.statistic(scans[0]).b, 2.0, draws=16).square().mean().sqrt()
+    assert float(estimated / measured) == pytest.approx(1.0, abs=0.15)
+
+
+def test_converged_energy_has_a_certificate(clean, problem, prior):  # noqa: F811
+    scan = clean.with_noise(1.0, 0)
+    one = reconstruct(scan, GRID, "mbir", prior=prior, problem=problem)
+    more = reconstruct(scan, GRID, "mbir", prior=prior, problem=problem, converge=True)
+    assert more.report["residual"] <= 1.1e-3 < one.report["residual"]
+
+
+def test_wrong_exposure_is_noticed(clean, problem, prior, caplog):  # noqa: F811
+    from dataclasses import replace
+
+    scan = clean.with_noise(1.0, 0)
+    wrong = replace(scan, exposure_s=4.0, counts=scan.counts * 4.0)
+    volume = reconstruct(wrong, GRID, "mbir", prior=prior, problem=problem)
+    assert volume.report["chi2"] > 2
+    assert any("noise variance" in text for text in volume.report["warnings"])
+    assert "noise variance" in caplog.text
+
+
+def test_unseen_dose_is_noticed(clean, problem, prior):  # noqa: F811
+    model = Unrolled(prior.model.prior.config, 6)
+    model.seen_scale_hu = torch.tensor([50.0, 60.0])
+    volume = reconstruct(clean.with_noise(0.01, 0), GRID, "mbir", prior=Mbir(model), problem=problem)
+    assert any("outside of the 50…60 HU" in text for text in volume.report["warnings"])
+
+
+def test_other_voxels_are_averages_of_the_working_grid(clean, prior):  # noqa: F811
+    coarse = VolumeGrid((4, 9, 9), 0.8, CENTER)
+    fine = working_grid(coarse, 0.4)
+    assert fine.shape == (8, 18, 18)
+    scan = clean.with_noise(4.0, 0)
+    whole = reconstruct(scan, fine, "mbir", prior=prior).data
+    averaged = whole.reshape(4, 2, 9, 2, 9, 2).mean(dim=(1, 3, 5))
+    torch.testing.assert_close(reconstruct(scan, coarse, "mbir", prior=prior).data, averaged, rtol=1e-4, atol=0.02)
+
+
+@pytest.mark.parametrize("voxel", [0.2, 0.25, 0.3, 0.4])
+def test_averages_keep_a_ramp(voxel):
+    target = VolumeGrid((5, 6, 7), voxel, (1.0, -2.0, 3.0))
+    source = working_grid(target, 0.2)
+    z, y, x = np.meshgrid(*source.axes, indexing="ij")
+    ramp = torch.from_numpy(1.0 + 2 * z - y + 3 * x)
+    z, y, x = np.meshgrid(*target.axes, indexing="ij")
+    expected = 1.0 + 2 * z - y + 3 * x
+    inner = (slice(1, -1),) * 3
+    np.testing.assert_allclose(average_onto(ramp, source, target).numpy()[inner], expected[inner], atol=0.35 * 0.2)
+
+
+def test_refusals(clean, problem, prior, tmp_path):  # noqa: F811
+    with pytest.raises(ValueError, match="another grid"):
+        reconstruct(clean, VolumeGrid((4, 9, 9), 0.4, CENTER), "mbir", prior=prior, problem=problem)
+    with pytest.raises(ValueError, match="one exposure"):
+        reconstruct([clean.with_noise(t, 0) for t in (1.0, 2.0)], GRID, "mbir", prior=prior, problem=problem)
+    coarse = InsetProblem(clean, VolumeGrid((4, 9, 9), 0.8, CENTER))
+    with pytest.raises(ValueError, match=r"voxels of 0\.4 mm"):
+        prior(coarse, torch.zeros(1, 4, 9, 9), 1.0)
+    with pytest.raises(FileNotFoundError, match="no weights"):
+        Mbir.load(tmp_path / "none.safetensors")
+    bad = tmp_path / "bad.safetensors"
+    bad.write_bytes(b"not weights")
+    with pytest.raises(ValueError, match="holds no weights"):
+        Mbir.load(bad)
+
+
+def test_shadow_of_dead_readings(clean, problem, prior):  # noqa: F811
+    """Readings without a count give a finite volume: the logarithm is bounded, the weight is the expected one."""
+    scan = clean.with_noise(0.5, 1)
+    scan.counts[::10] = 0
+    volume = reconstruct(scan, GRID, "mbir", prior=prior, problem=problem)
+    assert torch.isfinite(volume.data).all()
+    assert volume.report["warnings"]
+    assert math.isfinite(volume.report["chi2"])

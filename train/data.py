@@ -1,0 +1,234 @@
+"""Training data without a projector in the loop: random scenes, and the statistic AᵀW y drawn through Gram operators.
+
+For a scene x and an exposure, β = H x + noise of covariance H is distributed as AᵀW y of a scan (up to the model error
+of the Gram operator, see :mod:`recon.gram`), so thousands of scans a minute cost a few FFTs. The Gram operators are
+those of real scanners: several inset positions, patient sizes and pitches, each made when it is first asked for.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from recon.gram import Gram
+from recon.unrolled import NormalProblem
+from torchpcct.geometry import VolumeGrid
+from train.scenes import SceneConfig, random_scene
+
+__all__ = ["Batch", "Data", "DataConfig", "Situation", "seed_of"]
+
+
+@dataclass(frozen=True)
+class Situation:
+    """Where the inset lies and what the scan is like.
+
+    Args:
+        x, y: centre of the inset, mm.
+        patient_mm: diameter of the adipose cylinder.
+        pitch_scale: factor on the detector's pitch.
+    """
+
+    x: float
+    y: float
+    patient_mm: float = 240.0
+    pitch_scale: float = 1.0
+
+
+_SITUATIONS = (
+    Situation(42.0, 0.0),
+    Situation(-20.0, 38.0),
+    Situation(5.0, -8.0),
+    Situation(30.0, -55.0, patient_mm=280.0),
+    Situation(-50.0, -20.0, patient_mm=200.0),
+    Situation(10.0, 40.0, pitch_scale=1.15),
+)
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """What the training draws.
+
+    Args:
+        shape: voxels of the training inset (z, y, x).
+        voxel_mm: voxel size; 0.2 is the one that :func:`recon.mbir.reconstruct_mbir` works at.
+        exposure_s: range of the exposure, log-uniform.
+        views: views of the scans whose Gram operators are taken (their exposure is that of the whole scan).
+        situations: one Gram operator each; one is drawn per step.
+        scenes: changes of :class:`train.scenes.SceneConfig`.
+        core_roi, tissue_roi: ranges of the radii of the random ROIs, mm.
+    """
+
+    shape: tuple[int, int, int] = (20, 24, 24)
+    voxel_mm: float = 0.2
+    exposure_s: tuple[float, float] = (0.2, 16.0)
+    views: int = 984
+    situations: tuple[Situation, ...] = _SITUATIONS
+    scenes: dict[str, Any] = field(default_factory=dict)
+    core_roi: tuple[float, float] = (0.3, 1.0)
+    tissue_roi: tuple[float, float] = (0.15, 0.5)
+
+    def __post_init__(self) -> None:
+        set_ = object.__setattr__
+        set_(self, "shape", tuple(int(n) for n in self.shape))
+        set_(self, "exposure_s", tuple(float(v) for v in self.exposure_s))
+        set_(self, "core_roi", tuple(float(v) for v in self.core_roi))
+        set_(self, "tissue_roi", tuple(float(v) for v in self.tissue_roi))
+        set_(self, "situations", tuple(s if isinstance(s, Situation) else Situation(**s) for s in self.situations))
+        low, high = self.exposure_s
+        if not 0 < low <= high:
+            raise ValueError(f"exposure_s must be a range of positive times, got {self.exposure_s}")
+        if not self.voxel_mm > 0:
+            raise ValueError(f"voxel_mm must be positive, got {self.voxel_mm}")
+        if not self.situations:
+            raise ValueError("situations must name at least one scan")
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Scenes with two independent noise draws each.
+
+    Args:
+        problem: of ``2 · size`` volumes, the first draws of all scenes, then the second ones.
+        truth: ``(size, z, y, x)`` HU above the background.
+        contrast: ``(size, z, y, x)`` weights of a random ROI contrast: mean over a part of a core (or of plain tissue)
+            less mean over a part of the tissue around it; 0 where the scene offers none.
+        voxels: ``(size,)`` voxels of the smaller ROI, 0 if none.
+    """
+
+    problem: NormalProblem
+    truth: Tensor
+    contrast: Tensor
+    voxels: Tensor
+
+    @property
+    def size(self) -> int:
+        """Number of scenes."""
+        return self.truth.shape[0]
+
+
+class Data:
+    """Draws batches; a pure function of seed, step and scene index once the Gram operators are made."""
+
+    def __init__(self, config: DataConfig | None = None) -> None:
+        self.config = config or DataConfig()
+        self.scenes = SceneConfig(**self.config.scenes)
+        self._grams: dict[int, tuple[Gram, float]] = {}
+
+    def gram(self, situation: int) -> tuple[Gram, float]:
+        """Gram operator per second of exposure, and 1 HU in mm⁻¹."""
+        if situation not in self._grams:
+            self._grams[situation] = situation_gram(self.config.situations[situation], self.config)
+        return self._grams[situation]
+
+    def batch(self, seed: int, step: int, indices: Sequence[int]) -> Batch:
+        """Scenes ``indices`` of a step.
+
+        Args:
+            seed: of the run.
+            step: all scenes of a step share one Gram operator.
+            indices: scenes of the step, any subset in any order.
+        """
+        c = self.config
+        gram, hu = self.gram(seed_of(seed, step) % len(c.situations))
+        drawn = [self._scene(seed_of(seed, step, i), gram, hu) for i in indices]
+        truth, exposure, contrast, voxels, first, second = (torch.stack(list(v)) for v in zip(*drawn, strict=True))
+        scaled = (hu * exposure).reshape(-1, 1, 1, 1)
+        signal = gram.apply(truth) * scaled
+        b = torch.cat([signal + first, signal + second])
+        problem = NormalProblem.from_statistic(gram, b, torch.cat([exposure, exposure]), hu, c.voxel_mm)
+        return Batch(problem, truth, contrast, voxels)
+
+    def _scene(self, seed: int, gram: Gram, hu: float) -> tuple[Tensor, ...]:
+        c = self.config
+        generator = torch.Generator().manual_seed(seed)
+        scene = random_scene(c.shape, (c.voxel_mm,) * 3, generator=generator, config=self.scenes)
+        low, high = (math.log(v) for v in c.exposure_s)
+        exposure = torch.exp(low + (high - low) * torch.rand((), generator=generator))
+        noise = gram.noise((2,), generator=generator) * exposure.sqrt()
+        contrast, voxels = _random_contrast(scene.core[0], scene.surround[0], c, generator)
+        return scene.image[0] - scene.scenes[0].background, exposure, contrast, voxels, noise[0], noise[1]
+
+
+def situation_gram(situation: Situation, config: DataConfig) -> tuple[Gram, float]:
+    """The Gram operator of the training inset in one situation, per second of exposure, and 1 HU in mm⁻¹."""
+    from recon.roi import InsetProblem
+    from torchpcct.acquisition import acquire
+    from torchpcct.scanner import presets
+    from torchpcct.scene import Body, EllipticCylinder, Scene
+
+    scanner = presets.pcct(views=config.views)
+    g = scanner.geometry
+    if situation.pitch_scale != 1.0:
+        pitch = tuple(p * situation.pitch_scale for p in g.pitch)
+        scanner = replace(scanner, geometry=replace(g, pitch=pitch))
+    patient = Scene((Body("patient", EllipticCylinder(situation.patient_mm / 2), "pericoronary_fat"),))
+    grid = VolumeGrid(config.shape, config.voxel_mm, (0.0, situation.y, situation.x))
+    clean = acquire(patient, scanner, region=grid)
+    problem = InsetProblem(clean, grid, nodes=1)
+    return problem.gram.without_projector(), problem.mu_ref / 1000.0
+
+
+def seed_of(*numbers: int) -> int:
+    """A seed below 2⁶³ that depends on every number and on their order."""
+    text = ",".join(str(int(n)) for n in numbers)
+    return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "little") >> 1
+
+
+def _random_contrast(
+    core: Tensor, tissue: Tensor, config: DataConfig, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Weights of a random ROI contrast, and the voxels of its smaller ROI."""
+    inside, around = core > 0.97, tissue > 0.97
+    if not inside.any():
+        inside = around
+    first = _ball(inside, config.core_roi, config.voxel_mm, generator)
+    # The tissue next to the core is what the study's background ROI lies in, and hardest: half of all draws.
+    near = around & _within(
+        first, around.shape, 0.7 + 0.5 * float(torch.rand((), generator=generator)), config.voxel_mm
+    )
+    second = _ball(near if near.any() else around, config.tissue_roi, config.voxel_mm, generator, around)
+    n, m = int(first.sum()), int(second.sum())
+    if n < 4 or m < 4:
+        return torch.zeros(core.shape), torch.zeros(())
+    return first.float() / n - second.float() / m, torch.tensor(float(min(n, m)))
+
+
+def _ball(
+    mask: Tensor,
+    radius_mm: tuple[float, float],
+    voxel_mm: float,
+    generator: torch.Generator,
+    within: Tensor | None = None,
+) -> Tensor:
+    """The voxels of ``within`` (default: ``mask``) in a ball about a random voxel of ``mask``."""
+    places = torch.nonzero(mask)
+    low, high = radius_mm
+    radius = low + (high - low) * float(torch.rand((), generator=generator))
+    draw = torch.rand((), generator=generator)
+    if len(places) == 0:
+        return torch.zeros_like(mask)
+    centre = places[min(int(draw * len(places)), len(places) - 1)]
+    return (mask if within is None else within) & (_squared(mask.shape, centre) <= (radius / voxel_mm) ** 2)
+
+
+def _within(ball: Tensor, shape: torch.Size, margin_mm: float, voxel_mm: float) -> Tensor:
+    """Voxels within ``margin_mm`` of the box that holds ``ball``."""
+    places = torch.nonzero(ball)
+    if len(places) == 0:
+        return torch.ones(shape, dtype=torch.bool)
+    out = torch.zeros(shape, dtype=torch.bool)
+    reach = round(margin_mm / voxel_mm)
+    low, high = places.amin(0) - reach, places.amax(0) + reach + 1
+    out[tuple(slice(max(int(a), 0), int(b)) for a, b in zip(low, high, strict=True))] = True
+    return out
+
+
+def _squared(shape: torch.Size, centre: Tensor) -> Tensor:
+    z, y, x = (torch.arange(n) - int(c) for n, c in zip(shape, centre, strict=True))
+    return z[:, None, None] ** 2 + y[:, None] ** 2 + x**2
