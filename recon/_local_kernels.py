@@ -74,15 +74,6 @@ def _narrow(geometry: Geometry, window: DetectorWindow, grid: VolumeGrid) -> Det
     return DetectorWindow(np.clip(part.first_column, low, high), columns, r0, r1 - r0)
 
 
-def _crop(data: Tensor, window: DetectorWindow, part: DetectorWindow) -> Tensor:
-    """``(views, rows, columns)`` data on ``window``, on its part."""
-    r0 = part.first_row - window.first_row
-    first = torch.from_numpy(part.first_column - window.first_column)
-    index = first[:, None] + torch.arange(part.columns)
-    rows = data[:, r0 : r0 + part.rows]
-    return torch.gather(rows, 2, index[:, None, :].expand(-1, part.rows, -1))
-
-
 def kernel_at(projector: Any, weights: Tensor, node: tuple[int, int], reach: int) -> Tensor:
     """Impulse responses of AᵀWA for all slices of one voxel column.
 
@@ -111,7 +102,7 @@ def kernel_at(projector: Any, weights: Tensor, node: tuple[int, int], reach: int
     column = around((1, 1))
     window = _window_of(projector)
     part = _narrow(geometry, window, column)
-    w = _crop(weights.unsqueeze(1) if flat else weights, window, part)
+    w = window.crop(weights.unsqueeze(1) if flat else weights, part)
     w = w.squeeze(1) if flat else w
     make = type(projector)
     step = min(2 * reach + 1, nz)

@@ -65,7 +65,7 @@ def roi_covariance(
     if clean.window is None:
         raise ValueError("roi_covariance needs a windowed scan: acquire it with region=")
     near = _trim(fbp.shadow, clean.window)
-    variance = _crop(line_integral_variance(clean, exposure_s), clean.window, near)
+    variance = clean.window.crop(line_integral_variance(clean, exposure_s), near)
     weights = angular_weights(fbp.geometry)
     scale = 1000.0 / clean.linearisation.mu_ref
     results = []
@@ -87,12 +87,6 @@ def _trim(inner: DetectorWindow, outer: DetectorWindow) -> DetectorWindow:
     last = outer.first_column + outer.columns - width
     first = np.clip(inner.first_column - _MARGIN, outer.first_column, last)
     return DetectorWindow(first, width, outer.first_row, outer.rows)
-
-
-def _crop(values: Tensor, outer: DetectorWindow, inner: DetectorWindow) -> Tensor:
-    """The columns of ``inner`` from ``(views, rows, columns)`` values on ``outer``."""
-    columns = torch.from_numpy(inner.column_indices - outer.first_column[:, None])
-    return values.gather(-1, columns[:, None].expand(-1, inner.rows, -1))
 
 
 def _weighted_dot(a: Tensor, b: Tensor, weight: Tensor) -> float:

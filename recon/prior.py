@@ -84,7 +84,7 @@ class LearnedPrior(nn.Module):
         self.filters = nn.ParameterList(nn.Parameter(start.clone()) for _ in range(c.levels))
         groups = c.filters // c.group
         # A mild start, at which the first steps neither blur everything nor do nothing.
-        self.gain = nn.Parameter(torch.full((c.levels, c.units, len(c.thresholds)), -4.0))
+        self.gain = nn.Parameter(torch.full((c.levels, c.units, len(c.thresholds)), -2.5))
         # A prior that is fixed in HU grows with the square of the noise scale in noise units: start near that.
         self.gain_slope = nn.Parameter(torch.full((c.levels, c.units, len(c.thresholds)), 1.5))
         self.smooth = nn.Parameter(torch.tensor([0.05, 0.3]).log())

@@ -18,7 +18,7 @@ from torchpcct.geometry import VolumeGrid
 from torchpcct.projector import Projector
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
 from torchpcct.volume import Volume
-from torchpcct.window import DetectorWindow, shadow
+from torchpcct.window import shadow
 
 __all__ = ["DEFAULT_PRIOR", "InsetProblem", "Statistic", "reconstruct_pwls"]
 
@@ -78,7 +78,7 @@ class InsetProblem:
         slope = scan.linearisation.slope(polychromatic)
         exposure = scan.exposure_s or NOISE_FREE_EXPOSURE_S
         # Per second of exposure: the Gram of one exposure serves all by a factor.
-        self._weights = _at(scan.surround / slope.square() / exposure, self.window)
+        self._weights = self.window.take(scan.surround / slope.square() / exposure).contiguous()
         self.projector = Projector(scan.geometry, grid, self.window)
         self.gram = Gram(self.projector, self._weights, nodes=nodes)
 
@@ -86,11 +86,7 @@ class InsetProblem:
         """Line integrals of a scan on the grid's shadow, background taken off, ``(views, rows, columns)``."""
         if scan.window != self.outer or scan.geometry != self.geometry:
             raise ValueError("this scan has another geometry or window than the one the problem was made for")
-        lines = scan.line_integrals()
-        w = self.window
-        columns = torch.from_numpy(w.column_indices - self.outer.first_column[:, None])
-        rows = lines[:, w.first_row - self.outer.first_row :][:, : w.rows]
-        return rows.gather(-1, columns[:, None].expand(-1, w.rows, -1)) - _at(self.background, w)
+        return self.outer.crop(scan.line_integrals(), self.window) - self.window.take(self.background)
 
     def statistic(self, scan: Scan) -> Statistic:
         """What the solvers need of a scan, with the weights of its exposure (noise free: of 1 s)."""
@@ -119,12 +115,6 @@ class InsetProblem:
             hu=self.mu_ref / 1000.0, gram=self.gram.scaled(exposure), **options,
         )  # fmt: skip
         return to_hu(result.x + self.level, self.mu_ref), dict(result.report)
-
-
-def _at(cells: Tensor, window: DetectorWindow) -> Tensor:
-    """``(rows, columns)`` values on a window, ``(views, rows, columns)``."""
-    columns = torch.from_numpy(window.column_indices)
-    return cells[window.first_row : window.first_row + window.rows][:, columns].movedim(0, 1).contiguous()
 
 
 def reconstruct_pwls(

@@ -141,9 +141,7 @@ class Scan:
         """``(..., rows, columns)`` values of the cells as seen by the stored readings, ``(..., views | 1, r, c)``."""
         if self.window is None:
             return cells.unsqueeze(-3)
-        w = self.window
-        columns = torch.from_numpy(w.column_indices)
-        return cells[..., w.first_row : w.first_row + w.rows, :][..., columns].movedim(-2, -3)
+        return self.window.take(cells)
 
     def line_integrals(self) -> Tensor:
         """Water-linearised line integrals of the stored readings, shape and dtype of ``counts``, dimensionless.

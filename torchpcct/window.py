@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
 
@@ -63,6 +65,26 @@ class DetectorWindow:
     def column_indices(self) -> NDArray[np.int64]:
         """Detector column of every window cell, ``(views, columns)``."""
         return self.first_column[:, None] + np.arange(self.columns)
+
+    def take(self, cells: Tensor) -> Tensor:
+        """What each reading of the window has at its cell: ``(..., rows, columns)`` of the whole detector to
+        ``(..., views, rows, columns)``."""
+        kept = cells[..., self.first_row : self.first_row + self.rows, :]
+        return kept[..., torch.from_numpy(self.column_indices)].movedim(-2, -3)
+
+    def crop(self, values: Tensor, inner: DetectorWindow) -> Tensor:
+        """The readings of a smaller window: ``(..., views, rows, columns)`` on this window to those on ``inner``.
+
+        Raises:
+            ValueError: ``inner`` reaches beyond this window.
+        """
+        columns = torch.from_numpy(inner.column_indices - self.first_column[:, None])
+        row = inner.first_row - self.first_row
+        if row < 0 or row + inner.rows > self.rows or int(columns.min()) < 0 or int(columns.max()) >= self.columns:
+            raise ValueError("the inner window reaches beyond the outer one")
+        values = values[..., row : row + inner.rows, :]
+        index = columns[:, None].to(values.device).expand(*values.shape[:-1], -1)
+        return values.gather(-1, index)
 
     def fraction(self, geometry: Geometry) -> float:
         """Share of the detector's readings inside the window, 0…1."""

@@ -7,6 +7,9 @@ terms, all from two independent noise draws of each scene with errors e₁, e₂
 * ``white``: ‖e‖² per voxel, small, for the frequencies that the scanner does not see;
 * ``contrast``: the error d of a random ROI contrast, (d₁² + d₂²) / 2 + κ d₁ d₂. The product of two draws is an unbiased
   estimate of the squared bias, so κ trades variance against bias: the slope of the contrast stays near 1.
+
+κ grows during the training. With a large one from the start the network never dares to smooth: what is noisy is at
+least not biased. First it learns which noise can go, then to give back the contrast that went with it.
 """
 
 from __future__ import annotations
@@ -34,26 +37,34 @@ class ObjectiveConfig:
     """Weights of the terms and size of the validation.
 
     Args:
+        data: of eᵀH e.
         white: of ‖e‖², against ``data``.
-        contrast: of the ROI contrast's error, against ``data``.
-        bias: κ.
+        contrast: of the ROI contrast's error.
+        bias_start, bias: κ at the start, and from the share ``bias_ramp`` of the training on; geometric in between.
         contrast_sd: an ROI contrast error, in noise units, that counts as 1.
         validation_exposures_s: exposures of the validation scans.
         validation_draws: noise draws of each validation scene, contrast and exposure.
     """
 
+    data: float = 30.0
     white: float = 0.05
     contrast: float = 1.0
+    bias_start: float = 0.5
     bias: float = 8.0
+    bias_ramp: float = 0.7
     contrast_sd: float = 0.15
     validation_exposures_s: tuple[float, ...] = (0.35, 2.0)
     validation_draws: int = 6
 
     def __post_init__(self) -> None:
-        for name in ("white", "contrast", "bias", "contrast_sd"):
+        for name in ("data", "white", "contrast", "bias", "contrast_sd"):
             value = getattr(self, name)
             if not (isinstance(value, int | float) and math.isfinite(value) and value >= 0):
                 raise ValueError(f"{name} must be a finite number of at least 0, got {value!r}")
+        for name in ("bias_start", "bias_ramp"):
+            value = getattr(self, name)
+            if not (isinstance(value, int | float) and math.isfinite(value) and value > 0):
+                raise ValueError(f"{name} must be a finite number greater than 0, got {value!r}")
         object.__setattr__(self, "validation_exposures_s", tuple(float(v) for v in self.validation_exposures_s))
         if self.validation_draws < 2:
             raise ValueError(f"validation_draws must be at least 2 to give a variance, got {self.validation_draws}")
@@ -111,11 +122,18 @@ class Objective:
         variance, product = 0.5 * (d1 * d1 + d2 * d2), d1 * d2
         # A few scenes (calcifications at high dose) would drown all others: large losses count less than their size.
         tame = 1.0 / (1.0 + data.detach() / 0.2)
-        total = 5.0 * (tame * (data + c.white * white)).sum()
+        total = 0.5 * c.data * (tame * (data + c.white * white)).sum()
         tame = 1.0 / (1.0 + variance.detach() / 20.0)
-        total = total + c.contrast * (tame * (variance + c.bias * product)).sum()
+        total = total + c.contrast * (tame * (variance + self.kappa(progress) * product)).sum()
         parts = {"data": data.sum() / 2, "white": white.sum() / 2, "contrast": variance.sum(), "bias": product.sum()}
         return Loss(total, {k: float(v.detach()) for k, v in parts.items()})
+
+    def kappa(self, progress: float) -> float:
+        """κ at the finished share of the training."""
+        c = self.config
+        if c.bias == 0:
+            return 0.0
+        return c.bias_start * (c.bias / c.bias_start) ** min(1.0, progress / c.bias_ramp)
 
     @torch.no_grad()
     def validate(self, model: nn.Module, data: Data, seed: int = 0) -> Validation:
