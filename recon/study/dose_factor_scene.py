@@ -1,0 +1,459 @@
+"""One scene of the dose-factor study: its scan, its reconstruction problem, and what holds without sampling error."""
+
+from __future__ import annotations
+
+import copy
+import logging
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, map_coordinates
+from torch import Tensor
+
+from recon.exact_noise import _trim, line_integral_variance, roi_covariance
+from recon.inset import InsetFbp, _union
+from recon.roi import InsetProblem
+from recon.study.compare import REFERENCE_KERNEL, REFERENCE_VOXEL_MM, _enclosing, inset_grid
+from recon.study.dose_factor_store import Store
+from torchpcct.geometry import VolumeGrid
+from torchpcct.metrics.ceiling import information_matrix
+from torchpcct.metrics.observer import dog_channels
+from torchpcct.metrics.placement import RoiPair, place_rois
+from torchpcct.metrics.resolution import lumen_area
+from torchpcct.metrics.roi import axial_grid, sample_axial
+from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
+from torchpcct.window import DetectorWindow, shadow
+
+if TYPE_CHECKING:
+    from recon.study.dose_factor import Settings
+    from torchpcct.scene import Scene
+    from torchpcct.scene.plaque import Plaque
+
+__all__ = ["DOG_CHANNELS", "OBSERVERS", "SceneFacts", "StudyScene", "crop_window", "observer_channels", "segmentation"]
+
+log = logging.getLogger(__name__)
+
+Floats = NDArray[np.float64]
+
+CROP_MM = 3.8
+"""Edge of the cube about the core that is kept of every realisation: the core (1.97 mm) and the cap with a margin."""
+
+OBSERVERS = ("axial", "volume")
+DOG_CHANNELS = 6
+_LOWEST_CHANNEL = 0.1
+"""Difference-of-Gaussians channels from 0.1 line pairs per mm (the crop holds no lower ones) to 0.5."""
+
+_GLS_VIEWS = 246
+"""Views that the limit is summed over, then scaled: path lengths change slowly from view to view."""
+
+_SUB_RAYS = 16
+_CAP_STEP_MM = 0.01
+
+
+@dataclass(frozen=True)
+class SceneFacts:
+    """What holds without sampling error, at 1 s.
+
+    Attributes:
+        statistic: ``(z, y, x)`` AᵀW y of the noise-free scan.
+        tissues: names; amplitudes_hu: their values as the scanner sees them (generalised least squares on exact path
+            lengths of the noise-free scan), ``(tissues,)``; information: ``(tissues, tissues)`` HU⁻².
+        reference_hu: ROI means of noise-free standard FBP on 0.1 mm, ``(2,)``.
+        labels: FBP variants; fbp_hu: their ROI means ``(variants, 2)``; fbp_covariance: label → ``(F, F)`` HU² of the
+            ROI means and, where they were asked for, of the observer's channels; fbp_crop: label → image of the core.
+        fbp_shape: lumen area (mm²) and cap thickness (mm) of the noise-free reference FBP.
+    """
+
+    statistic: NDArray[np.float32]
+    tissues: list[str]
+    amplitudes_hu: Floats
+    information: Floats
+    reference_hu: Floats
+    labels: list[str]
+    fbp_hu: Floats
+    fbp_covariance: dict[str, Floats]
+    fbp_crop: dict[str, Any]
+    fbp_shape: Floats
+
+    def tissue(self, name: str) -> int:
+        """Index of a tissue."""
+        return self.tissues.index(name)
+
+    @property
+    def contrast_hu(self) -> float:
+        """True contrast, fibrous tissue minus core, HU."""
+        return float(self.amplitudes_hu[self.tissue("fibrous")] - self.amplitudes_hu[self.tissue("core")])
+
+    @property
+    def truth_hu(self) -> Floats:
+        """``(foreground, background)``."""
+        return self.amplitudes_hu[[self.tissue("core"), self.tissue("fibrous")]]
+
+    def fbp_contrast(self, label: str) -> float:
+        """Noise-free contrast of an FBP variant, HU."""
+        fg, bg = self.fbp_hu[self.labels.index(label)]
+        return float(bg - fg)
+
+
+@dataclass(frozen=True)
+class _Functional:
+    """A linear functional of a volume, as :func:`roi_covariance` takes ROIs."""
+
+    weights: Tensor
+
+
+def fbp_label(kernel: str, voxel_mm: float, blur_mm: float = 0.0) -> str:
+    """Name of an FBP variant."""
+    return f"{kernel} {voxel_mm:.2f} mm" + (f" + {blur_mm:.2f} mm Gauss" if blur_mm else "")
+
+
+def crop_window(grid: VolumeGrid, center: tuple[float, float, float]) -> tuple[tuple[slice, ...], VolumeGrid]:
+    """The cube about ``center`` (z, y, x in mm): its place in a volume, and its grid.
+
+    Raises:
+        ValueError: the cube leaves the grid.
+    """
+    places, middle = [], []
+    for n, step, axis, c in zip(grid.shape, grid.spacing, grid.axes, center, strict=True):
+        half = round(CROP_MM / step / 2)
+        k = round((c - axis[0]) / step)
+        if k - half < 0 or k + half >= n:
+            raise ValueError(f"the crop of {CROP_MM} mm about {center} mm leaves the inset: enlarge the inset")
+        places.append(slice(k - half, k + half + 1))
+        middle.append(float(axis[k]))
+    shape = tuple(p.stop - p.start for p in places)
+    return tuple(places), VolumeGrid(shape, grid.spacing, tuple(middle))
+
+
+def observer_channels(scene: StudyScene, grid: VolumeGrid, observer: str) -> Floats:
+    """Channels on the crop, ``(1 + DOG_CHANNELS, *crop)``: the core's own shape, then difference-of-Gaussians.
+
+    Args:
+        scene: where the core is.
+        grid: of the volumes.
+        observer: ``"axial"`` looks at the protocol's axial image (linear interpolation between two slices), as the
+            paper does; ``"volume"`` at all slices of the core.
+    """
+    z, y, x = scene.core_center
+    crop = crop_window(grid, scene.core_center)[1]
+    if observer == "axial":
+        image = VolumeGrid((1, *crop.shape[1:]), crop.spacing, (z, *crop.center[1:]))
+        dogs = dog_channels(image.slice, (y, x), DOG_CHANNELS, lowest=_LOWEST_CHANNEL)[:, None]
+        depth = np.clip(1.0 - np.abs(crop.axes[0] - z) / crop.spacing[0], 0.0, None)[:, None, None]
+    elif observer == "volume":
+        image, depth = crop, np.ones((1, 1, 1))
+        dogs = dog_channels(crop, scene.core_center, DOG_CHANNELS, lowest=_LOWEST_CHANNEL)
+    else:
+        raise ValueError(f"observer must be one of {', '.join(OBSERVERS)}, got {observer!r}")
+    core = (scene.geometry.labels(image) == scene.geometry.index("core")).astype(np.float64)
+    channels: Floats = np.concatenate([core[None] / np.sqrt(core.sum()), dogs]) * depth
+    return channels
+
+
+def segmentation(scene: StudyScene, grid: VolumeGrid, volume: Tensor) -> tuple[float, float]:
+    """Lumen area (mm²) and cap thickness (mm) in the protocol's axial image; NaN where the edges are lost.
+
+    The cap is measured on the line from the lumen's to the core's centre, between where the image first falls below
+    250 HU and below 70 HU: the core's whole contour at 70 HU runs into the thin wall (67 HU) beside it.
+    """
+    image = scene.rois.image
+    section = sample_axial(volume.to(torch.float64), grid, image)
+    lumen, core = np.array(scene.lumen_center[1:]), np.array(scene.core_center[1:])
+    area = lumen_area(section, image, (float(lumen[0]), float(lumen[1])))
+    length = float(np.hypot(*(core - lumen)))
+    along = np.arange(0.0, length, _CAP_STEP_MM)
+    points = lumen[:, None] + (core - lumen)[:, None] * along / length
+    origin = np.array([a[0] for a in image.axes[1:]])
+    index = (points - origin[:, None]) / np.array(image.spacing[1:])[:, None]
+    profile = map_coordinates(section[0].numpy(), index, order=1, mode="nearest")
+    lumen_end, core_start = (np.flatnonzero(profile < hu) for hu in (250.0, 70.0))
+    if not lumen_end.size or not core_start.size:
+        return area, float("nan")
+    return area, float(along[core_start[0]] - along[lumen_end[0]])
+
+
+class StudyScene:
+    """A scene by name: a variant of the plaque, or ``"variant:absent"``, the same without its core.
+
+    Args:
+        name: see above.
+        settings: of the study.
+        store: keeps scans and facts.
+    """
+
+    def __init__(self, name: str, settings: Settings, store: Store) -> None:
+        self.name, self.settings, self.store = name, settings, store
+        self.peers: dict[str, StudyScene] = {}
+        self._clean: Scan | None = None
+        self._problem: InsetProblem | None = None
+        self._facts: SceneFacts | None = None
+
+    # -- geometry -------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def _pair(self) -> tuple[Scene, Plaque]:
+        from torchpcct.scene.variants import plaque_variant
+
+        variant, _, absent = self.name.partition(":")
+        return plaque_variant(variant, core_contrast=0.0) if absent else plaque_variant(variant)
+
+    @property
+    def scene(self) -> Scene:
+        """All bodies."""
+        return self._pair[0]
+
+    @property
+    def plaque(self) -> Plaque:
+        """The plaque's geometry."""
+        return self._pair[1]
+
+    @cached_property
+    def geometry(self) -> Scene:
+        """The plain plaque of the same geometry, without extra bodies: where tissues are, whatever fills them."""
+        from torchpcct.scene.plaque import plaque_scene
+
+        return plaque_scene(self.plaque)[0]
+
+    @cached_property
+    def core_center(self) -> tuple[float, float, float]:
+        """(z, y, x) mm."""
+        x, y, z = (float(v) for v in self.plaque.to_scanner(self.plaque.core_center))
+        return z, y, x
+
+    @cached_property
+    def lumen_center(self) -> tuple[float, float, float]:
+        """(z, y, x) mm, in the plaque's middle slice."""
+        x, y, _, _ = (float(v) for v in self.plaque.section("lumen", 0.0))
+        x, y, z = (float(v) for v in self.plaque.to_scanner((x, y, 0.0)))
+        return z, y, x
+
+    @cached_property
+    def grid(self) -> VolumeGrid:
+        """The methods' grid."""
+        return inset_grid(self.plaque, self.settings.voxel_mm)
+
+    @cached_property
+    def rois(self) -> RoiPair:
+        """The paper's ROIs; a calcification is kept clear of, texture and stent are not (they have no bulk there)."""
+        scene = self.scene if "calcification" in self.name else self.geometry
+        return place_rois(scene, axial_grid(self.grid.center))
+
+    # -- scan -----------------------------------------------------------------------------------------------------
+
+    @property
+    def clean(self) -> Scan:
+        """The noise-free scan, cut to the inset's shadow and the columns whose noise the filter sees."""
+        if self._clean is None:
+            self._clean = self._load() or self._acquire()
+        return self._clean
+
+    @property
+    def _path(self) -> Any:
+        return self.store.path(f"scans/{_file(self.name)}_{self.settings.views}.h5")
+
+    def _load(self) -> Scan | None:
+        if not self._path.exists():
+            return None
+        try:
+            return Scan.load(self._path)
+        except ValueError as error:
+            log.warning("%s: simulated again", error)
+            return None
+
+    def _acquire(self) -> Scan:
+        from torchpcct.acquisition import acquire
+        from torchpcct.scanner import presets
+
+        views = self.settings.views
+        scanner = presets.pcct(views=views)
+        grids = [inset_grid(self.plaque, v) for v in {*self.settings.voxels_mm, self.settings.voxel_mm, 0.1}]
+        # Fewer views stand for the same scan, thinned out: the beam is on for as long as one of its views.
+        whole = acquire(self.scene, scanner, region=_enclosing(grids), duty=min(1.0, views / 1968))
+        assert whole.window is not None
+        windows = [shadow(whole.geometry, g, margin=1) for g in grids]
+        near = _trim(_union(windows, whole.geometry.columns), whole.window)
+        scan = replace(whole, counts=whole.window.crop(whole.counts, near), window=near)
+        scan.save(self._path)
+        return scan
+
+    def release(self) -> None:
+        """Forget the readings (they are on disk)."""
+        self._clean = None
+
+    @property
+    def problem(self) -> InsetProblem:
+        """Gram operator and background; shared by all scenes with this grid, window and surround."""
+        if self._problem is None:
+            clean = self.clean
+            assert clean.surround is not None
+            for other in self.peers.values():
+                if (
+                    other._problem is not None
+                    and other.grid == self.grid
+                    and other._problem.outer == clean.window
+                    and torch.equal(other._problem.background, clean.surround_line_integrals())
+                ):
+                    self._problem = other._problem
+                    break
+            else:
+                self._problem = InsetProblem(clean, self.grid)
+        return self._problem
+
+    def statistic(self, scan: Scan) -> Tensor:
+        """b = AᵀW y with the weights of the scan's exposure."""
+        return self.problem.statistic(scan).b
+
+    # -- facts ----------------------------------------------------------------------------------------------------
+
+    def facts(self) -> SceneFacts:
+        """Computed once, then read from the store."""
+        if self._facts is None:
+            s = self.settings
+            full = self.name == "paper"
+            key = f"views={s.views} voxel={s.voxel_mm:g} {s.kernels} {s.voxels_mm} {s.blurs_mm} 2"
+            self._facts = _unpack(self.store.piece(f"scenes/{_file(self.name)}", key, lambda: self._compute(full)))
+        return self._facts
+
+    def _compute(self, full: bool) -> dict[str, Any]:
+        from recon.study.dose_factor import FBP_BASE, MAIN_SCENES
+
+        clean, s = self.clean, self.settings
+        tissues, amplitudes, information = self._least_squares()
+        result: dict[str, Any] = {
+            "statistic": self.statistic(clean).to(torch.float32).numpy(),
+            "tissues": np.array(tissues), "amplitudes_hu": amplitudes, "information": information,
+        }  # fmt: skip
+        fine = inset_grid(self.plaque, REFERENCE_VOXEL_MM)
+        reference = InsetFbp(clean, [fine], [REFERENCE_KERNEL])(clean)[0][0]
+        result["reference_hu"] = np.array([float(r(reference)) for r in self.rois.on(fine)])
+        main = self.name in MAIN_SCENES
+        grids = [inset_grid(self.plaque, v) for v in (s.voxels_mm if main else FBP_BASE[1:])]
+        kernels = s.kernels if main else FBP_BASE[:1]
+        fbp = InsetFbp(clean, grids, kernels)
+        self._images(result, fbp, clean)
+        if full or not main:
+            self._covariances(result, fbp, clean, full)
+        return result
+
+    def _images(self, result: dict[str, Any], fbp: InsetFbp, clean: Scan) -> None:
+        """ROI means and crops of every FBP variant."""
+        from recon.study.dose_factor import FBP_BASE
+
+        labels, means = [], []
+        for grid, volumes in zip(fbp.grids, fbp(clean), strict=True):
+            pair, crop = self.rois.on(grid), crop_window(grid, self.core_center)[0]
+            for kernel, volume in zip(fbp.kernels, volumes, strict=True):
+                base = (kernel, grid.spacing[0]) == FBP_BASE
+                for blur in (0.0, *(self.settings.blurs_mm if base else ())):
+                    image = _blurred(volume, grid, blur)
+                    labels.append(fbp_label(kernel, grid.spacing[0], blur))
+                    means.append([float(r(image)) for r in pair])
+                    result[f"crop {labels[-1]}"] = image[crop].numpy()
+                if base:
+                    result["fbp_shape"] = np.array(segmentation(self, grid, volume))
+        result["labels"], result["fbp_hu"] = np.array(labels), np.array(means)
+
+    def _covariances(self, result: dict[str, Any], fbp: InsetFbp, clean: Scan, full: bool) -> None:
+        from recon.study.dose_factor import FBP_BASE
+
+        functionals = [self._functionals(grid, full) for grid in fbp.grids]
+        found = roi_covariance(clean, fbp, cast(Any, functionals), NOISE_FREE_EXPOSURE_S)
+        for grid, matrices in zip(fbp.grids, found, strict=True):
+            for kernel, matrix in zip(fbp.kernels, matrices, strict=True):
+                result[f"covariance {fbp_label(kernel, grid.spacing[0])}"] = matrix
+        if not full:
+            return
+        base = copy.copy(fbp)
+        base.kernels = FBP_BASE[:1]
+        base.grids = tuple(g for g in fbp.grids if g.spacing[0] == FBP_BASE[1])
+        blurs = self.settings.blurs_mm
+        grid = base.grids[0]
+        rows = [_Functional(_blurred(r.weights, grid, b)) for b in blurs for r in self.rois.on(grid)]
+        if not rows:
+            return
+        matrix = roi_covariance(clean, base, cast(Any, [rows]), NOISE_FREE_EXPOSURE_S)[0][0]
+        for k, blur in enumerate(blurs):
+            part = slice(2 * k, 2 * k + 2)
+            result[f"covariance {fbp_label(*FBP_BASE, blur)}"] = matrix[part, part]
+
+    def _functionals(self, grid: VolumeGrid, channels: bool) -> list[Any]:
+        rows: list[Any] = list(self.rois.on(grid))
+        if channels:
+            place = crop_window(grid, self.core_center)[0]
+            for observer in OBSERVERS:
+                for channel in observer_channels(self, grid, observer):
+                    weights = torch.zeros(grid.shape, dtype=torch.float64)
+                    weights[place] = torch.from_numpy(channel)
+                    rows.append(_Functional(weights))
+        return rows
+
+    def _least_squares(self) -> tuple[list[str], Floats, Floats]:
+        """Tissues, their generalised least-squares values in HU, and the information at 1 s."""
+        from torchpcct.scanner import presets
+        from torchpcct.scene.path_lengths import tissue_path_lengths
+
+        clean = self.clean
+        w, g = clean.window, clean.geometry
+        assert w is not None
+        stride = max(1, g.views // _GLS_VIEWS)
+        views = list(range(0, g.views, stride))
+        groups = _tissue_groups([b.name for b in self.scene.bodies])
+        window = DetectorWindow(w.first_column[views], w.columns, w.first_row, w.rows)
+        spot = presets.pcct(views=g.views).source.focal_spot
+        maps = tissue_path_lengths(
+            self.scene, list(groups.values()), g.select(views), window, sub_rays=_SUB_RAYS, focal_spot=spot
+        )
+        weight = 1.0 / line_integral_variance(clean, NOISE_FREE_EXPOSURE_S)[views]
+        lines = clean.line_integrals()[views]
+        scale = clean.linearisation.mu_ref / 1000.0
+        share = g.views / len(views)
+        information = information_matrix(maps, weight, scale=scale) * share
+        right = [float((m * weight * lines).sum((-1, -2), dtype=torch.float64).sum()) for m in maps]
+        amplitudes: Floats = np.asarray(np.linalg.solve(information, scale * share * np.array(right)), np.float64)
+        return list(groups), amplitudes - 1000.0, information
+
+
+def _tissue_groups(names: Sequence[str]) -> dict[str, list[str]]:
+    """Tissue → bodies: texture counts to its host, a stent's rings are one tissue, the blood in them is the lumen's."""
+    groups: dict[str, list[str]] = {}
+    for name in names:
+        host = re.sub(r"_texture_\d+$", "", name)
+        host = "lumen" if re.fullmatch(r"stent_\d+_blood", host) else re.sub(r"^stent_\d+$", "stent", host)
+        groups.setdefault(host, []).append(name)
+    return groups
+
+
+def _blurred(volume: Tensor, grid: VolumeGrid, blur_mm: float) -> Tensor:
+    """Gaussian filter of σ = ``blur_mm``, zero outside: its own transpose."""
+    if not blur_mm:
+        return volume
+    sigma = [blur_mm / s for s in grid.spacing]
+    return torch.from_numpy(gaussian_filter(volume.numpy(), sigma, mode="constant", truncate=5.0))
+
+
+def _file(name: str) -> str:
+    return name.replace(":", "_core_")
+
+
+def _unpack(arrays: dict[str, Any]) -> SceneFacts:
+    def all_of(prefix: str) -> dict[str, Any]:
+        return {k[len(prefix) :]: v for k, v in arrays.items() if k.startswith(prefix)}
+
+    return SceneFacts(
+        statistic=arrays["statistic"],
+        tissues=[str(t) for t in arrays["tissues"]],
+        amplitudes_hu=arrays["amplitudes_hu"],
+        information=arrays["information"],
+        reference_hu=arrays["reference_hu"],
+        labels=[str(v) for v in arrays["labels"]],
+        fbp_hu=arrays["fbp_hu"],
+        fbp_covariance=all_of("covariance "),
+        fbp_crop=all_of("crop "),
+        fbp_shape=arrays["fbp_shape"],
+    )

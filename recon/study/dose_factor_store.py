@@ -1,0 +1,57 @@
+"""Finished pieces of a study on disk: each appears whole or not at all, and is reused by the next run."""
+
+from __future__ import annotations
+
+import logging
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchpcct.volume import written_whole
+
+__all__ = ["Store"]
+
+log = logging.getLogger(__name__)
+
+
+class Store:
+    """A folder of ``.npz`` files, each with the key (settings, parameters) that it was made with.
+
+    Args:
+        folder: made if need be.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def path(self, name: str) -> Path:
+        """A file's path; its folder is made if need be."""
+        path = self.folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path
+
+    def piece(self, name: str, key: str, compute: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        """The arrays of a piece: read if it was finished with the same key, else computed and written.
+
+        Args:
+            name: path in the folder, without ending.
+            key: everything that the piece depends on.
+            compute: gives the arrays.
+        """
+        path = self.path(name + ".npz")
+        if path.exists():
+            try:
+                with np.load(path, allow_pickle=False) as file:
+                    if str(file["key"]) == key:
+                        return {k: file[k] for k in file.files if k != "key"}
+                log.info("%s was made with other settings: computed again", path)
+            except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+                log.warning("%s cannot be read (%s): computed again", path, error)
+        arrays = compute()
+        with written_whole(path) as part:
+            np.savez(part, key=np.array(key), **arrays)
+        return arrays
