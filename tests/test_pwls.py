@@ -186,3 +186,33 @@ def test_refusals(inset):
         pwls(y, w, A, EDGE, hu=HU, gram=gram, start=torch.full(A.domain_shape, torch.nan))
     with pytest.raises(ValueError, match="max_exact"):
         pwls(y, w, A, EDGE, hu=HU, gram=gram, max_exact=0)
+
+
+@pytest.mark.parametrize("value_hu", [1500.0, 8000.0])
+def test_calcification_and_metal_at_the_border(inset, dense, value_hu):
+    """Bright voxels in a corner of the inset, half of them cut off by it."""
+    A, w, gram, y = inset
+    bright = torch.zeros(A.domain_shape)
+    bright[1:3, :2, :2] = value_hu * HU
+    y = y + A(bright)
+    exact = reference(dense, A, w, y, EDGE, gram.information(HU))
+    result = pwls(y, w, A, EDGE, hu=HU, gram=gram, tolerance=0.2, max_exact=30)
+    assert result.report["converged"]
+    assert hu_rms(result.x, exact) < 1.0
+
+
+def test_wrong_centre_is_solved_as_stated(inset):
+    """Data of a detector shifted by half a column: the solver finds the minimum of the problem it was given."""
+    from dataclasses import replace
+
+    from torchpcct import Projector
+
+    A, w, gram, _ = inset
+    g = A.geometry
+    other = replace(g, offset=(g.offset[0], g.offset[1] + g.pitch[1] / 2))
+    y = Projector(other, A.grid, A.window)(tissue(A.grid))
+    result = pwls(y, w, A, EDGE, hu=HU, gram=gram, tolerance=0.1, max_exact=30)
+    assert result.report["converged"]
+    assert torch.isfinite(result.x).all()
+    shift = hu_rms(result.x, pwls(A(tissue(A.grid)), w, A, EDGE, hu=HU, gram=gram, tolerance=0.1).x)
+    assert 1.0 < shift < 200.0
