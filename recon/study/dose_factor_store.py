@@ -45,7 +45,7 @@ class Store:
         path = self.path(name + ".npz")
         if path.exists():
             try:
-                with np.load(path, allow_pickle=False) as file:
+                with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
                     if str(file["key"]) == key:
                         return {k: file[k] for k in file.files if k != "key"}
                 log.info("%s was made with other settings: computed again", path)
