@@ -1,0 +1,80 @@
+"""The notebooks run at quick scale, and what is stored of them is whole."""
+
+import os
+import shutil
+import subprocess
+import sys
+from importlib import resources
+from pathlib import Path
+
+import nbformat
+import pytest
+
+FOLDER = Path(__file__).parents[1] / "notebooks"
+NAMES = sorted(p.name for p in FOLDER.glob("*.ipynb"))
+
+needs_weights = pytest.mark.skipif(
+    not resources.files("recon").joinpath("weights", "mbir.safetensors").is_file(),
+    reason="the package has no weights yet",
+)
+
+
+def outputs(notebook):
+    return [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
+
+
+def pictures(notebook):
+    return [o for o in outputs(notebook) if "image/png" in o.get("data", {})]
+
+
+def code_lines(notebook):
+    sources = (cell.source for cell in notebook.cells if cell.cell_type == "code")
+    return [line for source in sources for line in source.splitlines() if line.strip()]
+
+
+def run(name, folder, timeout):
+    """The notebook executed by the build tool in ``folder``, away from the repository."""
+    path = folder / name
+    shutil.copy(FOLDER / name, path)
+    done = subprocess.run(
+        [sys.executable, FOLDER / "execute.py", path], capture_output=True, text=True, timeout=timeout, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    notebook = nbformat.read(path, as_version=4)
+    assert not [o for o in outputs(notebook) if o.output_type == "error"]
+    return notebook
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_stored_notebook_is_whole(name):
+    path = FOLDER / name
+    notebook = nbformat.read(path, as_version=4)
+    nbformat.validate(notebook)
+    assert path.stat().st_size < 1_000_000
+    cells = [c for c in notebook.cells if c.cell_type == "code" and c.source.strip()]
+    assert [c.execution_count for c in cells] == list(range(1, len(cells) + 1))
+    assert pictures(notebook)
+    assert not [o for o in outputs(notebook) if o.output_type in ("error", "stream")]
+    shown = "".join(str(o) for o in outputs(notebook) if "image/png" not in o.get("data", {}))
+    for place in ("/home/", "/tmp/", "/work/", os.sep + "Users" + os.sep):
+        assert place not in shown
+
+
+def test_first_scan_is_short():
+    assert len(code_lines(nbformat.read(FOLDER / "first_scan.ipynb", as_version=4))) < 15
+
+
+@needs_weights
+def test_first_scan_runs(tmp_path):
+    assert len(pictures(run("first_scan.ipynb", tmp_path, 600))) == 1
+
+
+@pytest.mark.slow
+@needs_weights
+def test_benchmark_runs(tmp_path):
+    notebook = run("fbp_vs_mbir.ipynb", tmp_path, 3600)
+    assert len(pictures(notebook)) == 4
+    text = "\n".join(o.data.get("text/markdown", "") for o in outputs(notebook) if "data" in o)
+    assert "MBIR saves" in text
+    # Away from the repository there is no full study to quote.
+    assert "There is no `notebooks/dose_factor/report.json` here" in text
