@@ -11,8 +11,8 @@ Each step k of the K unrolled ones reads
     u ← u − η_k M_k (H u − β + ∇R(u)) + θ_k (u − u_previous),        M_k = (circulant of H + λ_k)^(−1) by FFT.
 
 Whatever smooths, shrinks. So the steps are passed through again with what the first pass left in the data added back,
-β ← β + (β_measured − H u): the Bregman iteration (Osher, Burger, Goldfarb, Xu, Yin 2005, Multiscale Model. Simul.
-4:460), which restores contrast while the prior, sure of its edges by then, keeps the noise out.
+β ← β + w (β − H u): a Bregman iteration (Osher, Burger, Goldfarb, Xu, Yin 2005, Multiscale Model. Simul. 4:460), which
+restores contrast while the prior, sure of its edges by then, keeps the noise out.
 """
 
 from __future__ import annotations
@@ -24,10 +24,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from recon.prior import LearnedPrior, PriorConfig
+from recon.prior import REFERENCE_SCALE_HU, LearnedPrior, PriorConfig
 
 __all__ = ["NormalProblem", "Unrolled", "energy", "minimise", "residual"]
 
+LARGEST_ADD_BACK = 1.6
 FLOOR = 0.05
 """Smallest damping: frequencies that the scanner does not see are never divided by less."""
 
@@ -82,15 +83,17 @@ class Unrolled(nn.Module):
     Args:
         config: of the prior.
         steps: K of each pass.
-        passes: 1 for the minimiser of the energy; each further one adds the residual back once.
+        add_back: ``(a, b)`` of the weight ``w = a + b ln(c / 200 HU)`` of the residual in a second pass, c the noise
+            scale; None: one pass, the minimiser of the energy.
     """
 
-    def __init__(self, config: PriorConfig | None = None, steps: int = 8, passes: int = 1) -> None:
+    def __init__(
+        self, config: PriorConfig | None = None, steps: int = 8, add_back: tuple[float, float] | None = None
+    ) -> None:
         super().__init__()
-        for name, value in (("steps", steps), ("passes", passes)):
-            if value < 1:
-                raise ValueError(f"{name} must be at least 1, got {value}")
-        self.passes = passes
+        if steps < 1:
+            raise ValueError(f"steps must be at least 1, got {steps}")
+        self.add_back = add_back
         self.prior = LearnedPrior(config)
         self.steps = steps
         self.seen_scale_hu: Tensor
@@ -107,11 +110,17 @@ class Unrolled(nn.Module):
             low, high = self.seen_scale_hu.unbind()
             least = scale.min() if not low else torch.minimum(low, scale.min())
             self.seen_scale_hu = torch.stack([least, torch.maximum(high, scale.max())])
-        u, added = self.descend(problem), problem
-        for _ in range(self.passes - 1):
-            added = replace(added, beta=added.beta + problem.beta - problem.apply(u))
-            u = self.descend(added)
-        return u
+        u = self.descend(problem)
+        if self.add_back is None:
+            return u
+        a, b = self.add_back
+        weight = (a + b * torch.log(scale / REFERENCE_SCALE_HU)).clamp(0.0, LARGEST_ADD_BACK).reshape(-1, 1, 1, 1)
+        return self.descend(replace(problem, beta=problem.beta + weight * (problem.beta - problem.apply(u))))
+
+    @property
+    def iterations(self) -> int:
+        """Steps of all passes."""
+        return self.steps * (1 if self.add_back is None else 2)
 
     def descend(self, problem: NormalProblem) -> Tensor:
         """One pass: K steps from the regularised linear solution towards the minimum of the energy."""

@@ -163,18 +163,13 @@ def test_steps_are_refused():
 
 
 def test_adding_the_residual_back_restores_contrast(scan):
-    """A strong prior shrinks; every pass brings the volume closer to the data."""
+    """A strong prior shrinks; a second pass brings the volume closer to the data, the more so the larger its weight."""
     left = []
-    for passes in (1, 2, 4):
+    for add_back in (None, (0.5, 0.0), (1.0, 0.0)):
         torch.manual_seed(0)
-        net = Unrolled(SMALL, 6, passes).eval().requires_grad_(False)
+        net = Unrolled(SMALL, 6, add_back).eval().requires_grad_(False)
         net.prior.gain += 2.0
         p = normal(scan)
         left.append(float((p.beta - p.apply(net(p))).norm() / p.beta.norm()))
-    assert left[1] < 0.8 * left[0]
-    assert left[2] < 0.8 * left[1]
-
-
-def test_passes_are_refused():
-    with pytest.raises(ValueError, match="passes"):
-        Unrolled(SMALL, 2, 0)
+    assert left[1] < 0.9 * left[0]
+    assert left[2] < 0.9 * left[1]
