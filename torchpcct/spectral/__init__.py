@@ -1,0 +1,46 @@
+"""Spectral imaging: basis materials, decomposition of energy bins, virtual monochromatic images, tissue maps."""
+
+from torchpcct.spectral.basis import Basis, pe_pvc
+from torchpcct.spectral.decompose import (
+    Decomposition,
+    cramer_rao,
+    decompose,
+    decompose_scan,
+    decompose_surround,
+    inverse,
+)
+from torchpcct.spectral.mmd import MMD_TISSUES, clean, dice, label, mmd
+from torchpcct.spectral.model import SpectralModel
+from torchpcct.spectral.vmi import (
+    VMI_ENERGIES_KEV,
+    VmiCurve,
+    sample_covariance,
+    vmi,
+    vmi_curve,
+    vmi_noise,
+    vmi_weights,
+)
+
+__all__ = [
+    "MMD_TISSUES",
+    "VMI_ENERGIES_KEV",
+    "Basis",
+    "Decomposition",
+    "SpectralModel",
+    "VmiCurve",
+    "clean",
+    "cramer_rao",
+    "decompose",
+    "decompose_scan",
+    "decompose_surround",
+    "dice",
+    "inverse",
+    "label",
+    "mmd",
+    "pe_pvc",
+    "sample_covariance",
+    "vmi",
+    "vmi_curve",
+    "vmi_noise",
+    "vmi_weights",
+]

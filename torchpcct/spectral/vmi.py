@@ -1,0 +1,186 @@
+"""Virtual monochromatic images (VMI) from basis images, their noise, and the best energy.
+
+    HU(E) = 1000 (a₁ μ₁(E) + a₂ μ₂(E) − μ_w(E)) / (μ_w(E) − μ_air(E))                       (Li et al., eq. CTE)
+
+with μ_w of water *in the basis*: water reads 0 HU at every energy by construction, and what the basis cannot express of
+water (0.3 HU for PE and PVC) does not tint the images. A VMI is linear in the basis values, so its noise follows from
+their 2 × 2 covariance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from torchpcct.scene.materials import material
+from torchpcct.spectral.basis import Basis
+
+__all__ = ["VMI_ENERGIES_KEV", "VmiCurve", "sample_covariance", "vmi", "vmi_curve", "vmi_noise", "vmi_weights"]
+
+Floats = NDArray[np.float64]
+
+VMI_ENERGIES_KEV = tuple(float(e) for e in range(40, 141))
+
+
+def vmi_weights(
+    basis: Basis, energies_kev: ArrayLike = VMI_ENERGIES_KEV, water: ArrayLike | None = None
+) -> tuple[Floats, Floats]:
+    """The linear map from basis values to HU: ``HU(E) = g(E) · a + offset(E)``.
+
+    Args:
+        basis: of the images.
+        energies_kev: ``(E,)`` keV.
+        water: ``(2,)`` coefficients that read 0 HU, e.g. measured in a water phantom; None: water fitted in the basis.
+
+    Returns:
+        ``g`` (E, 2) in HU, ``offset`` (E,) in HU, float64.
+
+    Raises:
+        ValueError: energies outside 1…500 keV, ``water`` of another shape or not denser than air.
+    """
+    energies = np.atleast_1d(np.asarray(energies_kev, np.float64))
+    w = basis.coefficients("water") if water is None else np.asarray(water, np.float64)
+    if w.shape != (2,) or not np.isfinite(w).all():
+        raise ValueError(f"water must hold 2 finite basis coefficients, got {water!r}")
+    mu_water = basis.mu(w, energies)
+    span = mu_water - material("air").attenuation(energies)
+    if not (span > 0).all():
+        raise ValueError(f"water must attenuate more than air at every energy, its coefficients are {w}")
+    return 1000.0 * basis.attenuation(energies).T / span[:, None], -1000.0 * mu_water / span
+
+
+def _pair(name: str, value: Any, entries: int) -> Tensor:
+    t = torch.as_tensor(value)
+    if t.ndim < 1 or t.shape[0] != entries:
+        raise ValueError(f"{name} must have {entries} entries on the first axis, got the shape {tuple(t.shape)}")
+    return t if t.is_floating_point() else t.to(torch.float64)
+
+
+def vmi(
+    basis_images: Tensor, basis: Basis, energies_kev: ArrayLike = VMI_ENERGIES_KEV, water: ArrayLike | None = None
+) -> Tensor:
+    """Virtual monochromatic images.
+
+    Args:
+        basis_images: ``(2, ...)`` basis coefficients (dimensionless: line integrals in mm, reconstructed in mm).
+        basis, energies_kev, water: see :func:`vmi_weights`.
+
+    Returns:
+        ``(E, ...)`` in HU, dtype and device of ``basis_images``, differentiable.
+
+    Raises:
+        ValueError: a wrong shape, see also :func:`vmi_weights`.
+    """
+    images = _pair("basis_images", basis_images, 2)
+    g, offset = (torch.from_numpy(v).to(images) for v in vmi_weights(basis, energies_kev, water))
+    return torch.tensordot(g, images, dims=1) + offset.reshape(-1, *(1,) * (images.ndim - 1))
+
+
+def vmi_noise(
+    covariance: Any, basis: Basis, energies_kev: ArrayLike = VMI_ENERGIES_KEV, water: ArrayLike | None = None
+) -> Tensor:
+    """Standard deviation of virtual monochromatic images.
+
+    Args:
+        covariance: ``(3, ...)`` C₁₁, C₁₂, C₂₂ of the basis images (dimensionless).
+        basis, energies_kev, water: see :func:`vmi_weights`.
+
+    Returns:
+        ``(E, ...)`` in HU.
+
+    Raises:
+        ValueError: a wrong shape, a variance below 0.
+    """
+    c = _pair("covariance", covariance, 3)
+    if bool((c[0] < 0).any()) or bool((c[2] < 0).any()):
+        raise ValueError("covariance holds negative variances: pack it as C11, C12, C22")
+    g = torch.from_numpy(vmi_weights(basis, energies_kev, water)[0]).to(c)
+    terms = torch.stack([g[:, 0] ** 2, 2 * g[:, 0] * g[:, 1], g[:, 1] ** 2], dim=1)
+    return torch.tensordot(terms, c, dims=1).clamp_min(0).sqrt()
+
+
+def sample_covariance(basis_images: Any, mask: Any = None) -> Floats:
+    """Covariance ``(3,)`` of basis values over a region or over realisations, with n − 1 in the denominator.
+
+    Args:
+        basis_images: ``(2, ...)``.
+        mask: ``(...)`` bool, the voxels to use; None: all.
+
+    Raises:
+        ValueError: fewer than two values, a wrong shape.
+    """
+    values = _pair("basis_images", basis_images, 2).detach().to(torch.float64).cpu()
+    flat = values.reshape(2, -1) if mask is None else values[:, torch.as_tensor(mask, dtype=torch.bool)]
+    if flat.shape[1] < 2:
+        raise ValueError(f"a covariance needs at least 2 values, the region has {flat.shape[1]}")
+    c = torch.cov(flat)
+    return np.array([c[0, 0], c[0, 1], c[1, 1]], np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class VmiCurve:
+    """Contrast and noise of two tissues against energy, all ``(E,)`` float64.
+
+    Attributes:
+        energies: keV.
+        contrast: HU of the first tissue less the second.
+        noise: standard deviation in HU.
+        cnr: ``|contrast| / noise``.
+        limit: CNR of the best linear combination of the two basis images; no VMI exceeds it.
+    """
+
+    energies: Floats
+    contrast: Floats
+    noise: Floats
+    cnr: Floats
+    limit: float
+
+    @property
+    def optimum_kev(self) -> float:
+        """Energy of the highest CNR: a parabola through the best sample and its neighbours."""
+        k = int(self.cnr.argmax())
+        if 0 < k < self.cnr.size - 1:
+            a, b = np.polyfit(self.energies[k - 1 : k + 2] - self.energies[k], self.cnr[k - 1 : k + 2], 2)[:2]
+            if a < 0:
+                return float(self.energies[k] - b / (2 * a))
+        return float(self.energies[k])
+
+
+def vmi_curve(
+    first: ArrayLike,
+    second: ArrayLike,
+    covariance: ArrayLike,
+    basis: Basis,
+    energies_kev: ArrayLike = VMI_ENERGIES_KEV,
+    water: ArrayLike | None = None,
+) -> VmiCurve:
+    """Contrast, noise and CNR of two tissues against the energy of the VMI.
+
+    Args:
+        first, second: ``(2,)`` mean basis coefficients of the tissues.
+        covariance: ``(3,)`` C₁₁, C₁₂, C₂₂ of the noise of the basis images, positive definite.
+        basis, energies_kev, water: see :func:`vmi_weights`.
+
+    Raises:
+        ValueError: wrong shapes, a covariance that is not positive definite.
+    """
+    a, b, c = (np.asarray(v, np.float64) for v in (first, second, covariance))
+    if a.shape != (2,) or b.shape != (2,) or c.shape != (3,):
+        raise ValueError(
+            f"first and second must hold 2 coefficients, covariance 3 values, got the shapes {a.shape}, {b.shape} "
+            f"and {c.shape}"
+        )
+    det = c[0] * c[2] - c[1] ** 2
+    if not (c[0] > 0 and c[2] > 0 and det > 0):
+        raise ValueError(f"covariance must be positive definite, packed as C11, C12, C22, got {c}")
+    energies = np.atleast_1d(np.asarray(energies_kev, np.float64))
+    d = a - b
+    contrast = vmi_weights(basis, energies, water)[0] @ d
+    noise = vmi_noise(c, basis, energies, water).numpy()
+    limit = np.sqrt((c[2] * d[0] ** 2 - 2 * c[1] * d[0] * d[1] + c[0] * d[1] ** 2) / det)
+    return VmiCurve(energies, contrast, noise, np.abs(contrast) / noise, float(limit))
