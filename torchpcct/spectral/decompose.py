@@ -110,7 +110,7 @@ def decompose(
     if box.shape != (2, 2) or not (np.isfinite(box).all() and (box[:, 0] < box[:, 1]).all()):
         raise ValueError(f"bounds must be ((low, high), (low, high)) in mm with low < high, got {bounds!r}")
     column, intensity = model.rays(tuple(counts.shape[1:]), columns, scale)
-    line_integrals, information, steps = _Decompose.apply(  # type: ignore[no-untyped-call]
+    line_integrals, information, steps = _Decompose.apply(
         counts, model, column, intensity, bool(bias_reduction), float(tolerance), box
     )
     low_, high_ = (torch.from_numpy(b.copy()).reshape(2, *(1,) * (counts.ndim - 1)).to(counts.dtype) for b in box.T)
