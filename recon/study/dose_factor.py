@@ -62,7 +62,7 @@ FBP_BASE = ("soft", 0.25)
 """Kernel and voxel size (mm) that factors are quoted against, and of the FBP realisations."""
 
 _SECONDS = {"scene": 45.0, "fbp": 90.0, "data": 3.0, "linear": 0.3, "quadratic": 1.5, "qggmrf": 5.0, "tv": 10.0,
-            "mbir": 2.5}  # fmt: skip
+            "mbir_one_pass": 0.5, "mbir": 1.0}  # fmt: skip
 """Rough cost at 1968 views on two cores: one scene, exact FBP noise, one realisation, one volume of each method."""
 
 

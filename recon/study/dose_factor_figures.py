@@ -17,7 +17,9 @@ from torchpcct.viz import Panel, panels
 __all__ = ["curves_figure", "images_figure"]
 
 _COLORS = {
-    "linear": "tab:brown", "quadratic": "tab:olive", "qggmrf": "tab:green", "tv": "tab:purple", "mbir": "tab:red",
+    "linear": "tab:brown", "quadratic": "tab:olive", "qggmrf": "tab:green", "tv": "tab:purple",
+    "mbir_one_pass": "tab:orange",
+    "mbir": "tab:red",
 }  # fmt: skip
 _ASSUMED = 5.7
 

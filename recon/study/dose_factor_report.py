@@ -27,7 +27,8 @@ METHOD_NAMES = {
     "quadratic": "quadratic PWLS",
     "qggmrf": "q-GGMRF PWLS",
     "tv": "smoothed TV",
-    "mbir": "MBIR, learned prior",
+    "mbir_one_pass": "MBIR, one pass",
+    "mbir": "MBIR, two passes",
 }
 
 

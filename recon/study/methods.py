@@ -136,12 +136,12 @@ _BASELINES: dict[str, Any] = {
     "tv": Penalised("tv", QGGMRF(strength=2.0, threshold=30.0)),
 }
 
-METHODS = (*_BASELINES, "mbir")
+METHODS = (*_BASELINES, "mbir_one_pass", "mbir")
 """Names, in the order of the tables."""
 
 
 def load_methods(names: Iterable[str]) -> list[Method]:
-    """The methods of these names; ``mbir`` is left out with a logged warning where it is not installed.
+    """The methods of these names; MBIR is left out with a logged warning where its weights are missing.
 
     Raises:
         ValueError: an unknown name, or no method that can be run.
@@ -154,11 +154,13 @@ def load_methods(names: Iterable[str]) -> list[Method]:
             found.append(_BASELINES[name])
             continue
         try:
-            from recon.mbir import Mbir  # type: ignore[import-not-found, import-untyped, unused-ignore]
+            from recon.mbir import ADD_BACK, Mbir
 
-            found.append(Mbir.load())
-        except (ImportError, FileNotFoundError) as error:
-            log.warning("the method mbir is left out, its code or weights are missing: %s", error)
+            prior = Mbir.load(add_back=ADD_BACK if name == "mbir" else None)
+            prior.name = name
+            found.append(prior)
+        except FileNotFoundError as error:
+            log.warning("the method %s is left out, its weights are missing: %s", name, error)
     if not found:
         raise ValueError(f"no method to run: choose at least one of {', '.join(METHODS)}")
     return found
@@ -175,5 +177,5 @@ def fingerprint(method: Method) -> str:
         for key, value in sorted(model.state_dict().items()):
             digest.update(key.encode())
             digest.update(value.detach().cpu().contiguous().numpy().tobytes())
-        return f"{method.name}:{digest.hexdigest()[:16]}"
+        return f"{method.name}:{digest.hexdigest()[:16]}:{getattr(model, 'add_back', None)}"
     return repr(method)

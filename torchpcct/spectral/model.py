@@ -236,7 +236,7 @@ class SpectralModel:
         if line_integrals.ndim < 1 or line_integrals.shape[0] != 2:
             raise ValueError(f"line_integrals must have the shape (2, ...), got {tuple(line_integrals.shape)}")
         column, intensity = self.rays(tuple(line_integrals.shape[1:]), columns, scale)
-        return torch.as_tensor(_Expected.apply(line_integrals, self, column, intensity))  # type: ignore[no-untyped-call]
+        return torch.as_tensor(_Expected.apply(line_integrals, self, column, intensity))
 
 
 def evaluate(model: SpectralModel, line_integrals: Tensor, column: Any, intensity: Any) -> tuple[Floats, Floats]:
