@@ -18,6 +18,7 @@ restores contrast while the prior, sure of its edges by then, keeps the noise ou
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -103,26 +104,32 @@ class Unrolled(nn.Module):
         # What the training has seen, so that the weights know themselves where they may be trusted.
         self.register_buffer("seen_scale_hu", torch.zeros(2))
 
-    def forward(self, problem: NormalProblem) -> Tensor:
-        """The reconstruction ``(batch, z, y, x)`` in noise units (times ``problem.scale_hu``: HU above background)."""
+    def forward(self, problem: NormalProblem, callback: Callable[[int, Tensor], None] | None = None) -> Tensor:
+        """The reconstruction ``(batch, z, y, x)`` in noise units (times ``problem.scale_hu``: HU above background).
+
+        Args:
+            problem: normalised problem.
+            callback: called with the number of each step, counted over both passes, and the volume after it.
+        """
         scale = problem.scale_hu
         if self.training:
             low, high = self.seen_scale_hu.unbind()
             least = scale.min() if not low else torch.minimum(low, scale.min())
             self.seen_scale_hu = torch.stack([least, torch.maximum(high, scale.max())])
-        u = self.descend(problem)
+        u = self.descend(problem, callback)
         if self.add_back is None:
             return u
         a, b = self.add_back
         weight = (a + b * torch.log(scale / REFERENCE_SCALE_HU)).clamp(0.0, LARGEST_ADD_BACK).reshape(-1, 1, 1, 1)
-        return self.descend(replace(problem, beta=problem.beta + weight * (problem.beta - problem.apply(u))))
+        added = replace(problem, beta=problem.beta + weight * (problem.beta - problem.apply(u)))
+        return self.descend(added, None if callback is None else lambda k, v: callback(k + self.steps, v))
 
     @property
     def iterations(self) -> int:
         """Steps of all passes."""
         return self.steps * (1 if self.add_back is None else 2)
 
-    def descend(self, problem: NormalProblem) -> Tensor:
+    def descend(self, problem: NormalProblem, callback: Callable[[int, Tensor], None] | None = None) -> Tensor:
         """One pass: K steps from the regularised linear solution towards the minimum of the energy."""
         scale, shape = problem.scale_hu, problem.beta.shape[-3:]
         quadratic = self.prior.quadratic(shape, problem.voxel_mm, scale)
@@ -137,6 +144,8 @@ class Unrolled(nn.Module):
             step = _inverse((_spectrum(gradient) + quadratic * _spectrum(u)) / (curved + damping[k]), shape)
             new = u - torch.exp(self.log_step[k]) * step + self.momentum[k] * (u - previous)
             u, previous = new, u
+            if callback is not None:
+                callback(k, u)
         return u
 
 

@@ -173,3 +173,10 @@ def test_adding_the_residual_back_restores_contrast(scan):
         left.append(float((p.beta - p.apply(net(p))).norm() / p.beta.norm()))
     assert left[1] < 0.9 * left[0]
     assert left[2] < 0.9 * left[1]
+
+
+def test_callback_sees_every_step(scan):
+    net, seen = Unrolled(SMALL, 3, (0.5, 0.0)).eval().requires_grad_(False), []
+    last = net(normal(scan), lambda k, u: seen.append((k, u)))
+    assert [k for k, _ in seen] == list(range(net.iterations))
+    assert torch.equal(seen[-1][1], last)
