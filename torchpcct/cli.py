@@ -98,7 +98,9 @@ def _parser() -> argparse.ArgumentParser:
     factor.add_argument("--scene-n", type=int, default=None, help="realisations of each further scene (default 40)")
     factor.add_argument("--doses", type=float, nargs="+", default=None, metavar="S", help="exposures in s")
     factor.add_argument("--scene-doses", type=float, nargs="+", default=None, metavar="S", help="of further scenes")
-    factor.add_argument("--methods", nargs="+", default=None, metavar="M", help="linear quadratic qggmrf tv mbir_one_pass mbir")
+    factor.add_argument(
+        "--methods", nargs="+", default=None, metavar="M", help="linear quadratic qggmrf tv mbir_one_pass mbir"
+    )
     factor.add_argument("--scenes", nargs="*", default=None, metavar="NAME", help="further scenes (none: leave out)")
     factor.add_argument("--scene-methods", nargs="+", default=None, metavar="M", help="methods of further scenes")
     factor.add_argument("--fast-noise", action="store_true", help="draw the noise of AᵀW y, not that of the readings")
