@@ -639,7 +639,7 @@ def test_configuration_round_trip(tmp_path):
         ("prior: {levels: 2, filterz: 3}", r"unknown key 'prior\.filterz'"),
         ("data: {nonsense: 1}", r"unknown key 'data\.nonsense'"),
         ("objective: {nonsense: 1}", r"unknown key 'objective\.nonsense'"),
-        ("prior: {filters: 33}", "prior: filters"),
+        ("prior: {filters: 32}", "prior: filters"),
         ("steps: 3.5", "steps must be of type int"),
         ("steps: true", "steps must be of type int"),
         ("steps: 0", "steps must be an integer of at least 1"),

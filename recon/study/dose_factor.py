@@ -140,7 +140,8 @@ class Settings:
         """A first look in under a minute: an eighth of the views, 8 realisations, fast noise."""
         values: dict[str, Any] = {
             "n": 8, "scene_n": 4, "doses": (2.0,), "scene_doses": (2.0,), "views": 246, "fast_noise": True,
-            "scenes": ("half_size_core",), "kernels": ("soft", "standard"), "voxels_mm": (0.25,), "blurs_mm": (0.25,),
+            "methods": ("linear", "mbir_one_pass", "mbir"), "scenes": ("half_size_core",),
+            "kernels": ("soft", "standard"), "voxels_mm": (0.25,), "blurs_mm": (0.25,),
         }  # fmt: skip
         return cls(**{**values, **changes})
 
