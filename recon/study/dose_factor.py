@@ -137,7 +137,7 @@ class Settings:
 
     @classmethod
     def quick(cls, **changes: Any) -> Settings:
-        """A first look in under a minute: an eighth of the views, 8 realisations, fast noise."""
+        """A first look in about 90 s: an eighth of the views, 8 realisations, fast noise."""
         values: dict[str, Any] = {
             "n": 8, "scene_n": 4, "doses": (2.0,), "scene_doses": (2.0,), "views": 246, "fast_noise": True,
             "methods": ("linear", "mbir_one_pass", "mbir"), "scenes": ("half_size_core",),
