@@ -104,7 +104,7 @@ def _parser() -> argparse.ArgumentParser:
     factor.add_argument("--scenes", nargs="*", default=None, metavar="NAME", help="further scenes (none: leave out)")
     factor.add_argument("--scene-methods", nargs="+", default=None, metavar="M", help="methods of further scenes")
     factor.add_argument("--fast-noise", action="store_true", help="draw the noise of AᵀW y, not that of the readings")
-    factor.add_argument("--quick", action="store_true", help="8 realisations, one dose, an eighth of the views: about 90 s")
+    factor.add_argument("--quick", action="store_true", help="8 realisations, one dose, 246 views: about 90 s")
     factor.set_defaults(run=_dose_factor)
 
     simulate = commands.add_parser(
