@@ -12,7 +12,6 @@ import logging
 import math
 import time
 from collections.abc import Callable, Sequence
-from functools import cached_property
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -114,24 +113,6 @@ class Mbir:
         return to_hu(u * scale + problem.level, problem.mu_ref)
 
     @torch.no_grad()
-    def converged(
-        self, problem: InsetProblem, b: Tensor, exposure_s: float, tolerance: float = 1e-3, most: int = 400
-    ) -> tuple[Tensor, dict[str, Any]]:
-        """The stationary point of the same energy, and its certificate.
-
-        Args:
-            problem, b, exposure_s: as for a call.
-            tolerance: stop when the preconditioned gradient has fallen to this share of that of the zero volume.
-            most: largest number of iterations.
-
-        Returns:
-            Volumes in HU; ``iterations``, ``residual`` (one per volume), ``converged``.
-        """
-        normal = self.problem(problem, b, exposure_s)
-        u, report = minimise(self.model, normal, self.model(normal), tolerance, most)
-        return self._hu(problem, u, normal), report
-
-    @torch.no_grad()
     def noise_map(self, problem: InsetProblem, b: Tensor, exposure_s: float, draws: int = 8, seed: int = 0) -> Tensor:
         """Standard deviation of each voxel in HU, ``(z, y, x)``, of one statistic ``b`` ``(z, y, x)``.
 
@@ -146,10 +127,9 @@ class Mbir:
         square = (volumes[:draws] - volumes[draws:]).square().mean(0)
         return torch.nn.functional.avg_pool3d(square[None, None], 3, 1, 1, count_include_pad=False)[0, 0].sqrt()
 
-    def check(self, problem: InsetProblem, exposure_s: float, chi2: float) -> list[str]:
-        """What speaks against trusting the network on these data; also logged as warnings."""
+    def check(self, scale: float, chi2: float) -> list[str]:
+        """What speaks against trusting the network at a noise scale in HU and a misfit; also logged as warnings."""
         found = []
-        scale = (problem.gram.information(problem.mu_ref / 1000.0) * exposure_s * self.voxel_mm**3) ** -0.5
         low, high = self.model.seen_scale_hu.tolist()
         if not 0.98 * low <= scale <= 1.02 * high:
             found.append(
@@ -164,11 +144,6 @@ class Mbir:
         for text in found:
             _LOG.warning("%s", text)
         return found
-
-    @cached_property
-    def parameters_count(self) -> int:
-        """Trained values."""
-        return sum(p.numel() for p in self.model.parameters())
 
 
 def working_grid(grid: VolumeGrid, voxel_mm: float) -> VolumeGrid:
@@ -218,7 +193,8 @@ def reconstruct_mbir(
         problem: kept from an earlier call with the same scan and (working) grid; None: made here.
         batch: volumes at a time.
         noise_map: add an estimate of each voxel's standard deviation, ``report["noise_sd_hu"]``.
-        converge: run the energy to its stationary point instead of the unrolled steps alone.
+        converge: run the energy on to its stationary point. That is the limit of one pass: what a second pass has
+            added back goes again.
 
     Returns:
         Volumes in HU. Report: ``iterations``, ``residual`` (norm of the energy's preconditioned gradient over that of
@@ -254,7 +230,7 @@ def reconstruct_mbir(
         for k, (volume, statistic) in enumerate(zip(hu, statistics, strict=True)):
             chi2 = (statistic.energy + float(misfit[k])) / statistic.readings
             info = {**report, "residual": float(residuals[k]), "chi2": chi2, "seconds": round(seconds, 3)}
-            info["warnings"] = prior.check(problem, exposure, chi2)
+            info["warnings"] = prior.check(float(normal.scale_hu[k]), chi2)
             if noise_map:
                 sd = prior.noise_map(problem, statistic.b, exposure)
                 info["noise_sd_hu"] = sd if work is grid else average_onto(sd, work, grid)

@@ -157,11 +157,15 @@ def _inverse(spectrum: Tensor, shape: torch.Size) -> Tensor:
     return torch.fft.irfftn(spectrum, s=shape, dim=(-3, -2, -1))
 
 
+def _filtered(v: Tensor, spectrum: Tensor) -> Tensor:
+    return _inverse(spectrum * _spectrum(v), v.shape[-3:])
+
+
 def energy(model: Unrolled, problem: NormalProblem, u: Tensor) -> Tensor:
     """Φ(u) = ½ uᵀH u − βᵀu + R(u) of each volume, ``(batch,)`` float64."""
     data = (u * (0.5 * problem.apply(u) - problem.beta)).sum(dim=(1, 2, 3), dtype=torch.float64)
     quadratic = model.prior.quadratic(u.shape[-3:], problem.voxel_mm, problem.scale_hu)
-    smooth = 0.5 * (u * _inverse(quadratic * _spectrum(u), u.shape[-3:])).sum(dim=(1, 2, 3), dtype=torch.float64)
+    smooth = 0.5 * (u * _filtered(u, quadratic)).sum(dim=(1, 2, 3), dtype=torch.float64)
     return data + smooth + model.prior.energy(u, problem.scale_hu).double()
 
 
@@ -181,23 +185,21 @@ class _Preconditioned:
         v = torch.randn(shape[1:], generator=generator).to(self.problem.beta).expand(shape).clone()
         size = torch.ones(shape[0])
         for _ in range(iterations):
-            smooth = _inverse(self.quadratic * _spectrum(v), v.shape[-3:])
-            v = self(self.problem.apply(v) + smooth + self.bound * v)
+            v = self(self.problem.apply(v) + _filtered(v, self.quadratic) + self.bound * v)
             size = v.flatten(1).norm(dim=1)
             v = v / size.clamp_min(torch.finfo(v.dtype).tiny).reshape(-1, 1, 1, 1)
         return size.to(v)
 
     def gradient(self, u: Tensor) -> Tensor:
-        smooth = _inverse(self.quadratic * _spectrum(u), u.shape[-3:])
+        smooth = _filtered(u, self.quadratic)
         return self.problem.apply(u) - self.problem.beta + smooth + self.model.prior.gradient(u, self.problem.scale_hu)
 
     def __call__(self, gradient: Tensor) -> Tensor:
         return _inverse(_spectrum(gradient) / self.weight, gradient.shape[-3:])
 
-    def size(self, gradient: Tensor, moved: Tensor | None = None) -> Tensor:
+    def size(self, gradient: Tensor) -> Tensor:
         """√(gᵀM g), ``(batch,)``."""
-        moved = self(gradient) if moved is None else moved
-        return (gradient * moved).sum(dim=(1, 2, 3), dtype=torch.float64).clamp_min(0.0).sqrt()
+        return (gradient * self(gradient)).sum(dim=(1, 2, 3), dtype=torch.float64).clamp_min(0.0).sqrt()
 
 
 def residual(model: Unrolled, problem: NormalProblem, u: Tensor) -> Tensor:
