@@ -1,4 +1,4 @@
-"""Command line: ``torchpcct compare | dose-factor | simulate | reconstruct``.
+"""Command line: ``torchpcct compare | dose-factor | study | simulate | reconstruct``.
 
 The one module of the package that looks at :mod:`recon`: a command joins what the library keeps apart.
 """
@@ -51,11 +51,14 @@ class _Progress:
             self.bar = None
 
 
-def _common(parser: argparse.ArgumentParser, out_help: str, out_default: str | None) -> None:
+def _common(
+    parser: argparse.ArgumentParser, out_help: str, out_default: str | None, required: bool | None = None
+) -> None:
+    required = out_default is None if required is None else required
     parser.add_argument("--seed", type=int, default=0, help="first seed of the noise, ≥ 0 (default 0)")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where volumes are kept (default cpu)")
     parser.add_argument(
-        "--out", type=Path, default=out_default, required=out_default is None, metavar="PATH", help=out_help
+        "--out", type=Path, default=out_default, required=required, metavar="PATH", help=out_help
     )
     parser.add_argument("--no-progress", action="store_true", help="no progress bars")
     parser.add_argument("-v", "--verbose", action="store_true", help="log what the library does")
@@ -106,6 +109,23 @@ def _parser() -> argparse.ArgumentParser:
     factor.add_argument("--fast-noise", action="store_true", help="draw the noise of AᵀW y, not that of the readings")
     factor.add_argument("--quick", action="store_true", help="8 realisations, one dose, 246 views: about 90 s")
     factor.set_defaults(run=_dose_factor)
+
+    from recon.study.registry import STUDIES
+
+    study = commands.add_parser(
+        "study",
+        help=f"one of the paper's studies: {', '.join(STUDIES)}",
+        description="Run a study of the paper at full scale and print its figures beside the published ones.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog="studies:\n" + "\n".join(f"  {name:<12} {text}" for name, text in STUDIES.items()),
+    )
+    study.add_argument("name", choices=tuple(STUDIES), metavar="NAME", help=", ".join(STUDIES))
+    _common(study, "folder for report.json, report.md and the figures (default out/NAME)", None, required=False)
+    study.add_argument("--quick", action="store_true", help="reduced settings: a first look, < 60 s")
+    study.add_argument(
+        "--set", dest="changes", action="append", default=[], metavar="FIELD=VALUE", help="change a setting (repeatable)"
+    )
+    study.set_defaults(run=_study)
 
     simulate = commands.add_parser(
         "simulate",
@@ -201,6 +221,20 @@ def _dose_factor(arguments: argparse.Namespace, progress: _Progress) -> None:
     progress.close()
     report = build_report(result, time.perf_counter() - start, shlex.join(["torchpcct", *arguments.command_line]))
     files = report.save(arguments.out)
+    print(report.text)
+    print(f"\n{time.perf_counter() - start:.0f} s in all. Written: {', '.join(map(str, files))}")
+
+
+def _study(arguments: argparse.Namespace, progress: _Progress) -> None:
+    from recon.study import registry
+
+    settings = registry.build_settings(
+        arguments.name, quick=arguments.quick, seed=arguments.seed, changes=arguments.changes
+    )
+    start = time.perf_counter()
+    report = registry.run(arguments.name, settings, progress)
+    progress.close()
+    files = report.save(arguments.out or Path("out") / arguments.name)
     print(report.text)
     print(f"\n{time.perf_counter() - start:.0f} s in all. Written: {', '.join(map(str, files))}")
 

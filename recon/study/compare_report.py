@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from recon.study import paper
+from recon.study.checks import Check, checks_section
 from recon.study.compare import REFERENCE_KERNEL, REFERENCE_VOXEL_MM, Compared
 from recon.study.report import Report, environment, markdown_table
 from torchpcct.geometry import VolumeGrid
@@ -20,7 +21,7 @@ __all__ = ["build_report"]
 def build_report(result: Compared) -> Report:
     """Report of :func:`recon.study.compare.run`: ``report.json``, ``report.md``, ``compare.png``."""
     checks = _checks(result)
-    data = {"study": "compare", **result.as_dict(), "checks": checks, "environment": environment()}
+    data = {"study": "compare", **result.as_dict(), "checks": [c.as_dict() for c in checks], "environment": environment()}
     sections = [
         "# Plaque CNR by FBP and PWLS, beside the paper",
         _intro(result),
@@ -28,7 +29,7 @@ def build_report(result: Compared) -> Report:
         *(_tables(result, name, exposure) for name, exposure in result.settings.doses.items()),
         _noise_table(result),
         _pwls_table(result),
-        _check_table(checks),
+        checks_section(checks, every=False),
         _footer(result),
     ]
     figure = _figure(result)
@@ -174,18 +175,12 @@ def _pwls_table(result: Compared) -> str:
     return f"{text}\n\n{markdown_table(header, rows)}"
 
 
-def _within(value: float, low: float, high: float) -> bool:
-    return bool(low <= value <= high)
-
-
-def _checks(result: Compared) -> list[dict[str, Any]]:
+def _checks(result: Compared) -> list[Check]:
     """Every row of the paper that this study covers, with its tolerance."""
-    checks: list[dict[str, Any]] = []
+    checks: list[Check] = []
 
     def add(name: str, ours: float, published: float, low: float, high: float) -> None:
-        checks.append(
-            {"name": name, "ours": ours, "paper": published, "low": low, "high": high, "ok": _within(ours, low, high)}
-        )
+        checks.append(Check(name, ours, published, low, high))
 
     for e in result.noise_free:
         if (e["kernel"], e["voxel_mm"]) == (REFERENCE_KERNEL, REFERENCE_VOXEL_MM):
@@ -223,16 +218,6 @@ def _table_checks(entry: dict[str, Any], add: Any) -> None:
     # The paper's CNR must be one that 10 realisations of our scan would give in 95 of 100 repetitions.
     low, high = cnr_range(means, covariance, paper.REALIZATIONS)
     add(f"the paper's CNR, {name}, in the range of our 10-run estimates", published_cnr, published_cnr, low, high)
-
-
-def _check_table(checks: list[dict[str, Any]]) -> str:
-    passed = sum(c["ok"] for c in checks)
-    failed = [c for c in checks if not c["ok"]]
-    text = f"## Agreement with the paper\n\n{passed} of {len(checks)} checks inside their tolerance."
-    if not failed:
-        return text
-    rows = [[c["name"], f"{c['ours']:.2f}", f"{c['paper']:.2f}", f"{c['low']:.2f} … {c['high']:.2f}"] for c in failed]
-    return f"{text} Outside:\n\n{markdown_table(['check', 'ours', 'paper', 'accepted'], rows)}"
 
 
 def _footer(result: Compared) -> str:
