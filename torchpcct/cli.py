@@ -57,9 +57,7 @@ def _common(
     required = out_default is None if required is None else required
     parser.add_argument("--seed", type=int, default=0, help="first seed of the noise, ≥ 0 (default 0)")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where volumes are kept (default cpu)")
-    parser.add_argument(
-        "--out", type=Path, default=out_default, required=required, metavar="PATH", help=out_help
-    )
+    parser.add_argument("--out", type=Path, default=out_default, required=required, metavar="PATH", help=out_help)
     parser.add_argument("--no-progress", action="store_true", help="no progress bars")
     parser.add_argument("-v", "--verbose", action="store_true", help="log what the library does")
 
@@ -123,7 +121,12 @@ def _parser() -> argparse.ArgumentParser:
     _common(study, "folder for report.json, report.md and the figures (default out/NAME)", None, required=False)
     study.add_argument("--quick", action="store_true", help="reduced settings: a first look, < 60 s")
     study.add_argument(
-        "--set", dest="changes", action="append", default=[], metavar="FIELD=VALUE", help="change a setting (repeatable)"
+        "--set",
+        dest="changes",
+        action="append",
+        default=[],
+        metavar="FIELD=VALUE",
+        help="change a setting (repeatable)",
     )
     study.set_defaults(run=_study)
 

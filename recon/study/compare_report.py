@@ -21,7 +21,12 @@ __all__ = ["build_report"]
 def build_report(result: Compared) -> Report:
     """Report of :func:`recon.study.compare.run`: ``report.json``, ``report.md``, ``compare.png``."""
     checks = _checks(result)
-    data = {"study": "compare", **result.as_dict(), "checks": [c.as_dict() for c in checks], "environment": environment()}
+    data = {
+        "study": "compare",
+        **result.as_dict(),
+        "checks": [c.as_dict() for c in checks],
+        "environment": environment(),
+    }
     sections = [
         "# Plaque CNR by FBP and PWLS, beside the paper",
         _intro(result),
