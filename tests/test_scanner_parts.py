@@ -136,8 +136,8 @@ def test_roi_bowtie_geometry():
     assert np.degrees(half_angle) == pytest.approx(4.58, abs=0.005)
     assert np.all(bowtie.thickness(np.linspace(0, half_angle, 50)) == 0)
     at_filter = (626 - 263) * np.tan(half_angle)
-    assert bowtie.thickness(np.arctan((at_filter + 30) / (626 - 263))) == pytest.approx(39.0)
-    assert bowtie.thickness(np.arctan((at_filter + 15) / (626 - 263))) == pytest.approx(19.5, rel=0.03)
+    assert bowtie.thickness(np.arctan((at_filter + 15) / (626 - 263))) == pytest.approx(39.0)
+    assert bowtie.thickness(np.arctan((at_filter + 7.5) / (626 - 263))) == pytest.approx(19.5, rel=0.03)
     assert bowtie.thickness(0.4) == pytest.approx(39.0)
 
 

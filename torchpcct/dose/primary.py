@@ -1,0 +1,187 @@
+"""Absorbed dose by the photons that come straight from the tube: exact paths through analytic bodies.
+
+At a point r of the slice, at distance d from the focal spot of view β and fan angle γ,
+
+    D(r) = mAs · ⟨ Σ_E Φ(γ, E) · (1 m / d)² · exp(−Σ_b chord_b Δμ_b(E)) · E · (μ_en / ρ)(E) ⟩_β,
+
+Φ being the fluence in air at 1 m per mAs (:func:`torchpcct.dose.air_fluence`). Chords run from the focal spot to the
+point. Scattered photons are added by :mod:`torchpcct.dose.scatter`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from torchpcct.dose.coefficients import (
+    MGY_PER_KEV_PER_G,
+    air_fluence,
+    fan_half_angle,
+    mass_energy_absorption,
+    mass_interaction,
+)
+from torchpcct.geometry import VolumeGrid
+from torchpcct.scene.chords import interval
+from torchpcct.scene.scene import resolve_material
+
+if TYPE_CHECKING:
+    from torchpcct.scanner import Scanner
+    from torchpcct.scene import Scene
+
+__all__ = ["QUANTITIES", "plane_points", "primary_dose"]
+
+Floats = NDArray[np.float64]
+
+QUANTITIES = ("absorbed", "interacted")
+_AXIAL = ("plane", "contiguous")
+_FAN_NODES = 1025
+_GROUP_KEV = 3.0
+
+
+@numba.njit(parallel=True, cache=True, error_model="numpy")
+def _dose(
+    xs: Any, ys: Any, z: float, cos_b: Any, sin_b: Any, sod: float, kinds: Any, params: Any, coefficients: Any,
+    basis: Any, half_fan: float, fluence: Any, deposit: Any, medium: Any, falloff: int, out: Any,
+) -> None:  # fmt: skip
+    rank, energies = basis.shape
+    nodes = fluence.shape[0]
+    step = (nodes - 1) / (2.0 * half_fan)
+    for i in numba.prange(xs.size):
+        own = medium[i]
+        if own < 0:
+            continue
+        path = np.empty(rank)
+        total = 0.0
+        for view in range(cos_b.size):
+            ox, oy = sod * cos_b[view], sod * sin_b[view]
+            dx, dy = xs[i] - ox, ys[i] - oy
+            distance = math.sqrt(dx * dx + dy * dy)
+            dx /= distance
+            dy /= distance
+            # Columns grow along e_t = (−sin β, cos β); the central ray runs along −e_r.
+            gamma = math.atan2(dy * cos_b[view] - dx * sin_b[view], -(dx * cos_b[view] + dy * sin_b[view]))
+            place = (gamma + half_fan) * step
+            if place < 0.0 or place > nodes - 1:
+                continue
+            low = min(int(place), nodes - 2)
+            share = place - low
+            for a in range(rank):
+                path[a] = 0.0
+            for b in range(kinds.size):
+                t0, t1 = interval(kinds[b], params[b], ox, oy, z, dx, dy, 0.0)
+                t0, t1 = max(t0, 0.0), min(t1, distance)
+                if t1 > t0:
+                    for a in range(rank):
+                        path[a] += (t1 - t0) * coefficients[b, a]
+            view_sum = 0.0
+            for e in range(energies):
+                line = 0.0
+                for a in range(rank):
+                    line += path[a] * basis[a, e]
+                photons = (1.0 - share) * fluence[low, e] + share * fluence[low + 1, e]
+                view_sum += photons * math.exp(-line) * deposit[own, e]
+            total += view_sum * (1000.0 / distance) ** 2 * (distance / sod if falloff == 1 else 1.0)
+        out[i] = total / cos_b.size
+
+
+def plane_points(where: Any) -> Floats:
+    """Points ``(..., 2)`` of x, y in mm: the voxel centres of a 2-D grid, or points as they are.
+
+    Raises:
+        ValueError: a 3-D grid, points of another shape or that are not finite.
+    """
+    if isinstance(where, VolumeGrid):
+        if where.ndim != 2:
+            raise ValueError(f"the map needs a 2-D (y, x) grid, got {where.ndim} axes: use grid.slice")
+        y, x = np.meshgrid(*where.axes, indexing="ij")
+        return np.stack([x, y], axis=-1)
+    points = np.asarray(where, dtype=np.float64)
+    if points.shape[-1:] != (2,) or not np.isfinite(points).all():
+        raise ValueError(f"points must be finite and have the shape (..., 2) of x, y in mm, got {points.shape}")
+    return points
+
+
+def check_static(scene: Scene) -> None:
+    """Raise ``ValueError`` for a moving scene."""
+    if not scene.is_static:
+        raise ValueError("the scene moves: a dose map is that of one place, give scene.with_motion(None)")
+
+
+def primary_dose(
+    scene: Scene,
+    scanner: Scanner,
+    where: Any,
+    exposure_s: float,
+    *,
+    z_mm: float = 0.0,
+    views: int = 360,
+    medium: Any = None,
+    quantity: str = "absorbed",
+    axial: str = "plane",
+    group_kev: float = _GROUP_KEV,
+) -> Floats:
+    """Dose of one rotation by unscattered photons in an axial slice.
+
+    Args:
+        scene: bodies at rest; the source circles in the plane of the slice.
+        scanner: source, filters, bowties; the fan ends where the detector ends.
+        where: 2-D :class:`~torchpcct.geometry.VolumeGrid`, or points ``(..., 2)`` of x, y in mm.
+        exposure_s: duration of the rotation in s at the source's current.
+        z_mm: height of the slice.
+        views: source positions that stand for the continuous rotation; those of the scanner do not matter. 360 are
+            exact to 1e-3 inside bodies; behind bone edges give more.
+        medium: material or its name in which dose is scored; None: that of the innermost body at each point, and 0
+            in the surroundings. ``"air"`` gives air kerma (then also outside of the bodies).
+        quantity: ``"absorbed"``: collision kerma, which is the absorbed dose in electron equilibrium (ranges here are
+            below 0.3 mm); ``"interacted"``: every interaction deposits the photon's whole energy, an upper limit.
+        axial: ``"plane"``: in the plane of one thin slice, fluence falls as 1 / d²; ``"contiguous"``: mean over
+            contiguous rotations, each as wide at the isocentre as it is apart from the next, falls as 1 / d. This is
+            the primary part of CTDI.
+        group_kev: width of the energy groups in keV; 3 changes the dose by less than 0.5 %, 0 takes every bin.
+
+    Returns:
+        mGy, float64, of the grid's shape or ``points.shape[:-1]``.
+
+    Raises:
+        ValueError: an unknown option or material, a moving scene, ``exposure_s`` ≤ 0, a point outside the orbit.
+    """
+    for name, value, known in (("quantity", quantity, QUANTITIES), ("axial", axial, _AXIAL)):
+        if value not in known:
+            raise ValueError(f"{name} must be one of {known}, got {value!r}")
+    if isinstance(views, bool) or not isinstance(views, int | np.integer) or views < 1:
+        raise ValueError(f"views must be a whole number ≥ 1, got {views!r}")
+    if not (math.isfinite(exposure_s) and exposure_s > 0):
+        raise ValueError(f"exposure_s must be greater than 0 s, got {exposure_s}")
+    check_static(scene)
+    points = plane_points(where)
+    g = scanner.geometry
+    if points.size and float(np.hypot(points[..., 0], points[..., 1]).max()) >= g.sod:
+        raise ValueError(f"points reach beyond the source orbit of {g.sod} mm: move or shrink the grid")
+    half = fan_half_angle(scanner)
+    energies, fluence = air_fluence(scanner, np.linspace(-half, half, _FAN_NODES), group_kev=group_kev)
+    if medium is None:
+        labels = scene.labels(np.concatenate([points, np.full((*points.shape[:-1], 1), float(z_mm))], axis=-1))
+        media = list(scene.materials)
+    else:
+        labels = np.zeros(points.shape[:-1], dtype=np.int64)
+        media = [resolve_material(medium)]
+    per_gram = mass_energy_absorption if quantity == "absorbed" else mass_interaction
+    deposit = np.stack([per_gram(m, energies) * energies for m in media]) * MGY_PER_KEV_PER_G
+
+    from torchpcct.transmission import compress
+
+    kinds, params = scene.pack()
+    coefficients, basis = compress(scene.contrast(energies), tolerance=1e-6)
+    beta = (np.arange(views) + 0.5) * (2.0 * math.pi / views)
+    flat = points.reshape(-1, 2)
+    out = np.zeros(len(flat))
+    _dose(
+        np.ascontiguousarray(flat[:, 0]), np.ascontiguousarray(flat[:, 1]), float(z_mm), np.cos(beta), np.sin(beta),
+        g.sod, kinds, params, coefficients, basis, half, np.ascontiguousarray(fluence), deposit, labels.reshape(-1),
+        _AXIAL.index(axial), out,
+    )  # fmt: skip
+    return np.asarray((out * (scanner.source.current_ma * exposure_s)).reshape(points.shape[:-1]))

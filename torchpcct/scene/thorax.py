@@ -1,0 +1,136 @@
+"""An adult thorax at the height of the heart, from analytic bodies: what dose and noise studies of the chest need.
+
+An average adult man: body section 340 × 236 mm, skin 2 mm, subcutaneous fat 12 to 13 mm, chest wall of muscle with cut
+ribs (cortical shell, spongiosa), sternum, vertebra with arch and canal, both lungs around a mediastinum that holds
+heart, descending aorta and oesophagus. Tissues: ICRU Report 44; heart and spongiosa Woodard and White 1986. Dimensions
+are typical ones of axial CT images, chosen by us; no atlas was copied. All bodies are elliptic cylinders along z, so
+every slice is the same; ribs do not slope.
+
+The lungs are what a wide ellipse (the rib cage's inside) holds beside its children: so they follow the mediastinum.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from torchpcct.scene.bodies import EllipticCylinder, number, numbers
+from torchpcct.scene.plaque import Plaque
+from torchpcct.scene.scene import Body, Scene
+
+__all__ = ["HEART_CENTER_MM", "RIB_ANGLES_DEG", "thorax"]
+
+HEART_CENTER_MM = (14.0, 34.0)
+"""Centre of the heart relative to the middle of the body's section, x to the patient's left, y to the front."""
+
+RIB_ANGLES_DEG = (-58.0, -31.0, -2.0, 27.0, 54.0)
+"""Where the ribs of the left side cross the slice: polar angle on the chest wall's ellipse, 0 to the side."""
+
+_HEART_TILT = math.radians(-22.0)
+_POCKET_GAP_MM = 1.0
+_WALL = (145.0, 93.5, 2.0)  # ellipse on which the ribs lie: semi-axes, y of its centre
+
+# name, semi-axes, centre (body frame), turn in degrees, material, parent
+_ELLIPSES: tuple[tuple[str, tuple[float, float], tuple[float, float], float, str, str | None], ...] = (
+    ("skin", (170.0, 118.0), (0.0, 0.0), 0.0, "skin", None),
+    ("fat", (168.0, 116.0), (0.0, 0.0), 0.0, "adipose", "skin"),
+    ("muscle", (156.0, 103.0), (0.0, 0.0), 0.0, "skeletal_muscle", "fat"),
+    ("lungs", (134.0, 82.0), (0.0, 6.0), 0.0, "lung", "muscle"),
+    ("pericardium", (60.0, 43.0), HEART_CENTER_MM, -22.0, "adipose", "lungs"),
+    ("mediastinum", (38.0, 27.0), (3.0, -46.0), 0.0, "adipose", "lungs"),
+    ("aorta", (11.5, 11.5), (25.0, -39.0), 0.0, "blood", "mediastinum"),
+    ("oesophagus", (7.0, 4.5), (6.0, -28.0), 0.0, "soft_tissue", "mediastinum"),
+    ("vertebra", (18.0, 14.5), (0.0, -54.0), 0.0, "cortical_bone", "mediastinum"),
+    ("vertebra_marrow", (16.8, 13.3), (0.0, -54.0), 0.0, "spongiosa", "vertebra"),
+    ("arch", (17.0, 11.5), (0.0, -89.0), 0.0, "cortical_bone", "muscle"),
+    ("canal", (8.5, 7.0), (0.0, -86.5), 0.0, "soft_tissue", "arch"),
+    ("sternum", (19.0, 4.8), (0.0, 95.2), 0.0, "cortical_bone", "muscle"),
+    ("sternum_marrow", (18.0, 3.8), (0.0, 95.2), 0.0, "spongiosa", "sternum"),
+)
+
+# Cavities of the heart in its own frame (x along its long axis, towards the apex at the patient's left and front).
+_CHAMBERS = (
+    ("left_ventricle", (17.0, 10.5), (23.0, -12.0)),
+    ("right_ventricle", (18.0, 8.0), (15.0, 21.0)),
+    ("left_atrium", (16.0, 10.0), (-22.0, -18.0)),
+    ("right_atrium", (12.0, 13.0), (-33.0, 10.0)),
+)
+
+
+def _cylinder(axes: tuple[float, float], center: tuple[float, float], turn: float) -> EllipticCylinder:
+    return EllipticCylinder(axes, position=(*center, 0.0), rotation=turn)
+
+
+def thorax(
+    center: Any = (-HEART_CENTER_MM[0], -HEART_CENTER_MM[1]),
+    *,
+    blood: Any = "blood",
+    myocardium: Any = "heart",
+    plaque: Plaque | None = None,
+    plaque_blood: Any = "blood_iodine",
+    pocket_radius: float = 4.0,
+) -> Scene:
+    """The thorax, by default with the heart at the isocentre.
+
+    Args:
+        center: ``(x, y)`` in mm of the body section's middle. +x is the patient's left, +y the front.
+        blood: in the chambers and the aorta; ``"blood_iodine"`` for contrast medium.
+        myocardium: of the heart's walls.
+        plaque: a coronary plaque to put into the heart wall, at its own ``position`` (scanner's frame), in a pocket of
+            pericoronary fat; None: none. The paper's position, 42.4 mm off the isocentre, lies in the mediastinum
+            behind the heart: give one inside.
+        plaque_blood: blood in the plaque's lumen.
+        pocket_radius: radius in mm of the fat around the vessel.
+
+    Returns:
+        A scene of endless cylinders: ``"skin"``, ``"fat"``, ``"muscle"``, ``"lungs"``, ``"heart"`` and its chambers,
+        ``"rib_left_0"``… with ``"…_marrow"``, ``"vertebra"``, ``"sternum"`` and others; with a plaque also
+        ``"coronary_fat"`` and the bodies of :func:`~torchpcct.scene.plaque.plaque_scene`.
+
+    Raises:
+        ValueError: a plaque whose pocket leaves the heart's wall or touches a chamber; unknown materials.
+        TypeError: ``plaque`` is no :class:`~torchpcct.scene.plaque.Plaque`.
+    """
+    x0, y0 = numbers("center", center, 2)
+    bodies = []
+    for name, axes, (x, y), turn, material, parent in _ELLIPSES:
+        tissue = blood if name == "aorta" else material
+        bodies.append(Body(name, _cylinder(axes, (x0 + x, y0 + y), math.radians(turn)), tissue, parent))
+    cos, sin = math.cos(_HEART_TILT), math.sin(_HEART_TILT)
+    hx, hy = x0 + HEART_CENTER_MM[0], y0 + HEART_CENTER_MM[1]
+    bodies.append(Body("heart", _cylinder((56.0, 39.0), (hx, hy), _HEART_TILT), myocardium, "pericardium"))
+    for name, axes, (along, across) in _CHAMBERS:
+        place = (hx + along * cos - across * sin, hy + along * sin + across * cos)
+        bodies.append(Body(name, _cylinder(axes, place, _HEART_TILT), blood, "heart"))
+    bodies += _ribs(x0, y0)
+    if plaque is not None:
+        bodies += _plaque(plaque, plaque_blood, number("pocket_radius", pocket_radius, positive=True))
+    return Scene(bodies)
+
+
+def _ribs(x0: float, y0: float) -> list[Body]:
+    a, b, lift = _WALL
+    ribs = []
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        for k, angle in enumerate(RIB_ANGLES_DEG):
+            t = math.radians(angle)
+            turn = math.atan2(b * math.cos(t), -a * math.sin(t) * sign)
+            place = (x0 + sign * a * math.cos(t), y0 + lift + b * math.sin(t))
+            name = f"rib_{side}_{k}"
+            ribs.append(Body(name, _cylinder((13.0, 4.2), place, turn), "cortical_bone", "muscle"))
+            ribs.append(Body(f"{name}_marrow", _cylinder((12.0, 3.2), place, turn), "spongiosa", name))
+    return ribs
+
+
+def _plaque(plaque: Plaque, blood: Any, radius: float) -> list[Body]:
+    if not isinstance(plaque, Plaque):
+        raise TypeError(f"plaque must be a Plaque, got {type(plaque).__name__}")
+    x, y, z = plaque.position
+    pocket = EllipticCylinder(radius, plaque.vessel_length / 2.0 + _POCKET_GAP_MM, position=(x, y, z))
+    return [
+        Body("coronary_fat", pocket, "pericoronary_fat", "heart"),
+        Body("wall", plaque.outer, "vessel_wall", "coronary_fat"),
+        Body("fibrous", plaque.inner, "fibrous_tissue", "wall"),
+        Body("lumen", plaque.lumen, blood, "fibrous"),
+        Body("core", plaque.core, "necrotic_core", "fibrous"),
+    ]
