@@ -150,7 +150,7 @@ def acquire(
     sub_rays: int | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Scan:
-    """Simulate a scan: exact chords, polychromatic, finite focal spot, cells and views, counting noise.
+    """Simulate a scan: exact chords, polychromatic, finite focal spot, cells and views, quantum noise.
 
     Args:
         scene: nested analytic bodies (mm).
@@ -166,19 +166,16 @@ def acquire(
         progress: called with the finished fraction, 0…1.
 
     Returns:
-        :class:`torchpcct.Scan`; counts float32.
+        :class:`torchpcct.Scan`; counts float32. Of an energy-integrating detector: signals in keV, with the second
+        moment of the transmitted spectrum in ``quantum``, exact for every reading.
 
     Raises:
         ValueError: ``exposure_s`` ≤ 0, a bad seed, bodies outside ``region``, a region outside the field of view, a
-            moving scene without ``rotation_s``, noise from an energy-integrating detector.
+            moving scene without ``rotation_s``.
     """
     check_exposure(exposure_s)
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
         raise ValueError(f"seed must be a whole number ≥ 0, got {seed!r}")
-    if exposure_s is not None and scanner.detector.energy_integrating:
-        raise ValueError(
-            f"noise is modelled for photon-counting detectors, {scanner.name!r} integrates energy: use exposure_s=None"
-        )
     start = time.perf_counter()
     build, plan_, view_step = _prepare(
         scene, scanner, region, rotation_s if rotation_s is not None else exposure_s, duty, tolerance_hu, sub_rays
@@ -186,6 +183,10 @@ def acquire(
     log.info("%s", plan_.table())
     g = scanner.geometry
     energies, spectra = scanner.weights()
+    bins, integrating = scanner.detector.bins, scanner.detector.energy_integrating
+    if integrating:
+        # The variance is one more "bin": the same transmission, weighted by the squared signal.
+        spectra = np.concatenate([spectra, scanner.noise_weights()[1]])
     spectra = spectra * scanner.mas_per_view(NOISE_FREE_EXPOSURE_S)
     air = np.einsum("bce,r->brc", spectra, scanner.row_factor)
     step = np.full(g.views, view_step)
@@ -200,26 +201,34 @@ def acquire(
         dense = beam._replace(points=sub_rays_of(SUB_RAY_COUNTS[-1]))
         surround = expected_readings(one, whole, symmetric, dense, step[:1]).numpy()[:, 0]
     counts = _readings(plan_, g, build, energies, beam, step, surround, progress)
-    squeeze = scanner.detector.bins == 1
+    quantum = None
+    if integrating:
+        # In place: the readings of a whole detector are large. Behind a perfect absorber any energy will do.
+        dark = counts[:bins] <= 0
+        quantum = counts[bins:].div_(counts[:bins]).masked_fill_(dark, float(energies[-1]))
+
+    def squeezed(t: Tensor) -> Tensor:
+        return t[0] if bins == 1 else t[:bins]
 
     def tensor(values: Any) -> Tensor:
-        t = torch.from_numpy(np.array(values, dtype=np.float32))
-        return t[0] if squeeze else t
+        return squeezed(torch.from_numpy(np.array(values, dtype=np.float32)))
 
     scan = Scan(
-        counts=counts[0] if squeeze else counts,
+        counts=squeezed(counts),
         air=tensor(air),
         geometry=g,
         linearisation=scanner.water_linearisation(),
         window=plan_.kept,
         surround=None if plan_.kept is None else tensor(surround),
-        counting=not scanner.detector.energy_integrating,
+        counting=not integrating,
         info={
             "scanner": scanner.name,
             "scene": list(scene.names),
             "plan": plan_.as_dict(),
             "seconds": round(time.perf_counter() - start, 2),
         },
+        quantum=None if quantum is None else squeezed(quantum),
+        electronic_noise=scanner.detector.electronic_noise if integrating else 0.0,
     )
     return scan if exposure_s is None else scan.with_noise(exposure_s, int(seed))
 

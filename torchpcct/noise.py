@@ -1,9 +1,11 @@
-"""Counting noise that is a pure function of (seed, reading): the same for any thread count, crop or order.
+"""Quantum noise that is a pure function of (seed, reading): the same for any thread count, crop or order.
 
 Each reading owns a random stream, keyed by the seed and by the reading's index on the full detector. So a window
 of a scan carries exactly the noise that the full scan has there, and realisations can be spread over machines.
 The stream is SplitMix64 (Steele, Lea, Flood 2014); Poisson numbers come from Hörmann's transformed rejection PTRS
 (1993) for means of 10 and more, and from inversion below; normal numbers from Box and Muller (1958).
+
+An energy-integrating detector adds up the energies of a Poisson number of quanta: :func:`compound_poisson`.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
-__all__ = ["normal", "poisson"]
+__all__ = ["compound_poisson", "normal", "poisson"]
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _MIX1 = np.uint64(0xBF58476D1CE4E5B9)
@@ -99,13 +101,31 @@ def _normal_rows(first: Any, key: Any, out: Any) -> None:
             out[i, j] = radius * math.cos(2.0 * math.pi * _unit(state + _GOLDEN + _GOLDEN))
 
 
-def _key(seed: int) -> Any:
+@njit(parallel=True, cache=True)
+def _compound_rows(mean: Any, quantum: Any, first: Any, scale: float, key: Any, out: Any) -> None:
+    for i in prange(mean.shape[0]):
+        for j in range(mean.shape[1]):
+            q = np.float64(quantum[i, j])
+            lam = np.float64(mean[i, j]) * scale / q
+            if lam > 0.0 and q > 0.0:
+                out[i, j] = q * _poisson_one(lam, _stream(key, first[i] + j))
+            elif lam == 0.0 and q > 0.0:
+                out[i, j] = 0.0
+            else:
+                out[i, j] = np.nan
+
+
+_QUANTA, _ELECTRONICS = 0, 1
+"""Purposes of a reading's random numbers: each has a stream of its own."""
+
+
+def _key(seed: int, purpose: int = _QUANTA) -> Any:
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer):
         raise TypeError(f"seed must be a whole number, got {seed!r}")
     if not 0 <= seed < 2**63:
         raise ValueError(f"seed must lie in 0 … 2**63 - 1, got {seed}")
     with np.errstate(over="ignore"):
-        return np.uint64(_mix.py_func(np.uint64(seed) * _GOLDEN + _MIX1))
+        return np.uint64(_mix.py_func((np.uint64(seed) ^ (np.uint64(purpose) << np.uint64(63))) * _GOLDEN + _MIX1))
 
 
 def _first(first: Any, rows: int) -> Any:
@@ -133,6 +153,46 @@ def poisson(mean: Tensor, first_index: Any, seed: int, scale: float = 1.0) -> Te
     flat = mean.detach().cpu().contiguous().reshape(-1, mean.shape[-1])
     out = torch.empty_like(flat)
     _poisson_rows(flat.numpy(), _first(first_index, flat.shape[0]), float(scale), _key(seed), out.numpy())
+    return out.reshape(mean.shape)
+
+
+def compound_poisson(
+    mean: Tensor, quantum: Tensor, first_index: Any, seed: int, scale: float = 1.0, electronic: float = 0.0
+) -> Tensor:
+    """Signal of an energy-integrating detector: energies of a Poisson number of quanta, and electronic noise.
+
+    With N(E) Poisson quanta of signal s(E), a reading Σ s(E) N(E) has the mean m = Σ s N̄ and the variance
+    v = Σ s² N̄ (a compound Poisson law). It is drawn as q · Poisson(m / q) with q = v / m, the signal of an average
+    quantum weighted by its signal: mean and variance are exact, readings are never negative and go to zero together
+    with their mean. The third cumulant comes out as v² / m, short of the true Σ s³ N̄ by the factor
+    Σ s² N̄ · Σ s² N̄ / (Σ s N̄ · Σ s³ N̄), which is 0.94 in air and 0.96 behind 24 cm of fat at 100 kVp.
+
+    Args:
+        mean: ``(..., n)`` float32 or float64 expectations ≥ 0 on the CPU.
+        quantum: the shape of ``mean``, q > 0 in the unit of ``mean``.
+        first_index, seed, scale: as for :func:`poisson`; ``scale`` multiplies ``mean``, not ``quantum``.
+        electronic: standard deviation of normal noise added to every reading, in the unit of ``mean``.
+
+    Returns:
+        Tensor of the shape and dtype of ``mean``; negative values only through ``electronic``. A negative or NaN
+        expectation, or q ≤ 0, gives NaN.
+
+    Raises:
+        TypeError, ValueError: as :func:`poisson`; a ``quantum`` of another shape; ``electronic`` < 0.
+    """
+    if quantum.shape != mean.shape:
+        raise ValueError(f"quantum has shape {tuple(quantum.shape)}, mean {tuple(mean.shape)}: they must be equal")
+    if not 0 <= electronic < math.inf:
+        raise ValueError(f"electronic must be a finite standard deviation ≥ 0, got {electronic}")
+    flat = mean.detach().cpu().contiguous().reshape(-1, mean.shape[-1])
+    weight = quantum.detach().cpu().contiguous().reshape(flat.shape)
+    first = _first(first_index, flat.shape[0])
+    out = torch.empty_like(flat)
+    _compound_rows(flat.numpy(), weight.numpy(), first, float(scale), _key(seed), out.numpy())
+    if electronic:
+        added = torch.empty_like(flat)
+        _normal_rows(first, _key(seed, _ELECTRONICS), added.numpy())
+        out.add_(added, alpha=float(electronic))
     return out.reshape(mean.shape)
 
 

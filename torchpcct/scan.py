@@ -24,7 +24,8 @@ NOISE_FREE_EXPOSURE_S = 1.0
 """The exposure that the expected readings of a noise-free scan stand for."""
 
 _FORMAT = "torchpcct-scan"
-_VERSION = 1
+_VERSION = 2
+"""2: energy-integrating scans with their noise model. Counting scans are still written as version 1."""
 # Compress in blocks of whole views: fast to write, and a window of views can be read without the rest.
 _HDF5_COMPRESSION = {"compression": "lzf", "shuffle": True}
 
@@ -47,6 +48,11 @@ class Scan:
             and only if ``window`` is.
         counting: True: readings are photon counts with Poisson noise. False: an energy-integrating detector's signal.
         info: provenance (scanner, plan, versions), JSON values.
+        quantum: energy integrating only: variance over expectation of every stored reading without electronic noise,
+            in keV (Σ s² N̄ / Σ s N̄ over the quanta that reach the detector behind the object), the shape of ``counts``.
+            None: the noise of this signal is not known.
+        electronic_noise: energy integrating only: standard deviation in keV that the electronics add to every reading,
+            whatever the exposure.
 
     Raises:
         ValueError: NaN, Inf or negative counts, no counts at all, air readings ≤ 0, an exposure ≤ 0, shapes that do
@@ -63,6 +69,8 @@ class Scan:
     surround: Tensor | None = None
     counting: bool = True
     info: Mapping[str, Any] = field(default_factory=dict)
+    quantum: Tensor | None = None
+    electronic_noise: float = 0.0
 
     def __post_init__(self) -> None:
         g, w = self.geometry, self.window
@@ -83,12 +91,26 @@ class Scan:
         if not (np.isfinite(low) and np.isfinite(high)):  # aminmax propagates NaN
             bad = int((~torch.isfinite(self.counts)).sum())
             raise ValueError(f"{bad} readings are NaN or Inf: mask dead cells and interpolate them before")
-        if low < 0:
+        # Electronic noise makes readings of starved rays negative.
+        if low < 0 and not (self.electronic_noise > 0 and not self.noise_free):
             raise ValueError(f"counts must not be negative, the lowest is {low}: give raw counts, not line integrals")
         if high == 0:
             raise ValueError("all counts are zero: the scan holds no signal (exposure too low, or beam blocked)")
         if not bool((self.air > 0).all()):
             raise ValueError("air readings must be greater than 0 in every cell: mask dead cells before")
+        self._check_noise_model()
+
+    def _check_noise_model(self) -> None:
+        if not 0 <= self.electronic_noise < np.inf:
+            raise ValueError(f"electronic_noise must be finite and ≥ 0 keV, got {self.electronic_noise}")
+        if self.quantum is None:
+            return
+        if self.counting:
+            raise ValueError("quantum belongs to energy-integrating scans (counting=False): counts are Poisson")
+        if self.quantum.shape != self.counts.shape:
+            raise ValueError(f"quantum has shape {tuple(self.quantum.shape)}, counts {tuple(self.counts.shape)}")
+        if not bool((self.quantum > 0).all()):
+            raise ValueError("quantum must be greater than 0 keV in every reading")
 
     @property
     def noise_free(self) -> bool:
@@ -97,35 +119,82 @@ class Scan:
 
     @property
     def zero_fraction(self) -> float:
-        """Share of readings that counted nothing."""
-        return float((self.counts == 0).float().mean())
+        """Share of readings that registered nothing (energy integrating: 0 or less)."""
+        return float((self.counts <= 0).float().mean())
 
     def with_noise(self, exposure_s: float, seed: int) -> Scan:
         """A noisy realisation of a noise-free scan.
 
         The noise of a reading depends only on ``seed`` and the reading's place on the full detector, so a windowed
-        scan carries the same noise as the full one.
+        scan carries the same noise as the full one. Counts are Poisson; an energy-integrating signal is compound
+        Poisson with the second moment of the transmitted spectrum (:func:`torchpcct.noise.compound_poisson`), and
+        electronic noise is added.
 
         Raises:
-            ValueError: the scan is noisy already; ``exposure_s`` ≤ 0; a negative seed; the detector integrates energy
-                (its signal is no count, and Poisson noise would be wrong).
+            ValueError: the scan is noisy already; ``exposure_s`` ≤ 0; a negative seed; an energy-integrating scan that
+                does not hold ``quantum``.
         """
         if not self.noise_free:
             raise ValueError("with_noise needs a noise-free scan (acquire with exposure_s=None), this one is noisy")
-        if not self.counting:
-            raise ValueError(
-                "noise is modelled for photon-counting detectors; keep this scan noise free (exposure_s=None)"
-            )
+        self._require_noise_model()
         check_exposure(exposure_s)
         scale = exposure_s / NOISE_FREE_EXPOSURE_S
+        index = self._first_index()
+        if self.quantum is None:
+            readings = noise.poisson(self.counts, index, seed, scale)
+        else:
+            readings = noise.compound_poisson(self.counts, self.quantum, index, seed, scale, self.electronic_noise)
         return replace(
             self,
-            counts=noise.poisson(self.counts, self._first_index(), seed, scale),
+            counts=readings,
             air=self.air * scale,
             surround=None if self.surround is None else self.surround * scale,
             exposure_s=float(exposure_s),
             seed=int(seed),
         )
+
+    def crop(self, window: DetectorWindow) -> Scan:
+        """The same scan on a part of its window; its noise is that of the whole.
+
+        Raises:
+            ValueError: the scan is not windowed, or ``window`` reaches beyond its window.
+        """
+        if self.window is None:
+            raise ValueError("only a windowed scan can be cropped: acquire it with region=")
+        return replace(
+            self,
+            counts=self.window.crop(self.counts, window),
+            quantum=None if self.quantum is None else self.window.crop(self.quantum, window),
+            window=window,
+        )
+
+    def _require_noise_model(self) -> None:
+        if not self.counting and self.quantum is None:
+            raise ValueError(
+                "this energy-integrating scan does not hold the energy of its quanta, so its noise is not known: "
+                "simulate it with acquire(), or give quantum="
+            )
+
+    def relative_variance(self, exposure_s: float) -> Tensor:
+        """Variance over squared expectation of every reading at an exposure, shape and dtype of ``counts``.
+
+        It is the variance of ``ln`` of the reading (delta method). Counting: 1 / N̄. Energy integrating:
+        q / S̄ + (electronic noise / S̄)².
+
+        Raises:
+            ValueError: the scan is noisy (its expectations are needed); ``exposure_s`` ≤ 0; an energy-integrating scan
+                that does not hold ``quantum``.
+        """
+        if not self.noise_free:
+            raise ValueError("the variance follows from expected readings: give the noise-free scan")
+        if exposure_s is None or not exposure_s > 0:
+            raise ValueError(f"exposure_s must be greater than 0 s, got {exposure_s}")
+        self._require_noise_model()
+        inverse = (self.counts * (exposure_s / NOISE_FREE_EXPOSURE_S)).reciprocal_()
+        if self.quantum is None:
+            return inverse
+        variance = inverse * self.quantum
+        return variance.add_(inverse.mul_(self.electronic_noise).square_()) if self.electronic_noise else variance
 
     def _first_index(self) -> Any:
         """Global index of the first reading of every detector row held in ``counts``."""
@@ -148,11 +217,30 @@ class Scan:
 
         ``ln(air) − ln(counts + ½)`` for counts (½ removes the bias of the logarithm to second order in 1 / counts
         and keeps zero counts finite), ``ln(air) − ln(counts)`` for expectations; then the scanner's water correction,
-        so that a path through t mm of water reads ``mu_ref · t``.
+        so that a path through t mm of water reads ``mu_ref · t``. The shift of an energy-integrating signal S is
+        variance / (2 S) = q / 2 + electronic noise² / (2 S); starved readings are held at q / 2, which a counting
+        detector with quanta of q would read at zero counts.
+
+        Raises:
+            ValueError: a noisy energy-integrating scan that does not hold ``quantum``.
         """
-        shift = 0.0 if self.noise_free else 0.5
-        p = (self.counts + shift).log_().neg_().add_(self._at_window(self.air.log()))
+        p = self._positive().log_().neg_().add_(self._at_window(self.air.log()))
         return self.linearisation.apply(p, self.window)
+
+    def _positive(self) -> Tensor:
+        """A copy of the readings, shifted so that the logarithm is finite and nearly unbiased."""
+        if self.noise_free:
+            return self.counts.clone()
+        if self.counting:
+            return self.counts + 0.5
+        self._require_noise_model()
+        assert self.quantum is not None
+        half = self.quantum / 2
+        shifted = self.counts + half
+        sigma = self.electronic_noise
+        if sigma > 0:
+            shifted += (sigma**2 / 2) / self.counts.clamp(min=sigma)
+        return torch.maximum(shifted, half)
 
     def surround_line_integrals(self) -> Tensor:
         """Water-linearised line integrals of the surround (noise free), ``(..., rows, columns)``.
@@ -172,7 +260,8 @@ class Scan:
 
         g = self.geometry
         with written_whole(path) as part, h5py.File(part, "w") as file:
-            file.attrs.update(format=_FORMAT, version=_VERSION, software=f"torchpcct {__version__}")
+            version = 1 if self.counting else _VERSION
+            file.attrs.update(format=_FORMAT, version=version, software=f"torchpcct {__version__}")
             file.attrs["counting"] = self.counting
             file.attrs["info"] = json.dumps(dict(self.info), default=str)
             if self.exposure_s is not None:
@@ -181,10 +270,13 @@ class Scan:
                 file.attrs["seed"] = self.seed
             chunk = (*(1,) * (self.counts.ndim - 2), *self.counts.shape[-2:])
             # Counts are whole numbers: as integers they compress, and they stay exact.
-            whole = not self.noise_free and float(self.counts.max()) < 2**31
+            whole = self.counting and not self.noise_free and float(self.counts.max()) < 2**31
             data = self.counts.to(torch.int32) if whole else self.counts
             file.create_dataset("counts", data=data.numpy(), chunks=chunk, **_HDF5_COMPRESSION)
             file.create_dataset("air", data=self.air.numpy())
+            if self.quantum is not None:
+                file.create_dataset("quantum_kev", data=self.quantum.numpy(), chunks=chunk, **_HDF5_COMPRESSION)
+            file.attrs["electronic_noise_kev"] = self.electronic_noise
             geometry = file.create_group("geometry")
             geometry["angles_rad"] = g.angles
             geometry.attrs.update(
@@ -252,6 +344,8 @@ class Scan:
             surround=surround,
             counting=bool(file.attrs["counting"]),
             info=json.loads(file.attrs["info"]),
+            quantum=torch.from_numpy(file["quantum_kev"][()]) if "quantum_kev" in file else None,
+            electronic_noise=float(file.attrs.get("electronic_noise_kev", 0.0)),
         )
 
 
