@@ -1,14 +1,17 @@
-"""The exact covariance of ROI means after FBP: one adjoint pass per ROI, no Monte Carlo.
+"""The exact covariance of ROI means after FBP, and the ROI means of noisy scans without reconstructing them.
 
-FBP is linear, so an ROI mean is one inner product h·y of the line integrals with h = filterᵀ backprojectionᵀ w. The
-readings are independent, so Cov(h₁·y, h₂·y) = Σ_i h₁ᵢ h₂ᵢ Var(yᵢ) with Var(yᵢ) = slope² / expected counts (delta
-method, slope of the water correction). It holds for any number of photons at which the logarithm is nearly linear.
+FBP is linear, so an ROI mean is one inner product h·y of the line integrals with h = filterᵀ backprojectionᵀ w: one
+adjoint pass per ROI. The readings are independent, so Cov(h₁·y, h₂·y) = Σ_i h₁ᵢ h₂ᵢ Var(yᵢ) with
+Var(yᵢ) = slope² · Var(reading) / reading² (delta method, slope of the water correction;
+:meth:`torchpcct.scan.Scan.relative_variance` for counts and for energy-integrating signals). It holds for any number
+of photons at which the logarithm is nearly linear. The same h gives the ROI means of any realisation: a scan costs one
+pass over the few readings that the ROI sees instead of a reconstruction per kernel and voxel size.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -19,11 +22,12 @@ from recon._filtering import FilterPlan
 from recon.angular_weights import angular_weights
 from recon.backproject import BackprojectionPlan
 from recon.inset import InsetFbp
+from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.roi import RoiMean
-from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
+from torchpcct.scan import Scan
 from torchpcct.window import DetectorWindow
 
-__all__ = ["line_integral_variance", "roi_covariance"]
+__all__ = ["RoiAdjoints", "line_integral_variance", "roi_adjoints", "roi_covariance"]
 
 _MARGIN = 32
 """Columns on either side of the shadow whose noise is counted. The filter's tail falls as 1 / n², its square as
@@ -34,15 +38,80 @@ def line_integral_variance(clean: Scan, exposure_s: float) -> Tensor:
     """Variance of the water-linearised line integrals of a noise-free scan at an exposure, shape of ``clean.counts``.
 
     Raises:
-        ValueError: the scan is noisy (its expectations are needed), or ``exposure_s`` ≤ 0.
+        ValueError: the scan is noisy (its expectations are needed); ``exposure_s`` ≤ 0; an energy-integrating scan that
+            does not hold the energy of its quanta.
     """
-    if not clean.noise_free:
-        raise ValueError("the variance follows from expected readings: give the noise-free scan")
-    if not exposure_s > 0:
-        raise ValueError(f"exposure_s must be greater than 0 s, got {exposure_s}")
+    variance = clean.relative_variance(exposure_s)
     p = clean.counts.log().neg_().add_(clean._at_window(clean.air.log()))
     slope = clean.linearisation.slope(p, clean.window)
-    return slope.square_().div_(clean.counts).mul_(NOISE_FREE_EXPOSURE_S / exposure_s)
+    return slope.square_().mul_(variance)
+
+
+@dataclass(frozen=True, eq=False)
+class RoiAdjoints:
+    """ROI means of FBP as inner products with the line integrals.
+
+    Attributes:
+        window: the readings that the ROIs see.
+        vectors: for every grid ``(kernels, rois, views, rows, columns)`` on ``window``: h in HU, float32.
+    """
+
+    window: DetectorWindow
+    vectors: list[Tensor]
+
+    @property
+    def matrix(self) -> Tensor:
+        """All vectors as rows, ``(grids · kernels · rois, readings)``: the grid varies slowest, the ROI fastest."""
+        return torch.cat([v.flatten(0, 1).flatten(1) for v in self.vectors])
+
+    def covariance(self, clean: Scan, exposure_s: float) -> list[NDArray[np.float64]]:
+        """Covariance of the ROI means in HU² at an exposure, for every grid ``(kernels, rois, rois)``.
+
+        Args:
+            clean: the noise-free windowed scan.
+            exposure_s: exposure in s.
+
+        Raises:
+            ValueError: a scan that is noisy or not windowed, or whose window does not hold the ROIs' readings.
+        """
+        variance = line_integral_variance(clean.crop(self.window), exposure_s)
+        return [np.array([_gram(rois, variance) for rois in vectors]) for vectors in self.vectors]
+
+    def joint_covariance(self, clean: Scan, exposure_s: float) -> NDArray[np.float64]:
+        """Covariance in HU² of all ROI means with each other, ``(M, M)``, ordered as the rows of :attr:`matrix`.
+
+        Arguments and errors as :meth:`covariance`.
+        """
+        variance = line_integral_variance(clean.crop(self.window), exposure_s)
+        rows = self.matrix.view(-1, variance.shape[0], variance[0].numel())
+        total = np.zeros((rows.shape[0], rows.shape[0]))
+        for view in range(rows.shape[1]):  # one view in float64 at a time: no copy of all vectors
+            h = rows[:, view].double()
+            total += ((h * variance[view].double().reshape(-1)) @ h.T).numpy()
+        return total
+
+
+def roi_adjoints(clean: Scan, fbp: InsetFbp, rois: Sequence[Sequence[RoiMean]]) -> RoiAdjoints:
+    """The adjoint vectors of ROI means.
+
+    Args:
+        clean: a windowed scan of the family (its readings do not matter).
+        fbp: its grids and kernels.
+        rois: for every grid of ``fbp``, the ROIs on that grid.
+
+    Raises:
+        ValueError: a scan that is not windowed.
+    """
+    traces = [_traces(fbp, grid, r, clean) for grid, r in zip(fbp.grids, rois, strict=True)]
+    first = min(start for start, _ in traces)
+    rows = max(start + trace.shape[-2] for start, trace in traces) - first
+    window = _near(fbp, clean, first, rows)
+    vectors = []
+    for start, trace in traces:
+        padded = torch.zeros((*trace.shape[:2], rows, trace.shape[-1]), dtype=trace.dtype)
+        padded[:, :, start - first : start - first + trace.shape[-2]] = trace
+        vectors.append(torch.stack(list(_filtered(fbp, padded, window, clean))))
+    return RoiAdjoints(window, vectors)
 
 
 def roi_covariance(
@@ -54,7 +123,7 @@ def roi_covariance(
         clean: noise-free windowed scan.
         fbp: its grids and kernels.
         rois: for every grid of ``fbp``, the ROIs on that grid.
-        exposure_s: exposure; the covariance falls as its inverse.
+        exposure_s: exposure; the covariance falls as its inverse (but for the share of electronic noise).
 
     Returns:
         for every grid ``(kernels, rois, rois)``.
@@ -62,23 +131,49 @@ def roi_covariance(
     Raises:
         ValueError: a scan that is noisy or not windowed.
     """
-    if clean.window is None:
-        raise ValueError("roi_covariance needs a windowed scan: acquire it with region=")
-    near = _trim(fbp.shadow, clean.window)
-    variance = clean.window.crop(line_integral_variance(clean, exposure_s), near)
-    weights = angular_weights(fbp.geometry)
-    scale = 1000.0 / clean.linearisation.mu_ref
     results = []
-    for grid, grid_rois in zip(fbp.grids, rois, strict=True):
-        spread = BackprojectionPlan(fbp.geometry, grid, fbp.shadow).transpose
-        traces = spread(torch.stack([r.weights for r in grid_rois]).to(variance.dtype))
-        matrices = []
-        for kernel in fbp.kernels:
-            plan = FilterPlan(fbp.geometry, (kernel,), weights, near, fbp.shadow)
-            h: list[Any] = [plan.transpose(t[None]).mul_(scale) for t in traces]
-            matrices.append([[_weighted_dot(a, b, variance) for b in h] for a in h])
-        results.append(np.array(matrices))
+    for grid, grid_rois in zip(
+        fbp.grids, rois, strict=True
+    ):  # the vectors of many ROIs are large: one kernel at a time
+        first, trace = _traces(fbp, grid, grid_rois, clean)
+        window = _near(fbp, clean, first, trace.shape[-2])
+        variance = line_integral_variance(clean.crop(window), exposure_s)
+        results.append(np.array([_gram(h, variance) for h in _filtered(fbp, trace, window, clean)]))
     return results
+
+
+def _traces(fbp: InsetFbp, grid: VolumeGrid, rois: Sequence[RoiMean], clean: Scan) -> tuple[int, Tensor]:
+    """Transposed backprojection of ROI weights: first detector row, ``(rois, views, rows, columns)`` of those seen.
+
+    Filtering stays within a row, so the rows that no ROI sees are left out."""
+    if clean.window is None:
+        raise ValueError("the noise of ROI means needs a windowed scan: acquire it with region=")
+    spread = BackprojectionPlan(fbp.geometry, grid, fbp.shadow, fbp.motion).transpose
+    traces = spread(torch.stack([r.weights for r in rois]).to(clean.counts.dtype))
+    seen = (traces != 0).sum((0, 1, 3)).nonzero()
+    first, last = int(seen.min()), int(seen.max())
+    return fbp.shadow.first_row + first, traces[:, :, first : last + 1].contiguous()
+
+
+def _near(fbp: InsetFbp, clean: Scan, first_row: int, rows: int) -> DetectorWindow:
+    """Where the filtered traces are not negligible."""
+    assert clean.window is not None
+    near = _trim(fbp.shadow, clean.window)
+    return DetectorWindow(near.first_column, near.columns, first_row, rows)
+
+
+def _filtered(fbp: InsetFbp, traces: Tensor, window: DetectorWindow, clean: Scan) -> Iterator[Tensor]:
+    """Adjoint vectors in HU of every kernel, ``(rois, views, rows, columns)`` on ``window``."""
+    s = fbp.shadow
+    traced = DetectorWindow(s.first_column, s.columns, window.first_row, window.rows)
+    weights = angular_weights(fbp.geometry)
+    for kernel in fbp.kernels:
+        plan = FilterPlan(fbp.geometry, (kernel,), weights, window, traced)
+        yield torch.stack([plan.transpose(t[None]).mul_(1000.0 / clean.linearisation.mu_ref) for t in traces])
+
+
+def _gram(vectors: Tensor, variance: Tensor) -> list[list[float]]:
+    return [[_weighted_dot(a, b, variance) for b in vectors] for a in vectors]
 
 
 def _trim(inner: DetectorWindow, outer: DetectorWindow) -> DetectorWindow:

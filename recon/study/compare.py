@@ -14,10 +14,17 @@ import numpy as np
 import torch
 
 from recon.study import paper
+from recon.study.plaque_scan import (
+    INSET_MM,
+    REFERENCE_KERNEL,
+    REFERENCE_VOXEL_MM,
+    inset_grid,
+    prepare,
+    roi_entry,
+)
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.cnr import cnr, cnr_interval, mean_interval, sd_interval
-from torchpcct.metrics.placement import RoiPair, place_rois
-from torchpcct.metrics.roi import axial_grid
+from torchpcct.metrics.placement import RoiPair
 
 if TYPE_CHECKING:
     from torchpcct.scan import Scan
@@ -25,15 +32,13 @@ if TYPE_CHECKING:
     from torchpcct.scene import Scene
     from torchpcct.scene.plaque import Plaque
 
-__all__ = ["INSET_MM", "Compared", "Settings", "Statistics", "inset_grid", "run"]
+__all__ = ["FULL_VIEWS", "INSET_MM", "Compared", "Settings", "Statistics", "inset_grid", "run"]
 
 log = logging.getLogger(__name__)
 
-INSET_MM = (11.3, 9.0, 9.0)
-"""Extent (z, y, x) of the reconstructed inset: the paper's 113 × 90 × 90 voxels of 0.1 mm."""
+FULL_VIEWS = 1968
+"""Views per rotation of the paper's PCCT."""
 
-REFERENCE_VOXEL_MM = 0.10
-REFERENCE_KERNEL = "standard"
 PWLS_VOXEL_MM = 0.25
 """Voxel size at which PWLS is run at every dose (the paper's best for FBP); at the tables' dose it is run at all."""
 
@@ -55,7 +60,7 @@ class Settings:
 
     realizations: int = paper.REALIZATIONS
     seed: int = 0
-    views: int = 1968
+    views: int = FULL_VIEWS
     kernels: tuple[str, ...] = paper.KERNELS
     voxels_mm: tuple[float, ...] = paper.VOXELS_MM
     doses: dict[str, float] = field(default_factory=lambda: dict(paper.DOSES))
@@ -153,15 +158,6 @@ class Compared:
         }
 
 
-def inset_grid(plaque: Plaque, voxel_mm: float) -> VolumeGrid:
-    """The grid of the inset about a plaque at a voxel size."""
-    z, y, x = INSET_MM
-    # Never smaller than the inset: the protocol's image of 256 × 0.035 mm must fit in.
-    shape = tuple(math.ceil(extent / voxel_mm - 1e-6) for extent in (z, y, x))
-    px, py, pz = plaque.position
-    return VolumeGrid(shape, voxel_mm, (pz, py, px))
-
-
 def dose_slopes(result: Compared) -> list[dict[str, Any]]:
     """Slope of log σ against log dose per method, kernel, voxel size and ROI: −½ for pure counting noise.
 
@@ -217,36 +213,31 @@ def run(
     """
     from recon.exact_noise import roi_covariance
     from recon.inset import InsetFbp
-    from torchpcct.acquisition import acquire
     from torchpcct.scanner import presets
     from torchpcct.scene.plaque import plaque_scene
 
     settings = settings or Settings()
-    bodies, plaque = scene or plaque_scene()
     scanner = scanner or presets.pcct(views=settings.views)
     report = progress or (lambda step, fraction: None)
     clock = _Clock()
 
-    grids = [inset_grid(plaque, v) for v in settings.voxels_mm]
-    fine = inset_grid(plaque, REFERENCE_VOXEL_MM)
-    rois = place_rois(bodies, axial_grid(fine.center))
-    pairs = [rois.on(g) for g in grids]
-    region = _enclosing([*grids, fine])
-    # Fewer views than the paper's stand for the same scan, thinned out: the beam is on for as long as one of its views.
-    duty = min(1.0, settings.views / 1968)
-    clean = acquire(bodies, scanner, region=region, duty=duty, progress=lambda f: report("simulate", f))
+    scanned = prepare(
+        settings.kernels, settings.voxels_mm, scene or plaque_scene(), scanner, FULL_VIEWS,
+        lambda f: report("simulate", f),
+    )  # fmt: skip
+    clean, fine, grids, pairs, rois = scanned.clean, scanned.fine, scanned.grids, scanned.pairs, scanned.rois
     clock.lap("simulate")
 
     images: dict[tuple[str, str, float], Any] = {}
     noise_free = []
     reference = InsetFbp(clean, [fine], [REFERENCE_KERNEL])(clean)[0][0]
-    noise_free.append(_means("fbp", REFERENCE_KERNEL, REFERENCE_VOXEL_MM, rois.on(fine), reference))
+    noise_free.append(roi_entry("fbp", REFERENCE_KERNEL, REFERENCE_VOXEL_MM, rois.on(fine), reference))
     images["noise free", REFERENCE_KERNEL, REFERENCE_VOXEL_MM] = reference
-    fbp = InsetFbp(clean, grids, settings.kernels)
+    fbp = scanned.fbp
     expected = fbp(clean)
     for grid, pair, volumes in zip(grids, pairs, expected, strict=True):
         for kernel, volume in zip(settings.kernels, volumes, strict=True):
-            noise_free.append(_means("fbp", kernel, grid.spacing[0], pair, volume))
+            noise_free.append(roi_entry("fbp", kernel, grid.spacing[0], pair, volume))
     clock.lap("noise-free FBP")
     report("exact noise of FBP", 0.0)
     covariances = roi_covariance(clean, fbp, pairs, 1.0)
@@ -343,19 +334,3 @@ def _runs(settings: Settings) -> Iterator[tuple[float, int]]:
     for exposure in settings.doses.values():
         for i in range(settings.realizations):
             yield exposure, settings.seed + i
-
-
-def _means(method: str, kernel: str, voxel: float, pair: Any, volume: torch.Tensor) -> dict[str, Any]:
-    return {
-        "method": method,
-        "kernel": kernel,
-        "voxel_mm": voxel,
-        "foreground_hu": float(pair[0](volume)),
-        "background_hu": float(pair[1](volume)),
-    }
-
-
-def _enclosing(grids: list[VolumeGrid]) -> VolumeGrid:
-    """One voxel as large as the largest of ``grids`` that share a centre."""
-    extent = tuple(max(g.extent[a] for g in grids) for a in range(3))
-    return VolumeGrid((1, 1, 1), extent, grids[0].center)

@@ -8,10 +8,11 @@ import numpy as np
 
 from recon.study import paper
 from recon.study.checks import Check, checks_section
-from recon.study.compare import REFERENCE_KERNEL, REFERENCE_VOXEL_MM, Compared
+from recon.study.compare import Compared
+from recon.study.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM
 from recon.study.report import Report, environment, markdown_table
+from recon.study.tables import published, table_checks
 from torchpcct.geometry import VolumeGrid
-from torchpcct.metrics.cnr import cnr_range
 from torchpcct.metrics.roi import sample_axial
 from torchpcct.viz import Panel, panels
 
@@ -68,11 +69,7 @@ def _label(method: str, kernel: str) -> str:
 
 def _paper(table: Any, method: str, kernel: str, voxel: float, exposure: float) -> Any:
     """The paper's entry for this setting, or None."""
-    if method != "fbp" or exposure != paper.TABLE_EXPOSURE_S:
-        return None
-    if kernel not in paper.KERNELS or voxel not in paper.VOXELS_MM:
-        return None
-    return table[paper.KERNELS.index(kernel)][paper.VOXELS_MM.index(voxel)]
+    return published(table, kernel, voxel, exposure) if method == "fbp" else None
 
 
 def _noise_free_table(result: Compared) -> str:
@@ -111,8 +108,8 @@ def _tables(result: Compared, name: str, exposure: float) -> str:
             d = stat.as_dict()[roi]
             low, high = d["mean_interval"]
             text = f"{d['mean_hu']:.1f} [{low:.0f}, {high:.0f}] ({d['sd_hu']:.1f})"
-            published = _paper(table, method, kernel, voxel, exposure)
-            return text if published is None else f"{text} paper {published[0]:.1f} ({published[1]:.1f})"
+            entry = _paper(table, method, kernel, voxel, exposure)
+            return text if entry is None else f"{text} paper {entry[0]:.1f} ({entry[1]:.1f})"
 
         rows = [[_label(m, k), *(moments(m, k, v) for v in s.voxels_mm)] for m, k in _rows(result)]
         index = 0 if roi == "foreground" else 1
@@ -126,8 +123,8 @@ def _tables(result: Compared, name: str, exposure: float) -> str:
         d = stat.as_dict()
         low, high = d["cnr_interval"]
         text = f"{d['cnr']:.2f} [{low:.1f}, {high:.1f}]"
-        published = _paper(paper.CNR, method, kernel, voxel, exposure)
-        return text if published is None else f"{text} paper {published:.2f}"
+        entry = _paper(paper.CNR, method, kernel, voxel, exposure)
+        return text if entry is None else f"{text} paper {entry:.2f}"
 
     rows = [[_label(m, k), *(ratio(m, k, v) for v in s.voxels_mm)] for m, k in _rows(result)]
     rows += [[f"FBP {k}, exact", *(_exact(result, k, v, exposure, None) for v in s.voxels_mm)] for k in s.kernels]
@@ -193,7 +190,9 @@ def _checks(result: Compared) -> list[Check]:
                 p = paper.NOISE_FREE_ROI_HU[roi]
                 add(f"noise-free {roi} mean, standard 0.10 mm, HU", e[f"{roi}_hu"], p, p - 8, p + 8)
         if "covariance_hu2_s" in e:
-            _table_checks(e, add)
+            means = (e["foreground_hu"], e["background_hu"])
+            covariance = np.array(e["covariance_hu2_s"]) / paper.TABLE_EXPOSURE_S
+            checks += table_checks(e["kernel"], e["voxel_mm"], means, covariance)
     for e in result.as_dict()["noise_against_dose"]:
         if e["method"] == "fbp" and "pixel" in e:
             add(
@@ -204,25 +203,6 @@ def _checks(result: Compared) -> list[Check]:
                 -0.485,
             )
     return checks
-
-
-def _table_checks(entry: dict[str, Any], add: Any) -> None:
-    """The paper's tables against the exact expectation and covariance of the same ROI means: no sampling error."""
-    exposure = paper.TABLE_EXPOSURE_S
-    name = f"{entry['kernel']} {entry['voxel_mm']:.2f} mm"
-    covariance = np.array(entry["covariance_hu2_s"]) / exposure
-    means = (entry["foreground_hu"], entry["background_hu"])
-    for i, (roi, table) in enumerate((("core", paper.FOREGROUND), ("fibrous", paper.BACKGROUND))):
-        published = _paper(table, "fbp", entry["kernel"], entry["voxel_mm"], exposure)
-        if published is None:
-            return
-        mean, sd = (float(v) for v in published)
-        add(f"{roi} mean, {name}, HU", means[i], mean, mean - 10, mean + 10)
-        add(f"{roi} SD, {name}, HU", float(np.sqrt(covariance[i, i])), sd, sd / 1.5, sd * 1.5)
-    published_cnr = float(_paper(paper.CNR, "fbp", entry["kernel"], entry["voxel_mm"], exposure))
-    # The paper's CNR must be one that 10 realisations of our scan would give in 95 of 100 repetitions.
-    low, high = cnr_range(means, covariance, paper.REALIZATIONS)
-    add(f"the paper's CNR, {name}, in the range of our 10-run estimates", published_cnr, published_cnr, low, high)
 
 
 def _footer(result: Compared) -> str:

@@ -19,8 +19,8 @@ from torch import Tensor
 from recon.exact_noise import _trim, line_integral_variance, roi_covariance
 from recon.inset import InsetFbp, _union
 from recon.roi import InsetProblem
-from recon.study.compare import REFERENCE_KERNEL, REFERENCE_VOXEL_MM, _enclosing, inset_grid
 from recon.study.dose_factor_store import Store
+from recon.study.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM, enclosing, inset_grid
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.ceiling import information_matrix
 from torchpcct.metrics.observer import dog_channels
@@ -274,7 +274,7 @@ class StudyScene:
         scanner = presets.pcct(views=views)
         grids = [inset_grid(self.plaque, v) for v in {*self.settings.voxels_mm, self.settings.voxel_mm, 0.1}]
         # Fewer views stand for the same scan, thinned out: the beam is on for as long as one of its views.
-        whole = acquire(self.scene, scanner, region=_enclosing(grids), duty=min(1.0, views / 1968))
+        whole = acquire(self.scene, scanner, region=enclosing(grids), duty=min(1.0, views / 1968))
         assert whole.window is not None
         windows = [shadow(whole.geometry, g, margin=1) for g in grids]
         near = _trim(_union(windows, whole.geometry.columns), whole.window)
