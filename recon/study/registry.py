@@ -19,7 +19,9 @@ from recon.study.report import Report
 
 __all__ = ["STUDIES", "build_settings", "run"]
 
-STUDIES: dict[str, str] = {}
+STUDIES: dict[str, str] = {
+    "noise": "FBP with every kernel, voxel size and dose: CNR tables, and which rankings they establish",
+}
 """Name → one line of help. The module is ``recon.study.<name>``."""
 
 
