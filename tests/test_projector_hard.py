@@ -348,3 +348,14 @@ def test_nan_and_inf_do_not_leak_into_other_cells_of_slabs_far_apart():
     clean = A(hit).abs().amax(dim=-2, keepdim=True) == 0  # columns that miss the voxel in all rows
     assert clean.any()
     assert not A(x).isnan()[clean.expand(A.range_shape)].any()
+
+
+@pytest.mark.parametrize("tasks", [1, 2, 6, 12, 13, 64, 100])
+def test_tasks_of_the_plane_adjoint_are_mixed(tasks):
+    # Threads take runs of tasks; rows come first, and with symmetric views nearly all work is in the rows.
+    from torchpcct.projector.plane_kernels import _mixing_stride
+
+    order = np.arange(tasks) * _mixing_stride(tasks) % tasks
+    assert sorted(order) == list(range(tasks))
+    rows_of_each_thread = [(part < tasks // 2).sum() for part in np.array_split(order, 2)]
+    assert max(rows_of_each_thread) - min(rows_of_each_thread) <= 2

@@ -348,6 +348,8 @@ def picture(rows: list[dict[str, Any]], path: Path) -> None:
             scale.set_major_formatter(FormatStrFormatter("%.0e" if scale is axis.yaxis else "%g"))
             scale.set_minor_formatter(NullFormatter())
         axis.margins(0.2, 0.2)
+        errors = [r["gaussians"] for r in rows if r["case"] == name]
+        axis.set_ylim(min(errors) / 2, max(errors) * 2)  # equal errors stay equal marks
         axis.grid(alpha=0.3, which="both")
     axes.flat[0].legend(fontsize=7)
     for axis in axes.flat[len(names) :]:

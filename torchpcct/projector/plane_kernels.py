@@ -10,6 +10,8 @@ weights. Forward runs in parallel over views, the adjoint over slab blocks; all 
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import njit, prange
 
@@ -191,6 +193,19 @@ def _reverse_sums(out, r0, r1, knots, width, total, planes):
                 planes[l, r, k - 1] = total[l]
 
 
+@_small
+def _mixing_stride(tasks):
+    """A stride that visits all tasks once, in an order of which every run is a fair sample.
+
+    Each thread takes a run of neighbouring tasks. With symmetric views nearly all rays follow one axis: in the order
+    rows, then columns, one of two threads would have nothing to do.
+    """
+    stride = max(1, int(0.618 * tasks))
+    while math.gcd(stride, tasks) > 1:
+        stride += 1
+    return stride
+
+
 @njit(parallel=True, cache=True)
 def backproject(lanes, segments, offset, p, q, weight, values, by_row, by_column):
     """Transpose of :func:`project`: cell values ``(entries * lanes,)`` to ``(lanes, slabs, width)`` per axis."""
@@ -198,7 +213,9 @@ def backproject(lanes, segments, offset, p, q, weight, values, by_row, by_column
     real = by_row.dtype.type
     row_tasks = (by_row.shape[1] + BLOCK - 1) // BLOCK
     tasks = row_tasks + (by_column.shape[1] + BLOCK - 1) // BLOCK
-    for task in prange(tasks):
+    stride = _mixing_stride(tasks)
+    for turn in prange(tasks):
+        task = turn * stride % tasks
         axis = 0 if task < row_tasks else 1
         planes, r0 = (by_row, task * BLOCK) if axis == 0 else (by_column, (task - row_tasks) * BLOCK)
         r1 = min(r0 + BLOCK, planes.shape[1])
