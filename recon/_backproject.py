@@ -4,6 +4,8 @@ Every voxel belongs to one task of the backprojection and every view to one task
 order of summation: results do not depend on the number of threads. Positions on a curved detector are
 ``γ = 2 atan(across / (distance + depth))``, with the arc tangent as a polynomial that is fitted to the fans that
 occur, because a library call per voxel and view would cost more than all the rest.
+
+``shifts (views, 3)`` displaces the grid in every view: towards the source, along the columns, upwards, in mm.
 """
 
 from __future__ import annotations
@@ -26,12 +28,12 @@ _INLINE: Any = {"cache": True, "error_model": "numpy", "fastmath": _FAST}
 
 
 @njit(**_INLINE)
-def _positions_2d(kind, x, y, c, s, sod, sdd, scale, start, last, atan, index, near, far):
+def _positions_2d(kind, x, y, c, s, toward, aside, sod, sdd, scale, start, last, atan, index, near, far):
     """Left neighbour and the two weights of a line of pixels, in the precision of ``x``."""
     number = x.dtype.type
     zero, one, edge, first = number(0), number(1), number(last), number(start)
-    depth0, depth1 = number(sod - y * s), number(-c)
-    across0, across1 = number(y * c), number(-s)
+    depth0, depth1 = number((sod - toward) - y * s), number(-c)
+    across0, across1 = number(y * c + aside), number(-s)
     unit, radius = number(sdd * scale), number(sod)
     for i in range(x.size):
         across = across0 + across1 * x[i]
@@ -63,7 +65,7 @@ def _positions_2d(kind, x, y, c, s, sod, sdd, scale, start, last, atan, index, n
 
 
 @njit(**_OPTIONS)
-def backproject_2d(kind, data, cosines, sines, starts, x, y, sod, sdd, scale, atan, out):
+def backproject_2d(kind, data, cosines, sines, shifts, starts, x, y, sod, sdd, scale, atan, out):
     """``data (B, V, columns)`` into ``out (B, Y, X)``."""
     batch, views, columns = data.shape
     ny, nx = out.shape[1], out.shape[2]
@@ -91,6 +93,8 @@ def backproject_2d(kind, data, cosines, sines, starts, x, y, sod, sdd, scale, at
                     y[iy],
                     cosines[v],
                     sines[v],
+                    shifts[v, 0],
+                    shifts[v, 1],
                     sod,
                     sdd,
                     scale,
@@ -111,7 +115,7 @@ def backproject_2d(kind, data, cosines, sines, starts, x, y, sod, sdd, scale, at
 
 
 @njit(**_OPTIONS)
-def spread_2d(kind, volume, cosines, sines, starts, x, y, sod, sdd, scale, atan, out):
+def spread_2d(kind, volume, cosines, sines, shifts, starts, x, y, sod, sdd, scale, atan, out):
     """Transpose of :func:`backproject_2d`: ``volume (B, Y, X)`` into ``out (B, V, columns)``."""
     batch, views, columns = out.shape
     ny, nx = volume.shape[1], volume.shape[2]
@@ -126,8 +130,9 @@ def spread_2d(kind, volume, cosines, sines, starts, x, y, sod, sdd, scale, atan,
             xs[i] = number(x[i])
         for iy in range(ny):
             _positions_2d(
-                kind, xs, y[iy], cosines[v], sines[v], sod, sdd, scale, starts[v], columns - 1, atan, index, near, far
-            )
+                kind, xs, y[iy], cosines[v], sines[v], shifts[v, 0], shifts[v, 1], sod, sdd, scale, starts[v],
+                columns - 1, atan, index, near, far,
+            )  # fmt: skip
             for i in range(nx):
                 k = np.uint32(index[i])
                 row[k] += near[i] * volume[b, iy, i]
@@ -137,11 +142,11 @@ def spread_2d(kind, volume, cosines, sines, starts, x, y, sod, sdd, scale, atan,
 
 
 @njit(**_INLINE)
-def _positions_3d(kind, x, y, c, s, sod, sdd, scale, start, atan, index, weight, height):
+def _positions_3d(kind, x, y, c, s, toward, aside, sod, sdd, scale, start, atan, index, weight, height):
     """Column position, distance weight and magnification of heights of voxel columns, in float64."""
     for p in range(x.size):
-        across = y[p] * c - x[p] * s
-        depth = sod - (x[p] * c + y[p] * s)
+        across = (y[p] * c - x[p] * s) + aside
+        depth = (sod - toward) - (x[p] * c + y[p] * s)
         if kind == 1:
             inverse = 1.0 / depth
             height[p] = sdd * inverse
@@ -202,7 +207,24 @@ def _add_by_index(near, far, turned, m, z, step, origin, column, lower, upper, t
 
 @njit(**_OPTIONS)
 def backproject_3d(
-    kind, data, cosines, sines, starts, x, y, z, sod, sdd, scale, row_scale, row_start, atan, tile_y, tile_x, out
+    kind,
+    data,
+    cosines,
+    sines,
+    shifts,
+    starts,
+    x,
+    y,
+    z,
+    sod,
+    sdd,
+    scale,
+    row_scale,
+    row_start,
+    atan,
+    tile_y,
+    tile_x,
+    out,
 ):
     """``data (B, V, rows, columns)`` into ``out (B, Z, Y, X)``, tile by tile of ``tile_y × tile_x`` voxel columns."""
     batch, views, rows, columns = data.shape
@@ -212,7 +234,6 @@ def backproject_3d(
     tiles = tiles_y * tiles_x
     padded = (nz + 7) // 8 * 8
     last = columns - 1.0
-    reach = max(abs(z[0]), abs(z[nz - 1])) * row_scale
     origin = number(row_start)
     for task in prange(batch * tiles):
         b = task // tiles
@@ -227,15 +248,32 @@ def backproject_3d(
         index, weight, height = np.empty(n), np.empty(n), np.empty(n)
         total = np.zeros((n, padded), data.dtype)
         heights = np.zeros(padded, data.dtype)
-        for k in range(nz):
-            heights[k] = number(z[k])
         tau = np.zeros(padded, data.dtype)
         table = np.zeros((columns + 1, 3, padded), data.dtype)
         column = np.empty(rows + 1, data.dtype)
         turned = np.empty((columns + 1, rows + 2), data.dtype)
         lower, upper = np.empty(padded, np.int32), np.empty(padded, data.dtype)
         for v in range(views):
-            _positions_3d(kind, px, py, cosines[v], sines[v], sod, sdd, scale, starts[v], atan, index, weight, height)
+            _positions_3d(
+                kind,
+                px,
+                py,
+                cosines[v],
+                sines[v],
+                shifts[v, 0],
+                shifts[v, 1],
+                sod,
+                sdd,
+                scale,
+                starts[v],
+                atan,
+                index,
+                weight,
+                height,
+            )
+            lift = shifts[v, 2]
+            for k in range(nz):
+                heights[k] = number(z[k] + lift)
             low, high, left, right = height[0], height[0], index[0], index[0]
             for p in range(n):
                 low, high = min(low, height[p]), max(high, height[p])
@@ -249,10 +287,11 @@ def backproject_3d(
                     turned[i - first, r + 1] = slab[r, min(i, columns - 1)]
             for i in range(end - first):
                 turned[i, 0], turned[i, rows + 1] = turned[i, 1], turned[i, rows]
+            reach = max(abs(z[0] + lift), abs(z[nz - 1] + lift)) * row_scale
             kink = reach * (high - low) <= 1.0
             if kink:
                 for k in range(nz):
-                    r = max(z[k] * low, z[k] * high) * row_scale + row_start
+                    r = max((z[k] + lift) * low, (z[k] + lift) * high) * row_scale + row_start
                     middle = min(max(math.floor(r), 0.0), rows - 1.0)
                     tau[k] = number(row_start - middle)
                     lower[k] = np.int32(middle)
@@ -282,7 +321,7 @@ def backproject_3d(
 
 
 @njit(**_OPTIONS)
-def spread_3d(kind, volume, cosines, sines, starts, x, y, z, sod, sdd, scale, row_scale, row_start, atan, out):
+def spread_3d(kind, volume, cosines, sines, shifts, starts, x, y, z, sod, sdd, scale, row_scale, row_start, atan, out):
     """Transpose of :func:`backproject_3d`: ``volume (B, Y, X, Z)`` into ``out (B, V, rows, columns)``."""
     batch, views, rows, columns = out.shape
     ny, nx, nz = volume.shape[1], volume.shape[2], volume.shape[3]
@@ -298,11 +337,27 @@ def spread_3d(kind, volume, cosines, sines, starts, x, y, z, sod, sdd, scale, ro
         heights = np.empty(nz, volume.dtype)
         lower, upper = np.empty(nz, np.int32), np.empty(nz, volume.dtype)
         for k in range(nz):
-            heights[k] = number(z[k])
+            heights[k] = number(z[k] + shifts[v, 2])
         for iy in range(ny):
             for ix in range(nx):
                 line[ix] = y[iy]
-            _positions_3d(kind, x, line, cosines[v], sines[v], sod, sdd, scale, starts[v], atan, index, weight, height)
+            _positions_3d(
+                kind,
+                x,
+                line,
+                cosines[v],
+                sines[v],
+                shifts[v, 0],
+                shifts[v, 1],
+                sod,
+                sdd,
+                scale,
+                starts[v],
+                atan,
+                index,
+                weight,
+                height,
+            )
             for ix in range(nx):
                 position = min(max(index[ix], 0.0), last)
                 left = np.uint64(int(position))

@@ -13,6 +13,7 @@ from torch import Tensor
 from recon._filtering import full_window
 from recon._operator import apply_linear
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
+from torchpcct.projector.rays import check_motion
 from torchpcct.window import DetectorWindow
 
 __all__ = ["BackprojectionPlan", "backproject", "check_data", "data_shape"]
@@ -58,9 +59,9 @@ def data_shape(geometry: Geometry, window: DetectorWindow) -> tuple[int, ...]:
 
 
 class BackprojectionPlan:
-    """Geometry of one backprojection, and its two maps for numba."""
+    """Geometry of one backprojection, and its two maps for numba; arguments as of :func:`backproject`."""
 
-    def __init__(self, geometry: Geometry, grid: VolumeGrid, window: DetectorWindow) -> None:
+    def __init__(self, geometry: Geometry, grid: VolumeGrid, window: DetectorWindow, motion: Any = None) -> None:
         self.grid, self.window = grid, window
         self.cone = isinstance(geometry, ConeBeam)
         if isinstance(geometry, ParallelBeam):
@@ -75,12 +76,14 @@ class BackprojectionPlan:
             raise ValueError(f"a {type(geometry).__name__} needs a {axes}-D grid, got {grid.ndim} axes")
         if window.views != geometry.views:
             raise ValueError(f"the window has {window.views} views, but the geometry has {geometry.views}")
-        if self.kind != 0 and grid.in_plane_radius >= self.sod:
+        self.cosines, self.sines = np.cos(geometry.angles), np.sin(geometry.angles)
+        self.shifts = _shifts(motion, self.cosines, self.sines, grid.ndim)
+        self.travel = float(np.hypot(self.shifts[:, 0], self.shifts[:, 1]).max())
+        if self.kind != 0 and grid.in_plane_radius + self.travel >= self.sod:
             raise ValueError(
-                f"the grid reaches {grid.in_plane_radius:.1f} mm from the axis, beyond the source orbit "
+                f"the grid reaches {grid.in_plane_radius + self.travel:.1f} mm from the axis, beyond the source orbit "
                 f"(sod {self.sod} mm): move or shrink the grid"
             )
-        self.cosines, self.sines = np.cos(geometry.angles), np.sin(geometry.angles)
         self.scale = 1.0 / pitch
         first = geometry.column_positions[0]
         self.starts = -first / pitch - window.first_column.astype(np.float64)
@@ -92,14 +95,16 @@ class BackprojectionPlan:
         self._check_window(geometry)
 
     def _outside(self, geometry: Any) -> NDArray[np.bool_] | None:
-        """Voxel columns that some view does not see, or None. An inset must be seen whole."""
+        """Voxel columns that some view may not see, or None. An inset must be seen whole.
+
+        A grid that moves loses the voxels that its longest displacement could take out of the field of view."""
         if isinstance(geometry, ParallelBeam):
             u = geometry.column_positions
             radius = max(min(-u[0], u[-1]) + geometry.pitch / 2.0, 0.0)
         else:
             radius = geometry.fov_radius
         y, x = self.grid.axes[-2:]
-        outside = np.hypot(y[:, None], x[None, :]) > radius * (1.0 + 1e-9)
+        outside = np.hypot(y[:, None], x[None, :]) + self.travel > radius * (1.0 + 1e-9)
         if not outside.any():
             return None
         half_y, half_x = self.grid.extent[-2] / 2.0, self.grid.extent[-1] / 2.0
@@ -120,8 +125,8 @@ class BackprojectionPlan:
         y, x = self.grid.axes[-2:]
         cy, cx = np.meshgrid(y[[0, -1]], x[[0, -1]], indexing="ij")
         c, s = self.cosines[:, None], self.sines[:, None]
-        across = cy.ravel() * c - cx.ravel() * s
-        depth = self.sod - (cx.ravel() * c + cy.ravel() * s)
+        across = cy.ravel() * c - cx.ravel() * s + self.shifts[:, 1:2]
+        depth = self.sod - self.shifts[:, :1] - (cx.ravel() * c + cy.ravel() * s)
         if self.kind == 0:
             position, height = across, np.ones_like(across)
         elif self.kind == 1:
@@ -136,10 +141,10 @@ class BackprojectionPlan:
         if missing.any():
             raise ValueError(
                 f"the window misses columns that the grid needs in view {int(np.argmax(missing))}: "
-                "use torchpcct.window.shadow(geometry, grid, margin=1)"
+                "use torchpcct.window.shadow(geometry, grid, margin=1, motion=motion)"
             )
         if isinstance(geometry, ConeBeam):
-            z = self.grid.axes[0][[0, -1]]
+            z = self.grid.axes[0][[0, -1]] + np.array([self.shifts[:, 2].min(), self.shifts[:, 2].max()])
             row = z[:, None] * np.array([height.min(), height.max()]) * self.row_scale + self.row_start
             w = self.window
             short = row.min() < -1e-6 and w.first_row > 0
@@ -147,18 +152,19 @@ class BackprojectionPlan:
             if short:
                 raise ValueError(
                     f"the window's rows {w.first_row}…{w.first_row + w.rows - 1} do not cover the grid: "
-                    "use torchpcct.window.shadow(geometry, grid, margin=1)"
+                    "use torchpcct.window.shadow(geometry, grid, margin=1, motion=motion)"
                 )
 
     def _arguments(self, dtype: torch.dtype) -> list[Any]:
         axes = self.grid.axes
-        common: list[Any] = [self.cosines, self.sines, self.starts, axes[-1], axes[-2]]
+        common: list[Any] = [self.cosines, self.sines, self.shifts, self.starts, axes[-1], axes[-2]]
         if self.cone:
             common.append(axes[0])
         common += [self.sod, self.sdd, self.scale]
         if self.cone:
             common += [self.row_scale, self.row_start]
-        reach = math.tan(0.5 * math.asin(self.grid.in_plane_radius / self.sod)) if self.kind == 2 else 0.0
+        radius = self.grid.in_plane_radius + self.travel
+        reach = math.tan(0.5 * math.asin(radius / self.sod)) if self.kind == 2 else 0.0
         return [*common, _atan_polynomial(reach, self.sdd * self.scale, dtype)]
 
     def _tile(self) -> tuple[int, int]:
@@ -212,7 +218,27 @@ class BackprojectionPlan:
         return out.view(*lead, *shape)
 
 
-def backproject(filtered: Tensor, geometry: Geometry, grid: VolumeGrid, window: DetectorWindow | None = None) -> Tensor:
+def _shifts(motion: Any, cosines: Any, sines: Any, axes: int) -> NDArray[np.float64]:
+    """Displacement towards the source, along the columns and upwards, ``(views, 3)`` mm."""
+    out = np.zeros((cosines.size, 3))
+    if motion is None:
+        return out
+    shift = check_motion(motion, cosines.size, axes)
+    x, y = shift[:, -1], shift[:, -2]
+    out[:, 0], out[:, 1] = x * cosines + y * sines, y * cosines - x * sines
+    if axes == 3:
+        out[:, 2] = shift[:, 0]
+    return out
+
+
+def backproject(
+    filtered: Tensor,
+    geometry: Geometry,
+    grid: VolumeGrid,
+    window: DetectorWindow | None = None,
+    *,
+    motion: Any = None,
+) -> Tensor:
     """Backproject filtered data with FBP's distance weights: the second half of filtered backprojection.
 
     Voxel driven, with linear interpolation along columns and rows. A voxel whose shadow lies above or below the
@@ -224,17 +250,22 @@ def backproject(filtered: Tensor, geometry: Geometry, grid: VolumeGrid, window: 
         grid: voxels to reconstruct. A grid about the isocentre may be larger than the field of view: voxels outside
             are 0. A grid beside the isocentre must lie inside.
         window: the readings that ``filtered`` holds, default: the whole detector. It must hold the grid's shadow,
-            ``torchpcct.window.shadow(geometry, grid, margin=1)``.
+            ``torchpcct.window.shadow(geometry, grid, margin=1, motion=motion)``.
+        motion: displacement of the grid in every view, ``(views, 2)`` (y, x) or ``(views, 3)`` (z, y, x) mm as for
+            :class:`torchpcct.projector.Projector`, or None: everything that the data hold moves with the grid, and the
+            image shows it at rest. What stands still must be backprojected on its own, without motion (see
+            :class:`recon.inset.InsetFbp`).
 
     Returns:
         ``(..., *grid.shape)`` mm⁻¹, dtype and device of ``filtered``. Differentiable to any order.
 
     Raises:
-        ValueError: a wrong shape, a grid outside the field of view or the source's orbit, a window that is too small.
+        ValueError: a wrong shape, a grid outside the field of view or the source's orbit, a window that is too small,
+            a motion that is not finite.
         TypeError: data that are not float32 or float64 tensors, or not a geometry.
     """
     if window is None:
         window = full_window(geometry)
     check_data("filtered", filtered, data_shape(geometry, window))
-    plan = BackprojectionPlan(geometry, grid, window)
+    plan = BackprojectionPlan(geometry, grid, window, motion)
     return apply_linear(filtered, plan.forward, plan.transpose)

@@ -51,6 +51,11 @@ class InsetProblem:
         grid: ``(z, y, x)`` grid that holds everything the background does not.
         nodes: of the Gram operator. Linear in position (5) is enough for solvers: what the model lacks, the exact
             pairs repair, and each step costs half of that with 9.
+        motion: displacement of the inset in every view, ``(views, 3)`` z, y, x mm (:func:`recon.inset.view_motion`);
+            None: at rest. The background stands still; it is taken off before, so that only what moves is projected.
+            The Gram is that of the inset at rest: a displacement of millimetres changes the weights, which follow the
+            smooth background, and the magnification by less than the model's own error. Exact pairs use the moving
+            projector.
 
     The weights are the inverse variances of the line integrals expected from the BACKGROUND: weights from the noisy
     readings themselves would bias the result, and a small inset changes the counts behind it by a few per cent only.
@@ -59,13 +64,13 @@ class InsetProblem:
         ValueError: a grid outside the field of view or the scan's region; a spectral scan.
     """
 
-    def __init__(self, scan: Scan, grid: VolumeGrid, nodes: int = 5) -> None:
+    def __init__(self, scan: Scan, grid: VolumeGrid, nodes: int = 5, *, motion: Any = None) -> None:
         if scan.counts.ndim != 3:
             raise ValueError("PWLS in HU needs a counting-mode scan; decompose or sum the energy bins before")
         if scan.surround is None or scan.window is None:
             raise ValueError("PWLS of an inset needs a scan with a known surround: acquire it with region=")
         self.grid, self.geometry, self.outer = grid, scan.geometry, scan.window
-        self.window = shadow(scan.geometry, grid, margin=1)
+        self.window = shadow(scan.geometry, grid, margin=1, motion=motion)
         fbp = InsetFbp(scan, [grid], ["standard"])
         self.mu_ref = scan.linearisation.mu_ref
         self.background = scan.surround_line_integrals()
@@ -78,9 +83,14 @@ class InsetProblem:
         slope = scan.linearisation.slope(polychromatic)
         exposure = scan.exposure_s or NOISE_FREE_EXPOSURE_S
         # Per second of exposure: the Gram of one exposure serves all by a factor.
-        self._weights = self.window.take(scan.surround / slope.square() / exposure).contiguous()
-        self.projector = Projector(scan.geometry, grid, self.window)
-        self.gram = Gram(self.projector, self._weights, nodes=nodes)
+        weights = scan.surround / slope.square() / exposure
+        self._weights = self.window.take(weights).contiguous()
+        self.projector = Projector(scan.geometry, grid, self.window, motion)
+        if motion is None:
+            self.gram = Gram(self.projector, self._weights, nodes=nodes)
+        else:
+            still = shadow(scan.geometry, grid, margin=1)
+            self.gram = Gram(Projector(scan.geometry, grid, still), still.take(weights).contiguous(), nodes=nodes)
 
     def data(self, scan: Scan) -> Tensor:
         """Line integrals of a scan on the grid's shadow, background taken off, ``(views, rows, columns)``."""

@@ -1,0 +1,154 @@
+"""Lumen, core and cap by thresholds, against drawn shapes whose measures are known."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from torchpcct.geometry import VolumeGrid
+from torchpcct.metrics.resolution import ellipsoid_distance
+from torchpcct.metrics.segmentation import basin_depth, cap_on_line, dice, segment_plaque
+
+GRID = VolumeGrid((160, 180), (0.03, 0.025), (-30.0, -29.0))
+HALF = {"lumen_hu": 300.0, "core_hu": (10.0, 70.0)}
+"""Thresholds halfway between blood (500), tissue (100) and core (40)."""
+
+
+def edge(center: tuple[float, float], radius: float, grid: VolumeGrid = GRID, width: float = 0.08) -> np.ndarray:
+    """1 inside a disc, 0 outside, with a linear edge whose middle lies on the circle."""
+    return np.clip(0.5 - ellipsoid_distance(grid, center, (radius, radius)) / width, 0.0, 1.0)
+
+
+def vessel(
+    lumen: float = 0.8, core: float = 0.35, cap: float = 0.2, angle: float = 0.0, grid: VolumeGrid = GRID
+) -> tuple[np.ndarray, tuple[float, float], tuple[float, float]]:
+    """Fat, fibrous tissue, blood and beside it a core; and the centres of the two."""
+    a = (-30.0 - 0.35 * math.sin(angle), -29.0 - 0.35 * math.cos(angle))
+    away = lumen + cap + core
+    b = (a[0] + away * math.sin(angle), a[1] + away * math.cos(angle))
+    image = -100.0 + 200.0 * edge((-30.0, -29.0), 1.75, grid)
+    return image + 400.0 * edge(a, lumen, grid) - 60.0 * edge(b, core, grid), a, b
+
+
+@settings(max_examples=10, deadline=None)
+@given(
+    lumen=st.floats(0.4, 0.85), core=st.floats(0.2, 0.4), cap=st.floats(0.1, 0.25), angle=st.floats(-math.pi, math.pi)
+)
+def test_discs(lumen, core, cap, angle):
+    image, a, b = vessel(lumen, core, cap, angle)
+    found = segment_plaque(image, GRID, **HALF)
+    # Counting pixels errs by a fraction of those on the rim.
+    assert found.lumen_area == pytest.approx(math.pi * lumen**2, abs=0.15 * 2 * math.pi * lumen * 0.03)
+    assert found.core_area == pytest.approx(math.pi * core**2, abs=0.2 * 2 * math.pi * core * 0.03)
+    assert found.cap_thickness == pytest.approx(cap, abs=0.004)
+    assert cap_on_line(image, GRID, a, b, lumen_hu=300.0, core_hu=70.0) == pytest.approx(cap, abs=0.003)
+
+
+def test_rims_belong_to_the_band_but_not_to_the_core():
+    image, _, b = vessel()
+    found = segment_plaque(image, GRID)
+    assert found.core_found
+    assert found.band.sum() > 1.5 * found.core.sum()  # the rim between tissue and fat
+    distance = ellipsoid_distance(GRID, b, (0.35, 0.35))
+    assert distance[found.core].max() < 0.0
+    assert (found.band & ~found.core)[distance < -0.1].sum() == 0
+
+
+def test_an_open_core_is_lost_but_not_its_line():
+    image, a, b = vessel()
+    rows, columns = (np.abs(GRID.axes[0] - b[0]) < 0.05), GRID.axes[1] > b[1]
+    image[np.ix_(rows, columns)] = np.minimum(image[np.ix_(rows, columns)], 50.0)
+    found = segment_plaque(image, GRID, **HALF)
+    assert not found.core_found
+    assert math.isnan(found.core_area)
+    assert math.isnan(found.cap_thickness)
+    assert found.lumen_area == pytest.approx(math.pi * 0.8**2, rel=0.02)
+    assert cap_on_line(image, GRID, a, b, lumen_hu=300.0, core_hu=70.0) == pytest.approx(0.2, abs=0.003)
+
+
+def test_a_diagonal_line_of_bright_pixels_closes():
+    image = np.full((7, 7), 100.0)
+    image[:2] = -100.0
+    image[3, 3] = image[2, 2] = 40.0  # dark pixels that touch at a corner only
+    image[5, 3] = 500.0
+    found = segment_plaque(image, VolumeGrid((7, 7), 0.5), **HALF)
+    assert found.core.sum() == 1
+    assert found.core[3, 3]
+    assert found.core_area == 0.25
+
+
+def test_nothing_there():
+    found = segment_plaque(np.full((5, 6), -100.0), VolumeGrid((5, 6), 0.1))
+    assert not found.lumen.any()
+    assert math.isnan(found.lumen_area)
+    assert math.isnan(found.cap_thickness)
+    fat = np.full((5, 6), -100.0)
+    assert math.isnan(cap_on_line(fat, VolumeGrid((5, 6), 0.1), (0.0, -0.2), (0.0, 0.2)))
+    bright = np.full((5, 6), 500.0)
+    assert math.isnan(cap_on_line(bright, VolumeGrid((5, 6), 0.1), (0.0, -0.2), (0.0, 0.2)))
+
+
+def test_tensors_slices_and_any_place():
+    image, _, _ = vessel()
+    plain = segment_plaque(image, GRID, **HALF)
+    one = VolumeGrid((1, *GRID.shape), (0.1, *GRID.spacing), (3.0, 5.0, 7.0))
+    moved = segment_plaque(torch.from_numpy(image)[None].float(), one, **HALF)
+    np.testing.assert_array_equal(moved.core, plain.core)
+    assert moved.cap_thickness == pytest.approx(plain.cap_thickness, abs=1e-6)
+    turned = segment_plaque(image.T, VolumeGrid(GRID.shape[::-1], GRID.spacing[::-1]), **HALF)
+    np.testing.assert_array_equal(turned.core, plain.core.T)
+    assert turned.cap_thickness == pytest.approx(plain.cap_thickness, rel=1e-9)
+    double = segment_plaque(image, VolumeGrid(GRID.shape, tuple(2 * s for s in GRID.spacing)), **HALF)
+    assert double.cap_thickness == pytest.approx(2 * plain.cap_thickness, rel=1e-9)
+    assert double.lumen_area == pytest.approx(4 * plain.lumen_area, rel=1e-12)
+
+
+def test_depth_of_a_basin():
+    image = np.full((7, 9), 100.0)
+    image[:, :2] = -90.0
+    image[3, 4:7] = (55.0, 40.0, 60.0)
+    grid = VolumeGrid((7, 9), 0.1)
+    core = np.zeros((7, 9), bool)
+    core[2:5, 3:8] = True
+    assert basin_depth(image, grid, core) == 100.0 - 40.0
+    image[3, 2:4] = 65.0, 70.0  # a way to the fat, and its highest point
+    assert basin_depth(image, grid, core) == 70.0 - 40.0
+    image[3, 2:4] = 100.0
+    image[2, 7] = image[1, 8] = -50.0  # corners do not open it
+    assert basin_depth(image, grid, core) == 100.0 + 50.0
+    slope = np.broadcast_to(np.arange(9.0), (7, 9))
+    assert basin_depth(slope, grid, core) == 0.0
+    assert not segment_plaque(slope, grid).core_found
+
+
+def test_dice():
+    a, b = np.zeros((2, 4), bool), np.zeros((2, 4), bool)
+    assert math.isnan(dice(a, b))
+    a[0], b[0, 2:] = True, True
+    assert dice(a, b) == pytest.approx(2 * 2 / 6)
+    assert dice(a, a) == 1.0
+    assert dice(a, ~a) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("call", "match"),
+    [
+        (lambda: segment_plaque(np.zeros((3, 3)), GRID), "one slice of the grid's shape"),
+        (lambda: segment_plaque(np.zeros((2, 3, 3)), VolumeGrid((2, 3, 3), 1.0)), "sample the axial image"),
+        (lambda: segment_plaque(np.full(GRID.shape, np.nan), GRID), "NaN"),
+        (lambda: segment_plaque(np.zeros(GRID.shape), GRID, core_hu=(60.0, 20.0)), "thresholds must rise"),
+        (lambda: segment_plaque(np.zeros(GRID.shape), GRID, lumen_hu=50.0), "thresholds must rise"),
+        (lambda: cap_on_line(np.zeros(GRID.shape), GRID, (-30, -29), (-30, -9)), "leaves the image"),
+        (lambda: cap_on_line(np.zeros(GRID.shape), GRID, (-30, -29), (-30, -29)), "step_mm"),
+        (lambda: basin_depth(np.zeros(GRID.shape), GRID, np.zeros(GRID.shape)), "must mark pixels"),
+        (lambda: dice(np.zeros(3), np.zeros(4)), "same shape"),
+    ],
+)
+def test_refusals(call, match):
+    with pytest.raises(ValueError, match=match):
+        call()
