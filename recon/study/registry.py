@@ -20,7 +20,9 @@ from recon.study.report import Report
 __all__ = ["STUDIES", "build_settings", "run"]
 
 STUDIES: dict[str, str] = {
+    "dose": "ROI bowtie: CTDI and thorax dose, noise inside and outside, and its product with MBIR",
     "noise": "FBP with every kernel, voxel size and dose: CNR tables, and which rankings they establish",
+    "spectral": "energy bins into PE and PVC: monochromatic images, best energy, tissue maps, by FBP and joint MBIR",
 }
 """Name → one line of help. The module is ``recon.study.<name>``."""
 
