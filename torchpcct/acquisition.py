@@ -13,6 +13,7 @@ from torch import Tensor
 from torchpcct.geometry import ConeBeam, VolumeGrid
 from torchpcct.plan import Plan, active_window, make_plan
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan, check_exposure
+from torchpcct.scanner.pileup import PileUpMap
 from torchpcct.transmission import SUB_RAY_COUNTS, Beam, BodySet, expected_readings
 from torchpcct.transmission import sub_rays as sub_rays_of
 from torchpcct.window import DetectorWindow, shadow
@@ -201,6 +202,9 @@ def acquire(
         dense = beam._replace(points=sub_rays_of(SUB_RAY_COUNTS[-1]))
         surround = expected_readings(one, whole, symmetric, dense, step[:1]).numpy()[:, 0]
     counts = _readings(plan_, g, build, energies, beam, step, surround, progress)
+    pile_up = PileUpMap.of(scanner)
+    if pile_up is not None:
+        counts, air, surround = _recorded(pile_up, counts, air, surround, plan_.kept)
     quantum = None
     if integrating:
         # In place: the readings of a whole detector are large. Behind a perfect absorber any energy will do.
@@ -231,6 +235,20 @@ def acquire(
         electronic_noise=scanner.detector.electronic_noise if integrating else 0.0,
     )
     return scan if exposure_s is None else scan.with_noise(exposure_s, int(seed))
+
+
+def _recorded(
+    pile_up: PileUpMap, counts: Tensor, air: Any, surround: Any, kept: DetectorWindow | None
+) -> tuple[Tensor, Any, Any]:
+    """What a detector with dead time records of the expected counts: readings, air, surround."""
+    cells = torch.from_numpy(np.array(air))
+    columns = np.arange(air.shape[-1])
+    for v in range(counts.shape[1]):
+        part = cells if kept is None else cells[:, kept.first_row : kept.first_row + kept.rows]
+        seen = columns if kept is None else kept.column_indices[v]
+        counts[:, v] = pile_up.apply(counts[:, v], part[..., torch.from_numpy(seen)], seen)
+    recorded = pile_up.apply(cells, cells, columns).numpy()
+    return counts, recorded, pile_up.apply(torch.from_numpy(np.array(surround)), cells, columns).numpy()
 
 
 def _readings(

@@ -104,7 +104,10 @@ class SiliconDetector:
         charge_sharing: share of the interactions whose charge is split, at a uniformly distributed ratio, between two
             cells; each part counts where it exceeds a threshold. 0 switches it off. The correlation that it makes
             between neighbours is not modelled.
-        dead_time_ns: dead time per depth segment after a count; 0 switches pile-up off. See :meth:`live_fraction`.
+        dead_time_ns: dead time per depth segment after a count; 0 switches pile-up off
+            (:mod:`torchpcct.scanner.pileup`).
+        merge_ns: time after a count in which further pulses add to its height, at most the dead time; it shifts counts
+            to higher bins.
 
     Raises:
         ValueError: a value outside its range, thresholds that do not increase, an unknown mode.
@@ -119,6 +122,7 @@ class SiliconDetector:
     dead_layer_mm: float = 0.0
     charge_sharing: float = 0.0
     dead_time_ns: float = 0.0
+    merge_ns: float = 0.0
 
     def __post_init__(self) -> None:
         if self.mode not in _MODES:
@@ -138,6 +142,7 @@ class SiliconDetector:
         set_(self, "dead_layer_mm", _check("dead_layer_mm", self.dead_layer_mm, 0.0, 1e3, "mm"))
         set_(self, "charge_sharing", _check("charge_sharing", self.charge_sharing, 0.0, 1.0, "(a share of events)"))
         set_(self, "dead_time_ns", _check("dead_time_ns", self.dead_time_ns, 0.0, 1e6, "ns"))
+        set_(self, "merge_ns", _check("merge_ns", self.merge_ns, 0.0, self.dead_time_ns, "ns (the dead time)"))
 
     @property
     def bins(self) -> int:
@@ -223,7 +228,7 @@ class SiliconDetector:
     def live_fraction(self, count_rate: ArrayLike, energies_kev: ArrayLike, weights: ArrayLike) -> Floats:
         """Recorded over true counts at a count rate: non-paralysable dead time in every depth segment.
 
-        A factor on the summed counts: the spectral distortion by pulses that merge is not modelled.
+        A factor on the summed counts; :func:`torchpcct.scanner.pileup.recorded_rates` has the bins.
 
         Args:
             count_rate: true counts per second and cell (all segments), any shape.

@@ -8,6 +8,7 @@ every radius and in every geometry; other materials keep the small nonlinearity 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -42,7 +43,12 @@ class WaterLinearisation:
 
     @classmethod
     def calibrate(
-        cls, weights: ArrayLike, mu_water: ArrayLike, max_mm: float = 400.0, order: int = _ORDER
+        cls,
+        weights: ArrayLike,
+        mu_water: ArrayLike,
+        max_mm: float = 400.0,
+        order: int = _ORDER,
+        shift: Callable[[Floats], Floats] | None = None,
     ) -> WaterLinearisation:
         """Fit from the spectra of the columns.
 
@@ -51,6 +57,7 @@ class WaterLinearisation:
             mu_water: ``(E,)`` attenuation of water in mm⁻¹.
             max_mm: thickest water of the calibration.
             order: number of coefficients.
+            shift: what else the detector adds to the line integrals ``(columns, samples)`` that it is given (pile-up).
 
         Raises:
             ValueError: a thickness ≤ 0 or an order < 1.
@@ -62,6 +69,8 @@ class WaterLinearisation:
         t = max_mm * (0.5 - 0.5 * np.cos(np.pi * (np.arange(_SAMPLES) + 0.5) / _SAMPLES))
         transmitted = np.exp(-np.outer(mu, t))
         p = -np.log(w @ transmitted / w.sum(1, keepdims=True))
+        if shift is not None:
+            p = p + shift(p)
         scale = p[:, -1]
         centre = w[w.shape[0] // 2] @ np.exp(-mu * max_mm / 2)
         mu_ref = float((w[w.shape[0] // 2] * np.exp(-mu * max_mm / 2)) @ mu / centre)

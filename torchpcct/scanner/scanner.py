@@ -15,6 +15,7 @@ from torchpcct.geometry import ConeBeam, full_turn
 from torchpcct.scanner.detector import Detector
 from torchpcct.scanner.filters import Bowtie
 from torchpcct.scanner.linearisation import WaterLinearisation
+from torchpcct.scanner.pileup import PileUpMap
 from torchpcct.scanner.source import Slabs, Source, slabs
 from torchpcct.scene.materials import MATERIALS, Material
 
@@ -140,14 +141,20 @@ class Scanner:
             max_mm: thickest water of the calibration.
             bin: calibrate this energy bin alone; None: the sum of all bins.
             order: coefficients per column; None: 7 for the sum, 11 for a single bin (the low bins hold Compton counts
-                of hard photons beside photoelectric counts of soft ones, which bends their curve more).
+                of hard photons beside photoelectric counts of soft ones, which bends their curve more), 15 with
+                pile-up, which bends it most.
 
         Raises:
-            ValueError: no such bin, ``max_mm`` ≤ 0.
+            ValueError: no such bin, ``max_mm`` ≤ 0; a single bin with pile-up.
+
+        It is calibrated on what the detector records: pile-up, if the detector has a dead time, is part of the curve.
         """
         if bin is not None and not 0 <= bin < self.detector.bins:
             raise ValueError(f"bin must lie in 0…{self.detector.bins - 1}, got {bin}")
-        return _linearisation(_Optics.of(self), self.detector, float(max_mm), bin, order)
+        pile_up = PileUpMap.of(self)
+        if pile_up is not None and bin is not None:
+            raise ValueError("single energy bins have no water correction with pile-up: calibrate the sum, bin=None")
+        return _linearisation(_Optics.of(self), self.detector, float(max_mm), bin, order, pile_up)
 
     def describe(self) -> dict[str, Any]:
         """The scanner's numbers as JSON values, for reports and file headers."""
@@ -222,9 +229,11 @@ def _weights(optics: _Optics, detector: Detector, squared: bool) -> tuple[Floats
 
 @functools.lru_cache(maxsize=16)
 def _linearisation(
-    optics: _Optics, detector: Detector, max_mm: float, bin: int | None, order: int | None
+    optics: _Optics, detector: Detector, max_mm: float, bin: int | None, order: int | None, pile_up: PileUpMap | None
 ) -> WaterLinearisation:
     energies, weights = _weights(optics, detector, False)
     spectra = weights.sum(0) if bin is None else weights[bin]
-    order = (7 if bin is None else 11) if order is None else order
-    return WaterLinearisation.calibrate(spectra, MATERIALS["water"].attenuation(energies), max_mm, order)
+    if order is None:
+        order = 15 if pile_up is not None else 7 if bin is None else 11
+    shift = None if pile_up is None else pile_up.shift
+    return WaterLinearisation.calibrate(spectra, MATERIALS["water"].attenuation(energies), max_mm, order, shift)

@@ -1,0 +1,285 @@
+"""Pile-up, charge sharing and photons followed through the silicon detector, against closed forms and event lists."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from recon.study import detector as study
+from torchpcct import acquire
+from torchpcct.scanner import SiliconDetector, presets
+from torchpcct.scanner.compton import mean_recoil_fraction
+from torchpcct.scanner.pileup import PileUpMap, pulse_heights, recorded_rates
+from torchpcct.scanner.transport import Stack, efficiency, follow
+from torchpcct.scene.materials import material
+from torchpcct.scene.phantoms import water_cylinder
+
+ENERGIES = np.array([25.0, 45.0, 70.0, 95.0])
+QUANTA = np.array([2e6, 8e6, 6e6, 1e6])
+
+
+# --- pile-up ------------------------------------------------------------------------------------------------------
+
+
+def test_without_dead_time_rates_are_quanta_times_response():
+    for mode in ("counting", "spectral"):
+        detector = SiliconDetector(mode)
+        np.testing.assert_allclose(
+            recorded_rates(detector, ENERGIES, QUANTA), detector.response(ENERGIES) @ QUANTA, rtol=1e-12
+        )
+
+
+def test_pulse_heights_add_up_to_the_counts_above_any_threshold():
+    detector = SiliconDetector(charge_sharing=0.2)
+    heights = pulse_heights(detector, ENERGIES, 256)
+    for threshold in (0, 5, 12, 60):
+        expected = detector.above(ENERGIES, [threshold if threshold else -np.inf])[0]
+        np.testing.assert_allclose(heights[:, threshold:].sum(1), expected, atol=1e-9)
+
+
+def test_one_segment_is_non_paralysable():
+    detector = SiliconDetector(segments=1, dead_time_ns=80.0)
+    true = detector.response(ENERGIES)[0] @ QUANTA
+    recorded = recorded_rates(detector, ENERGIES, QUANTA)[0]
+    assert recorded == pytest.approx(true / (1 + 80e-9 * true), rel=1e-12)
+    # More segments share the load, and the counting mode is the sum of the bins.
+    three = replace(detector, segments=3)
+    assert recorded < recorded_rates(three, ENERGIES, QUANTA)[0] < true
+    for merge in (0.0, 30.0):
+        spectral = replace(three, mode="spectral", merge_ns=merge)
+        assert recorded_rates(spectral, ENERGIES, QUANTA).sum() == pytest.approx(
+            recorded_rates(three, ENERGIES, QUANTA)[0], rel=1e-6
+        )
+
+
+def test_merged_pulses_against_a_list_of_events():
+    """Arrival times, pulse heights, dead time and merging drawn event by event in one segment."""
+    rng = np.random.default_rng(3)
+    detector = SiliconDetector("spectral", segments=1, dead_time_ns=60.0, merge_ns=30.0)
+    photo, compton = detector.interaction(ENERGIES)
+    expected = recorded_rates(detector, ENERGIES, QUANTA)
+    duration = 0.02
+    rate = float((photo + compton) @ QUANTA)
+    n = rng.poisson(rate * duration)
+    times = np.sort(rng.uniform(0, duration, n))
+    cumulative = detector.above(ENERGIES, np.arange(-12.0, 120.0, 0.05)) @ QUANTA / rate  # survival of the height
+    heights = np.interp(-rng.random(n), -cumulative, np.arange(-12.0, 120.0, 0.05))
+    recorded, free_at, i = [], -1.0, 0
+    while i < n:
+        if times[i] >= free_at and heights[i] > detector.thresholds_kev[0]:
+            last = np.searchsorted(times, times[i] + 30e-9)
+            recorded.append(heights[i:last].sum())
+            free_at = times[i] + 60e-9
+        i += 1
+    counts, _ = np.histogram(recorded, [*detector.thresholds_kev, np.inf])
+    assert counts.sum() == pytest.approx(expected.sum() * duration, rel=0.015)
+    # Heights are in steps of 1 keV: 1 % of the total on top of the counting error.
+    error = 4.5 * np.sqrt(counts) + 0.006 * counts.sum()
+    assert np.all(np.abs(counts - expected * duration) < error)
+    # Merging matters here: without it the top bin would hold a quarter of that.
+    plain = recorded_rates(replace(detector, merge_ns=0.0), ENERGIES, QUANTA)
+    assert counts[-1] > 1.3 * plain[-1] * duration
+
+
+def test_the_map_is_off_by_default_and_reproduces_the_rates():
+    assert PileUpMap.of(presets.pcct()) is None
+    assert PileUpMap.of(presets.eid()) is None
+    scanner = presets.pcct(detector=SiliconDetector(dead_time_ns=50.0))
+    pile_up = PileUpMap.of(scanner)
+    energies, quanta = scanner.quanta()
+    for column, path in ((750, 0.0), (750, 55.0), (123, 170.0), (40, 0.0)):
+        arriving = quanta[column] * 1000.0 * np.exp(-material("water").attenuation(energies) * path)
+        true = scanner.detector.response(energies)[0] @ arriving
+        air = scanner.detector.response(energies)[0] @ quanta[column] * 1000.0
+        found = float(pile_up.at(np.log(air / true), column)[0])
+        recorded = recorded_rates(scanner.detector, energies, arriving)[0]
+        assert found == pytest.approx(np.log(recorded / true), abs=2e-4)
+    # Twice the current, more loss; the number of views does not matter.
+    double = PileUpMap.of(scanner.replace(source=replace(scanner.source, current_ma=2000.0)))
+    assert double.at(0.0, 750)[0] < pile_up.at(0.0, 750)[0]
+    assert PileUpMap.of(scanner.with_views(17)) is pile_up
+
+
+def test_scans_with_pile_up_lose_counts_and_stay_linear_in_water():
+    system = presets.pcct(views=4, detector=SiliconDetector(dead_time_ns=50.0))
+    system = system.replace(geometry=replace(system.geometry, rows=1), source=replace(system.source, focal_spot=(0, 0)))
+    ideal = system.replace(detector=SiliconDetector())
+    scan, free = (acquire(water_cylinder(200.0), s, sub_rays=1, duty=1e-6) for s in (system, ideal))
+    lost = 1 - scan.air / free.air
+    assert 0.4 < float(lost[0, 750]) < 0.6
+    behind = 1 - scan.counts / free.counts
+    assert 0.01 < float(behind[0, 0, 750]) < 0.05
+    gamma = system.geometry.fan_angles
+    chord = 2 * np.sqrt(np.clip(100.0**2 - (626.0 * np.sin(gamma)) ** 2, 0, None))
+    inside = chord > 20
+    lines = scan.line_integrals()[0, 0].double().numpy()
+    linear = lines / (scan.linearisation.mu_ref * np.maximum(chord, 1))
+    np.testing.assert_allclose(linear[inside], 1.0, atol=2.5e-3)
+    np.testing.assert_allclose(linear[chord > 60], 1.0, atol=5e-4)
+    # With the ideal detector's correction the same readings would be far off.
+    wrong = replace(scan, linearisation=free.linearisation).line_integrals()[0, 0].double().numpy()
+    assert (wrong[740:760] / (free.linearisation.mu_ref * chord[740:760]) < 0.9).all()
+
+
+def test_a_window_sees_the_pile_up_of_the_whole():
+    from torchpcct import VolumeGrid
+    from torchpcct.scene.plaque import plaque_scene
+
+    scene, _ = plaque_scene(vessel_length=4.0)
+    system = presets.pcct(views=6, mode="spectral", detector=SiliconDetector("spectral", dead_time_ns=50.0))
+    system = system.replace(geometry=replace(system.geometry, rows=2))
+    region = VolumeGrid((1, 1, 1), (4.2, 9.0, 9.0), (0.0, -30.38, -29.63))
+    part, whole = acquire(scene, system, region=region, sub_rays=1), acquire(scene, system, sub_rays=1)
+    w = part.window
+    for v in range(6):
+        cut = whole.counts[:, v, :, w.first_column[v] : w.first_column[v] + w.columns]
+        torch.testing.assert_close(part.counts[:, v], cut, rtol=1e-6, atol=0)
+    torch.testing.assert_close(part.air, whole.air, rtol=1e-6, atol=0)
+
+
+def test_bad_merging_time():
+    with pytest.raises(ValueError, match="merge_ns must lie"):
+        SiliconDetector(dead_time_ns=20.0, merge_ns=30.0)
+    with pytest.raises(ValueError, match="single energy bins"):
+        presets.pcct(columns=4, detector=SiliconDetector("spectral", dead_time_ns=20.0)).water_linearisation(bin=1)
+
+
+# --- photons followed ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def followed():
+    scanner = presets.pcct()
+    energies, quanta = scanner.quanta()
+    beam = quanta[750] * np.exp(-material("pericoronary_fat").attenuation(energies) * 240.0)
+    return energies, beam, follow(SiliconDetector(), energies, beam, 60_000, np.random.default_rng(1))
+
+
+def test_first_interactions_are_the_one_interaction_model(followed):
+    energies, beam, deposits = followed
+    detector = SiliconDetector()
+    first = deposits.order == 0
+    n = deposits.photons
+    heights = np.full(n, -1e9)
+    heights[deposits.photon[first]] = deposits.energy_kev[first]
+    heights += np.random.default_rng(2).normal(0, detector.sigma_kev, n)
+    for threshold in (-np.inf, 5.0, 22.0, 52.0):
+        share = float(detector.above(energies, [threshold])[0] @ beam / beam.sum())
+        counted = (heights > max(threshold, -1e6)).mean()
+        assert abs(counted - share) < 4.5 * np.sqrt(share * (1 - share) / n)
+    shares = (detector.segment_shares(energies) * detector.above(energies, [-np.inf])[0]) @ beam
+    found = np.bincount(deposits.segment[first], minlength=3) / first.sum()
+    np.testing.assert_allclose(found, shares / shares.sum(), atol=4.5 * 0.5 / np.sqrt(n))
+
+
+def test_energy_is_conserved_and_coincidences_only_merge(followed):
+    deposits = followed[2]
+    total = np.bincount(deposits.photon, deposits.energy_kev, deposits.photons)
+    assert np.all(total <= deposits.incident_kev * (1 + 1e-9))
+    photon, strip, segment = (
+        deposits.counts(5.0, 1e-6, np.random.default_rng(0), p) for p in ("photon", "strip", "segment")
+    )
+    assert photon.max() == 1
+    assert photon.mean() < strip.mean() <= segment.mean()
+    assert segment.max() > 1
+
+
+def test_compton_deposits_have_the_mean_of_klein_and_nishina():
+    n = 40_000
+    deposits = follow(SiliconDetector(fill_factor=1.0), [80.0], [1.0], n, np.random.default_rng(4), Stack(foil_mm=0.0))
+    first = deposits.order == 0
+    compton = deposits.energy_kev[first & (deposits.energy_kev < 79.9)]
+    expected = 80.0 * float(mean_recoil_fraction(80.0)[0])
+    assert compton.mean() == pytest.approx(expected, abs=4.5 * compton.std() / np.sqrt(compton.size))
+    photo, scattered = SiliconDetector(fill_factor=1.0).interaction([80.0])
+    share = float(scattered[0] / (photo + scattered)[0])
+    assert compton.size / first.sum() == pytest.approx(share, abs=4.5 * 0.5 / np.sqrt(n))
+
+
+def test_foils_stop_scattered_photons():
+    rng = np.random.default_rng(5)
+    k = [
+        follow(SiliconDetector(), [70.0], [1.0], 8000, rng, Stack(foil_mm=f)).counts(-1e9, 1.0, rng).mean()
+        for f in (0.0, 0.005, 0.02)
+    ]
+    assert k[0] > 1.5 > k[1] > 1.1 > k[2]
+
+
+def test_a_dead_layer_records_nothing():
+    rng = np.random.default_rng(6)
+    detector = SiliconDetector(dead_layer_mm=5.0, fill_factor=1.0)
+    deposits = follow(detector, [40.0], [1.0], 20_000, rng, Stack(foil_mm=0.0))
+    photo, compton = detector.interaction([40.0])
+    first = (deposits.order == 0).sum() / 20_000
+    assert first == pytest.approx(float(photo[0] + compton[0]), abs=4.5 * 0.5 / np.sqrt(20_000))
+
+
+def test_efficiency_in_closed_form():
+    counts = np.repeat([0, 1, 2], [20, 60, 20])
+    value, error = efficiency(counts)
+    assert value == pytest.approx(1.0**2 / 1.4)
+    assert error > 0
+    assert efficiency(np.zeros(10)) == (0.0, 0.0)
+    ones = np.ones(4)
+    assert efficiency(ones)[0] == 1.0
+    assert efficiency(ones, [1.0, 1.0, 3.0, 3.0])[0] == pytest.approx(2.0**2 / 5.0)
+    # The standard error against repeated experiments.
+    rng = np.random.default_rng(0)
+    draws = [efficiency(rng.choice([0, 1, 2], 500, p=[0.2, 0.6, 0.2])) for _ in range(400)]
+    values, errors = np.array(draws).T
+    assert errors.mean() == pytest.approx(values.std(), rel=0.15)
+    with pytest.raises(ValueError, match="task has shape"):
+        efficiency(ones, [1.0])
+
+
+def test_charge_sharing_of_followed_pulses_doubles_counts_without_a_threshold(followed):
+    deposits = followed[2]
+    rng = np.random.default_rng(7)
+    plain = deposits.counts(-1e9, 1.0, rng).mean()
+    assert deposits.counts(-1e9, 1.0, rng, charge_sharing=1.0).mean() == pytest.approx(2 * plain)
+
+
+def test_refusals():
+    rng = np.random.default_rng(0)
+    with pytest.raises(ValueError, match="photons must be"):
+        follow(SiliconDetector(), [60.0], [1.0], 0, rng)
+    with pytest.raises(ValueError, match="weights must be"):
+        follow(SiliconDetector(), [60.0], [0.0], 10, rng)
+    with pytest.raises(ValueError, match="foil_mm"):
+        Stack(foil_mm=0.6)
+    with pytest.raises(ValueError, match="pulses must be"):
+        follow(SiliconDetector(), [60.0], [1.0], 10, rng).counts(5.0, 1.0, rng, "pixel")
+
+
+# --- study --------------------------------------------------------------------------------------------------------
+
+
+def test_the_study_at_small_scale(tmp_path):
+    report = study.run(study.Settings(photons=3000, dead_times_ns=(50.0,), charge_sharing=(0.1,)))
+    report.save(tmp_path)
+    assert (tmp_path / "detector.png").read_bytes().startswith(b"\x89PNG")
+    checks = {c["name"]: c for c in report.data["checks"]}
+    assert checks["counted / incident behind 24 cm fat"]["ok"]
+    assert checks["pile-up behind the body, calibrated, HU"]["ok"]
+    first = report.data["efficiency"][0]["rows"][0]
+    # Repeated counts cost efficiency, but not all that separates 60 mm from the published value.
+    assert 0.72 < first["dqe"] < first["one_interaction"] - 0.03
+    entry = report.data["pile_up"][0]
+    assert entry["air"]["lost_percent"] > 40 > 2 > entry["body"]["lost_percent"] > 0.5
+    assert abs(entry["uncorrected_body_hu"]) > 100
+    assert "## Charge sharing" in report.text
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"photons": 10}, "photons"),
+        ({"dead_times_ns": ()}, "dead_times"),
+        ({"charge_sharing": (0.0,)}, "charge_sharing"),
+        ({"seed": -1}, "seed"),
+    ],
+)
+def test_bad_settings(change, match):
+    with pytest.raises(ValueError, match=match):
+        study.Settings(**change)
