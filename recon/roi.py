@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -70,7 +71,6 @@ class InsetProblem:
         if scan.surround is None or scan.window is None:
             raise ValueError("PWLS of an inset needs a scan with a known surround: acquire it with region=")
         self.grid, self.geometry, self.outer = grid, scan.geometry, scan.window
-        self.window = shadow(scan.geometry, grid, margin=1, motion=motion)
         fbp = InsetFbp(scan, [grid], ["standard"])
         self.mu_ref = scan.linearisation.mu_ref
         self.background = scan.surround_line_integrals()
@@ -83,14 +83,26 @@ class InsetProblem:
         slope = scan.linearisation.slope(polychromatic)
         exposure = scan.exposure_s or NOISE_FREE_EXPOSURE_S
         # Per second of exposure: the Gram of one exposure serves all by a factor.
-        weights = scan.surround / slope.square() / exposure
-        self._weights = self.window.take(weights).contiguous()
-        self.projector = Projector(scan.geometry, grid, self.window, motion)
-        if motion is None:
-            self.gram = Gram(self.projector, self._weights, nodes=nodes)
-        else:
-            still = shadow(scan.geometry, grid, margin=1)
-            self.gram = Gram(Projector(scan.geometry, grid, still), still.take(weights).contiguous(), nodes=nodes)
+        self._all_weights = scan.surround / slope.square() / exposure
+        self._place(None)
+        self.gram = Gram(self.projector, self._weights, nodes=nodes)
+        if motion is not None:
+            self._place(motion)
+
+    def _place(self, motion: Any) -> None:
+        self.window = shadow(self.geometry, self.grid, margin=1, motion=motion)
+        self._weights = self.window.take(self._all_weights).contiguous()
+        self.projector = Projector(self.geometry, self.grid, self.window, motion)
+
+    def with_motion(self, motion: Any) -> InsetProblem:
+        """The same problem for another displacement of the inset (None: at rest); shares the Gram.
+
+        Args:
+            motion: as for :class:`InsetProblem`.
+        """
+        other = copy.copy(self)
+        other._place(motion)
+        return other
 
     def data(self, scan: Scan) -> Tensor:
         """Line integrals of a scan on the grid's shadow, background taken off, ``(views, rows, columns)``."""
