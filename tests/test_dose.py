@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchpcct.dose import air_fluence, ctdi_dose, mass_energy_absorption, monte_carlo_dose, primary_dose
-from torchpcct.dose._transport import _compton, _rayleigh
+from torchpcct.dose._transport import _compton, _rayleigh, _turned
 from torchpcct.dose.coefficients import MGY_PER_KEV_PER_G, fan_half_angle
 from torchpcct.dose.ctdi import CtdiDose, disc_samples
 from torchpcct.dose.scatter import _form_factor
@@ -211,6 +211,26 @@ def test_compton_samples_follow_klein_and_nishina(energy):
     mean, square = ((probability * electron**k).sum() for k in (1, 2))
     assert (energy - scattered).mean() == pytest.approx(mean, abs=4.0 * math.sqrt((square - mean**2) / 20_000))
     assert ((energy - scattered) ** 2).mean() == pytest.approx(square, rel=0.03)
+
+
+@given(st.floats(-1.0, 1.0), st.floats(0.0, 6.28), st.floats(-1.0, 1.0), st.floats(0.0, 6.28))
+@settings(deadline=None)
+def test_scattered_directions_keep_the_angle(dz, azimuth, cosine, phi):
+    across = math.sqrt(1.0 - dz * dz)
+    old = np.array([across * math.cos(azimuth), across * math.sin(azimuth), dz])
+    new = np.array(_turned(*old, cosine, phi))
+    assert np.linalg.norm(new) == pytest.approx(1.0, abs=1e-12)
+    assert old @ new == pytest.approx(cosine, abs=2e-6)
+
+
+def test_a_longer_scan_adds_scatter_only(scanners):
+    grid, scene = VolumeGrid((60, 60), 4.0), water_cylinder(200.0)
+    short, long = (
+        monte_carlo_dose(scene, scanners["large"], grid, 0.35, histories=16_000, scan_length_mm=length)
+        for length in (5.0, 100.0)
+    )
+    np.testing.assert_array_equal(short.primary, long.primary)
+    assert short.scattered.sum() < 0.3 * long.scattered.sum()
 
 
 @pytest.mark.parametrize("energy", [20.0, 80.0])

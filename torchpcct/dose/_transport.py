@@ -87,6 +87,22 @@ def _rayleigh(energy: float, squares: Any, cumulative: Any, state: Any) -> Any:
             return state, cosine
 
 
+@numba.njit(inline="always", cache=True)
+def _turned(dx: float, dy: float, dz: float, cosine: float, phi: float) -> Any:
+    """Unit direction at the polar angle arccos(cosine) and the azimuth phi about another."""
+    sine = math.sqrt(max(0.0, 1.0 - cosine * cosine))
+    cp, sp = sine * math.cos(phi), sine * math.sin(phi)
+    across = math.sqrt(max(0.0, 1.0 - dz * dz))
+    if across > 1e-6:
+        x = dx * cosine + (dx * dz * cp - dy * sp) / across
+        y = dy * cosine + (dy * dz * cp + dx * sp) / across
+        z = dz * cosine - across * cp
+    else:
+        x, y, z = cp, sp * math.copysign(1.0, dz), cosine * math.copysign(1.0, dz)
+    norm = 1.0 / math.sqrt(x * x + y * y + z * z)
+    return x * norm, y * norm, z * norm
+
+
 @numba.njit(parallel=True, cache=True, error_model="numpy")
 def transport(
     histories: int, key: Any, labels: Any, x0: float, y0: float, step: float, radius: float, half_z: float,
@@ -164,15 +180,4 @@ def transport(
                     break
                 state, u = _draw(state)
                 phi = 2.0 * math.pi * u
-                sine = math.sqrt(max(0.0, 1.0 - cosine * cosine))
-                cp, sp = sine * math.cos(phi), sine * math.sin(phi)
-                across = math.sqrt(max(0.0, 1.0 - dz * dz))
-                if across > 1e-6:
-                    nx_, ny_ = (dx * dz * cp - dy * sp) / across, (dy * dz * cp + dx * sp) / across
-                    dx, dy, dz = dx * cosine + nx_, dy * cosine + ny_, dz * cosine - across * cp
-                else:
-                    dx, dy, dz = cp, sp * math.copysign(1.0, dz), cosine * math.copysign(1.0, dz)
-                norm = 1.0 / math.sqrt(dx * dx + dy * dy + dz * dz)
-                dx *= norm
-                dy *= norm
-                dz *= norm
+                dx, dy, dz = _turned(dx, dy, dz, cosine, phi)
