@@ -162,6 +162,21 @@ def test_any_counts_give_finite_bounded_lengths(model, bias_reduction):
         assert not found.at_bound[:3].any()  # pseudo-counts keep empty rays inside
 
 
+def test_starved_rays_converge(model):
+    """Few or no counts behind 0…600 mm of water at a millionth of the exposure to all of it."""
+    rng, n = np.random.default_rng(3), 20000
+    lengths = torch.from_numpy(np.outer(model.basis.coefficients("water"), rng.uniform(0, 600, n)))
+    columns, scale = rng.integers(0, 4, n), 10.0 ** rng.uniform(-6, 0, n)
+    counts = torch.from_numpy(
+        rng.poisson(model.expected(lengths, columns=columns, scale=scale).numpy()).astype(np.float64)
+    )
+    found = decompose(counts, model, columns=columns, scale=scale)
+    assert (counts.sum(0) == 0).sum() > 1000
+    assert found.converged.all()
+    assert torch.isfinite(found.line_integrals).all()
+    assert torch.isfinite(found.information).all()
+
+
 def test_gradient(model):
     columns = np.array([0, 1, 3])
     a = truth(*BEHIND_24_CM_FAT, 60.0, 3.0, 10.0, 0.5)

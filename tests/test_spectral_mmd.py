@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchpcct.spectral import MMD_TISSUES, clean, dice, label, mmd, pe_pvc
+from torchpcct.spectral import MMD_TISSUES, clean, dice, label, mmd, nearest, pe_pvc
 
 BASIS = pe_pvc()
 CORNERS = torch.from_numpy(np.stack([BASIS.coefficients(t) for t in MMD_TISSUES], axis=1))
@@ -108,6 +108,26 @@ def test_cleaning_keeps_pure_labels_and_repeats():
     only_fat = torch.zeros(4, 8, 8)
     only_fat[3] = 1
     assert (clean(only_fat) == 3).all()
+
+
+def test_nearest_finds_what_the_largest_fraction_loses():
+    """Core and fibrous tissue 4 standard deviations apart, on one line with fat: errors as of a threshold between."""
+    truth = torch.tensor([1, 2, 3]).repeat(4000)
+    c = np.array([[0.0440, -0.0145], [-0.0145, 0.0053]]) / 16  # a quarter of the noise of the paper's tables
+    noise = np.random.default_rng(5).multivariate_normal([0, 0], c, truth.numel()).T
+    fractions = mmd(CORNERS[:, truth] + torch.from_numpy(noise), BASIS, covariance=(c[0, 0], c[0, 1], c[1, 1]))
+    found = nearest(fractions, BASIS, covariance=(c[0, 0], c[0, 1], c[1, 1]))
+    assert found.dtype == torch.int64
+    wrong = float((found != truth).double().mean())
+    assert wrong < 0.06
+    assert float((label(fractions) != truth).double().mean()) > 3 * wrong
+
+
+def test_nearest_of_pure_tissues():
+    fractions = torch.eye(4).reshape(4, 2, 2)
+    assert nearest(fractions, BASIS).tolist() == [[0, 1], [2, 3]]
+    with pytest.raises(ValueError, match="4 tissues"):
+        nearest(fractions[:3], BASIS)
 
 
 def test_dice_of_known_masks():

@@ -9,7 +9,7 @@ from torchpcct.spectral.decompose import (
     decompose_surround,
     inverse,
 )
-from torchpcct.spectral.mmd import MMD_TISSUES, clean, dice, label, mmd
+from torchpcct.spectral.mmd import MMD_TISSUES, clean, dice, label, mmd, nearest
 from torchpcct.spectral.model import SpectralModel
 from torchpcct.spectral.vmi import (
     VMI_ENERGIES_KEV,
@@ -37,6 +37,7 @@ __all__ = [
     "inverse",
     "label",
     "mmd",
+    "nearest",
     "pe_pvc",
     "sample_covariance",
     "vmi",

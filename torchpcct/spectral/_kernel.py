@@ -29,6 +29,9 @@ _C2, _C3, _C4, _C5, _C6, _C7, _C8, _C9, _C10, _C11 = (1.0 / math.factorial(k) fo
 # Exponents stay where neither counts nor their products overflow; only passing iterates get there.
 _LOWEST, _HIGHEST = -300.0, 200.0
 
+# After so many steps they are halved, after twice as many quartered, …
+_PATIENCE = 40
+
 _BLOCK = 256
 _SUM = {"reassoc", "contract", "nsz"}
 
@@ -148,15 +151,16 @@ def _iterate(
         best, halvings = merit, 0
         d1, d2 = _direction(u1, u2, j11, j12, j22, held1, held2)
         longest = max(abs(d1) / reach[0], abs(d2) / reach[1])
-        if 2 * k >= limit:
-            longest = max(longest, 2.0)  # a few starved rays jump back and forth: halve their steps
         if longest > 1.0:
             d1, d2 = d1 / longest, d2 / longest
+        # A few starved rays jump back and forth about the solution: shorten their steps more and more.
+        shorter = 2.0 ** (k // _PATIENCE)
+        d1, d2 = d1 / shorter, d2 / shorter
         b1 = min(max(a1 + d1, bounds[0, 0]), bounds[0, 1])
         b2 = min(max(a2 + d2, bounds[1, 0]), bounds[1, 1])
         d1, d2 = b1 - a1, b2 - a2
         a1, a2 = b1, b2
-        if d1 * d1 * f11 + 2.0 * d1 * d2 * f12 + d2 * d2 * f22 <= tolerance * tolerance:
+        if (d1 * d1 * f11 + 2.0 * d1 * d2 * f12 + d2 * d2 * f22) * shorter * shorter <= tolerance * tolerance:
             return a1, a2, f11, f12, f22, k + 1
     return a1, a2, f11, f12, f22, -1
 

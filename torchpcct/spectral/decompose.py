@@ -32,7 +32,8 @@ COARSE_TOLERANCE = 0.5
 EXACT_TOLERANCE = 1e-7
 """The same for noise-free counts, where standard deviations are no measure."""
 
-STEP_LIMIT = 40
+STEP_LIMIT = 160
+"""Most rays take three steps; a few in a million, with a handful of counts, need their steps damped."""
 
 
 def inverse(packed: Tensor) -> Tensor:

@@ -7,9 +7,10 @@ the one whose triangle in the plane of coefficients holds the voxel or comes nea
 smallest one wins (the most specific explanation); a voxel outside all of them moves to the nearest point of the nearest
 triangle.
 
-Cleaning: Li et al. name "a standard 2D k-means clustering" without its features. Here they are the fractions averaged
-over a small in-plane window, and the clusters start at the pure tissues, so that each keeps its name and the result
-does not depend on chance.
+Cleaning: Li et al. name "a standard 2D k-means clustering" without its features. :func:`clean` takes the fractions,
+averaged over a small in-plane window, and starts the clusters at the pure tissues, so that each keeps its name and the
+result does not depend on chance. :func:`nearest` keeps the centres there and measures distances in the two dimensions
+of the basis plane, in units of its noise: voxels at the edge of the vessel, mixed with fat, then move no centre.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from torch import Tensor
 from torchpcct.scene.materials import Material
 from torchpcct.spectral.basis import FIT_ENERGIES_KEV, Basis
 
-__all__ = ["MMD_TISSUES", "clean", "dice", "label", "mmd"]
+__all__ = ["MMD_TISSUES", "clean", "dice", "label", "mmd", "nearest"]
 
 MMD_TISSUES = ("blood_iodine", "necrotic_core", "fibrous_tissue", "pericoronary_fat")
 """The tissues of Li et al."""
@@ -134,6 +135,38 @@ def _nearest(x: Tensor, corners: Tensor) -> tuple[Tensor, Tensor]:
 def label(fractions: Tensor) -> Tensor:
     """Index of the largest fraction, ``(K, ...)`` → ``(...)`` int64."""
     return fractions.argmax(0)
+
+
+def nearest(
+    fractions: Tensor, basis: Basis, tissues: Sequence[Material | str] | Any = MMD_TISSUES, covariance: Any = None
+) -> Tensor:
+    """The pure tissue nearest to each mixture: k-means whose centres stay at the tissues, which are known.
+
+    The largest fraction is a poor label where tissues lie nearly on one line of the basis plane: the necrotic core
+    lies 0.08 standard deviations off the line from fat to fibrous tissue (0.2 mm voxels, the exposure of the paper's
+    tables), so noise turns a core into a mixture of fat and fibrous tissue with hardly any core in it. The mixture
+    itself stays where it was; with its distance to the tissues measured in standard deviations, the nearest one is the
+    most likely.
+
+    Args:
+        fractions: ``(K, ...)`` of :func:`mmd`.
+        basis, tissues, covariance: as given there.
+
+    Returns:
+        ``(...)`` int64 index of the tissue.
+
+    Raises:
+        ValueError: a number of fractions that is not that of the tissues; see also :func:`mmd`.
+    """
+    corners = _whitening(basis, covariance) @ _corners(basis, tissues)
+    if fractions.ndim < 1 or fractions.shape[0] != corners.shape[1]:
+        raise ValueError(
+            f"fractions must have {corners.shape[1]} tissues first, got the shape {tuple(fractions.shape)}"
+        )
+    points = torch.from_numpy(corners)
+    x = points @ fractions.detach().to(torch.float64).reshape(len(fractions), -1).cpu()
+    distance = points.square().sum(0)[:, None] - 2 * points.T @ x  # less |x|², the same for all tissues
+    return distance.argmin(0).reshape(fractions.shape[1:]).to(fractions.device)
 
 
 def clean(fractions: Tensor, window: int = 3, iterations: int = 50) -> Tensor:
