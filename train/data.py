@@ -19,7 +19,8 @@ from torch import Tensor
 from recon.gram import Gram
 from recon.unrolled import NormalProblem
 from torchpcct.geometry import VolumeGrid
-from train.scenes import SceneConfig, random_scene
+from train.rasterise import random_scene
+from train.scenes import SceneConfig
 
 __all__ = ["Batch", "Data", "DataConfig", "Situation", "seed_of"]
 
@@ -62,6 +63,7 @@ class DataConfig:
         situations: one Gram operator each; one is drawn per step.
         scenes: changes of :class:`train.scenes.SceneConfig`.
         core_roi, tissue_roi: ranges of the radii of the random ROIs, mm.
+        flat_roi: share of ROIs that are discs of one slice, as in an axial image, instead of balls.
     """
 
     shape: tuple[int, int, int] = (20, 24, 24)
@@ -70,8 +72,9 @@ class DataConfig:
     views: int = 984
     situations: tuple[Situation, ...] = _SITUATIONS
     scenes: dict[str, Any] = field(default_factory=dict)
-    core_roi: tuple[float, float] = (0.3, 1.0)
-    tissue_roi: tuple[float, float] = (0.15, 0.5)
+    core_roi: tuple[float, float] = (0.25, 0.8)
+    tissue_roi: tuple[float, float] = (0.15, 0.45)
+    flat_roi: float = 0.6
 
     def __post_init__(self) -> None:
         set_ = object.__setattr__
@@ -85,6 +88,8 @@ class DataConfig:
             raise ValueError(f"exposure_s must be a range of positive times, got {self.exposure_s}")
         if not self.voxel_mm > 0:
             raise ValueError(f"voxel_mm must be positive, got {self.voxel_mm}")
+        if not 0 <= self.flat_roi <= 1:
+            raise ValueError(f"flat_roi must be from 0 to 1, got {self.flat_roi}")
         if not self.situations:
             raise ValueError("situations must name at least one scan")
 
@@ -187,12 +192,15 @@ def _random_contrast(
     inside, around = core > 0.97, tissue > 0.97
     if not inside.any():
         inside = around
+    flat = float(torch.rand((), generator=generator)) < config.flat_roi
     first = _ball(inside, config.core_roi, config.voxel_mm, generator)
     # The tissue next to the core is what the study's background ROI lies in, and hardest: half of all draws.
     near = around & _within(
         first, around.shape, 0.7 + 0.5 * float(torch.rand((), generator=generator)), config.voxel_mm
     )
     second = _ball(near if near.any() else around, config.tissue_roi, config.voxel_mm, generator, around)
+    if flat:
+        first, second = _fullest_slice(first), _fullest_slice(second)
     n, m = int(first.sum()), int(second.sum())
     if n < 4 or m < 4:
         return torch.zeros(core.shape), torch.zeros(())
@@ -215,6 +223,14 @@ def _ball(
         return torch.zeros_like(mask)
     centre = places[min(int(draw * len(places)), len(places) - 1)]
     return (mask if within is None else within) & (_squared(mask.shape, centre) <= (radius / voxel_mm) ** 2)
+
+
+def _fullest_slice(mask: Tensor) -> Tensor:
+    """The mask in the slice that holds most of it, empty elsewhere."""
+    out = torch.zeros_like(mask)
+    z = int(mask.sum(dim=(1, 2)).argmax())
+    out[z] = mask[z]
+    return out
 
 
 def _within(ball: Tensor, shape: torch.Size, margin_mm: float, voxel_mm: float) -> Tensor:

@@ -1,0 +1,152 @@
+"""Held-out plaques that checkpoints are selected with: neither random scenes nor the paper's plaque."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from scipy import ndimage
+
+from train.drawing import Draw
+from train.rasterise import check_grid, rasterise
+from train.scenes import Scene, Triple, Vessel, Volume
+
+__all__ = ["ValidationScenes", "validation_scenes"]
+
+
+@dataclass(frozen=True)
+class ValidationScenes:
+    """Held-out plaques, each at several core contrasts with all else equal.
+
+    Args:
+        image: ``(scenes, contrasts, nz, ny, nx)`` float32, HU.
+        contrasts: ``(contrasts,)`` HU of the core to its fibrous layer.
+        core: ``(scenes, nz, ny, nx)`` float32, volume fraction of the core.
+        core_roi: likewise, 0 or 1: voxels wholly inside the core.
+        fibrous_roi: likewise, 0 or 1: voxels at most 1.5 mm from the core that lie, with all their 26 neighbours,
+            wholly inside fibrous tissue (or, where that leaves fewer than 20, that lie wholly inside without them).
+        scenes: parameters at the first contrast.
+    """
+
+    image: torch.Tensor
+    contrasts: torch.Tensor
+    core: torch.Tensor
+    core_roi: torch.Tensor
+    fibrous_roi: torch.Tensor
+    scenes: tuple[Scene, ...]
+
+
+def validation_scenes(
+    grid_shape: tuple[int, int, int],
+    spacing_mm: Triple,
+    *,
+    seed: int = 0,
+    contrasts: tuple[float, ...] = (-60.0, -30.0, 0.0, 40.0),
+    size: int = 8,
+) -> ValidationScenes:
+    """Plaques for the selection of checkpoints, each with several core contrasts; not the paper's, and not random ones.
+
+    Vessels of 2.6 and 4.4 mm alternate, with a superquadric or a crescent in the fibrous layer; position, orientation,
+    eccentricity and HU vary with ``seed``. The vessel's axis at z = 0 lies in the inner third of the inset.
+
+    Raises:
+        ValueError: an invalid grid, or one in which a ROI is empty (too coarse or too small for the plaques).
+    """
+    shape, spacing = check_grid(grid_shape, spacing_mm)
+    extent = (shape[0] * spacing[0], shape[1] * spacing[1], shape[2] * spacing[2])
+    rng = np.random.default_rng(seed)
+    images, cores, core_rois, fibrous_rois, scenes = [], [], [], [], []
+    for index in range(size):
+        draw = Draw(int(rng.integers(2**62)))
+        scene = _validation_scene(draw, extent, large=bool(index % 2), crescent=bool(index // 2 % 2))
+        base, weight, fibrous = rasterise(_with_contrast(scene, 0.0), shape, spacing)
+        core_roi = weight > 0.99
+        near = ndimage.distance_transform_edt(weight < 0.5, sampling=spacing) <= 1.5
+        tissue = (fibrous > 0.99) & near
+        fibrous_roi = ndimage.binary_erosion(fibrous > 0.99, np.ones((3, 3, 3))) & near
+        if fibrous_roi.sum() < 20:
+            fibrous_roi = tissue
+        if not core_roi.any() or not fibrous_roi.any():
+            raise ValueError(
+                f"grid {shape} at {spacing} mm leaves no voxel wholly inside core or fibrous tissue of validation "
+                f"scene {index}: take smaller voxels or a larger inset"
+            )
+        images.append(np.stack([base + contrast * weight for contrast in contrasts]))
+        cores.append(weight)
+        core_rois.append(core_roi.astype(np.float32))
+        fibrous_rois.append(fibrous_roi.astype(np.float32))
+        scenes.append(_with_contrast(scene, contrasts[0]))
+    return ValidationScenes(
+        torch.from_numpy(np.stack(images)),
+        torch.tensor(contrasts, dtype=torch.float32),
+        torch.from_numpy(np.stack(cores)),
+        torch.from_numpy(np.stack(core_rois)),
+        torch.from_numpy(np.stack(fibrous_rois)),
+        tuple(scenes),
+    )
+
+
+def _with_contrast(scene: Scene, contrast: float) -> Scene:
+    """The scene with another contrast of all cores."""
+
+    def change(vessel: Vessel) -> Vessel:
+        volumes = tuple(
+            replace(v, contrast=contrast, hu=vessel.fibrous_hu + contrast) if v.kind == "core" else v
+            for v in vessel.volumes
+        )
+        return replace(vessel, volumes=volumes)
+
+    return replace(scene, vessels=tuple(change(vessel) for vessel in scene.vessels))
+
+
+def _validation_scene(draw: Draw, extent: Triple, *, large: bool, crescent: bool) -> Scene:
+    diameter = 4.4 if large else 2.6
+    wall = 0.25 if large else 0.15
+    inner = 0.5 * diameter - wall
+    lumen = (0.45 if large else 0.4) * inner
+    eccentricity, direction, angle = draw((0.75, 0.95)), draw.angle(), draw.angle()
+    edge = lumen - eccentricity * (inner - lumen)  # far side of the lumen, seen from the axis towards the plaque
+    thickness = inner - edge
+    cap = 0.15
+    plaque = direction + math.pi
+    c, s = math.cos(plaque), math.sin(plaque)
+    z = draw((-0.1, 0.1)) * extent[0]
+    if crescent:
+        # Tangentially wide, hollowed out by the lumen's cap; the wall side stays fibrous.
+        axes = (0.45 * thickness, 0.8 * inner, 0.9 if large else 0.8)
+        r, exponent = edge + 0.3 * thickness, 2.0
+    else:
+        axes = (0.27 * thickness, 0.4 * inner, 0.9 if large else 0.75)
+        r, exponent = edge + cap + 0.27 * thickness, 4.0
+    fibrous = draw((80.0, 110.0))
+    core = Volume(
+        kind="core",
+        shape="crescent" if crescent else "superquadric",
+        hu=fibrous,
+        centre=(r * c, r * s, z),
+        semi_axes=axes,
+        exponent=exponent,
+        rotation=(c, s, 0.0, -s, c, 0.0, 0.0, 0.0, 1.0),
+        cap=cap,
+    )
+    tilt = math.tan(math.radians(draw((0.0, 20.0))))
+    vessel = Vessel(
+        position=(draw((-0.15, 0.15)) * extent[2], draw((-0.15, 0.15)) * extent[1]),
+        slope=(tilt * math.cos(angle), tilt * math.sin(angle)),
+        diameter=diameter,
+        aspect=1.0,
+        angle=0.0,
+        wall=wall,
+        wall_hu=draw((20.0, 60.0)),
+        fibrous_hu=fibrous,
+        lumen_hu=draw((300.0, 420.0)),
+        lumen_radius=lumen,
+        lumen_aspect=1.0,
+        lumen_angle=0.0,
+        eccentricity=eccentricity,
+        eccentric_angle=direction,
+        volumes=(core,),
+    )
+    return Scene(draw((-100.0, -80.0)), (vessel,))
