@@ -26,7 +26,7 @@ _LUMEN_TOLERANCE = 20.0
 def build_report(m: Measured) -> Report:
     """Report of :func:`recon.study.motion.measure_all`: ``report.json``, ``report.md`` and two figures."""
     checks = _checks(m)
-    data = {
+    data: dict[str, Any] = {
         "study": "motion",
         "settings": asdict(m.settings),
         "range_mm": m.range_mm,
@@ -235,13 +235,13 @@ def _compensation_text(m: Measured) -> str:
     s = m.settings
     worst = max(s.fractions)
     return (
-        f"The scan with {100 * worst:.0f} % of the motion ({worst * s.amplitude_mm:g} mm), reconstructed with the motion "
-        "given. The fat around the vessel stands still: its known readings are taken off and reconstructed at rest; "
-        "what the vessel adds is filtered and backprojected along the rays that met the vessel where it was (FBP), or "
-        "projected with the grid displaced in every view (PWLS and MBIR). Wrong by e: the estimate is (1 − e) times "
-        f"the true motion, a residual motion of e · {worst * s.amplitude_mm:g} mm. NRMSE: against the same method's "
-        "noise-free image at rest. In noise, thresholds on single pixels find no closed core in FBP; there, contrast "
-        "and lumen are the figures to read. PWLS was run to its certified minimum, at rest and with the true motion."
+        f"The scan with {100 * worst:.0f} % of the motion ({worst * s.amplitude_mm:g} mm), reconstructed with the "
+        "motion given. The fat around the vessel stands still: its known readings are taken off and reconstructed at "
+        "rest; what the vessel adds is filtered and backprojected along the rays that met the vessel where it was "
+        "(FBP), or projected with the grid displaced in every view (PWLS and MBIR). Wrong by e: the estimate is "
+        f"(1 − e) times the true motion, a residual motion of e · {worst * s.amplitude_mm:g} mm. NRMSE: against the "
+        "same method's noise-free image at rest. PWLS was run to its certified minimum, at rest and with the true "
+        "motion."
     )
 
 

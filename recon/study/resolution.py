@@ -20,11 +20,12 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from recon.study import paper
-from recon.study.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM, prepare
-from recon.study.resolution_measures import Blurred, SystemWidth, centers, measure, truth, wire_width
+from recon.study.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM, PlaqueScan, prepare
+from recon.study.resolution_measures import FWHM_PER_SIGMA, Blurred, SystemWidth, centers, measure, truth, wire_width
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.roi import PROTOCOL_PIXEL_MM, PROTOCOL_PIXELS, axial_grid, sample_axial
 
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from torchpcct.scene import Scene
     from torchpcct.scene.plaque import Plaque
 
-__all__ = ["FULL_VIEWS", "Imaged", "Measured", "Settings", "run"]
+__all__ = ["FULL_VIEWS", "Imaged", "Measured", "Settings", "Smoothed", "measure_all", "run"]
 
 FULL_VIEWS = {"PCCT": 1968, "EID-CT": 984}
 """Views per turn of the paper."""
@@ -82,6 +83,16 @@ class Settings:
         return cls(**{"thinning": 8, "bulges_mm": (0.5,), **changes})
 
 
+@dataclass(frozen=True)
+class Smoothed:
+    """ROI figures of a blurred volume: widths of the blur as σ in mm (z, y, x), contrasts and the noise of theirs."""
+
+    sigma_mm: tuple[float, float, float]
+    contrast_hu: float
+    own_contrast_hu: float
+    sd_hu: float
+
+
 @dataclass
 class Imaged:
     """One scanner's noise-free image.
@@ -95,6 +106,7 @@ class Imaged:
         width: of the system.
         blurred: one entry per blur (EID-CT: without blur only).
         plan: what was modelled.
+        smoothed: the PCCT's two ROIs after a blur of its volume to the resolution of the EID-CT.
     """
 
     axial: Tensor
@@ -106,6 +118,7 @@ class Imaged:
     width: SystemWidth
     blurred: list[Blurred]
     plan: dict[str, Any]
+    smoothed: Smoothed | None = None
 
     @property
     def contrast_hu(self) -> float:
@@ -151,13 +164,14 @@ def measure_all(settings: Settings, progress: Callable[[str, float], None] | Non
         settings, plaque, axial_grid((z, y, x)), {}, {},
         {name: float(plaque.area(name, 0.0)) for name in ("lumen", "core")},
     )  # fmt: skip
+    kept: dict[str, _Kept] = {}
     sod = presets.pcct(8).geometry.sod
     for name, preset in (("PCCT", presets.pcct), ("EID-CT", presets.eid)):
         start = time.perf_counter()
         scanner = preset(FULL_VIEWS[name] // settings.thinning)
         exposure = settings.exposure_s * (scanner.geometry.sod / sod) ** 2
         sigmas = settings.sigmas_px if name == "PCCT" else settings.sigmas_px[:1]
-        measured.scanners[name] = _image(
+        measured.scanners[name], kept[name] = _image(
             name, scanner, (scene, plaque), measured.image, sigmas, exposure, partial(report, name)
         )
         measured.seconds[name] = time.perf_counter() - start
@@ -166,6 +180,7 @@ def measure_all(settings: Settings, progress: Callable[[str, float], None] | Non
     for done, bulge in enumerate(bulges):
         measured.variants[bulge] = _variant(bulge, settings)
         report("variants", (done + 1) / len(bulges))
+    measured.scanners["PCCT"].smoothed = _smooth(measured, kept)
     measured.seconds["variants"] = time.perf_counter() - start
     return measured
 
@@ -178,7 +193,7 @@ def _image(
     sigmas: tuple[float, ...],
     exposure_s: float,
     progress: Callable[[float], None],
-) -> Imaged:
+) -> tuple[Imaged, _Kept]:
     from recon.exact_noise import roi_covariance
     from torchpcct.scene.plaque import plaque_scene
 
@@ -195,7 +210,7 @@ def _image(
     cut = VolumeGrid((high, 1, PROTOCOL_PIXELS), PROTOCOL_PIXEL_MM, (z, y, x))
     axial = sample_axial(volume.double(), scanned.fine, image)[0]
     masks, line = truth(scene, image), centers(plaque)
-    return Imaged(
+    imaged = Imaged(
         axial,
         sample_axial(volume.double(), scanned.fine, cut)[:, 0],
         (core, fibrous),
@@ -206,6 +221,51 @@ def _image(
         [measure(axial, image, s, masks, line) for s in sigmas],
         dict(scanned.clean.info["plan"]),
     )
+    return imaged, _Kept(scanned, volume, (grid, slab))
+
+
+@dataclass
+class _Kept:
+    """One scanner's scan, its volume, and the middle slices without a core."""
+
+    scanned: PlaqueScan
+    volume: Tensor
+    empty: tuple[VolumeGrid, Tensor]
+
+
+@dataclass(frozen=True)
+class _Functional:
+    """A linear functional of a volume, as :func:`recon.exact_noise.roi_covariance` takes ROIs."""
+
+    weights: Tensor
+
+
+def _smooth(m: Measured, kept: dict[str, _Kept]) -> Smoothed:
+    """The PCCT blurred by the Gaussian that makes up for the difference in width: in the plane that of the wire, along
+    z that of the detector rows at the isocentre (as uniform ones: variance width² / 12)."""
+    from scipy.ndimage import gaussian_filter
+
+    from recon.exact_noise import roi_covariance
+
+    wide, narrow = m.scanners["EID-CT"].width.area, m.scanners["PCCT"].width.area
+    plane = math.sqrt(max(wide**2 - narrow**2, 0.0)) / FWHM_PER_SIGMA
+    rows = [k.scanned.clean.geometry.pitch[0] / k.scanned.clean.geometry.magnification for k in kept.values()]
+    along = math.sqrt(max(rows[1] ** 2 - rows[0] ** 2, 0.0) / 12.0)
+    sigma = (along, plane, plane)
+
+    def blurred(values: Tensor) -> Tensor:
+        return torch.from_numpy(gaussian_filter(values.double().numpy(), np.array(sigma) / REFERENCE_VOXEL_MM))
+
+    k = kept["PCCT"]
+    # A Gaussian is its own transpose: blurred weights on the volume are the weights on the blurred volume.
+    pair = [_Functional(blurred(r.weights)) for r in k.scanned.pairs[0]]
+    core, fibrous = (float((f.weights * k.volume).sum()) for f in pair)
+    grid, slab = k.empty
+    empty = [float((blurred(r.weights) * slab).sum()) for r in k.scanned.rois.on(grid)]
+    rois: Any = [pair]
+    covariance = roi_covariance(k.scanned.clean, k.scanned.fbp, rois, m.scanners["PCCT"].exposure_s)[0][0]
+    contrast = fibrous - core
+    return Smoothed(sigma, contrast, contrast - (empty[1] - empty[0]), math.sqrt(float(np.trace(covariance))))
 
 
 def _middle_slices(scene: Scene, plaque: Plaque, scanner: Scanner, duty: float) -> tuple[VolumeGrid, Tensor]:

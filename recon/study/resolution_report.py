@@ -99,6 +99,7 @@ def _entry(s: Imaged) -> dict[str, Any]:
         "contrast_sd_hu": s.sd_hu,
         "cnr": s.contrast_hu / s.sd_hu,
         "own_cnr": s.own_contrast_hu / s.sd_hu,
+        "smoothed": None if s.smoothed is None else asdict(s.smoothed),
         "exposure_s": s.exposure_s,
         "fwhm_mm": asdict(s.width),
         "blurred": [b.as_dict() for b in s.blurred],
@@ -151,9 +152,19 @@ def _checks(m: Measured, found: dict[str, Any], final: float) -> list[Check]:
             Check("EID-CT: CNR that the core makes, over the PCCT's at equal fluence",
                   e.own_contrast_hu / e.sd_hu / (p.own_contrast_hu / p.sd_hu), "collapses", high=0.5),
             f"the contrast falls to {100 * e.own_contrast_hu / p.own_contrast_hu:.0f} %, the noise of the ROI means "
-            f"to {100 * e.sd_hu / p.sd_hu:.0f} %: the coarse cells pass little of the noise either",
+            f"to {100 * e.sd_hu / p.sd_hu:.0f} %: the coarse cells pass little of the noise either{_same_blur(p)}",
         ),
     ]  # fmt: skip
+
+
+def _same_blur(p: Imaged) -> str:
+    if p.smoothed is None:
+        return ""
+    s = p.smoothed
+    return (
+        f". The PCCT blurred to the EID-CT's resolution: contrast of the core {s.own_contrast_hu:.1f} HU, CNR "
+        f"{s.own_contrast_hu / s.sd_hu:.2f}"
+    )
 
 
 def _with_cause(check: Check, cause: str) -> Check:
@@ -192,6 +203,18 @@ def _scanners_section(m: Measured) -> str:
                 _or(b.segmentation.core_area, 2),
                 _or(b.cap_line, 3),
                 f"{b.depth:.1f}",
+            ]
+        )
+    if m.scanners["PCCT"].smoothed is not None:
+        f = m.scanners["PCCT"].smoothed
+        rows.append(
+            [
+                "PCCT blurred to the EID-CT's width",
+                f"{m.scanners['EID-CT'].width.area:.3f}",
+                "–",
+                f"{f.contrast_hu:.1f} ({f.own_contrast_hu:.1f})",
+                f"{f.contrast_hu / f.sd_hu:.2f} ({f.own_contrast_hu / f.sd_hu:.2f})",
+                *["–"] * 4,
             ]
         )
     head = [

@@ -1,0 +1,109 @@
+"""The motion study: its measures, its settings, and a whole run at small scale."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from recon.study import registry
+from recon.study.motion import Settings, measure_all
+from recon.study.motion_measures import Reference, observe
+from recon.study.motion_report import build_report
+from recon.study.plaque_scan import inset_grid
+from torchpcct.scene.plaque import plaque_scene
+
+TISSUES = {"patient": -100.0, "wall": 60.0, "fibrous": 100.0, "lumen": 470.0, "core": 40.0}
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    """The plaque as its tissues' values on 0.2 mm voxels."""
+    scene, plaque = plaque_scene()
+    grid = inset_grid(plaque, 0.2)
+    labels = scene.labels(grid)
+    volume = torch.zeros(grid.shape)
+    for name, value in TISSUES.items():
+        volume[torch.from_numpy(labels == scene.index(name))] = value
+    return grid, Reference.of(scene, plaque), volume
+
+
+def test_measures_of_a_known_volume(drawn):
+    grid, reference, volume = drawn
+    found = observe(volume, grid, reference, volume)
+    assert found.nrmse == 0.0
+    assert found.roi_hu == pytest.approx((40.0, 100.0), abs=6.0)  # of binary voxels of 0.2 mm
+    assert found.lumen_dice > 0.95
+    deviation = float((volume.double() + 100.0).square().mean().sqrt())
+    raised = observe(volume + 10.0, grid, reference, volume)
+    assert raised.nrmse == pytest.approx(10.0 / deviation, rel=1e-5)
+    assert raised.contrast_hu == pytest.approx(found.contrast_hu, abs=1e-4)
+    assert raised.depth == pytest.approx(found.depth, abs=1e-4)
+    away = observe(volume.roll(8, dims=-1), grid, reference, volume)
+    assert math.isnan(away.cap_line)  # 1.6 mm: the lumen's centre reads fat
+    assert away.lumen_dice < 0.4
+    assert away.segmentation.lumen_area == pytest.approx(found.segmentation.lumen_area, rel=1e-3)
+
+
+@pytest.fixture(scope="module")
+def measured():
+    torch.set_num_threads(1)
+    settings = Settings(
+        thinning=12, fractions=(0.2, 1.0), eid_fractions=(0.2,), errors=(0.2,), voxel_mm=0.4, realizations=1,
+        exposure_s=20.0, methods=("fbp", "pwls"),
+    )  # fmt: skip
+    return measure_all(settings)
+
+
+def test_motion_spoils_and_its_knowledge_repairs(measured):
+    m = measured
+    assert m.range_mm == pytest.approx((0.0, 2.0), abs=0.01)
+    small, large = (m.residual["PCCT", f] for f in (0.2, 1.0))
+    assert 0.05 < small[0].nrmse < large[0].nrmse
+    assert large[1].nrmse < large[0].nrmse  # the shift alone taken out
+    fixed = m.compensated["fbp", 0.0, False][0]
+    assert fixed.nrmse < 0.1 * large[0].nrmse
+    wrong = m.compensated["fbp", 0.2, False][0]
+    assert fixed.nrmse < wrong.nrmse < large[0].nrmse
+    # An estimate that is wrong by a fifth leaves a fifth of the motion.
+    assert wrong.nrmse == pytest.approx(small[0].nrmse, rel=0.15)
+    noisy = m.compensated["fbp", 0.0, True][0]
+    assert noisy.nrmse > fixed.nrmse
+    rest = m.at_rest["PCCT"].segmentation.lumen_area
+    assert fixed.segmentation.lumen_area == pytest.approx(rest, rel=0.02)
+    assert m.compensated["pwls", 0.0, False][0].nrmse < 0.1 * large[0].nrmse
+    assert m.compensated["pwls", None, False][0].nrmse == 0.0
+
+
+def test_eid_is_less_sensitive(measured):
+    assert measured.residual["EID-CT", 0.2][0].nrmse < measured.residual["PCCT", 0.2][0].nrmse
+
+
+def test_report(measured):
+    report = build_report(measured)
+    assert {"range [0, A]", "EID-CT less sensitive"} <= {c["paper"] for c in report.data["checks"]}
+    assert len(report.data["residual"]) == 3
+    assert len(report.data["compensated"]) == 10
+    assert set(report.figures) == {"motion.png", "motion_images.png"}
+    assert "One view in 12" in report.text or "one view in 12" in report.text
+    assert "wrong by 20 %" in report.text
+    assert "## What was modelled" in report.text
+
+
+def test_settings():
+    quick = registry.build_settings("motion", quick=True)
+    assert quick.thinning == 8
+    assert np.allclose(quick.motion.displacement([0.25]), [[2.0, 0.0, 0.0]])
+    for change, message in (
+        ({"thinning": 0}, "thinning"),
+        ({"voxel_mm": 0.0}, "voxel_mm"),
+        ({"fractions": (0.4, 0.2)}, "fractions must rise"),
+        ({"fractions": ()}, "at least one"),
+        ({"errors": (1.5,)}, "errors must rise"),
+        ({"methods": ("pwls",)}, "must hold fbp"),
+        ({"methods": ("fbp", "tv")}, "must hold fbp"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            Settings(**change)
