@@ -55,7 +55,7 @@ class Settings:
         ValueError: a value out of range.
     """
 
-    photons: int = 400_000
+    photons: int = 200_000
     seed: int = 0
     dead_times_ns: tuple[float, ...] = (20.0, 50.0, 100.0)
     charge_sharing: tuple[float, ...] = (0.1, 0.2)
@@ -72,7 +72,7 @@ class Settings:
 
     @classmethod
     def quick(cls, **changes: Any) -> Settings:
-        """A tenth of the photons."""
+        """A fifth of the photons."""
         return cls(**{"photons": 40_000, **changes})
 
 

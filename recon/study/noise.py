@@ -139,6 +139,11 @@ class Measured:
         """The truth at an exposure."""
         return exact_table(self.expected, self.covariance / exposure_s)
 
+    def variance_ratios(self) -> Any:
+        """Variance of the ROI means from the readings' squared deviations over the exact one, ``(doses, 2 S)``."""
+        exact = np.diag(self.covariance)
+        return np.array([v * exposure / exact for exposure, v in self.variances.items()])
+
     def slopes(self) -> Any:
         """Slope of log σ against log exposure of every ROI mean, ``(2 S,)``; −½ for counting noise."""
         x = np.log(list(self.variances))

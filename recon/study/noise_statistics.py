@@ -215,10 +215,14 @@ def _groups(settings: Sequence[Setting], axis: int) -> list[list[int]]:
     ]
 
 
-def _smallest_at_quarter(figure: Floats, settings: Sequence[Setting]) -> NDArray[np.bool_]:
-    """Whether, for every kernel, ``figure`` is smallest at 0.25 mm."""
+def _smallest_at_quarter(
+    figure: Floats, settings: Sequence[Setting], kernels: Sequence[str] | None = None
+) -> NDArray[np.bool_]:
+    """Whether, for every kernel (or those given), ``figure`` is smallest at 0.25 mm."""
     result = np.ones(figure.shape[:-1], dtype=bool)
     for members in _groups(settings, 0):
+        if kernels is not None and settings[members[0]][0] not in kernels:
+            continue
         sizes = [settings[i][1] for i in members]
         result &= figure[..., members].argmin(-1) == sizes.index(0.25)
     return result
@@ -241,7 +245,7 @@ def _closest(table: Table, settings: Sequence[Setting]) -> NDArray[np.bool_]:
     from recon.study import paper
 
     reference = np.array([paper.NOISE_FREE_ROI_HU["foreground"], paper.NOISE_FREE_ROI_HU["background"]])
-    return _smallest_at_quarter(np.abs(table.mean - reference).sum(-1), settings)
+    return _smallest_at_quarter(np.abs(table.mean - reference).sum(-1), settings, ("soft", "standard"))
 
 
 def _worst(table: Table, settings: Sequence[Setting]) -> NDArray[np.bool_]:
@@ -260,7 +264,7 @@ CLAIMS = (
         _QUARTER[:1],
         lambda t, s: _smallest_at_quarter(t.sd[..., 0], s),
     ),
-    Claim("the means come closest to 40 and 92 HU at 0.25 mm with every kernel", _QUARTER[:1], _closest),
+    Claim("the means come closest to 40 and 92 HU at 0.25 mm (soft and standard)", _QUARTER[:2], _closest),
     Claim("bone, 0.30 mm has the lowest CNR", (("bone", 0.30),), _worst),
 )
 """What the paper reads from its tables. All but the last are stated in its text; the last one is read off its table."""

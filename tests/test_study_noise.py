@@ -1,0 +1,254 @@
+"""The noise study: exact moments, realisations without reconstruction, and what few runs establish."""
+
+import itertools
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from recon.exact_noise import roi_adjoints, roi_covariance
+from recon.study import noise, paper, registry
+from recon.study.noise_statistics import (
+    CLAIMS,
+    Table,
+    exact_table,
+    few_run_tables,
+    kendall,
+    measured_table,
+    pair_differences,
+    resampled_tables,
+)
+from recon.study.tables import published, table_checks
+from torchpcct.metrics._bootstrap import resampling
+
+TINY = noise.Settings(
+    realizations=24,
+    views=48,
+    kernels=("soft", "bone"),
+    voxels_mm=(0.25, 0.40),
+    doses={"1x": 0.35, "5.7x": 2.0},
+    reconstructed=2,
+    experiments=500,
+)
+
+
+@pytest.fixture(scope="module")
+def measured():
+    return noise.measure(TINY)
+
+
+# --- the study ----------------------------------------------------------------------------------------------------
+
+
+def test_realisations_without_reconstruction_are_those_of_fbp(measured):
+    assert measured.check["reconstructed"] == 2
+    assert measured.check["largest_difference_in_sd"] < 0.03
+
+
+def test_joint_covariance_holds_the_covariances_of_every_setting(measured):
+    scanned = measured.scanned
+    single = list(itertools.chain.from_iterable(roi_covariance(scanned.clean, scanned.fbp, scanned.pairs, 1.0)))
+    joint = measured.covariance
+    assert measured.axes == [(k, v) for v in (0.25, 0.40) for k in ("soft", "bone")]
+    for i, matrix in enumerate(single):
+        np.testing.assert_allclose(joint[2 * i : 2 * i + 2, 2 * i : 2 * i + 2], matrix, rtol=2e-4)
+    np.testing.assert_allclose(joint, joint.T, rtol=1e-6)
+    assert np.linalg.eigvalsh(joint).min() > -1e-6 * np.trace(joint)
+
+
+def test_realisations_follow_the_exact_law(measured):
+    """Whitened by the exact covariance, the deviations are standard normal: χ² of all settings together."""
+    for exposure, values in measured.means.items():
+        deviation = (values - measured.expected).reshape(len(values), -1)
+        root = np.linalg.cholesky(measured.covariance / exposure)
+        white = np.linalg.solve(root, deviation.T)
+        assert (white**2).mean() == pytest.approx(1.0, abs=4.5 * np.sqrt(2 / white.size))
+
+
+def test_adjoint_vectors_of_the_grids_share_one_window(measured):
+    scanned = measured.scanned
+    adjoints = roi_adjoints(scanned.clean, scanned.fbp, scanned.pairs)
+    assert [tuple(v.shape[:2]) for v in adjoints.vectors] == [(2, 2), (2, 2)]
+    assert adjoints.matrix.shape[0] == 8
+    assert adjoints.window.rows < scanned.clean.window.rows
+    for a, b in zip(
+        adjoints.covariance(scanned.clean, 2.0),
+        roi_covariance(scanned.clean, scanned.fbp, scanned.pairs, 2.0),
+        strict=True,
+    ):
+        np.testing.assert_allclose(a, b, rtol=2e-4)
+    whole = replace(scanned.clean, counts=torch.ones(scanned.clean.geometry.shape), window=None, surround=None)
+    with pytest.raises(ValueError, match="windowed"):
+        whole.crop(adjoints.window)
+    with pytest.raises(ValueError, match="windowed"):
+        roi_adjoints(whole, scanned.fbp, scanned.pairs)
+
+
+def test_noise_falls_with_the_square_root_of_dose(measured):
+    assert np.all(np.abs(measured.slopes() + 0.5) < 0.015)
+
+
+def test_averaging_voxels_are_quieter_with_sharp_kernels(measured):
+    sd = np.sqrt(np.diag(measured.covariance)).reshape(-1, 2)
+    bone = measured.axes.index(("bone", 0.40))
+    assert set(measured.averaging) == {("soft", 0.40), ("bone", 0.40)}
+    assert np.all(measured.averaging["bone", 0.40] < 0.7 * sd[bone])
+    assert np.all(measured.averaging["soft", 0.40] < sd[measured.axes.index(("soft", 0.40))])
+
+
+def test_energy_integrating_rows_are_at_equal_dose(measured):
+    rows = [r for r in measured.eid if r["scanner"] == "EID-CT"]
+    assert len(rows) == 4  # soft, two voxel sizes, two doses
+    assert rows[0]["own_exposure_s"] == pytest.approx(0.35 * (541 / 626) ** 2)
+    by = {(r["scanner"], r["voxel_mm"], r["exposure_s"]): r for r in measured.eid}
+    pcct, eid = by["PCCT", 0.25, 2.0], by["EID-CT", 0.25, 2.0]
+    assert eid["contrast_hu"] < 0.5 * pcct["contrast_hu"]  # the core is lost in the blur
+    assert eid["cnr"] < pcct["cnr"]
+    assert eid["sd_hu"][0] < pcct["sd_hu"][0]
+
+
+def test_report_files(measured, tmp_path):
+    from recon.study.noise_report import build_report
+
+    build_report(measured).save(tmp_path)
+    data = json.loads((tmp_path / "report.json").read_text())
+    assert len(data["doses"]["1x"]) == 4
+    assert data["pairs"]["pairs"] == 6
+    claims = {c["claim"]: c for c in data["claims"]}
+    assert "soft, 0.25 mm has the highest CNR" in claims
+    assert all(0 <= c["ten_run_share"] <= 1 for c in claims.values())
+    assert sum(data["ten_run_experiments"]["winners"].values()) == pytest.approx(1.0)
+    text = (tmp_path / "report.md").read_text()
+    for title in (
+        "## Which rankings are established",
+        "## EID-CT at equal dose",
+        "## Agreement",
+        "## What was modelled",
+    ):
+        assert title in text
+    for name in ("noise_images.png", "noise_cnr.png"):
+        assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
+
+
+def test_registry_settings():
+    settings = registry.build_settings("noise", quick=True, seed=7, changes=["realizations=12", "eid=False"])
+    assert (settings.realizations, settings.seed, settings.eid) == (12, 7, False)
+    assert settings.table_exposure_s == 2.0
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"realizations": 9}, "realizations"),
+        ({"views": 4}, "views"),
+        ({"seed": -1}, "seed"),
+        ({"doses": {"1x": 1.0}}, "two exposures"),
+        ({"kernels": ("soft",), "voxels_mm": (0.2,)}, "two settings"),
+        ({"experiments": 1}, "experiments"),
+        ({"reconstructed": 0}, "reconstructed"),
+    ],
+)
+def test_bad_settings(changes, match):
+    with pytest.raises(ValueError, match=match):
+        noise.Settings(**changes)
+
+
+# --- statistics ---------------------------------------------------------------------------------------------------
+
+MEAN = np.array([[40.0, 90.0], [45.0, 95.0], [50.0, 85.0]])
+
+
+def _covariance(seed=0):
+    a = np.random.default_rng(seed).normal(size=(6, 6))
+    return a @ a.T * 10 + 20 * np.eye(6)
+
+
+def test_few_run_tables_have_the_moments_of_their_law():
+    covariance = _covariance()
+    table = few_run_tables(MEAN, covariance, 10, 20_000, seed=1)
+    sd = np.sqrt(np.diag(covariance)).reshape(3, 2)
+    np.testing.assert_allclose(table.mean.mean(0), MEAN, atol=5 * sd.max() / np.sqrt(200_000))
+    np.testing.assert_allclose((table.sd**2).mean(0), sd**2, rtol=0.02)
+    # The mean of ten correlated runs keeps their correlation; scans of their own do not.
+    flat = table.mean.reshape(-1, 6)
+    np.testing.assert_allclose(np.cov(flat.T), covariance / 10, atol=0.03 * np.trace(covariance) / 10)
+    own = few_run_tables(MEAN, covariance, 10, 20_000, seed=1, groups=[0, 1, 0])
+    cross = np.cov(own.mean.reshape(-1, 6).T)
+    assert abs(cross[0, 2]) < 0.03 * np.trace(covariance) / 10
+    np.testing.assert_allclose(cross[0, 4], covariance[0, 4] / 10, atol=0.03 * np.trace(covariance) / 10)
+    with pytest.raises(ValueError, match="realizations"):
+        few_run_tables(MEAN, covariance, 1, 10, seed=0)
+
+
+def test_resampled_tables_are_the_tables_of_resamples():
+    values = np.random.default_rng(0).normal(MEAN, 10.0, (15, 3, 2))
+    fast = resampled_tables(values, 40, seed=5)
+    slow = measured_table(values[resampling(15, 40, 5)])
+    np.testing.assert_allclose(fast.mean, slow.mean, rtol=1e-10)
+    np.testing.assert_allclose(fast.sd, slow.sd, rtol=1e-8)
+
+
+def test_pairwise_intervals_cover_the_exact_difference():
+    """200 experiments of 60 runs: a 90 % interval covers the truth in about 90 % of them."""
+    covariance = _covariance(3)
+    exact = exact_table(MEAN, covariance)
+    root = np.linalg.cholesky(covariance)
+    rng = np.random.default_rng(4)
+    hits = 0
+    for trial in range(200):
+        means = MEAN + (rng.standard_normal((60, 6)) @ root.T).reshape(60, 3, 2)
+        pair = pair_differences(means, exact, [(0, 1)], level=0.9, draws=400, seed=trial)[0]
+        assert pair.exact == pytest.approx(exact.cnr[0] - exact.cnr[1])
+        hits += pair.low <= pair.exact <= pair.high
+    assert 0.82 < hits / 200 < 0.96
+
+
+def test_a_setting_does_not_differ_from_itself():
+    means = np.random.default_rng(0).normal(MEAN, 10.0, (20, 3, 2))
+    means[:, 1] = means[:, 0]
+    pair = pair_differences(means, exact_table(MEAN, _covariance()), [(0, 1)], draws=100)[0]
+    assert (pair.difference, pair.low, pair.high) == (0, 0, 0)
+    assert not pair.established
+
+
+def test_kendall():
+    assert kendall([1, 2, 3, 4], [10, 20, 30, 40]) == 1
+    assert kendall([1, 2, 3, 4], [4, 3, 2, 1]) == -1
+    assert kendall([1, 2, 3, 4], [2, 1, 4, 3]) == pytest.approx(1 / 3)
+    assert kendall(np.array([[1, 2, 3], [3, 2, 1]]), [1, 2, 3]).tolist() == [1, -1]
+
+
+def test_the_paper_meets_its_own_claims():
+    """Every claim holds for the paper's own tables."""
+    axes = [(k, v) for v in paper.VOXELS_MM for k in paper.KERNELS]
+    order = [(paper.KERNELS.index(k), paper.VOXELS_MM.index(v)) for k, v in axes]
+    both = np.stack([paper.FOREGROUND, paper.BACKGROUND], axis=2)
+    table = Table(*(np.array([both[i, j, :, part] for i, j in order]) for part in (0, 1)))
+    np.testing.assert_allclose(table.cnr, [paper.CNR[i, j] for i, j in order], atol=0.03)
+    for claim in CLAIMS:
+        assert claim.holds(table, axes), claim.text
+
+
+def test_claims_can_fail():
+    axes = [(k, v) for v in paper.VOXELS_MM for k in paper.KERNELS]
+    rng = np.random.default_rng(0)
+    table = Table(rng.normal(MEAN[0], 5.0, (400, 20, 2)), rng.uniform(10, 30, (400, 20, 2)))
+    for claim in CLAIMS:
+        held = claim.holds(table, axes)
+        assert held.shape == (400,)
+        assert held.mean() < 0.2, claim.text
+
+
+def test_table_checks_are_those_of_the_paper():
+    i, j = 0, 1
+    means = (paper.FOREGROUND[i, j, 0], paper.BACKGROUND[i, j, 0])
+    covariance = np.diag([paper.FOREGROUND[i, j, 1] ** 2, paper.BACKGROUND[i, j, 1] ** 2])
+    assert [c.ok for c in table_checks("soft", 0.25, means, covariance)] == [True] * 5
+    far = table_checks("soft", 0.25, (means[0] + 11, means[1]), covariance * 4, note="why")
+    assert [c.ok for c in far] == [False, False, True, False, False]
+    assert far[0].note == "why"
+    assert table_checks("soft", 0.5, means, covariance) == []
+    assert published(paper.CNR, "soft", 0.25, 2.0) == 2.20
+    assert published(paper.CNR, "soft", 0.25, 0.35) is None
