@@ -285,6 +285,7 @@ def _footer(m: Measured) -> str:
     e = environment()
     seconds = ", ".join(f"{k} {v:.0f} s" for k, v in m.seconds.items())
     return (
-        f"Seed {m.settings.seed}. Time: {seconds}. torchpcct {e['torchpcct']}, torch {e['torch']}, numpy {e['numpy']}, "
+        f"Command `torchpcct study dose`, seed {m.settings.seed}. Time: {seconds}. "
+        f"torchpcct {e['torchpcct']}, torch {e['torch']}, numpy {e['numpy']}, "
         f"numba {e['numba']}, {e['cores']} cores ({e['machine']}). All settings are in report.json."
     )
