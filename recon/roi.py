@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,7 +20,7 @@ from torchpcct.geometry import VolumeGrid
 from torchpcct.projector import Projector
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
 from torchpcct.volume import Volume
-from torchpcct.window import shadow
+from torchpcct.window import DetectorWindow, shadow
 
 __all__ = ["DEFAULT_PRIOR", "InsetProblem", "Statistic", "reconstruct_pwls"]
 
@@ -54,8 +55,7 @@ class InsetProblem:
             pairs repair, and each step costs half of that with 9.
         motion: displacement of the inset in every view, ``(views, 3)`` z, y, x mm (:func:`recon.inset.view_motion`);
             None: at rest. The background stands still; it is taken off before, so that only what moves is projected.
-            The Gram is that of the inset at rest: a displacement of millimetres changes the weights, which follow the
-            smooth background, and the magnification by less than the model's own error. Exact pairs use the moving
+            The Gram is that of a grid at rest with the weights that the moving one meets; exact pairs use the moving
             projector.
 
     The weights are the inverse variances of the line integrals expected from the BACKGROUND: weights from the noisy
@@ -83,19 +83,28 @@ class InsetProblem:
         slope = scan.linearisation.slope(polychromatic)
         exposure = scan.exposure_s or NOISE_FREE_EXPOSURE_S
         # Per second of exposure: the Gram of one exposure serves all by a factor.
-        self._all_weights = scan.surround / slope.square() / exposure
-        self._place(None)
-        self.gram = Gram(self.projector, self._weights, nodes=nodes)
-        if motion is not None:
-            self._place(motion)
+        self._cell_weights = scan.surround / slope.square() / exposure
+        self._nodes = nodes
+        self._place(motion)
 
     def _place(self, motion: Any) -> None:
-        self.window = shadow(self.geometry, self.grid, margin=1, motion=motion)
-        self._weights = self.window.take(self._all_weights).contiguous()
-        self.projector = Projector(self.geometry, self.grid, self.window, motion)
+        geometry, grid = self.geometry, self.grid
+        self.window = shadow(geometry, grid, margin=1, motion=motion)
+        self._weights = self.window.take(self._cell_weights).contiguous()
+        self.projector = Projector(geometry, grid, self.window, motion)
+        if motion is None:
+            self.gram = Gram(self.projector, self._weights, nodes=self._nodes)
+            return
+        # A displaced grid sees its voxels as the grid at rest does, a magnification of 0.3 % apart, but through the
+        # weights of where it is.
+        still = shadow(geometry, grid, margin=1)
+        first = np.clip(self.window.first_column, 0, geometry.columns - still.columns)
+        along = DetectorWindow(first, still.columns, still.first_row, still.rows)
+        weights = along.take(self._cell_weights).contiguous()
+        self.gram = Gram(Projector(geometry, grid, still), weights, nodes=self._nodes)
 
     def with_motion(self, motion: Any) -> InsetProblem:
-        """The same problem for another displacement of the inset (None: at rest); shares the Gram.
+        """The same problem for another displacement of the inset (None: at rest); the background is kept.
 
         Args:
             motion: as for :class:`InsetProblem`.

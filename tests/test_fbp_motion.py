@@ -169,11 +169,25 @@ def test_compensated_fbp_shows_the_inset_at_rest(scans, path):
 
 def test_compensated_pwls_shows_the_inset_at_rest(scans, path):
     prior = QGGMRF(strength=0.3, threshold=300.0)
-    rest, _ = InsetProblem(scans[0.0], GRID).solve([scans[0.0]], prior, tolerance=2.0)
-    found, report = InsetProblem(scans[2.0], GRID, motion=path).solve([scans[2.0]], prior, tolerance=2.0)
+    problem = InsetProblem(scans[0.0], GRID)
+    rest, _ = problem.solve([scans[0.0]], prior, tolerance=2.0)
+    moved = problem.with_motion(path)
+    found, report = moved.solve([scans[2.0]], prior, tolerance=2.0)
     assert report["converged"]
     assert report["exact_pairs"] <= 6
     assert float((found - rest).square().mean().sqrt()) < 12.0
+    same = InsetProblem(scans[2.0], GRID, nodes=1, motion=path)
+    assert torch.equal(same.data(scans[2.0]), moved.data(scans[2.0]))
+    assert moved.with_motion(None).window == problem.window != moved.window
+    # The Gram holds for the moving operator about as well as for the one at rest; its weights move along.
+    x = rest[0] - rest.min()
+    errors = []
+    for gram, p in ((problem.gram, problem), (moved.gram, moved), (problem.gram, moved)):
+        exact = p.projector.T(p._weights * p.projector(x))
+        errors.append(float((gram(x) - exact).norm() / exact.norm()))
+    assert errors[0] < 0.005
+    assert errors[1] < 0.007
+    assert errors[2] > 0.015
 
 
 def test_refusals(scans, path):

@@ -44,7 +44,7 @@ def test_measures_of_a_known_volume(drawn):
     away = observe(volume.roll(8, dims=-1), grid, reference, volume)
     assert math.isnan(away.cap_line)  # 1.6 mm: the lumen's centre reads fat
     assert away.lumen_dice < 0.4
-    assert away.segmentation.lumen_area == pytest.approx(found.segmentation.lumen_area, rel=1e-3)
+    assert away.segmentation.lumen_area == pytest.approx(found.segmentation.lumen_area, rel=0.02)
 
 
 @pytest.fixture(scope="module")

@@ -33,7 +33,10 @@ def compensate(m: Measured, still: Scan, moving: Scan, reference: Reference, pro
     estimates: list[float | None] = [None, 0.0, *s.errors]
     noise: list[int | None] = [None, *range(s.seed, s.seed + s.realizations)]
     makers = {"fbp": _fbp, "pwls": _pwls, "mbir": _mbir}
-    problem = InsetProblem(still, m.grid) if set(s.methods) - {"fbp"} else None
+    problems: dict[float | None, InsetProblem] = {}
+    if set(s.methods) - {"fbp"}:
+        problem = InsetProblem(still, m.grid)
+        problems = {e: problem if e is None else problem.with_motion((1.0 - e) * path) for e in estimates}
     rest: dict[str, Tensor] = {}
     for k, seed in enumerate(noise):
         # The same draws at rest and in motion: noise belongs to the reading, not to what is seen.
@@ -45,7 +48,7 @@ def compensate(m: Measured, still: Scan, moving: Scan, reference: Reference, pro
                 if method == "pwls" and error:
                     continue
                 motion = None if error is None else (1.0 - error) * path
-                volume = makers[method](scans[error is not None], m, motion, problem)
+                volume = makers[method](scans[error is not None], m, motion, problems.get(error))
                 if seed is None and error is None:
                     rest[method] = volume
                 found: Observed = observe(volume, m.grid, reference, rest[method])
@@ -58,9 +61,7 @@ def _fbp(scan: Scan, m: Measured, motion: Any, problem: InsetProblem | None) -> 
 
 
 def _pwls(scan: Scan, m: Measured, motion: Any, problem: InsetProblem | None) -> Tensor:
-    assert problem is not None
-    here = problem.with_motion(motion)
-    return reconstruct_pwls([scan], m.grid, problem=here, tolerance=_PWLS_TOLERANCE_HU)[0].data
+    return reconstruct_pwls([scan], m.grid, problem=problem, tolerance=_PWLS_TOLERANCE_HU)[0].data
 
 
 @lru_cache(maxsize=1)
@@ -73,6 +74,5 @@ def _learned() -> Mbir:
 def _mbir(scan: Scan, m: Measured, motion: Any, problem: InsetProblem | None) -> Tensor:
     """Noise free: as a scan of the study's exposure whose readings happen to be their expectations."""
     assert problem is not None
-    here = problem.with_motion(motion)
-    b = here.statistic(scan).b * (m.settings.exposure_s / NOISE_FREE_EXPOSURE_S if scan.noise_free else 1.0)
-    return _learned()(here, b[None], m.settings.exposure_s)[0]
+    b = problem.statistic(scan).b * (m.settings.exposure_s / NOISE_FREE_EXPOSURE_S if scan.noise_free else 1.0)
+    return _learned()(problem, b[None], m.settings.exposure_s)[0]
