@@ -43,7 +43,11 @@ def test_one_segment_is_non_paralysable():
     true = detector.response(ENERGIES)[0] @ QUANTA
     recorded = recorded_rates(detector, ENERGIES, QUANTA)[0]
     assert recorded == pytest.approx(true / (1 + 80e-9 * true), rel=1e-12)
-    # More segments share the load, and the counting mode is the sum of the bins.
+    # Three segments share the load, each with the photons that interact in it.
+    parts = (detector.response(ENERGIES)[0] * QUANTA) @ replace(detector, segments=3).segment_shares(ENERGIES).T
+    split = recorded_rates(replace(detector, segments=3), ENERGIES, QUANTA)[0]
+    assert split == pytest.approx(float((parts / (1 + 80e-9 * parts)).sum()), rel=1e-12)
+    # More segments lose less, and the counting mode is the sum of the bins.
     three = replace(detector, segments=3)
     assert recorded < recorded_rates(three, ENERGIES, QUANTA)[0] < true
     for merge in (0.0, 30.0):
