@@ -33,11 +33,11 @@ __all__ = ["Mbir", "average_onto", "reconstruct_mbir", "working_grid"]
 _LOG = logging.getLogger(__name__)
 
 SHIPPED = "mbir.safetensors"
-FORMAT = "torchpcct unrolled weights 1"
-ADD_BACK = (0.975, 0.63)
-"""Weight of the residual that the second pass adds back, see :class:`recon.unrolled.Unrolled`: chosen on the held-out
-plaques of the training's validation for a contrast slope of about 0.95 at 0.35 s and at 2 s. One pass leaves 0.6 and
-0.8."""
+WEIGHTS_FORMAT = "torchpcct unrolled weights 1"
+ADD_BACK = (1.13, 0.51)
+"""Weight of the residual that the second pass adds back, see :class:`recon.unrolled.Unrolled`: chosen on held-out
+plaques (see the training card) for a contrast slope of about 0.96 between small ROIs, at 0.35 s and at 2 s. One pass
+leaves 0.6 and 0.8."""
 CHI2_RANGE = (0.85, 1.2)
 """Weighted squared residual per reading that a scan of the stated noise level can have; 1 is perfect."""
 
@@ -76,8 +76,8 @@ class Mbir:
             with safe_open(str(source), framework="pt") as file:
                 header = file.metadata() or {}
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            if header.get("format") != FORMAT:
-                raise ValueError(f"{source} holds {header.get('format', 'something else')!r}, not {FORMAT!r}")
+            if header.get("format") != WEIGHTS_FORMAT:
+                raise ValueError(f"{source} holds {header.get('format', 'something else')!r}, not {WEIGHTS_FORMAT!r}")
             config = json.loads(header["metadata"])
             model = Unrolled(PriorConfig(**config["prior"]), steps=config["unroll"], add_back=add_back)
             model.load_state_dict(tensors)

@@ -25,7 +25,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-__all__ = ["LearnedPrior", "PriorConfig"]
+__all__ = ["LearnedPrior", "PriorConfig", "squared_frequencies"]
 
 REFERENCE_SCALE_HU = 200.0
 """Noise scale at which the conditioning variable is 0 (see :class:`recon.unrolled.NormalProblem`): about 1 s."""
@@ -89,6 +89,7 @@ class LearnedPrior(nn.Module):
         self.gain_slope = nn.Parameter(torch.full((c.levels, c.units, len(c.thresholds)), 1.5))
         self.smooth = nn.Parameter(torch.tensor([0.05, 0.3]).log())
         self.smooth_slope = nn.Parameter(torch.tensor([1.0, 1.0]))
+        self.along = nn.Parameter(torch.tensor([math.log(2.0), 0.0]))
         mixtures = torch.full((c.units, groups, 3, 3, 3), -5.0)
         for n in range(c.units):  # each unit starts with one group of its own
             mixtures[n, n % groups, 1, 1, 1] = 0.0
@@ -124,15 +125,15 @@ class LearnedPrior(nn.Module):
 
     def quadratic(self, shape: tuple[int, ...], voxel_mm: float, scale_hu: Tensor) -> Tensor:
         """Q on the frequencies of ``rfftn``: a part ∝ f² and one ∝ f⁴ (f in line pairs per mm)."""
-        z, y, x = shape
-        f2 = (
-            torch.fft.fftfreq(z, voxel_mm, device=scale_hu.device)[:, None, None] ** 2
-            + torch.fft.fftfreq(y, voxel_mm, device=scale_hu.device)[:, None] ** 2
-            + torch.fft.rfftfreq(x, voxel_mm, device=scale_hu.device) ** 2
-        ).to(scale_hu)
+        f2 = squared_frequencies(shape, voxel_mm).to(scale_hu)
         level = torch.log(scale_hu / REFERENCE_SCALE_HU).clamp(-3.0, 3.0)
         first, second = torch.exp(self.smooth + self.smooth_slope * level[:, None]).T
         return first.reshape(-1, 1, 1, 1) * f2 + second.reshape(-1, 1, 1, 1) * f2 * f2
+
+    def along_strength(self, scale_hu: Tensor) -> Tensor:
+        """Strength of the smoothing along vessels (:class:`recon.steering.Steering`), ``(batch,)``."""
+        level = torch.log(scale_hu / REFERENCE_SCALE_HU).clamp(-3.0, 3.0)
+        return torch.exp(self.along[0] + self.along[1] * level)
 
     def curvature(self, scale_hu: Tensor) -> Tensor:
         """Mean eigenvalue of the Hessian of a flat volume, ``(batch,)``: for preconditioners."""
@@ -207,6 +208,17 @@ class LearnedPrior(nn.Module):
         block = 2**self.config.levels
         extra = [(-n) % block for n in u.shape[-3:]]
         return F.pad(u, (0, extra[2], 0, extra[1], 0, extra[0]))
+
+
+def squared_frequencies(shape: tuple[int, ...], voxel_mm: float) -> Tensor:
+    """f² in (line pairs per mm)² on the frequencies of ``rfftn`` of ``(z, y, x)`` volumes, float32."""
+    z, y, x = shape
+    total: Tensor = (
+        torch.fft.fftfreq(z, voxel_mm)[:, None, None] ** 2
+        + torch.fft.fftfreq(y, voxel_mm)[:, None] ** 2
+        + torch.fft.rfftfreq(x, voxel_mm) ** 2
+    )
+    return total
 
 
 def to_blocks(u: Tensor) -> Tensor:

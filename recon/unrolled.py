@@ -8,7 +8,10 @@ The problem is normalised before the network sees it. With the data's informatio
 So the same tissue at four times the dose looks to the network like twice the contrast at the same noise.
 Each step k of the K unrolled ones reads
 
-    u ← u − η_k M_k (H u − β + ∇R(u)) + θ_k (u − u_previous),        M_k = (circulant of H + λ_k)^(−1) by FFT.
+    u ← u − η_k M_k (H u − β + ∇R(u) + ∇S(u)) + θ_k (u − u_previous),    M_k = (circulant of H, S + λ_k)^(−1) by FFT,
+
+with the learned prior R and the smoothing S along vessels, whose direction the linear solution before the first step
+tells (:mod:`recon.steering`).
 
 Whatever smooths, shrinks. So the steps are passed through again with what the first pass left in the data added back,
 β ← β + w (β − H u): a Bregman iteration (Osher, Burger, Goldfarb, Xu, Yin 2005, Multiscale Model. Simul. 4:460), which
@@ -26,6 +29,7 @@ import torch
 from torch import Tensor, nn
 
 from recon.prior import REFERENCE_SCALE_HU, LearnedPrior, PriorConfig
+from recon.steering import Steering
 
 __all__ = ["NormalProblem", "Unrolled", "energy", "minimise", "residual"]
 
@@ -116,31 +120,46 @@ class Unrolled(nn.Module):
             low, high = self.seen_scale_hu.unbind()
             least = scale.min() if not low else torch.minimum(low, scale.min())
             self.seen_scale_hu = torch.stack([least, torch.maximum(high, scale.max())])
-        u = self.descend(problem, callback)
+        steering = self.steering(problem)
+        u = self.descend(problem, steering, callback)
         if self.add_back is None:
             return u
         a, b = self.add_back
         weight = (a + b * torch.log(scale / REFERENCE_SCALE_HU)).clamp(0.0, LARGEST_ADD_BACK).reshape(-1, 1, 1, 1)
         added = replace(problem, beta=problem.beta + weight * (problem.beta - problem.apply(u)))
-        return self.descend(added, None if callback is None else lambda k, v: callback(k + self.steps, v))
+        return self.descend(added, steering, None if callback is None else lambda k, v: callback(k + self.steps, v))
 
     @property
     def iterations(self) -> int:
         """Steps of all passes."""
         return self.steps * (1 if self.add_back is None else 2)
 
-    def descend(self, problem: NormalProblem, callback: Callable[[int, Tensor], None] | None = None) -> Tensor:
+    def _damping(self, scale: Tensor) -> Tensor:
+        """λ_k of every step and, last, of the linear start: ``(steps + 1, batch, 1, 1, 1)``."""
+        # The prior's own curvature sets how far a step may go, at every noise level and throughout the training.
+        curvature = self.prior.curvature(scale)
+        return (torch.exp(self.log_damping)[:, None] * curvature + FLOOR)[..., None, None, None]
+
+    def steering(self, problem: NormalProblem) -> Steering:
+        """S of a problem: directions from the regularised linear solution."""
+        scale, shape = problem.scale_hu, problem.beta.shape[-3:]
+        with torch.no_grad():
+            curved = problem.spectrum() + self.prior.quadratic(shape, problem.voxel_mm, scale)
+            pilot = _inverse(_spectrum(problem.beta) / (curved + self._damping(scale)[self.steps]), shape)
+        return Steering.of(pilot, problem.voxel_mm, self.prior.along_strength(scale))
+
+    def descend(
+        self, problem: NormalProblem, steering: Steering, callback: Callable[[int, Tensor], None] | None = None
+    ) -> Tensor:
         """One pass: K steps from the regularised linear solution towards the minimum of the energy."""
         scale, shape = problem.scale_hu, problem.beta.shape[-3:]
         quadratic = self.prior.quadratic(shape, problem.voxel_mm, scale)
-        # The prior's own curvature sets how far a step may go, at every noise level and throughout the training.
-        curvature = self.prior.curvature(scale)
-        damping = (torch.exp(self.log_damping)[:, None] * curvature + FLOOR)[..., None, None, None]
-        curved = problem.spectrum() + quadratic
+        damping = self._damping(scale)
+        curved = problem.spectrum() + quadratic + steering.spectrum()
         u = _inverse(_spectrum(problem.beta) / (curved + damping[self.steps]), shape)
         previous = u
         for k in range(self.steps):
-            gradient = problem.apply(u) - problem.beta + self.prior.gradient(u, scale)
+            gradient = problem.apply(u) - problem.beta + self.prior.gradient(u, scale) + steering.gradient(u)
             step = _inverse((_spectrum(gradient) + quadratic * _spectrum(u)) / (curved + damping[k]), shape)
             new = u - torch.exp(self.log_step[k]) * step + self.momentum[k] * (u - previous)
             u, previous = new, u
@@ -161,12 +180,19 @@ def _filtered(v: Tensor, spectrum: Tensor) -> Tensor:
     return _inverse(spectrum * _spectrum(v), v.shape[-3:])
 
 
-def energy(model: Unrolled, problem: NormalProblem, u: Tensor) -> Tensor:
-    """Φ(u) = ½ uᵀH u − βᵀu + R(u) of each volume, ``(batch,)`` float64."""
+def energy(model: Unrolled, problem: NormalProblem, u: Tensor, steering: Steering | None = None) -> Tensor:
+    """Φ(u) = ½ uᵀH u − βᵀu + R(u) + S(u) of each volume, ``(batch,)`` float64.
+
+    Args:
+        model, problem: whose energy.
+        u: ``(batch, z, y, x)`` noise units.
+        steering: of the problem, where it is known already.
+    """
+    steering = steering or model.steering(problem)
     data = (u * (0.5 * problem.apply(u) - problem.beta)).sum(dim=(1, 2, 3), dtype=torch.float64)
     quadratic = model.prior.quadratic(u.shape[-3:], problem.voxel_mm, problem.scale_hu)
     smooth = 0.5 * (u * _filtered(u, quadratic)).sum(dim=(1, 2, 3), dtype=torch.float64)
-    return data + smooth + model.prior.energy(u, problem.scale_hu).double()
+    return data + smooth + model.prior.energy(u, problem.scale_hu).double() + steering.energy(u)
 
 
 class _Preconditioned:
@@ -175,8 +201,9 @@ class _Preconditioned:
     def __init__(self, model: Unrolled, problem: NormalProblem) -> None:
         self.model, self.problem = model, problem
         self.quadratic = model.prior.quadratic(problem.beta.shape[-3:], problem.voxel_mm, problem.scale_hu)
+        self.steering = model.steering(problem)
         self.bound = model.prior.slope_bound(problem.scale_hu).reshape(-1, 1, 1, 1)
-        self.weight = problem.spectrum() + self.quadratic + self.bound + FLOOR
+        self.weight = problem.spectrum() + self.quadratic + self.steering.spectrum() + self.bound + FLOOR
 
     def steepest(self, iterations: int = 12) -> Tensor:
         """Largest eigenvalue of M times an upper bound of the Hessian, ``(batch,)``, by power iteration."""
@@ -185,13 +212,14 @@ class _Preconditioned:
         v = torch.randn(shape[1:], generator=generator).to(self.problem.beta).expand(shape).clone()
         size = torch.ones(shape[0])
         for _ in range(iterations):
-            v = self(self.problem.apply(v) + _filtered(v, self.quadratic) + self.bound * v)
+            smooth = _filtered(v, self.quadratic) + self.steering.gradient(v)
+            v = self(self.problem.apply(v) + smooth + self.bound * v)
             size = v.flatten(1).norm(dim=1)
             v = v / size.clamp_min(torch.finfo(v.dtype).tiny).reshape(-1, 1, 1, 1)
         return size.to(v)
 
     def gradient(self, u: Tensor) -> Tensor:
-        smooth = _filtered(u, self.quadratic)
+        smooth = _filtered(u, self.quadratic) + self.steering.gradient(u)
         return self.problem.apply(u) - self.problem.beta + smooth + self.model.prior.gradient(u, self.problem.scale_hu)
 
     def __call__(self, gradient: Tensor) -> Tensor:
@@ -229,7 +257,7 @@ def minimise(
     metric = _Preconditioned(model, problem)
     reference = metric.size(problem.beta).clamp_min(torch.finfo(torch.float64).tiny)
     u, previous = start, start
-    value = energy(model, problem, u)
+    value = energy(model, problem, u, metric.steering)
     # Power iteration comes from below: a little shorter, and halved where the energy rises all the same.
     length = 1.0 / (1.1 * metric.steepest())
     count, ages = 0, torch.zeros_like(length)
@@ -240,7 +268,7 @@ def minimise(
         ahead = u + momentum * (u - previous)
         gradient = metric.gradient(ahead)
         trial = ahead - length.reshape(-1, 1, 1, 1) * metric(gradient)
-        new = energy(model, problem, trial)
+        new = energy(model, problem, trial, metric.steering)
         # Rounding of the energy's large terms must not count as a rise.
         worse = new > value + 1e-6 * value.abs()
         keep = worse.reshape(-1, 1, 1, 1)

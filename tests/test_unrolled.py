@@ -39,6 +39,7 @@ def normal(scan, exposure=1.0, noise=0.0, seed=0, batch=1):
 def no_prior(net):
     """Only the quadratic part of the energy is left."""
     net.prior.gain.fill_(-60.0)
+    net.prior.along[0] = -60.0
     return net
 
 

@@ -14,7 +14,8 @@ from typing import Any
 
 from torch import Tensor
 
-from train.checkpoint import WEIGHTS_FORMAT, digest, read_tensors, write_atomically, write_tensors
+from recon.mbir import WEIGHTS_FORMAT
+from train.checkpoint import digest, read_tensors, write_atomically, write_tensors
 from train.config import TrainConfig
 
 __all__ = ["export", "finite", "hardware", "load_weights", "versions"]

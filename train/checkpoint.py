@@ -30,7 +30,6 @@ __all__ = [
 ]
 
 CHECKPOINT_FORMAT = "torchpcct training checkpoint 1"
-WEIGHTS_FORMAT = "torchpcct unrolled weights 1"
 TEMPORARY = re.compile(r"\.\d+\.tmp$")
 
 

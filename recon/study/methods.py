@@ -17,6 +17,7 @@ from torch import Tensor
 
 from recon._model_solver import dot
 from recon.inset import to_hu
+from recon.prior import squared_frequencies
 from recon.pwls import solve_normal
 from recon.qggmrf import QGGMRF, quadratic
 from recon.roi import DEFAULT_PRIOR
@@ -75,12 +76,7 @@ class LinearFilter:
         exposure = torch.full((b.shape[0],), float(exposure_s), dtype=b.dtype)
         normal = NormalProblem.from_statistic(problem.gram, b, exposure, problem.mu_ref / 1000.0, voxel)
         shape, axes = b.shape[-3:], (-3, -2, -1)
-        z, y, x = shape
-        f2 = (
-            torch.fft.fftfreq(z, voxel)[:, None, None] ** 2
-            + torch.fft.fftfreq(y, voxel)[:, None] ** 2
-            + torch.fft.rfftfreq(x, voxel) ** 2
-        ).to(b)
+        f2 = squared_frequencies(shape, voxel).to(b)
         prior = self.lam + self.mu * f2
 
         def filtered(v: Tensor, spectrum: Tensor) -> Tensor:
