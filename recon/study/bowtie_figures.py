@@ -51,7 +51,7 @@ def draw(measured: Measured) -> Any:
     """The figure as ``matplotlib.figure.Figure``."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(12.5, 9.0), dpi=95, layout="constrained")
+    figure = Figure(figsize=(12.5, 9.0), dpi=74, layout="constrained")
     axes = figure.subplots(3, 4)
     _bowties(axes[0, 0], measured.transmission)
     for row, name in ((1, "ctdi"), (2, "thorax")):

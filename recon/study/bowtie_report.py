@@ -141,11 +141,14 @@ def _summary(m: Measured) -> str:
             f" With scattered photons the saving is smaller: CTDIw {t['weighted']:.2f}, and the centre falls to "
             f"{t['central']:.2f}, because most of its dose is scatter from outside the region."
         )
-    for c in m.combined:
-        value = _interval(_product(c.factors["contrast_variance"], _saved(m, "plane")))
+    if m.combined:
+        each = ", ".join(
+            f"{_interval(_product(c.factors['contrast_variance'], _saved(m, 'plane')))} at {c.exposure_s:g} s"
+            for c in m.combined
+        )
         text += (
-            f" Together with MBIR at {c.exposure_s:g} s: {value} times less dose for equal contrast noise "
-            "(slope-corrected), where the paper adds up 8."
+            f" MBIR and ROI bowtie together save a factor of {each} in dose for equal, slope-corrected contrast noise "
+            "(FBP soft 0.25 mm with the large bowtie is 1), where the paper adds up 8."
         )
     return text
 
