@@ -250,7 +250,9 @@ def _footer(m: Measured, versions: dict[str, Any]) -> str:
     seconds = ", ".join(f"{k} {v:.0f} s" for k, v in m.seconds.items())
     stack = ", ".join(f"{k} {v}" for k, v in versions.items())
     seeds = f"Seeds of the noise: {s.seed} … {s.seed + s.realizations - 1}."
-    return f"Time: {seconds}. {seeds} Environment: {stack}."
+    thinned = "" if s.thinning == 1 else f" --set thinning={s.thinning}"
+    repeat = f"torchpcct study motion{thinned} --set realizations={s.realizations}"
+    return f"Repeat: `{repeat}`. Time: {seconds}. {seeds} Environment: {stack}."
 
 
 def _or(value: float, digits: int) -> str:
