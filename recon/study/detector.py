@@ -110,18 +110,23 @@ def run(settings: Settings | None = None, progress: Progress | None = None) -> R
     }
     checks = _checks(data)
     data["checks"] = [c.as_dict() for c in checks]
+    return Report("detector", data, _text(data, checks), {"detector.png": figure(data)})
+
+
+def _text(data: dict[str, Any], checks: list[Check]) -> str:
+    s = data["settings"]
     sections = [
         "# The deep-silicon detector: counts, efficiency, pile-up, charge sharing",
-        _counts_section(rates),
-        _efficiency_section(efficiencies, s.photons),
-        _energy_section(spectrum),
-        charge_sharing_section(sharing),
-        pile_up_section(piled),
+        _counts_section(data["counts"]),
+        _efficiency_section(data["efficiency"], s["photons"]),
+        _energy_section(data["efficiency_by_energy"]),
+        charge_sharing_section(data["charge_sharing"]),
+        pile_up_section(data["pile_up"]),
         checks_section(checks),
         effects_section(_effects(data)),
-        f"Time: {data['seconds']:.0f} s, seed {s.seed}.",
+        f"Time: {data['seconds']:.0f} s, seed {s['seed']}.",
     ]
-    return Report("detector", data, "\n\n".join(sections), {"detector.png": figure(data)})
+    return "\n\n".join(sections)
 
 
 # --- counts -------------------------------------------------------------------------------------------------------
@@ -264,14 +269,13 @@ def _at_energy(energy: float, photons: int, rng: np.random.Generator) -> dict[st
     }
 
 
-def _repeated_counts_hu(rows: list[dict[str, Any]]) -> float:
-    """Largest shift of the plaque's CT numbers by the weight that repeated counts give to the energies."""
+def _repeated_counts_hu(rows: list[dict[str, Any]]) -> dict[str, float]:
+    """Shifts of the plaque's CT numbers by the weight that repeated counts give to the energies."""
     energies, beam = beam_behind(presets.pcct())
     weight = SiliconDetector().response(energies)[0] * beam
     ratio = [r["counts_per_photon"] / r["one_interaction"] for r in rows]
     repeated = weight * np.interp(energies, [r["energy_kev"] for r in rows], ratio)
-    shifts = [material(n).hu(energies, repeated) - material(n).hu(energies, weight) for n in PLAQUE_MATERIALS]
-    return float(np.abs(shifts).max())
+    return {n: material(n).hu(energies, repeated) - material(n).hu(energies, weight) for n in PLAQUE_MATERIALS}
 
 
 def _energy_section(rows: list[dict[str, Any]]) -> str:
@@ -317,16 +321,14 @@ def _checks(data: dict[str, Any]) -> list[Check]:
 def _effects(data: dict[str, Any]) -> list[Effect]:
     pile = next((r for r in data["pile_up"] if r["dead_time_ns"] == 50), data["pile_up"][-1])
     sharing = data["charge_sharing"][0]
+
+    def tissues(shifts: dict[str, float]) -> tuple[float, str]:
+        return abs(shifts["fibrous_tissue"]), f"fibrous tissue; blood {shifts['blood_iodine']:+.1f} HU; noise see above"
+
+    lost = f"after water calibration; {pile['body']['lost_percent']:.1f} % of the counts behind the body"
     return [
-        Effect(
-            f"pile-up, dead time {pile['dead_time_ns']:.0f} ns", False, abs(pile["calibrated_body_hu"]),
-            f"after water calibration; {pile['body']['lost_percent']:.1f} % of the counts behind the body",
-        ),
-        Effect(
-            f"charge sharing, {100 * sharing['share']:.0f} %", False,
-            abs(max(sharing["hu_shift"].values(), key=abs)), "shift of the plaque's tissues; noise see above",
-        ),
-        Effect("repeated counts of scattered photons", False, data["repeated_counts_hu"],
-               "shift of the plaque's tissues; noise see above"),
+        Effect(f"pile-up, dead time {pile['dead_time_ns']:.0f} ns", False, abs(pile["calibrated_body_hu"]), lost),
+        Effect(f"charge sharing, {100 * sharing['share']:.0f} %", False, *tissues(sharing["hu_shift"])),
+        Effect("repeated counts of scattered photons", False, *tissues(data["repeated_counts_hu"])),
         Effect("tungsten fluorescence, coherent scatter in silicon", False, None, "left out of the followed photons"),
-    ]  # fmt: skip
+    ]

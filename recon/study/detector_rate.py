@@ -62,16 +62,16 @@ def charge_sharing_section(rows: list[dict[str, Any]]) -> str:
             f"{100 * r['share']:.0f} % of pulses split",
             f"{r['counts_percent']:+.1f} %",
             f"{r['energy_shift_kev']:+.1f} keV",
-            f"{max(r['hu_shift'].values(), key=abs):+.2f} HU",
+            f"{r['hu_shift']['fibrous_tissue']:+.2f} / {r['hu_shift']['blood_iodine']:+.2f} HU",
             f"{r['dqe_without']:.3f} → {r['dqe']:.3f}",
             f"{100 * ((r['dqe_without'] / r['dqe']) ** 0.5 - 1):+.1f} %",
         ]
         for r in rows
     ]
-    head = ["charge sharing", "counts", "mean bin energy", "largest shift of a tissue", "DQE", "noise"]
+    head = ["charge sharing", "counts", "mean bin energy", "fibrous tissue / blood", "DQE", "noise"]
     return (
         "## Charge sharing\n\nOff by default (`SiliconDetector(charge_sharing=…)`); the shares are assumed. Behind "
-        "24 cm of fat, counting mode with its water correction; the tissues are the plaque's.\n\n"
+        "24 cm of fat, counting mode with its water correction; the shifts are those of CT numbers.\n\n"
         f"{markdown_table(head, table)}"
     )
 
