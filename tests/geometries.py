@@ -20,6 +20,7 @@ def _case(make: Callable[[], Case]) -> Callable[[], Case]:
 
 
 _PLANE = VolumeGrid((9, 9), 2.0)
+_EVEN = full_turn(24, math.pi / 24)  # no view on an axis or diagonal: every one has all its mirrored copies
 _VOLUME = VolumeGrid((5, 7, 6), (1.5, 2.0, 2.2), (0.4, 1.0, -2.0))
 
 
@@ -41,6 +42,32 @@ def fan_flat() -> Case:
 @_case
 def fan_flat_offset_shifted_grid() -> Case:
     return FanBeam(full_turn(7, 0.2), 60.0, 110.0, 20, 2.1, 0.525), VolumeGrid((7, 10), (1.9, 1.1), (4.0, 3.0)), None
+
+
+@_case
+def fan_symmetric_shifted_grid() -> Case:
+    return FanBeam(_EVEN, 60.0, 110.0, 20, 2.1), VolumeGrid((9, 9), 2.0, (0.7, -1.3)), None
+
+
+@_case
+def fan_symmetric_grid_off_by_parts_of_a_voxel() -> Case:
+    return FanBeam(_EVEN, 60.0, 110.0, 20, 2.1), VolumeGrid((9, 9), 2.0, (0.3, 0.7)), None
+
+
+@_case
+def fan_quarter_column_shifted_grid() -> Case:
+    return FanBeam(_EVEN, 60.0, 110.0, 21, 2.1, 0.525), VolumeGrid((9, 9), 2.0, (0.5, 1.0)), None
+
+
+@_case
+def fan_mirrored_views_shifted_grid() -> Case:
+    geometry = FanBeam(_EVEN, 60.0, 110.0, 20, 2.1, detector="curved")
+    return geometry, VolumeGrid((7, 9), (2.0, 1.5), (1.0, 0.9)), None
+
+
+@_case
+def parallel_symmetric_shifted_grid() -> Case:
+    return ParallelBeam((np.arange(12) + 0.5) * math.pi / 12, 18, 1.9), VolumeGrid((9, 9), 2.0, (0.3, 1.1)), None
 
 
 @_case

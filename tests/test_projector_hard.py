@@ -12,12 +12,15 @@ import torch
 from geometries import REGISTRY
 
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
-from torchpcct.projector import Projector
+from torchpcct.projector import Projector, plane
 from torchpcct.projector.analytic import Gaussian, line_integrals, rasterize
 from torchpcct.window import DetectorWindow, shadow
 
 NAMES = sorted(REGISTRY)
-SOME = ["parallel_half_turn", "fan_flat", "fan_flat_offset_shifted_grid", "cone_curved_offset", "cone_window"]
+SOME = [
+    "parallel_half_turn", "fan_flat", "fan_flat_offset_shifted_grid", "fan_symmetric_shifted_grid",
+    "cone_curved_offset", "cone_window",
+]  # fmt: skip
 
 
 def _projector(name):
@@ -88,6 +91,40 @@ def test_views_in_any_order_and_repeated(name):
     x = _random(grid.shape)
     whole = Projector(geometry, grid)(x)
     torch.testing.assert_close(Projector(geometry.select(order), grid)(x), whole[order], rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "operations", "reach"),
+    [
+        ("fan_flat", 8, 0),
+        ("fan_symmetric_shifted_grid", 8, 2),
+        ("fan_symmetric_grid_off_by_parts_of_a_voxel", 8, 3),
+        ("fan_quarter_column_shifted_grid", 4, 2),
+        ("fan_mirrored_views_shifted_grid", 2, 0),
+        ("parallel_symmetric_shifted_grid", 4, 3),
+    ],
+)
+def test_symmetric_views_share_work_and_read_the_same(name, operations, reach):
+    geometry, grid, _ = REGISTRY[name]()
+    A = Projector(geometry, grid)
+    passes = A._engine._plane
+    x = _random((3, *grid.shape))
+    assert (passes.operations, len(passes.tables(np.dtype(np.float64), passes.lanes(3)).reach)) == (operations, reach)
+    singly = torch.cat([Projector(geometry.select([v]), grid)(x) for v in range(geometry.views)], dim=-2)
+    # A ray along an exact diagonal takes rows or columns; its symmetric copies may take the other.
+    even = geometry.columns % 2 == 0 or geometry.offset != 0
+    torch.testing.assert_close(A(x), singly, rtol=0, atol=(1e-12 if even else 0.2) * float(singly.abs().max()))
+
+
+def test_views_whose_displaced_grids_lie_too_far_apart_are_projected_singly(monkeypatch):
+    geometry, grid, _ = REGISTRY["fan_symmetric_shifted_grid"]()
+    x = _random(grid.shape)
+    together, expect = Projector(geometry, grid), Projector(geometry, grid)(x)
+    assert together._engine._plane.operations == 8
+    monkeypatch.setattr(plane, "_FAR", 0.1)
+    singly = Projector(geometry, grid)
+    assert singly._engine._plane.operations == 1
+    torch.testing.assert_close(singly(x), expect, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["fan_window", "cone_window"])
@@ -336,6 +373,32 @@ def test_working_memory_does_not_grow_with_the_batch(name):
         return A.memory_estimate(batch) - arrays
 
     assert working(8) == working(16) == working(1000)
+
+
+@pytest.mark.parametrize("name", ["cone_window", "cone_flat"])
+def test_a_small_memory_limit_gives_the_same_bits(name):
+    case = REGISTRY[name]()
+    whole = Projector(*case)
+    forward, adjoint, per_view = whole._engine._volume_bytes(4)
+    limit = max(forward, adjoint + 2 * per_view)
+    limited = Projector(*case, memory=limit)
+    assert limited._engine._views_at_once(4) < whole._engine._views_at_once(4) == whole.range_shape[0]
+    x, y = _random((2, *whole.domain_shape), torch.float32), _random((2, *whole.range_shape), torch.float32)
+    assert torch.equal(limited(x), whole(x))
+    assert torch.equal(limited.T(y), whole.T(y))
+    arrays = 4 * 2 * (math.prod(whole.domain_shape) + math.prod(whole.range_shape))
+    assert limited.memory_estimate(2) - arrays <= limit < whole.memory_estimate(2) - arrays
+
+
+@pytest.mark.parametrize("name", ["cone_flat", "fan_flat"])
+def test_a_memory_limit_below_the_smallest_slice_is_refused(name):
+    A = Projector(*REGISTRY[name](), memory=1000)
+    for operator in (A, A.T):
+        with pytest.raises(ValueError, match="bytes of working memory, memory allows 1000"):
+            operator(torch.zeros(operator.domain_shape))
+    for bad in (0, -5, 1.5, True):
+        with pytest.raises(ValueError, match="memory must be a number of bytes"):
+            Projector(*REGISTRY[name](), memory=bad)
 
 
 def test_nan_and_inf_do_not_leak_into_other_cells_of_slabs_far_apart():

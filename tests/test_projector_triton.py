@@ -44,6 +44,34 @@ def test_same_weights_as_the_cpu(name):
     torch.testing.assert_close(passes.adjoint(y), A.T(y), rtol=1e-10, atol=1e-10)
 
 
+@pytest.mark.parametrize("name", ["fan", "cone"])
+def test_slices_that_fit_the_memory_give_the_same_bits(name):
+    geometry, grid, window = CASES[name]
+    geometry = geometry.select([0, 0, 0])
+    whole = gpu.GpuPasses(Projector(geometry, grid, window)._engine, CPU)
+    least = next(m for m in range(1, 10**6, 8) if _fits(geometry, grid, window, m))
+    limited = Projector(geometry, grid, window, memory=least)
+    passes = gpu.GpuPasses(limited._engine, CPU)
+    assert gpu._slice(limited._engine, least, 2, 4)[0] == 1
+    generator = torch.Generator().manual_seed(0)
+    x, y = (torch.randn((2, *shape), generator=generator) for shape in (limited.domain_shape, limited.range_shape))
+    assert torch.equal(passes.forward(x), whole.forward(x))
+    assert torch.equal(passes.adjoint(y), whole.adjoint(y))
+    assert limited.memory_estimate(2, device="cuda") < Projector(geometry, grid, window).memory_estimate(
+        2, device="cuda"
+    )
+    with pytest.raises(ValueError, match="bytes of working memory at least"):
+        gpu.GpuPasses(Projector(geometry, grid, window, memory=1)._engine, CPU).forward(x)
+
+
+def _fits(geometry, grid, window, memory):
+    try:
+        gpu._slice(Projector(geometry, grid, window, memory=memory)._engine, memory, 2, 4)
+    except ValueError:
+        return False
+    return True
+
+
 def test_a_deviating_kernel_is_refused(monkeypatch):
     engine = Projector(*(FanBeam([0.0], 60.0, 110.0, 1, 1.0), VolumeGrid((1, 1), 3.0)))._engine
     assert gpu.agrees(engine, CPU, torch.float32)

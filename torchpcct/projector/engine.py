@@ -16,7 +16,16 @@ from numpy.typing import NDArray
 from torchpcct.geometry import Geometry, VolumeGrid
 from torchpcct.projector.layers import layer_spacing, running_sums
 from torchpcct.projector.plane import PlanePasses
-from torchpcct.projector.rays import Rays, Segments, check_motion, check_pair, check_source, rays_of, split
+from torchpcct.projector.rays import (
+    Rays,
+    Segments,
+    check_motion,
+    check_pair,
+    check_source,
+    rays_of,
+    slab_lattice,
+    split,
+)
 from torchpcct.window import DetectorWindow
 
 if TYPE_CHECKING:
@@ -33,24 +42,31 @@ class Engine:
     """Forward and adjoint passes on NumPy arrays with exactly one leading batch axis.
 
     Args:
-        geometry, grid, window, motion: as for ``Projector``.
+        geometry, grid, window, motion, memory: as for ``Projector``.
 
     Raises:
-        TypeError, ValueError: see ``rays.check_pair`` and ``rays.check_source``.
+        TypeError, ValueError: see ``rays.check_pair``, ``rays.check_source`` and ``Projector``.
     """
 
-    def __init__(self, geometry: Geometry, grid: VolumeGrid, window: DetectorWindow | None, motion: Any = None) -> None:
+    def __init__(
+        self,
+        geometry: Geometry,
+        grid: VolumeGrid,
+        window: DetectorWindow | None,
+        motion: Any = None,
+        memory: int | None = None,
+    ) -> None:
         check_pair(geometry, grid, window)
+        if memory is not None and (isinstance(memory, bool) or not isinstance(memory, int) or memory < 1):
+            raise ValueError(f"memory must be a number of bytes ≥ 1 or None, got {memory!r}")
+        self.memory = memory
         # Symmetric views share their work only if all of the detector is read and nothing moves.
         self.geometry, self.grid, self.windowed = geometry, grid, window is not None or motion is not None
         self.rays: Rays = rays_of(geometry, window)
         if motion is not None:
             self.rays = self.rays.moved(check_motion(motion, geometry.views, grid.ndim))
         check_source(self.rays, grid)
-        hy, hx = grid.spacing[-2:]
-        y, x = grid.axes[-2:]
-        self.lattice = np.array([y[0], hy, x[0] - hx / 2, hx, x[0], hx, y[0] - hy / 2, hy])
-
+        self.lattice = slab_lattice(grid.center[-2:], grid.shape[-2:], grid.spacing[-2:])
         self._devices: dict[Any, GpuPasses] = {}
 
     def on(self, device: Any) -> GpuPasses:
@@ -80,11 +96,13 @@ class Engine:
 
     def forward(self, x: NDArray) -> NDArray:
         """Line integrals of ``x``, ``(batch, *domain_shape)``, as ``(batch, *range_shape)``."""
+        self._check_memory(x)
         with _LAUNCH:
             return self._forward_volume(x) if self.grid.ndim == 3 else self._plane.forward(x)
 
     def adjoint(self, y: NDArray) -> NDArray:
         """The transpose: ``(batch, *range_shape)`` to ``(batch, *domain_shape)``."""
+        self._check_memory(y)
         with _LAUNCH:
             return self._adjoint_volume(y) if self.grid.ndim == 3 else self._plane.adjoint(y)
 
@@ -92,18 +110,36 @@ class Engine:
         """Bytes that one pass holds besides its input and output (the larger of the two directions)."""
         if self.grid.ndim == 2:
             return self._plane.workspace(batch, itemsize)
+        forward, adjoint, per_view = self._volume_bytes(itemsize)
+        return max(forward, adjoint + per_view * self._views_at_once(itemsize))
+
+    def _volume_bytes(self, itemsize: int) -> tuple[int, int, int]:
+        """Working memory of the passes of one volume (volumes pass one by one): forward, adjoint, adjoint per view."""
         r, table = self.rays, 8 * (8 * self.rays.views + 4 * len(self.segments.table))
         nz, ny, nx = self.grid.shape
-        # Volumes pass one by one, so that the batch does not matter.
         forward = ny * nx * (nz + 16) + r.columns * r.rows * _threads()
-        row_sums = r.columns * (r.rows + 1)
-        row_sums *= int(max(1, min(r.views, ROW_SUMS_BYTES // (row_sums * itemsize))))
-        adjoint = 2 * ny * nx * (nz + 8) + row_sums
-        return table + itemsize * max(forward, adjoint)
+        return (
+            table + itemsize * forward,
+            table + itemsize * 2 * ny * nx * (nz + 8),
+            itemsize * r.columns * (r.rows + 1),
+        )
+
+    def _views_at_once(self, itemsize: int) -> int:
+        """Views whose row sums the adjoint holds at a time."""
+        _, rest, per_view = self._volume_bytes(itemsize)
+        room = ROW_SUMS_BYTES if self.memory is None else min(ROW_SUMS_BYTES, self.memory - rest)
+        return int(max(1, min(self.rays.views, room // per_view)))
+
+    def _check_memory(self, x: NDArray) -> None:
+        if self.memory is not None and (need := self.workspace(x.shape[0], x.itemsize)) > self.memory:
+            raise ValueError(
+                f"a pass of this scan needs {need} bytes of working memory, memory allows {self.memory}: raise it, or "
+                "use fewer voxels, fewer columns, float32" + (", or a smaller batch" if self.grid.ndim == 2 else "")
+            )
 
     @cached_property
     def _plane(self) -> PlanePasses:
-        return PlanePasses(self.geometry, self.grid, self.rays, self.lattice, self.windowed)
+        return PlanePasses(self.geometry, self.grid, self.rays, self.windowed)
 
     @cached_property
     def _layer(self) -> float:
@@ -137,7 +173,7 @@ class Engine:
         for n in range(y.shape[0]):
             volume_kernels.backproject(
                 y[n], self._poses, r.edges, r.centers, r.first, seg.table, seg.start, self.lattice, *self._heights(),
-                self._layer, ROW_SUMS_BYTES, x[n],
+                self._layer, self._views_at_once(y.itemsize), x[n],
             )  # fmt: skip
         return x
 

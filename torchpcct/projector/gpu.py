@@ -14,7 +14,7 @@ from torch import Tensor
 if TYPE_CHECKING:
     from torchpcct.projector.engine import Engine
 
-__all__ = ["GpuPasses", "agrees", "available"]
+__all__ = ["GpuPasses", "agrees", "available", "workspace"]
 
 _TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-10}
 _CHECKED: dict[tuple[str, torch.dtype], bool] = {}
@@ -84,8 +84,22 @@ class GpuPasses:
         nz, ny, nx = (1, *self.engine.grid.shape) if self.plane else self.engine.grid.shape
         return nz, ny, nx
 
+    def _budget(self) -> int | None:
+        """Bytes of working memory allowed, None for no limit."""
+        if self.engine.memory is None and self.device.type == "cuda":
+            return int(torch.cuda.mem_get_info(self.device)[0]) // 2
+        return self.engine.memory
+
     def forward(self, x: Tensor) -> Tensor:
         """``(batch, *domain_shape)`` to ``(batch, *range_shape)``."""
+        rays, batch = self.engine.rays, x.shape[0]
+        out = x.new_empty((batch, rays.views, rays.rows, rays.columns))
+        step = _slice(self.engine, self._budget(), batch, x.element_size())[0]
+        for n in range(0, batch, step):
+            self._forward_slice(x[n : n + step], out[n : n + step])
+        return out.reshape(batch, *self.engine.range_shape)
+
+    def _forward_slice(self, x: Tensor, out: Tensor) -> None:
         from torchpcct.projector.triton_kernels import project_kernel
 
         nz, ny, nx = self._shape()
@@ -96,43 +110,104 @@ class GpuPasses:
             knots = nz + 1
             lines = x.new_zeros((batch, ny, nx, knots))
             torch.cumsum(x.permute(0, 2, 3, 1), dim=-1, out=lines[..., 1:])
-        out = x.new_empty((batch, rays.views, rays.rows, rays.columns))
         block = 1 if self.plane else min(64, _power_of_two(rays.rows))
         project_kernel[(rays.views * rays.columns, math.ceil(rays.rows / block), batch)](
             lines, out, self.cells, self.pose, self.axes, ny, nx, knots, knots - 1, rays.views, rays.rows,
             rays.columns, *self.heights, self.layer, *self.limits, self.plane, rays.parallel, block,
         )  # fmt: skip
-        return out.reshape(batch, *self.engine.range_shape)
 
     def adjoint(self, y: Tensor) -> Tensor:
         """``(batch, *range_shape)`` to ``(batch, *domain_shape)``."""
+        batch = y.shape[0]
+        out = y.new_empty((batch, *self.engine.domain_shape))
+        step, views = _slice(self.engine, self._budget(), batch, y.element_size())
+        for n in range(0, batch, step):
+            out[n : n + step] = self._adjoint_slice(y[n : n + step], views)
+        return out
+
+    def _adjoint_slice(self, y: Tensor, views: int) -> Tensor:
+        """The whole sum, ``views`` at a time: each voxel's sum goes on where the views before left it."""
         from torchpcct.projector.triton_kernels import backproject_kernel
 
         nz, ny, nx = self._shape()
-        rays, batch = self.engine.rays, y.shape[0]
-        if self.plane:
-            sums = y.contiguous()
-        else:
-            sums = y.new_zeros((batch, rays.views, rays.columns, rays.rows + 1))
-            torch.cumsum((y * self._slant(y.dtype)).transpose(-1, -2), dim=-1, out=sums[..., 1:])
+        rays, batch, start = self.engine.rays, y.shape[0], self.engine.segments.start
         along, block = (min(64, _power_of_two(max(nx, ny))), 1) if self.plane else (1, min(64, _power_of_two(nz)))
-        parts = []
-        for axis, (slabs, width) in enumerate(((ny, nx), (nx, ny))):
-            out = y.new_empty((batch, slabs, width, nz))
-            backproject_kernel[(slabs * math.ceil(width / along), math.ceil(nz / block), batch)](
-                sums, out, self.cells, self.pose, self.segments, len(self.segments), axis, slabs, width, nz,
-                rays.views, rays.rows, rays.columns, *self.heights, self.layer, *self.limits,
-                self.plane, rays.parallel, rays.columns.bit_length() + 1, along, block,
-            )  # fmt: skip
-            parts.append(out)
-        total = parts[0] + parts[1].transpose(1, 2)
-        return total[..., 0].contiguous() if self.plane else total.permute(0, 3, 1, 2).contiguous()
+        parts = [y.new_zeros((batch, ny, nx, nz)), y.new_zeros((batch, nx, ny, nz))]
+        for begin in range(0, rays.views, views):
+            stop = min(begin + views, rays.views)
+            part = y[:, begin:stop]
+            if self.plane:
+                sums = part.contiguous()
+            else:
+                sums = y.new_zeros((batch, stop - begin, rays.columns, rays.rows + 1))
+                slanted = (part * self._slant(y.dtype, begin, stop)).transpose(-1, -2)
+                torch.cumsum(slanted, dim=-1, out=sums[..., 1:])
+            segments = self.segments[start[begin] : start[stop]]
+            for axis, (slabs, width) in enumerate(((ny, nx), (nx, ny))):
+                backproject_kernel[(slabs * math.ceil(width / along), math.ceil(nz / block), batch)](
+                    sums, parts[axis], self.cells, self.pose, segments, len(segments), axis, slabs, width, nz,
+                    begin, stop - begin, rays.rows, rays.columns, *self.heights, self.layer, *self.limits,
+                    self.plane, rays.parallel, rays.columns.bit_length() + 1, along, block,
+                )  # fmt: skip
+        total = parts[0].add_(parts[1].transpose(1, 2))
+        return total[..., 0] if self.plane else total.permute(0, 3, 1, 2)
 
-    def _slant(self, dtype: torch.dtype) -> Tensor:
+    def _slant(self, dtype: torch.dtype, begin: int, stop: int) -> Tensor:
         _, _, row0, pitch = self.heights
         rows = torch.arange(self.engine.rays.rows, device=self.device, dtype=torch.float64)
-        rise = row0 + (rows + 0.5) * pitch + (self.pose[:, 7] - self.pose[:, 2])[:, None]
-        return torch.sqrt(1.0 + rise[:, :, None] ** 2 / self.cells[:, None, :, 7]).to(dtype)
+        pose = self.pose[begin:stop]
+        rise = row0 + (rows + 0.5) * pitch + (pose[:, 7] - pose[:, 2])[:, None]
+        return torch.sqrt(1.0 + rise[:, :, None] ** 2 / self.cells[begin:stop, None, :, 7]).to(dtype)
+
+
+def _slice_bytes(engine: Engine, itemsize: int) -> tuple[int, int, int]:
+    """Working memory per volume: forward; adjoint; adjoint per view (also per view of a whole batch: the slants)."""
+    rays, voxels = engine.rays, math.prod(engine.grid.shape)
+    readings = rays.rows * rays.columns
+    if engine.grid.ndim == 2:
+        return itemsize * voxels, 2 * itemsize * voxels, itemsize * readings
+    lines = voxels + voxels // engine.grid.shape[0]
+    # Running sums and a copy in their order; two partial volumes; slants, slanted readings, a copy, running sums.
+    return (
+        itemsize * (lines + voxels),
+        2 * itemsize * voxels,
+        itemsize * (3 * readings + 2 * rays.columns) + 24 * readings,
+    )
+
+
+def _tables(engine: Engine) -> int:
+    rays = engine.rays
+    return rays.views * (68 * rays.columns + 64) + 32 * len(engine.segments.table)
+
+
+def _slice(engine: Engine, budget: int | None, batch: int, itemsize: int) -> tuple[int, int]:
+    """Volumes per launch and, for the adjoint, views at a time, so that the working memory stays within the budget.
+
+    Raises:
+        ValueError: ``Projector``'s ``memory`` is less than one volume and one view need.
+    """
+    views = engine.rays.views
+    if budget is None:
+        return batch, views
+    forward, adjoint, per_view = _slice_bytes(engine, itemsize)
+    room = budget - _tables(engine)
+    volumes = min(batch, room // max(forward, adjoint + views * per_view))
+    if volumes >= 1:
+        return volumes, views
+    least = max(forward, adjoint + per_view)
+    if room < least and engine.memory is not None:
+        raise ValueError(
+            f"a pass of this scan needs {least + _tables(engine)} bytes of working memory at least, memory allows "
+            f"{engine.memory}: raise it, or use fewer voxels or float32"
+        )
+    return 1, max(1, min(views, (room - adjoint) // per_view))
+
+
+def workspace(engine: Engine, batch: int, itemsize: int) -> int:
+    """Bytes that one pass on a CUDA device holds besides input and output, within the engine's limit if it has one."""
+    volumes, views = _slice(engine, engine.memory, batch, itemsize)
+    forward, adjoint, per_view = _slice_bytes(engine, itemsize)
+    return _tables(engine) + volumes * max(forward, adjoint + views * per_view)
 
 
 def _power_of_two(n: int) -> int:

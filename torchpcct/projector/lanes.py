@@ -1,15 +1,19 @@
 """The inner loops of the kernels as explicit SIMD, through LLVM vectors.
 
 In the plane kernels a lane is an image that shares its geometry with the others: a rotated or mirrored copy, or another
-image of the batch. All lanes of an edge use one interpolation index, so that every load is contiguous. In the volume
-kernels the lanes lie along z. numba's own vectoriser does not find these loops reliably; LLVM vectors are portable
-all the same, LLVM splits or merges them for the machine it compiles for.
+image of the batch. All lanes of an edge use one interpolation index, so that every load is contiguous. Copies of a grid
+off the axis lie a part of a voxel apart: then each lane interpolates at its own place among three or four shared knots
+(``reach``: 2 or 3 intervals; 0: the lanes lie at the same place). In the volume kernels the lanes lie along z. numba's
+own vectoriser does not find these loops reliably; LLVM vectors are portable all the same, LLVM splits or merges them
+for the machine it compiles for.
 
-The vector width is the length of the tuple ``lanes``, so that numba compiles one version per width and caches each.
+The vector width is the length of the tuple ``lanes`` and the reach that of the tuple ``reach``, so that numba compiles
+one version of each and caches it.
 """
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 from llvmlite import ir
@@ -27,7 +31,7 @@ class _Code:
     def __init__(self, context: Any, builder: Any, signature: Any, args: Any) -> None:
         self.b = builder
         self.width = signature.args[0].count
-        self.dtype = signature.args[1].dtype
+        self.dtype = next(t for t in signature.args if isinstance(t, types.Array)).dtype
         self.real = ir.FloatType() if self.dtype == types.float32 else ir.DoubleType()
         self.wide = ir.VectorType(self.real, self.width)
         self.double = ir.VectorType(self.real, 2 * self.width)
@@ -73,27 +77,64 @@ class _Code:
     def times(self, index: Any, factor: int) -> Any:
         return self.b.mul(index, ir.Constant(self.index, factor), flags=("nsw", "nuw"))
 
-    def knots(self, p: Any, q: Any, first: Any, count: int, weight: Any, top: Any) -> list[tuple[Any, Any]]:
-        """Lower knot of ``t = p + q r`` and the weights of its lanes and the next knot's, slabs ``first … + count``.
-
-        Positions and weights of all slabs are one vector computation; ``weight`` points at the weight of slab 0.
-        """
+    def _places(self, p: Any, q: Any, first: Any, count: int, top: Any) -> tuple[Any, Any]:
+        """Lower knots of ``t = p + q r`` and what ``t`` exceeds them by, for the slabs ``first … + count``."""
         reals, integers = (ir.VectorType(self.real, count), ir.VectorType(ir.IntType(32), count))
         r = self.splat(self.b.sitofp(first, self.real), count)
         r = self.add(r, ir.Constant(reals, [ir.Constant(self.real, float(i)) for i in range(count)]))
         t = self.add(self.splat(p, count), self.mul(self.splat(q, count), r))
         t = self.clamp(t, self.splat(top, count))
         k = self.b.fptosi(t, integers)
-        w = self.load(weight, first, reals)
-        high = self.mul(w, self.sub(t, self.b.sitofp(k, reals)))
+        return k, self.sub(t, self.b.sitofp(k, reals))
+
+    def _index(self, k: Any, i: int) -> Any:
+        return self.b.zext(self.b.extract_element(k, ir.Constant(ir.IntType(32), i)), self.index)
+
+    def knots(self, p: Any, q: Any, first: Any, count: int, weight: Any, top: Any) -> list[tuple[Any, Any]]:
+        """Lower knot of ``t = p + q r`` and the weights of its lanes and the next knot's, slabs ``first … + count``.
+
+        Positions and weights of all slabs are one vector computation; ``weight`` points at the weight of slab 0.
+        """
+        k, part = self._places(p, q, first, count, top)
+        w = self.load(weight, first, part.type)
+        high = self.mul(w, part)
         low = self.sub(w, high)
         return [
-            (
-                self.b.zext(self.b.extract_element(k, ir.Constant(ir.IntType(32), i)), self.index),
-                self.shuffle(low, high, [i] * self.width + [count + i] * self.width),
-            )
+            (self._index(k, i), self.shuffle(low, high, [i] * self.width + [count + i] * self.width))
             for i in range(count)
         ]
+
+    def knots_apart(
+        self, p: Any, q: Any, first: Any, count: int, top: Any, ahead: Any, reach: int
+    ) -> list[tuple[Any, list[Any]]]:
+        """First shared knot and the lanes' weights of the ``reach + 1`` knots from there, for each slab.
+
+        ``ahead``: how far each lane's position lies beyond the shared one, 0 ≤ ahead ≤ reach - 1.
+        """
+        k, part = self._places(p, q, first, count, top)
+        one, zero = ir.Constant(self.wide, [ir.Constant(self.real, 1.0)] * self.width), ir.Constant(self.wide, None)
+        result = []
+        for i in range(count):
+            at = self.add(self.shuffle(part, part, [i] * self.width), ahead)
+            # Parts of the intervals that lie below the position; each knot gets the difference of its two.
+            covered = [one]
+            for interval in range(reach):
+                start = ir.Constant(self.wide, [ir.Constant(self.real, float(interval))] * self.width)
+                inside = self.sub(at, start) if interval else at
+                if interval:
+                    inside = self.b.select(self.b.fcmp_ordered(">", inside, zero), inside, zero)
+                if interval < reach - 1:
+                    inside = self.b.select(self.b.fcmp_ordered("<", inside, one), inside, one)
+                covered.append(inside)
+            weights = [self.sub(a, b) for a, b in pairwise(covered)] + [covered[-1]]
+            result.append((self._index(k, i), weights))
+        return result
+
+    def ahead(self, apart: Any, q: Any) -> Any:
+        """Positions of the lanes beyond the shared one: ``q * apart[0] + apart[1]``."""
+        across = self.load(apart, ir.Constant(self.index, 0), self.wide)
+        along = self.load(apart, ir.Constant(self.index, self.width), self.wide)
+        return self.add(self.mul(self.splat(q, self.width), across), along)
 
     def slabs(self, r0: Any, r1: Any, body: Any) -> None:
         """Call ``body(first slab, how many)`` for groups of slabs, then for the rest one by one.
@@ -110,25 +151,40 @@ class _Code:
 
 
 @intrinsic
-def sum_edges(typingctx, lanes, sums, stride, p, q, weight, gain, e0, e1, r0, r1, top, out):
+def sum_edges(typingctx, lanes, reach, sums, stride, p, q, weight, gain, e0, e1, r0, r1, top, apart, out):
     """Sum slabs ``r0…r1`` at the edges ``e0…e1`` and add the differences of neighbouring edges to ``out``.
 
-    ``lanes``: tuple of the vector's length W. ``sums``: running sums, slab r starts at ``r * stride`` (in elements),
-    knots of W lanes each. ``p, q``: edge lines, ``weight``: per slab, ``gain``: per cell, ``out``: cells of W lanes.
+    ``lanes``: tuple of the vector's length W. ``reach``: tuple, see the module's text. ``sums``: running sums, slab r
+    starts at ``r * stride`` (in elements), knots of W lanes each. ``p, q``: edge lines, ``weight``: per slab (with a
+    reach: per slab and lane), ``gain``: per cell, ``apart``: see ``ahead``, ``out``: cells of W lanes.
     """
-    signature = types.void(lanes, sums, stride, p, q, weight, gain, e0, e1, r0, r1, top, out)
+    signature = types.void(lanes, reach, sums, stride, p, q, weight, gain, e0, e1, r0, r1, top, apart, out)
 
     def codegen(context, builder, signature, args):
         c = _Code(context, builder, signature, args)
-        _, sums, stride, p, q, weight, gain, e0, e1, r0, r1, top, out = c.values
+        intervals = signature.args[1].count
+        _, _, sums, stride, p, q, weight, gain, e0, e1, r0, r1, top, apart, out = c.values
         before = cgutils.alloca_once(builder, c.wide)
         # Both knots of an interpolation lie side by side: one load, one product.
-        totals = [cgutils.alloca_once(builder, c.double) for _ in range(4)]
+        total_type = c.wide if intervals else c.double
+        totals = [cgutils.alloca_once(builder, total_type) for _ in range(4)]
         builder.store(ir.Constant(c.wide, None), before)
         with cgutils.for_range(builder, e1, start=e0) as edge:
             pe, qe = c.load(p, edge.index, c.real), c.load(q, edge.index, c.real)
             for total in totals:
-                builder.store(ir.Constant(c.double, None), total)
+                builder.store(ir.Constant(total_type, None), total)
+            ahead = c.ahead(apart, qe) if intervals else None
+
+            def apart_body(first, count):
+                for i, (k, weights) in enumerate(c.knots_apart(pe, qe, first, count, top, ahead, intervals)):
+                    r, total = (builder.add(first, ir.Constant(c.index, i)), totals[i % len(totals)])
+                    base = builder.add(builder.mul(r, stride), c.times(k, c.width))
+                    value = None
+                    for m, w in enumerate(weights):
+                        part = c.mul(w, c.load(sums, builder.add(base, ir.Constant(c.index, m * c.width)), c.wide))
+                        value = part if value is None else c.add(value, part)
+                    value = c.mul(c.load(weight, c.times(r, c.width), c.wide), value)
+                    builder.store(c.add(builder.load(total), value), total)
 
             def body(first, count):
                 for i, (k, weights) in enumerate(c.knots(pe, qe, first, count, weight, top)):
@@ -136,12 +192,13 @@ def sum_edges(typingctx, lanes, sums, stride, p, q, weight, gain, e0, e1, r0, r1
                     values = c.load(sums, builder.add(builder.mul(r, stride), c.times(k, c.width)), c.double)
                     builder.store(c.add(builder.load(total), c.mul(weights, values)), total)
 
-            c.slabs(r0, r1, body)
-            both = c.add(
+            c.slabs(r0, r1, apart_body if intervals else body)
+            now = c.add(
                 c.add(builder.load(totals[0]), builder.load(totals[1])),
                 c.add(builder.load(totals[2]), builder.load(totals[3])),
             )
-            now = c.add(*(c.shuffle(both, both, list(range(i, i + c.width))) for i in (0, c.width)))
+            if not intervals:
+                now = c.add(*(c.shuffle(now, now, list(range(i, i + c.width))) for i in (0, c.width)))
             with builder.if_then(builder.icmp_signed(">", edge.index, e0)):
                 cell = builder.sub(edge.index, ir.Constant(c.index, 1))
                 change = c.mul(c.splat(c.load(gain, cell, c.real), c.width), c.sub(now, builder.load(before)))
@@ -154,16 +211,17 @@ def sum_edges(typingctx, lanes, sums, stride, p, q, weight, gain, e0, e1, r0, r1
 
 
 @intrinsic
-def add_edges(typingctx, lanes, out, stride, p, q, weight, e0, e1, r0, r1, top, values):
+def add_edges(typingctx, lanes, reach, out, stride, p, q, weight, e0, e1, r0, r1, top, apart, values):
     """Transpose of ``sum_edges``: spread cell values (already times their gain) to the knots of slabs ``r0…r1``.
 
     ``values``: cells of W lanes, one more entry than cells. ``out``: slab r starts at ``(r - r0) * stride``.
     """
-    signature = types.void(lanes, out, stride, p, q, weight, e0, e1, r0, r1, top, values)
+    signature = types.void(lanes, reach, out, stride, p, q, weight, e0, e1, r0, r1, top, apart, values)
 
     def codegen(context, builder, signature, args):
         c = _Code(context, builder, signature, args)
-        _, out, stride, p, q, weight, e0, e1, r0, r1, top, values = c.values
+        intervals = signature.args[1].count
+        _, _, out, stride, p, q, weight, e0, e1, r0, r1, top, apart, values = c.values
         before = cgutils.alloca_once(builder, c.wide)
         zero = ir.Constant(c.wide, None)
         builder.store(zero, before)
@@ -176,6 +234,16 @@ def add_edges(typingctx, lanes, out, stride, p, q, weight, e0, e1, r0, r1, top, 
             builder.store(cell, before)
 
             twice = c.shuffle(value, value, list(range(c.width)) * 2)
+            ahead = c.ahead(apart, qe) if intervals else None
+
+            def apart_body(first, count):
+                for i, (k, weights) in enumerate(c.knots_apart(pe, qe, first, count, top, ahead, intervals)):
+                    r = builder.add(first, ir.Constant(c.index, i))
+                    base = builder.add(builder.mul(builder.sub(r, r0), stride), c.times(k, c.width))
+                    given = c.mul(c.load(weight, c.times(r, c.width), c.wide), value)
+                    for m, w in enumerate(weights):
+                        where = builder.add(base, ir.Constant(c.index, m * c.width))
+                        c.store(c.add(c.load(out, where, c.wide), c.mul(w, given)), out, where)
 
             def body(first, count):
                 for i, (k, weights) in enumerate(c.knots(pe, qe, first, count, weight, top)):
@@ -183,7 +251,7 @@ def add_edges(typingctx, lanes, out, stride, p, q, weight, e0, e1, r0, r1, top, 
                     base = builder.add(builder.mul(builder.sub(r, r0), stride), c.times(k, c.width))
                     c.store(c.add(c.load(out, base, c.double), c.mul(weights, twice)), out, base)
 
-            c.slabs(r0, r1, body)
+            c.slabs(r0, r1, apart_body if intervals else body)
         return context.get_dummy_value()
 
     return signature, codegen

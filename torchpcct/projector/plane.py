@@ -7,63 +7,97 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpcct.geometry import Geometry, VolumeGrid
-from torchpcct.projector.rays import Rays, split
-from torchpcct.projector.symmetry import address, find_orbits
+from torchpcct.projector.rays import Rays, Segments, slab_lattice, split
+from torchpcct.projector.symmetry import Orbits, address, find_orbits, no_orbits, place
 
 __all__ = ["PlanePasses"]
 
 _WIDTHS = (1, 2, 4, 8)
+# Lanes whose positions spread over this many voxels at most reach two, or three, intervals between knots.
+_NEAR, _FAR = 1.0, 2.0
 
 
 class _Tables:
-    """Edge lines, gains and slab weights of the projected views in one dtype."""
+    """Edge lines, gains and slab weights of the projected views, and the lanes' places, in one dtype.
 
-    def __init__(self, passes: PlanePasses, dtype: np.dtype) -> None:
+    ``apart``: ``(2, 2 * lanes)`` per axis: at an edge of the slope q, lane l reads ``q * apart[l] + apart[lanes + l]``
+    beyond the shared position.
+    """
+
+    def __init__(self, passes: PlanePasses, dtype: np.dtype, width: int, steepest: float) -> None:
         from torchpcct.projector import plane_kernels
 
         n = int(passes.entries)
         self.p, self.q, self.gain = (np.empty(n, dtype=dtype) for _ in range(3))
-        self.weight = np.empty((len(passes.segments), max(passes.grid.shape)), dtype=dtype)
+        part = passes.placement.part
+        part = part[np.arange(width) % len(part)] if passes.placement.apart else part[:1]
+        bias, self.apart = np.zeros(2), np.zeros((2, 2 * width), dtype=dtype)
+        self.reach: tuple[int, ...] = ()
+        if passes.placement.apart:
+            lowest, spread = _lane_range(passes.placement.part, steepest)
+            self.reach = (0,) * (2 if spread.max() <= _NEAR else 3)
+            bias = len(self.reach) + lowest
+            for axis in range(2):
+                self.apart[axis] = np.concatenate([part[:, axis], -part[:, 1 - axis] - lowest[axis]])
+        self.weight = np.empty((len(passes.segments), max(passes.placement.shape), len(part)), dtype=dtype)
         rays = passes.rays
         pose = np.ascontiguousarray(rays.pose[passes.orbits.views])
         first = np.ascontiguousarray(rays.first[passes.orbits.views])
         plane_kernels.tabulate(
             passes.segments, passes.offset, pose, rays.edges, rays.centers, first, passes.lattice,
-            np.array(passes.grid.shape), rays.parallel, self.p, self.q, self.gain, self.weight,
+            np.array(passes.placement.shape), rays.parallel, bias, np.ascontiguousarray(part.T), self.p, self.q,
+            self.gain, self.weight,
         )  # fmt: skip
+        self.weight = self.weight.reshape(len(passes.segments), -1)
+
+
+def _lane_range(part: NDArray[np.float64], steepest: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Per axis: lowest position of a lane against the shared one for slopes up to ``steepest``, and the spread."""
+    across, along = part, -part[:, ::-1]  # axis 0: slabs are rows
+    lowest = (along - steepest * np.abs(across)).min(axis=0)
+    return lowest, (along + steepest * np.abs(across)).max(axis=0) - lowest
 
 
 class PlanePasses:
     """Forward and adjoint passes of a 2-D scan on arrays with one leading batch axis.
 
     Args:
-        geometry, grid: the scan and the pixels. rays: its rays. lattice: slab positions (see ``_edge_line``).
+        geometry, grid: the scan and the pixels. rays: its rays.
         windowed: only a part of the detector is read, which breaks symmetries.
     """
 
-    def __init__(
-        self, geometry: Geometry, grid: VolumeGrid, rays: Rays, lattice: NDArray[np.float64], windowed: bool
-    ) -> None:
-        self.grid, self.rays, self.lattice = grid, rays, lattice
-        self.orbits = find_orbits(geometry, grid, rays, windowed)
+    def __init__(self, geometry: Geometry, grid: VolumeGrid, rays: Rays, windowed: bool) -> None:
+        self.grid, self.rays = grid, rays
         segments = split(rays, grid)
+        self._lay_out(segments, find_orbits(geometry, grid, rays, windowed))
+        if self.placement.apart:
+            self._steepest = float(np.abs(_Tables(self, np.dtype(np.float64), 1, 0.0).q).max())
+            if _lane_range(self.placement.part, self._steepest)[1].max() > _FAR:
+                self._lay_out(segments, no_orbits(geometry.views))
+
+    def _lay_out(self, segments: Segments, orbits: Orbits) -> None:
+        rays, grid = self.rays, self.grid
+        self.orbits, self.placement = orbits, place(orbits.operations, grid)
         kept = np.full(rays.views, -1)
-        kept[self.orbits.views] = np.arange(self.orbits.views.size)
+        kept[orbits.views] = np.arange(orbits.views.size)
         table = segments.table[kept[segments.table[:, 0]] >= 0].copy()
         table[:, 0] = kept[table[:, 0]]
         self.segments = np.ascontiguousarray(table)
-        self.start = np.searchsorted(table[:, 0], np.arange(self.orbits.views.size + 1)).astype(np.int64)
+        self.start = np.searchsorted(table[:, 0], np.arange(orbits.views.size + 1)).astype(np.int64)
         entries = np.concatenate([[0], np.cumsum(table[:, 3] + 1)])
         self.offset, self.entries = np.ascontiguousarray(entries[:-1]), int(entries[-1])
         ny, nx = grid.shape
-        self.addresses = np.array([address(g, ny, nx) for g in self.orbits.operations])
+        self.addresses = np.array([address(g, ny, nx) for g in orbits.operations])
         self.inverse = np.array([_inverse(a, ny, nx) for a in self.addresses])
-        self._tables: dict[np.dtype, _Tables] = {}
+        self.lattice = slab_lattice(self.placement.center, self.placement.shape, grid.spacing[-2:])
+        self._steepest = 0.0
+        self._tables: dict[tuple[np.dtype, int], _Tables] = {}
 
-    def tables(self, dtype: np.dtype) -> _Tables:
-        if dtype not in self._tables:
-            self._tables[dtype] = _Tables(self, dtype)
-        return self._tables[dtype]
+    def tables(self, dtype: np.dtype, width: int) -> _Tables:
+        key = (dtype, width if self.placement.apart else 1)
+        if key not in self._tables:
+            self._tables[key] = _Tables(self, dtype, width, self._steepest)
+        return self._tables[key]
 
     @property
     def operations(self) -> int:
@@ -74,13 +108,26 @@ class PlanePasses:
         images = max(1, min(batch, 8 // self.operations))
         return next(w for w in _WIDTHS if w >= images * self.operations)
 
+    def _size(self, reach: int) -> NDArray[np.int64]:
+        """``(2, 2)``: slabs and knots of the lattice per axis."""
+        ny, nx = self.placement.shape
+        more = 2 * reach + 1 if reach else 1
+        return np.array([[ny, nx + 1 + more], [nx, ny + 1 + more]], dtype=np.int64)
+
+    def _place(self, width: int, reach: int) -> NDArray[np.int64]:
+        """``(2, lanes, 2)`` per axis: slab and knot where each lane's image begins."""
+        shift = self.placement.shift[np.arange(width) % self.operations]
+        places = np.stack([shift, shift[:, ::-1]])
+        places[..., 1] += reach
+        return np.ascontiguousarray(places)
+
     def workspace(self, batch: int, itemsize: int) -> int:
         """Bytes held besides input and output, tables included."""
-        ny, nx = self.grid.shape
         lanes = self.lanes(batch)
-        knots = ny * (nx + 2) + nx * (ny + 2)
+        knots = int(self._size(3 if self.placement.apart else 0).prod(axis=1).sum())
         readings = max(self.orbits.views.size * self.rays.columns, self.entries)
-        return itemsize * (lanes * (knots + readings) + 3 * self.entries + len(self.segments) * max(ny, nx))
+        weights = len(self.segments) * max(self.placement.shape) * (lanes if self.placement.apart else 1)
+        return itemsize * (lanes * (knots + readings) + 3 * self.entries + weights)
 
     def forward(self, x: NDArray) -> NDArray:
         from torchpcct.projector import plane_kernels as kernels
@@ -88,20 +135,23 @@ class PlanePasses:
         ny, nx = self.grid.shape
         images = x.reshape(x.shape[0], ny * nx)
         y = np.empty((x.shape[0], self.rays.views, self.rays.columns), dtype=x.dtype)
-        t = self.tables(x.dtype)
         width = self.lanes(x.shape[0])
+        t = self.tables(x.dtype, width)
         step = max(1, width // self.operations)
+        places = self._place(width, len(t.reach))
         out = np.empty((self.orbits.views.size, self.rays.columns * width), dtype=x.dtype)
         for n in range(0, x.shape[0], step):
             count = min(step, x.shape[0] - n)
             sums = []
-            for axis, shape in ((0, (ny, nx)), (1, (nx, ny))):
-                lines = np.empty((shape[0], shape[1] + 2, width), dtype=x.dtype)
-                kernels.load_image(images, self._lane_table(n, count, width, axis), axis, lines)
+            for axis, shape in enumerate(self._size(len(t.reach))):
+                lines = np.empty((*shape, width), dtype=x.dtype)
+                slabs, pixels = (ny, nx) if axis == 0 else (nx, ny)
+                kernels.load_image(images, self._lane_table(n, count, width, axis), places[axis], slabs, pixels, lines)
                 sums.append(lines.reshape(shape[0], -1))
             kernels.project(
-                (0,) * width, self.segments, self.offset, self.start, *sums, t.p, t.q, t.gain, t.weight, out
-            )
+                (0,) * width, t.reach, self.segments, self.offset, self.start, *sums, t.p, t.q, t.gain, t.weight,
+                t.apart, out,
+            )  # fmt: skip
             orbits = self.orbits
             kernels.deal(out.reshape(len(out), -1, width), orbits.target, orbits.reverse, count, y[n : n + count])
         return y
@@ -111,9 +161,10 @@ class PlanePasses:
 
         ny, nx = self.grid.shape
         x = np.empty((y.shape[0], ny, nx), dtype=y.dtype)
-        t = self.tables(y.dtype)
         width = self.lanes(y.shape[0])
+        t = self.tables(y.dtype, width)
         step = max(1, width // self.operations)
+        size, places = self._size(len(t.reach)), self._place(width, len(t.reach))
         values = np.zeros((self.entries, width), dtype=y.dtype)
         by_row = np.empty((width, ny, nx), dtype=y.dtype)
         by_column = np.empty((width, nx, ny), dtype=y.dtype)
@@ -122,8 +173,9 @@ class PlanePasses:
             orbits = self.orbits
             kernels.cell_values(part, orbits.target, orbits.reverse, self.segments, self.offset, t.gain, values)
             kernels.backproject(
-                (0,) * width, self.segments, self.offset, t.p, t.q, t.weight, values.reshape(-1), by_row, by_column
-            )
+                (0,) * width, t.reach, self.segments, self.offset, t.p, t.q, t.weight, t.apart, values.reshape(-1),
+                size, places, by_row, by_column,
+            )  # fmt: skip
             kernels.collect(by_row, by_column, self.inverse, self.operations, x[n : n + step])
         return x
 

@@ -26,12 +26,14 @@ _small = njit(cache=True, fastmath=_FLAGS, error_model="numpy")
 
 
 @_small
-def tabulate(segments, offset, pose, edges, centers, first, lattice, slabs, parallel, p, q, gain, weight):
-    """Edge lines ``p, q`` and cell gains of every segment (at ``offset[s]``), and the slab weights ``(segments, …)``.
+def tabulate(segments, offset, pose, edges, centers, first, lattice, slabs, parallel, bias, across, p, q, gain, weight):
+    """Edge lines ``p, q`` and cell gains of every segment (at ``offset[s]``), slab weights ``(segments, …, lanes)``.
 
-    Cell width on slab r: divergent ``(q1 - q0) (r - r_source)``, parallel ``p1 - p0``.
+    Cell width on slab r: divergent ``(q1 - q0) (r - r_source)``, parallel ``p1 - p0``. ``bias``: added to p, per axis.
+    ``across``: ``(2, lanes)``, slabs by which each lane's slabs lie beyond the lattice's.
     """
     real = p.dtype.type
+    lanes = across.shape[1]
     for s in range(segments.shape[0]):
         v, axis, start, count = segments[s]
         at = pose[v]
@@ -39,7 +41,7 @@ def tabulate(segments, offset, pose, edges, centers, first, lattice, slabs, para
         p0, q0 = 0.0, 0.0
         for j in range(count + 1):
             p1, q1 = _edge_line(at, edges, first[v] + start + j, axis, lattice, parallel)
-            p[here + j], q[here + j] = real(p1), real(q1)
+            p[here + j], q[here + j] = real(p1 + bias[axis]), real(q1)
             if j > 0:
                 _, _, path, _ = _depth_line(at, centers, first[v] + start + j - 1, axis, lattice, parallel)
                 gain[here + j - 1] = real(path / (p1 - p0 if parallel else q1 - q0))
@@ -47,12 +49,13 @@ def tabulate(segments, offset, pose, edges, centers, first, lattice, slabs, para
         gain[here + count] = 0
         l0, l1, _, _ = _depth_line(at, centers, first[v] + start + count // 2, axis, lattice, parallel)
         for r in range(slabs[axis]):
-            if parallel:
-                weight[s, r] = 1
-            else:
-                # l0 + l1 r is proportional to the distance from the source, positive in front of it.
-                depth = l0 + l1 * r
-                weight[s, r] = real(l1 / depth) if depth > 1e-6 else real(0)
+            for l in range(lanes):
+                if parallel:
+                    weight[s, r, l] = 1
+                else:
+                    # l0 + l1 r is proportional to the distance from the source, positive in front of it.
+                    depth = l0 + l1 * (r + across[axis, l])
+                    weight[s, r, l] = real(l1 / depth) if depth > 1e-6 else real(0)
 
 
 @_small
@@ -79,27 +82,37 @@ def _active(p, q, here, count, r0, r1, top):
 
 
 @njit(parallel=True, cache=True)
-def load_image(image, address, axis, sums):
-    """Running sums of one axis, ``(slabs, width + 2, lanes)``, of ``(batch, pixels)`` under the lane addresses.
+def load_image(image, address, place, count, width, sums):
+    """Running sums of one axis, ``(slabs, knots, lanes)``, of ``(batch, pixels)`` under the lane addresses.
 
-    ``address``: ``(lanes, 4)``: batch index, base, per slab, per step. The last knot is doubled, so that the
-    interpolation may read one beyond the end.
+    ``address``: ``(lanes, 4)``: batch index, base, per slab, per step. ``place``: ``(lanes, 2)``: slab and knot where
+    the ``count`` slabs of ``width`` pixels begin; all around is zero. The last knot repeats up to the end, so that the
+    interpolation may read beyond it.
     """
     slabs, knots, lanes = sums.shape
     for r in prange(slabs):
         for l in range(lanes):
-            n, base = address[l, 0], address[l, 1] + r * address[l, 2]
-            step = address[l, 3]
+            i, first = r - place[l, 0], place[l, 1]
             total = sums.dtype.type(0)
-            for k in range(knots - 2):
+            if i < 0 or i >= count:
+                for k in range(knots):
+                    sums[r, k, l] = total
+                continue
+            n, base = address[l, 0], address[l, 1] + i * address[l, 2]
+            step = address[l, 3]
+            for k in range(first + 1):
                 sums[r, k, l] = total
+            for k in range(width):
                 total += image[n, base + k * step]
-            sums[r, knots - 2, l] = total
-            sums[r, knots - 1, l] = total
+                sums[r, first + 1 + k, l] = total
+            for k in range(first + 1 + width, knots):
+                sums[r, k, l] = total
 
 
 @_small
-def _project_view(lanes, segments, offset, s0, s1, axis, sums, stride, slabs, top, p, q, gain, weight, out):
+def _project_view(
+    lanes, reach, segments, offset, s0, s1, axis, sums, stride, slabs, top, p, q, gain, weight, apart, out
+):
     width = len(lanes)
     for r0 in range(0, slabs, BLOCK):
         r1 = min(r0 + BLOCK, slabs)
@@ -108,16 +121,22 @@ def _project_view(lanes, segments, offset, s0, s1, axis, sums, stride, slabs, to
                 start, count, here = segments[s, 2], segments[s, 3], offset[s]
                 e0, e1 = _active(p, q, here, count, r0, r1, top)
                 sum_edges(
-                    lanes, sums, stride, p[here:], q[here:], weight[s], gain[here:], e0, e1, r0, r1, top,
-                    out[start * width :],
+                    lanes, reach, sums, stride, p[here:], q[here:], weight[s], gain[here:], e0, e1, r0, r1, top,
+                    apart, out[start * width :],
                 )  # fmt: skip
 
 
+@_small
+def _beyond(reach):
+    """Knots read after the highest interpolation index."""
+    return max(1, len(reach))
+
+
 @njit(parallel=True, cache=True)
-def project(lanes, segments, offset, start, by_row, by_column, p, q, gain, weight, out):
+def project(lanes, reach, segments, offset, start, by_row, by_column, p, q, gain, weight, apart, out):
     """Lane readings of all canonical views, ``out``: ``(views, columns * lanes)``, overwritten.
 
-    ``by_row, by_column``: ``(slabs, (width + 2) * lanes)``.
+    ``by_row, by_column``: ``(slabs, knots * lanes)``. ``apart``: ``(2, 2 * lanes)``, see ``lanes.sum_edges``.
     """
     width = len(lanes)
     real = by_row.dtype.type
@@ -127,10 +146,10 @@ def project(lanes, segments, offset, start, by_row, by_column, p, q, gain, weigh
         for axis in range(2):
             sums = by_row if axis == 0 else by_column
             slabs, stride = sums.shape
-            top = real(stride // width - 2)
+            top = real(stride // width - 1 - _beyond(reach))
             _project_view(
-                lanes, segments, offset, start[v], start[v + 1], axis, sums.reshape(-1), stride, slabs, top,
-                p, q, gain, weight, line,
+                lanes, reach, segments, offset, start[v], start[v + 1], axis, sums.reshape(-1), stride, slabs, top,
+                p, q, gain, weight, apart[axis], line,
             )  # fmt: skip
 
 
@@ -171,18 +190,22 @@ def cell_values(data, target, reverse, segments, offset, gain, values):
 
 
 @_small
-def _spread_block(lanes, segments, offset, axis, r0, r1, top, p, q, weight, values, out, stride):
+def _spread_block(lanes, reach, segments, offset, axis, r0, r1, top, p, q, weight, apart, values, out, stride):
     width = len(lanes)
     for s in range(segments.shape[0]):
         if segments[s, 1] == axis:
             count, here = segments[s, 3], offset[s]
             e0, e1 = _active(p, q, here, count, r0, r1, top)
-            add_edges(lanes, out, stride, p[here:], q[here:], weight[s], e0, e1, r0, r1, top, values[here * width :])
+            add_edges(
+                lanes, reach, out, stride, p[here:], q[here:], weight[s], e0, e1, r0, r1, top, apart,
+                values[here * width :],
+            )  # fmt: skip
 
 
 @_small
-def _reverse_sums(out, r0, r1, knots, width, total, planes):
-    """Knot values to voxels, ``Σ_{k > m} out[k]``, into ``planes``, ``(lanes, slabs, knots - 2)``."""
+def _reverse_sums(out, r0, r1, knots, width, total, place, planes):
+    """Knot values to voxels, ``Σ_{k > m} out[k]``, into ``planes``, ``(lanes, slabs, width)``."""
+    _, slabs, pixels = planes.shape
     for r in range(r0, r1):
         base = (r - r0) * knots * width
         for l in range(width):
@@ -190,7 +213,9 @@ def _reverse_sums(out, r0, r1, knots, width, total, planes):
         for k in range(knots - 2, 0, -1):
             for l in range(width):
                 total[l] += out[base + k * width + l]
-                planes[l, r, k - 1] = total[l]
+                i, m = r - place[l, 0], k - 1 - place[l, 1]
+                if 0 <= i < slabs and 0 <= m < pixels:
+                    planes[l, i, m] = total[l]
 
 
 @_small
@@ -207,25 +232,29 @@ def _mixing_stride(tasks):
 
 
 @njit(parallel=True, cache=True)
-def backproject(lanes, segments, offset, p, q, weight, values, by_row, by_column):
-    """Transpose of :func:`project`: cell values ``(entries * lanes,)`` to ``(lanes, slabs, width)`` per axis."""
+def backproject(lanes, reach, segments, offset, p, q, weight, apart, values, size, place, by_row, by_column):
+    """Transpose of :func:`project`: cell values ``(entries * lanes,)`` to ``(lanes, slabs, width)`` per axis.
+
+    ``size``: ``(2, 2)``, slabs and knots per axis. ``place``: ``(2, lanes, 2)``, see ``load_image``.
+    """
     width = len(lanes)
     real = by_row.dtype.type
-    row_tasks = (by_row.shape[1] + BLOCK - 1) // BLOCK
-    tasks = row_tasks + (by_column.shape[1] + BLOCK - 1) // BLOCK
+    row_tasks = (size[0, 0] + BLOCK - 1) // BLOCK
+    tasks = row_tasks + (size[1, 0] + BLOCK - 1) // BLOCK
     stride = _mixing_stride(tasks)
     for turn in prange(tasks):
         task = turn * stride % tasks
         axis = 0 if task < row_tasks else 1
         planes, r0 = (by_row, task * BLOCK) if axis == 0 else (by_column, (task - row_tasks) * BLOCK)
-        r1 = min(r0 + BLOCK, planes.shape[1])
-        knots = planes.shape[2] + 2
+        r1 = min(r0 + BLOCK, size[axis, 0])
+        knots = size[axis, 1]
         out = np.zeros((r1 - r0) * knots * width, dtype=by_row.dtype)
         total = np.empty(width, dtype=by_row.dtype)
         _spread_block(
-            lanes, segments, offset, axis, r0, r1, real(knots - 2), p, q, weight, values, out, knots * width
+            lanes, reach, segments, offset, axis, r0, r1, real(knots - 1 - _beyond(reach)), p, q, weight, apart[axis],
+            values, out, knots * width,
         )  # fmt: skip
-        _reverse_sums(out, r0, r1, knots, width, total, planes)
+        _reverse_sums(out, r0, r1, knots, width, total, place[axis], planes)
 
 
 @_small

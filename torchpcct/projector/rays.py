@@ -10,6 +10,7 @@ and starts at ``source + b * across``.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
 from torchpcct.window import DetectorWindow
 
-__all__ = ["Rays", "Segments", "check_motion", "check_pair", "check_source", "rays_of", "split"]
+__all__ = ["Rays", "Segments", "check_motion", "check_pair", "check_source", "rays_of", "slab_lattice", "split"]
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -212,6 +213,14 @@ def split(rays: Rays, grid: VolumeGrid) -> Segments:
     table = np.ascontiguousarray(np.concatenate(rows).astype(np.int64))
     start = np.searchsorted(table[:, 0], np.arange(rays.views + 1)).astype(np.int64)
     return Segments(table, start)
+
+
+def slab_lattice(center: Sequence[float], shape: Sequence[int], spacing: Sequence[float]) -> Floats:
+    """``(8,)`` mm: y of the first row of voxels and the row pitch, x of the first voxel edge and the pitch along a row;
+    then the same for columns. All arguments ``(y, x)``."""
+    (hy, hx), (ny, nx) = spacing, shape
+    y, x = center[0] - (ny - 1) / 2 * hy, center[1] - (nx - 1) / 2 * hx
+    return np.array([y, hy, x - hx / 2, hx, x, hx, y - hy / 2, hy])
 
 
 def check_source(rays: Rays, grid: VolumeGrid) -> None:

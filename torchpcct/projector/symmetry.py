@@ -2,7 +2,9 @@
 
 An operation ``(m, s)`` maps a point ``p`` to ``R^m S^s p``: R turns by 90° counter-clockwise, S mirrors y. If it maps
 every view to another view of the scan, the readings of view β of the image ``f(R^m S^s p)`` are the readings of the
-mapped view of ``f``. Then one pass over a part of the views serves all operations at once.
+mapped view of ``f``. Then one pass over a part of the views serves all operations at once. The grid need not be
+centred on the axis: the operated grids then lie apart from each other, by whole voxels and by a part of one
+(:class:`Placement`).
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from numpy.typing import NDArray
 from torchpcct.geometry import Geometry, VolumeGrid
 from torchpcct.projector.rays import Rays
 
-__all__ = ["Orbits", "address", "find_orbits"]
+__all__ = ["Orbits", "Placement", "address", "find_orbits", "no_orbits", "place"]
 
 Ints = NDArray[np.int64]
 _TURNS = [(m, 0) for m in range(4)]
@@ -30,9 +32,11 @@ _SETS = (
     [(0, 0), (0, 1)],
     [(0, 0)],
 )
-# Relative time of one pass with that many lanes (a vector of 8 float32 is one register).
+# Relative time of one pass with that many lanes (a vector of 8 float32 is one register), at the same place and apart.
 _COST = {1: 1.0, 2: 1.2, 4: 1.3, 8: 1.5}
+_COST_APART = {2: 2.6, 4: 2.8, 8: 3.2}
 _TOLERANCE = 1e-9  # rad
+_SAME_PLACE = 1e-12  # voxels; rounding of the centre
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,17 +56,74 @@ class Orbits:
     reverse: Ints
 
 
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Where the operated grids lie on one lattice that holds them all.
+
+    Args:
+        center: centre of the lattice's voxels ``(y, x)``, mm, for a lattice of the shape ``shape``.
+        shape: rows and columns of the lattice.
+        shift: ``(operations, 2)`` int64, row and column of the lattice where each operated grid begins.
+        part: ``(operations, 2)`` float64, part of a row and column by which it lies beyond that.
+    """
+
+    center: tuple[float, float]
+    shape: tuple[int, int]
+    shift: Ints
+    part: NDArray[np.float64]
+
+    @property
+    def apart(self) -> bool:
+        """True if the operated grids do not share a lattice exactly."""
+        return bool(self.part.any())
+
+
+def place(operations: tuple[tuple[int, int], ...], grid: VolumeGrid) -> Placement:
+    """The lattice of all operated grids on which they lie least apart."""
+    cy, cx = grid.center
+    centers = np.empty((len(operations), 2))
+    for i, (m, s) in enumerate(operations):
+        x, y = cx, cy
+        for _ in range(m):
+            x, y = y, -x  # the operated image shows the point p at S^s R^-m p
+        centers[i] = (-y if s else y), x
+    centers /= np.asarray(grid.spacing)
+    start, middle = np.empty(2), np.empty(2)
+    shift, part = np.empty(centers.shape, dtype=np.int64), np.empty_like(centers)
+    for axis in range(2):
+        fraction = np.sort(np.mod(centers[:, axis], 1.0))
+        gaps = np.diff(np.append(fraction, fraction[0] + 1.0))
+        # The parts of a voxel lie on a circle: cut it in the widest gap.
+        first = fraction[(int(gaps.argmax()) + 1) % fraction.size]
+        spread = 1.0 - gaps.max()
+        middle[axis] = first + (spread / 2 if spread > _SAME_PLACE else 0.0)
+        away = centers[:, axis] - middle[axis]
+        whole = np.round(away).astype(np.int64)
+        part[:, axis] = away - whole
+        start[axis] = whole.min()
+        shift[:, axis] = whole - whole.min()
+    part[np.abs(part) < _SAME_PLACE] = 0.0
+    more = shift.max(axis=0)
+    center = (middle + start + more / 2) * np.asarray(grid.spacing)
+    shape = tuple(int(n + k) for n, k in zip(grid.shape, more, strict=True))
+    return Placement((float(center[0]), float(center[1])), (shape[0], shape[1]), shift, part)
+
+
+def no_orbits(views: int) -> Orbits:
+    """Every view on its own."""
+    return Orbits(((0, 0),), np.arange(views), np.arange(views)[:, None], np.zeros((views, 1), dtype=np.int64))
+
+
 def find_orbits(geometry: Geometry, grid: VolumeGrid, rays: Rays, windowed: bool) -> Orbits:
     """The cheapest set of operations (the identity alone, if the scan or the grid has no symmetry)."""
     views = geometry.views
-    trivial = Orbits(((0, 0),), np.arange(views), np.arange(views)[:, None], np.zeros((views, 1), dtype=np.int64))
+    trivial = no_orbits(views)
     turn = 2 * math.pi
     angles = np.mod(geometry.angles, turn)
     order = np.argsort(angles, kind="stable")
     sorted_angles = angles[order]
     gaps = np.diff(np.append(sorted_angles, sorted_angles[0] + turn))
-    centred = all(abs(c) < 1e-9 * e for c, e in zip(grid.center, grid.extent, strict=True))
-    if windowed or not centred or (views > 1 and gaps.min() < _TOLERANCE):
+    if windowed or (views > 1 and gaps.min() < _TOLERANCE):
         return trivial
     square = grid.shape[0] == grid.shape[1] and math.isclose(grid.spacing[0], grid.spacing[1], rel_tol=1e-12)
     position = rays.edges[:, 1] if rays.edges.shape[0] else np.zeros(1)
@@ -105,7 +166,9 @@ def find_orbits(geometry: Geometry, grid: VolumeGrid, rays: Rays, windowed: bool
                 else:
                     seen[target[v, lane]] = True
             chosen.append(v)
-        cost = len(chosen) * _COST[len(operations)]
+        placed = place(tuple(operations), grid)
+        cost = len(chosen) * (_COST_APART if placed.apart else _COST)[len(operations)]
+        cost *= math.prod(placed.shape) / math.prod(grid.shape)  # empty voxels between the lanes' grids and the rest
         if cost < best_cost:
             best_cost = cost
             best = Orbits(tuple(operations), np.array(chosen), target[chosen], reverse[chosen])

@@ -85,17 +85,22 @@ def project_kernel(
 
 @triton.jit
 def backproject_kernel(
-    sums, out, cells, pose, segments, count, axis, slabs, width, nz, views, rows, columns, z0, dz, row0, row_pitch,
-    layer, nearest, layered_below, PLANE: tl.constexpr, PARALLEL: tl.constexpr, STEPS: tl.constexpr,
+    sums, out, cells, pose, segments, count, axis, slabs, width, nz, begin, views, rows, columns, z0, dz, row0,
+    row_pitch, layer, nearest, layered_below, PLANE: tl.constexpr, PARALLEL: tl.constexpr, STEPS: tl.constexpr,
     ALONG: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """``out``: ``(batch, slabs, width, nz)``; ``sums``: ``(batch, views, columns, rows + 1)`` (plane: readings)."""
+    """Add a slice of views, ``begin`` and on, to ``out``, ``(batch, slabs, width, nz)``.
+
+    ``sums``: ``(batch, views, columns, rows + 1)`` (plane: readings); ``segments``: those of the slice.
+    """
     blocks = tl.cdiv(width, ALONG)
     r = tl.program_id(0) // blocks
     k = (tl.program_id(0) % blocks) * ALONG + tl.arange(0, ALONG)[:, None]
     z = tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)[None, :]
     batch = tl.program_id(2).to(tl.int64)
-    acc = tl.zeros((ALONG, BLOCK), dtype=out.dtype.element_ty)
+    target = out + ((batch * slabs + r) * width + k) * nz + z
+    inside = (k < width) & (z < nz)
+    acc = tl.load(target, mask=inside, other=0.0)
     entries = tl.where(PLANE, 1, rows + 1)
     s = slabs * 0
     while s < count:
@@ -132,7 +137,7 @@ def backproject_kernel(
                     good = good & (depth > nearest)
                 w = tl.where(good, tl.load(here + 6) * (hi - lo) / tl.abs(tb - ta), 0.0)
                 column = start + tl.minimum(j, cells_in - 1)
-                base = sums + ((batch * views + view) * columns + column) * entries
+                base = sums + ((batch * views + view - begin) * columns + column) * entries
                 if PLANE:
                     acc += tl.where(good, w.to(acc.dtype) * tl.load(base), 0.0)
                 else:
@@ -148,5 +153,4 @@ def backproject_kernel(
                 j += 1
                 more = tl.max(tl.where(touch & (j < cells_in), 1, 0))
         s += 1
-    target = out + ((batch * slabs + r) * width + k) * nz + z
-    tl.store(target, acc, mask=(k < width) & (z < nz))
+    tl.store(target, acc, mask=inside)

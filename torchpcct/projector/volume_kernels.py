@@ -18,6 +18,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
+from torchpcct.projector.even_knots import read_even
 from torchpcct.projector.lanes import add_lines, spread_lines
 
 __all__ = ["backproject", "padded", "project"]
@@ -73,23 +74,20 @@ def _depth_line(pose, table, j, axis, lattice, parallel):
 
 
 @_small
-def _rows_at(zeta0, step, last, index, part):
-    """Interpolation knots of equally spaced heights: ``zeta0 + step * i`` clamped to the knots 0…last."""
-    real = part.dtype.type
-    top = real(last)
-    for i in range(index.size):
-        zeta = min(max(zeta0 + step * real(i), real(0)), top)
-        k = min(np.int32(zeta), np.int32(last - 1))
-        index[i] = k
-        part[i] = zeta - real(k)
+def _cell(pose, edges, centers, j, axis, lattice):
+    """Lines of a cell's two edges (see ``_edge_line``) and its depth line (see ``_depth_line``)."""
+    p0, q0 = _edge_line(pose, edges, j, axis, lattice, False)
+    p1, q1 = _edge_line(pose, edges, j + 1, axis, lattice, False)
+    l0, l1, path, square = _depth_line(pose, centers, j, axis, lattice, False)
+    return p0, q0, p1, q1, l0, l1, path, square
 
 
 @_small
-def _read(line, index, part, read):
-    for i in range(index.size):
-        k = np.uint64(index[i])
-        low = line[k]
-        read[i] = low + part[i] * (line[k + np.uint64(1)] - low)
+def _with_room(room, offset, low, high):
+    """The entries' arrays, or larger ones."""
+    if room <= offset.size:
+        return offset, low, high
+    return np.empty(room, dtype=np.int64), np.empty(room, dtype=low.dtype), np.empty(room, dtype=low.dtype)
 
 
 @_small
@@ -154,12 +152,12 @@ def _plan(p0, q0, p1, q1, l0, l1, path, layer, layered, r0, r1, width, across, a
 
 
 @_small
-def _add_rows(line, at, depth, z0, dz, row0, row_pitch, index, part, read, out):
+def _add_rows(lanes, line, at, depth, z0, dz, row0, row_pitch, read, out):
     """Add the row means of one layer (running sums ``line``) at the ray parameter ``depth`` to ``out``."""
     real = line.dtype.type
     step = depth * row_pitch / dz
-    _rows_at(real((at[2] + depth * (row0 + at[7] - at[2]) - z0) / dz), real(step), line.size - 8, index, part)
-    _read(line, index, part, read)
+    zeta = real((at[2] + depth * (row0 + at[7] - at[2]) - z0) / dz)
+    read_even(lanes, line, zeta, real(step), line.size - 8, line.size, read, read.size)
     gain = real(1.0 / step)
     for i in range(out.size):
         out[i] += gain * (read[i + 1] - read[i])
@@ -175,9 +173,7 @@ def _project_view(
     real = lines.dtype.type
     flat = lines.reshape(-1)
     pair = np.zeros((2, knots), dtype=lines.dtype)
-    index = np.zeros(padded(rows + 1), dtype=np.uint32)
-    part = np.zeros(index.size, dtype=lines.dtype)
-    read = np.zeros(index.size, dtype=lines.dtype)
+    read = np.zeros(padded(rows + 1), dtype=lines.dtype)
     sums = np.zeros((columns, rows), dtype=lines.dtype)
     table = np.empty((max(ny, nx), 2), dtype=np.int64)
     offset = np.empty(0, dtype=np.int64)
@@ -187,14 +183,9 @@ def _project_view(
         slabs, width = (ny, nx) if axis == 0 else (nx, ny)
         across, along = (nx * knots, knots) if axis == 0 else (knots, nx * knots)
         for j in range(segments[s, 2], segments[s, 2] + segments[s, 3]):
-            p0, q0 = _edge_line(at, edges, first + j, axis, lattice, False)
-            p1, q1 = _edge_line(at, edges, first + j + 1, axis, lattice, False)
-            l0, l1, path, square = _depth_line(at, centers, first + j, axis, lattice, False)
+            p0, q0, p1, q1, l0, l1, path, square = _cell(at, edges, centers, first + j, axis, lattice)
             layered = abs(l1) < MAX_LAYERS_PER_SLAB * layer
-            room = _room(p0, q0, p1, q1, 0, slabs, width)
-            if room > offset.size:
-                offset = np.empty(room, dtype=np.int64)
-                low, high = (np.empty(room, dtype=lines.dtype), np.empty(room, dtype=lines.dtype))
+            offset, low, high = _with_room(_room(p0, q0, p1, q1, 0, slabs, width), offset, low, high)
             runs = _plan(
                 p0, q0, p1, q1, l0, l1, path, layer, layered, 0, slabs, width, across, along, table, offset, low,
                 high,
@@ -206,7 +197,7 @@ def _project_view(
                 add_lines(lanes, flat, offset, low, high, e0, e1, knots, pair[lower], pair[upper])
                 e0 = e1
                 if not layered:
-                    _add_rows(pair[lower], at, l0 + l1 * now, z0, dz, row0, row_pitch, index, part, read, sums[j])
+                    _add_rows(lanes, pair[lower], at, l0 + l1 * now, z0, dz, row0, row_pitch, read, sums[j])
                     _clear(pair[lower])
                     _clear(pair[upper])  # zero weights of NaN or Inf
                     continue
@@ -214,7 +205,7 @@ def _project_view(
                 for m in range(now, now + 2):
                     if m != after and m != after + 1:
                         line = pair[m % 2]
-                        _add_rows(line, at, m * layer, z0, dz, row0, row_pitch, index, part, read, sums[j])
+                        _add_rows(lanes, line, at, m * layer, z0, dz, row0, row_pitch, read, sums[j])
                         _clear(line)
             for i in range(rows):
                 rise = row0 + (i + 0.5) * row_pitch + at[7] - at[2]
@@ -277,12 +268,11 @@ def _row_sums(data, pose, centers, first, row0, row_pitch, begin, sums):
 
 
 @_small
-def _layer_values(sums, at, depth, z0, dz, row0, row_pitch, index, part, read, values):
+def _layer_values(lanes, sums, at, depth, z0, dz, row0, row_pitch, read, values):
     """Transpose of ``_add_rows``: what each voxel of a line at ``depth`` collects from the running row sums."""
     real = sums.dtype.type
     rho = ((z0 - at[2]) / depth - (row0 + at[7] - at[2])) / row_pitch
-    _rows_at(real(rho), real(dz / (depth * row_pitch)), sums.size - 1, index, part)
-    _read(sums, index, part, read)
+    read_even(lanes, sums, real(rho), real(dz / (depth * row_pitch)), sums.size - 1, sums.size, read, read.size)
     for z in range(values.size):
         values[z] = read[z + 1] - read[z]
 
@@ -295,8 +285,6 @@ def _gather_slabs(
     """Slabs ``r0 … r1`` of ``_gather``; ``out``: ``(slabs, width, padded(nz))``."""
     _, width, nz = out.shape
     flat = out.reshape(-1)
-    index = np.empty(nz + 8, dtype=np.uint32)
-    part = np.empty(nz + 8, dtype=sums.dtype)
     read = np.empty(nz + 8, dtype=sums.dtype)
     pair = np.empty((2, nz), dtype=sums.dtype)
     table = np.empty((r1 - r0, 2), dtype=np.int64)
@@ -308,14 +296,9 @@ def _gather_slabs(
         v = segments[s, 0]
         at = pose[v]
         for j in range(segments[s, 2], segments[s, 2] + segments[s, 3]):
-            p0, q0 = _edge_line(at, edges, first[v] + j, axis, lattice, False)
-            p1, q1 = _edge_line(at, edges, first[v] + j + 1, axis, lattice, False)
-            l0, l1, path, _ = _depth_line(at, centers, first[v] + j, axis, lattice, False)
+            p0, q0, p1, q1, l0, l1, path, _ = _cell(at, edges, centers, first[v] + j, axis, lattice)
             layered = abs(l1) < MAX_LAYERS_PER_SLAB * layer
-            room = _room(p0, q0, p1, q1, r0, r1, width)
-            if room > offset.size:
-                offset = np.empty(room, dtype=np.int64)
-                low, high = (np.empty(room, dtype=sums.dtype), np.empty(room, dtype=sums.dtype))
+            offset, low, high = _with_room(_room(p0, q0, p1, q1, r0, r1, width), offset, low, high)
             runs = _plan(
                 p0, q0, p1, q1, l0, l1, path, layer, layered, r0, r1, width, width * nz, nz, table, offset, low, high
             )
@@ -327,14 +310,13 @@ def _gather_slabs(
                     for m in range(now, now + 2):
                         if m != before and m != before + 1:
                             _layer_values(
-                                sums[v - begin, j], at, m * layer, z0, dz, row0, row_pitch, index, part, read,
-                                pair[m % 2],
-                            )  # fmt: skip
+                                lanes, sums[v - begin, j], at, m * layer, z0, dz, row0, row_pitch, read, pair[m % 2]
+                            )
                     before = now
                 else:
                     upper = lower  # its weight is zero
                     _layer_values(
-                        sums[v - begin, j], at, l0 + l1 * now, z0, dz, row0, row_pitch, index, part, read, pair[lower]
+                        lanes, sums[v - begin, j], at, l0 + l1 * now, z0, dz, row0, row_pitch, read, pair[lower]
                     )
                 spread_lines(lanes, flat, offset, low, high, e0, e1, nz, pair[lower], pair[upper])
                 e0 = e1
@@ -359,13 +341,13 @@ def _gather(
 
 
 def backproject(
-    data, pose, edges, centers, first, segments, start, lattice, z0, dz, row0, row_pitch, layer, memory, volume
+    data, pose, edges, centers, first, segments, start, lattice, z0, dz, row0, row_pitch, layer, chunk, volume
 ):
     """The exact transpose of :func:`project`.
 
     Args:
         data: ``(views, rows, columns)``.
-        memory: bytes allowed for the row sums; the views are taken in chunks that fit.
+        chunk: views whose row sums are held at a time; the result does not depend on it.
         volume: ``(nz, ny, nx)`` output, overwritten; dtype of ``data``.
     """
     views, rows, columns = data.shape
@@ -373,7 +355,6 @@ def backproject(
     lanes = (0,) * (32 // data.dtype.itemsize)
     by_row = np.zeros((ny, nx, padded(nz)), dtype=data.dtype)
     by_column = np.zeros((nx, ny, padded(nz)), dtype=data.dtype)
-    chunk = int(max(1, min(views, memory // (columns * (rows + 1) * data.itemsize))))
     for begin in range(0, views, chunk):
         stop = min(begin + chunk, views)
         sums = np.empty((stop - begin, columns, rows + 1), dtype=data.dtype)
