@@ -57,11 +57,13 @@ def images_figure(m: Measured) -> Any:
             if row:
                 rows.append(row)
                 labels.append(f"{title.split(' (')[0]}{', noise' if noisy else ''}")
-    return panels(
+    figure = panels(
         rows, labels, "Residual motion, and compensation of the largest",
         f"C150 / W600 HU; error maps C0 / W{_ERROR_WIDTH_HU:g} HU. Outlines: lumen (red), core where segmented "
         "(yellow).",
     )  # fmt: skip
+    figure.set_dpi(90)  # ten rows of small images
+    return figure
 
 
 def curves_figure(m: Measured) -> Any:
