@@ -62,12 +62,16 @@ class InsetProblem:
     readings themselves would bias the result, and a small inset changes the counts behind it by a few per cent only.
 
     Raises:
-        ValueError: a grid outside the field of view or the scan's region; a spectral scan.
+        ValueError: a grid outside the field of view or the scan's region; a spectral or energy-integrating scan.
     """
 
     def __init__(self, scan: Scan, grid: VolumeGrid, nodes: int = 5, *, motion: Any = None) -> None:
         if scan.counts.ndim != 3:
             raise ValueError("PWLS in HU needs a counting-mode scan; decompose or sum the energy bins before")
+        if not scan.counting:
+            raise ValueError(
+                "PWLS and MBIR weigh readings as photon counts; reconstruct an energy-integrating scan by fbp"
+            )
         if scan.surround is None or scan.window is None:
             raise ValueError("PWLS of an inset needs a scan with a known surround: acquire it with region=")
         self.grid, self.geometry, self.outer = grid, scan.geometry, scan.window

@@ -84,6 +84,8 @@ def test_refusals(clean):
     with pytest.raises(ValueError, match="one exposure"):
         InsetProblem(clean, GRID).solve([clean.with_noise(1.0, 0), clean.with_noise(2.0, 0)], WEAK)
     spectral = replace(whole, counts=clean.counts[None], air=clean.air[None], surround=clean.surround[None])
+    with pytest.raises(ValueError, match="photon counts"):
+        InsetProblem(replace(clean, counting=False), GRID)
     with pytest.raises(ValueError, match="counting-mode"):
         reconstruct(spectral, GRID, "pwls")
     with pytest.raises(ValueError, match="region"):
