@@ -29,7 +29,7 @@ from torchpcct.window import DetectorWindow
 
 __all__ = ["RoiAdjoints", "line_integral_variance", "roi_adjoints", "roi_covariance"]
 
-_MARGIN = 32
+FILTER_MARGIN_COLUMNS = 32
 """Columns on either side of the shadow whose noise is counted. The filter's tail falls as 1 / n², its square as
 1 / n⁴: what lies beyond adds less than 1e-4 to the variance of an ROI mean."""
 
@@ -158,7 +158,7 @@ def _traces(fbp: InsetFbp, grid: VolumeGrid, rois: Sequence[RoiMean], clean: Sca
 def _near(fbp: InsetFbp, clean: Scan, first_row: int, rows: int) -> DetectorWindow:
     """Where the filtered traces are not negligible."""
     assert clean.window is not None
-    near = _trim(fbp.shadow, clean.window)
+    near = fbp.shadow.widened(FILTER_MARGIN_COLUMNS, clean.window)
     return DetectorWindow(near.first_column, near.columns, first_row, rows)
 
 
@@ -174,14 +174,6 @@ def _filtered(fbp: InsetFbp, traces: Tensor, window: DetectorWindow, clean: Scan
 
 def _gram(vectors: Tensor, variance: Tensor) -> list[list[float]]:
     return [[_weighted_dot(a, b, variance) for b in vectors] for a in vectors]
-
-
-def _trim(inner: DetectorWindow, outer: DetectorWindow) -> DetectorWindow:
-    """``inner`` widened by the margin, inside ``outer``."""
-    width = min(inner.columns + 2 * _MARGIN, outer.columns)
-    last = outer.first_column + outer.columns - width
-    first = np.clip(inner.first_column - _MARGIN, outer.first_column, last)
-    return DetectorWindow(first, width, outer.first_row, outer.rows)
 
 
 def _weighted_dot(a: Tensor, b: Tensor, weight: Tensor) -> float:

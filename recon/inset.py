@@ -82,7 +82,7 @@ class InsetFbp:
         self.motion = motion
         paths = (None,) if motion is None else (None, motion)
         windows = [shadow(self.geometry, grid, margin=1, motion=path) for grid in self.grids for path in paths]
-        self.shadow = _union(windows, self.geometry.columns)
+        self.shadow = DetectorWindow.union(windows, self.geometry.columns)
         self.surround: Tensor | None = None
         if scan.window is not None:
             _require_inside(self.shadow, scan.window)
@@ -134,16 +134,6 @@ class InsetFbp:
         """The surround on every grid, mm⁻¹."""
         assert self.surround is not None
         return [backproject(self.surround, self.geometry, grid, self.shadow) for grid in self.grids]
-
-
-def _union(windows: Sequence[DetectorWindow], columns: int) -> DetectorWindow:
-    """The smallest window that holds all ``windows``."""
-    first = np.min([w.first_column for w in windows], axis=0)
-    last = np.max([w.first_column + w.columns for w in windows], axis=0)
-    width = int((last - first).max())
-    first_row = min(w.first_row for w in windows)
-    rows = max(w.first_row + w.rows for w in windows) - first_row
-    return DetectorWindow(np.minimum(first, columns - width), width, first_row, rows)
 
 
 def _require_inside(inner: DetectorWindow, outer: DetectorWindow) -> None:

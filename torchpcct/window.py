@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -85,6 +86,23 @@ class DetectorWindow:
         values = values[..., row : row + inner.rows, :]
         index = columns[:, None].to(values.device).expand(*values.shape[:-1], -1)
         return values.gather(-1, index)
+
+    @staticmethod
+    def union(windows: Sequence[DetectorWindow], columns: int) -> DetectorWindow:
+        """The smallest window that holds all ``windows`` of a detector with ``columns`` columns."""
+        first = np.min([w.first_column for w in windows], axis=0)
+        last = np.max([w.first_column + w.columns for w in windows], axis=0)
+        width = int((last - first).max())
+        first_row = min(w.first_row for w in windows)
+        rows = max(w.first_row + w.rows for w in windows) - first_row
+        return DetectorWindow(np.minimum(first, columns - width), width, first_row, rows)
+
+    def widened(self, margin: int, outer: DetectorWindow) -> DetectorWindow:
+        """This window with ``margin`` more columns on either side and all rows, as far as ``outer`` goes."""
+        width = min(self.columns + 2 * margin, outer.columns)
+        last = outer.first_column + outer.columns - width
+        first = np.clip(self.first_column - margin, outer.first_column, last)
+        return DetectorWindow(first, width, outer.first_row, outer.rows)
 
     def fraction(self, geometry: Geometry) -> float:
         """Share of the detector's readings inside the window, 0…1."""

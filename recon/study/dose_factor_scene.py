@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 from torch import Tensor
 
-from recon.exact_noise import _trim, line_integral_variance, roi_covariance
-from recon.inset import InsetFbp, _union
+from recon.exact_noise import FILTER_MARGIN_COLUMNS, line_integral_variance, roi_covariance
+from recon.inset import InsetFbp
 from recon.roi import InsetProblem
 from recon.study.dose_factor_store import Store
 from recon.study.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM, enclosing, inset_grid
@@ -277,7 +277,7 @@ class StudyScene:
         whole = acquire(self.scene, scanner, region=enclosing(grids), duty=min(1.0, views / 1968))
         assert whole.window is not None
         windows = [shadow(whole.geometry, g, margin=1) for g in grids]
-        near = _trim(_union(windows, whole.geometry.columns), whole.window)
+        near = DetectorWindow.union(windows, whole.geometry.columns).widened(FILTER_MARGIN_COLUMNS, whole.window)
         scan = replace(whole, counts=whole.window.crop(whole.counts, near), window=near)
         scan.save(self._path)
         return scan
