@@ -64,7 +64,7 @@ def test_mbir_is_less_noisy_than_fbp(report):
     assert noisy["noise"] == 1.0
     assert noisy["joint MBIR"]["fat_sd_hu"] < 0.9 * noisy["FBP"]["fat_sd_hu"]
     clean = report.data["mbir"]["at_best_energy"][0]
-    assert clean["joint MBIR"]["fat_sd_hu"] < 0.1 * noisy["joint MBIR"]["fat_sd_hu"]
+    assert clean["joint MBIR"]["fat_sd_hu"] < 0.25 * noisy["joint MBIR"]["fat_sd_hu"]
     for method in ("FBP", "joint MBIR"):
         assert report.data["dice"][method][0]["pericoronary_fat"]["mean"] > 0.9
 
