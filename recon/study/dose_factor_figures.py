@@ -31,11 +31,14 @@ def curves_figure(data: dict[str, Any]) -> Any:
     doses = data["settings"]["doses"]
     figure = Figure(figsize=(3.9 * len(doses) + 1.6, 7.0), dpi=150, layout="constrained")
     axes = figure.subplots(2, len(doses), squeeze=False, sharex=True, sharey="row")
+    shown: list[list[float]] = [[], []]
     for column, limit in enumerate(data["ceiling"]):
         for row, (figure_key, value) in enumerate((("paper_cnr", "paper_cnr"), ("contrast_sd_hu", "contrast_sd_hu"))):
-            _draw(axes[row, column], data, limit, figure_key, value)
+            shown[row] += _draw(axes[row, column], data, limit, figure_key, value)
         axes[0, column].set_title(f"1× = {limit['exposure_s']:g} s", fontsize=10)
         axes[1, column].set_xlabel("dose relative to the method's")
+    for row, values in enumerate(shown):
+        axes[row, 0].set_ylim(0.8 * min(values), 1.25 * max(values))
     axes[0, 0].set_ylabel("paper's CNR")
     axes[1, 0].set_ylabel("contrast SD at slope 1, HU")
     handles, labels = axes[0, 0].get_legend_handles_labels()
@@ -45,7 +48,8 @@ def curves_figure(data: dict[str, Any]) -> Any:
     return figure
 
 
-def _draw(ax: Any, data: dict[str, Any], limit: dict[str, Any], key: str, value: str) -> None:
+def _draw(ax: Any, data: dict[str, Any], limit: dict[str, Any], key: str, value: str) -> list[float]:
+    """One panel; the lowest and highest values that must be visible."""
     from matplotlib.ticker import FuncFormatter
 
     rising = key == "paper_cnr"
@@ -80,18 +84,17 @@ def _draw(ax: Any, data: dict[str, Any], limit: dict[str, Any], key: str, value:
     reach = float(np.clip(met(top), relative[0], relative[-1]))
     ax.plot([1.0, reach], [top, top], color="black", linewidth=1.6, label="limit of the data")
     ax.plot([1.0], [top], "k*", markersize=8)
-    beyond = (top, ax.get_ylim()[1] * 3) if rising else (ax.get_ylim()[0] / 3 + 1e-9, top)
-    ylim = ax.get_ylim()
-    ax.axhspan(*beyond, color="black", alpha=0.06)
+    ax.axhspan(top, 10.0 * top if rising else 0.1 * top, color="black", alpha=0.06)
     ax.axvline(_ASSUMED, color="tab:blue", linewidth=0.8, linestyle=":", label="assumed, 5.7×")
     ax.set_xscale("log", base=2)
     ax.set_yscale("log")
-    ax.set_ylim(max(ylim[0], 0.05) if rising else max(1.0, min(0.8 * top, ylim[1])), ylim[1])
     ax.set_xticks(relative, [f"{d:g}" for d in relative], fontsize=7)
     ax.yaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
     ax.yaxis.set_minor_formatter(FuncFormatter(lambda v, _: f"{v:g}" if f"{v:.0e}"[0] in "235" else ""))
     ax.tick_params(labelsize=7, which="both")
     ax.grid(True, which="both", linewidth=0.3, alpha=0.6)
+    # The thinnest dose makes the worst FBP.
+    return [top, at_one * relative[0] ** (0.5 if rising else -0.5)]
 
 
 def images_figure(measured: Measured, data: dict[str, Any]) -> Any:
