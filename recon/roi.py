@@ -69,9 +69,7 @@ class InsetProblem:
         if scan.counts.ndim != 3:
             raise ValueError("PWLS in HU needs a counting-mode scan; decompose or sum the energy bins before")
         if not scan.counting:
-            raise ValueError(
-                "PWLS and MBIR weigh readings as photon counts; use fbp for an energy-integrating scan"
-            )
+            raise ValueError("PWLS and MBIR weigh readings as photon counts; use fbp for an energy-integrating scan")
         if scan.surround is None or scan.window is None:
             raise ValueError("PWLS of an inset needs a scan with a known surround: acquire it with region=")
         self.grid, self.geometry, self.outer = grid, scan.geometry, scan.window
