@@ -11,10 +11,8 @@ treats all directions in the space of channels alike, so the channels must be of
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib import import_module
-from typing import Any
+from typing import Any, ClassVar
 
-import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -33,6 +31,8 @@ class JointPrior(BoundPrior):
         spacing: 1 for the axis of channels, which has no neighbours, then the voxel size per axis in mm.
         hu: the value of the channels that counts as 1 HU.
     """
+
+    _KERNELS: ClassVar[str] = "recon._joint_kernels"
 
     def __post_init__(self) -> None:
         if len(self.spacing) not in (3, 4) or self.spacing[0] != 1.0:
@@ -69,23 +69,6 @@ class JointPrior(BoundPrior):
             a, b = _pair(x, step)
             out.append(torch.linalg.vector_norm(a - b, dim=-len(step), keepdim=True) / (self.hu * d))
         return out
-
-    def _fused_majorizer(self, x: Tensor, direction: Tensor) -> Tensor:
-        kernels = import_module("recon._joint_kernels")
-
-        a, b = self._volumes(x), self._volumes(direction)
-        out = np.empty_like(a)
-        kernels.majorize(a, b, *self._tables(a.dtype, both=True), out)
-        return torch.from_numpy(out).reshape(x.shape)
-
-    def _fused_along(self, x: Tensor, direction: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
-        kernels = import_module("recon._joint_kernels")
-
-        a, v, u = self._volumes(x), self._volumes(direction), self._volumes(other)
-        rows = np.empty((a.shape[0], *a.shape[2:4], 2))
-        kernels.along(a, u, v, *self._tables(a.dtype, both=False), rows)
-        sums = torch.from_numpy(rows.sum(axis=(1, 2))).reshape(*x.shape[: x.dim() - len(self.spacing)], 2)
-        return sums[..., 0], sums[..., 1]
 
     def _volumes(self, x: Tensor) -> NDArray[Any]:
         """``(batch, channels, nz, ny, nx)`` contiguous."""

@@ -23,7 +23,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -108,6 +108,8 @@ class BoundPrior:
         spacing: voxel size per axis in mm.
         hu: 1 HU in mm⁻¹.
     """
+
+    _KERNELS: ClassVar[str] = "recon._qggmrf_kernels"
 
     lam: float
     threshold: float
@@ -236,7 +238,7 @@ class BoundPrior:
         return out
 
     def _fused_majorizer(self, x: Tensor, direction: Tensor) -> Tensor:
-        kernels = import_module("recon._qggmrf_kernels")
+        kernels = import_module(self._KERNELS)
 
         a, b = self._volumes(x), self._volumes(direction)
         out = np.empty_like(a)
@@ -244,10 +246,10 @@ class BoundPrior:
         return torch.from_numpy(out).reshape(x.shape)
 
     def _fused_along(self, x: Tensor, direction: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
-        kernels = import_module("recon._qggmrf_kernels")
+        kernels = import_module(self._KERNELS)
 
         a, v, u = self._volumes(x), self._volumes(direction), self._volumes(other)
-        rows = np.empty((*a.shape[:3], 2))
+        rows = np.empty((a.shape[0], *a.shape[-3:-1], 2))
         kernels.along(a, u, v, *self._tables(a.dtype, both=False), rows)
         sums = torch.from_numpy(rows.sum(axis=(1, 2))).reshape(*x.shape[: x.dim() - len(self.spacing)], 2)
         return sums[..., 0], sums[..., 1]
