@@ -108,16 +108,16 @@ def _parser() -> argparse.ArgumentParser:
     factor.add_argument("--quick", action="store_true", help="8 realisations, one dose, 246 views: about 90 s")
     factor.set_defaults(run=_dose_factor)
 
-    from recon.study.registry import STUDIES
-
     study = commands.add_parser(
         "study",
-        help=f"one of the paper's studies: {', '.join(STUDIES)}",
+        help="one of the paper's studies; torchpcct study --help lists them",
         description="Run a study of the paper at full scale and print its figures beside the published ones.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        epilog="studies:\n" + "\n".join(f"  {name:<12} {text}" for name, text in STUDIES.items()),
     )
-    study.add_argument("name", choices=tuple(STUDIES), metavar="NAME", help=", ".join(STUDIES))
+    # Named when asked for: the list lies beside the studies, whose packages take seconds to load.
+    plain = study.format_help
+    study.format_help = lambda: f"{plain()}\n{_study_list()}"  # type: ignore[method-assign]
+    study.add_argument("name", metavar="NAME", help="of the study")
     _common(study, "folder for report.json, report.md and the figures (default out/NAME)", None, required=False)
     study.add_argument("--quick", action="store_true", help="reduced settings: a first look, < 60 s")
     study.add_argument(
@@ -173,6 +173,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     reconstruct.set_defaults(run=_reconstruct)
     return parser
+
+
+def _study_list() -> str:
+    from recon.study.registry import STUDIES
+
+    return "studies:\n" + "".join(f"  {name:<12} {text}\n" for name, text in STUDIES.items())
 
 
 def _check_device(device: str) -> None:
