@@ -11,12 +11,14 @@ import torch
 
 from recon.qggmrf import quadratic
 from recon.study import dose_factor as study
-from recon.study.dose_factor import MAIN_SCENES, Settings, estimate_seconds, run
+from recon.study.dose_factor import Settings, estimate_seconds, run
 from recon.study.dose_factor_analysis import analyse
+from recon.study.dose_factor_noise import Realisations
 from recon.study.dose_factor_report import build_report, headline
-from recon.study.dose_factor_scene import _tissue_groups, crop_window
+from recon.study.dose_factor_rois import Wide
+from recon.study.dose_factor_scene import MAIN_SCENES, StudyScene, _tissue_groups, crop_window
 from recon.study.dose_factor_store import Store
-from recon.study.methods import METHODS, LinearFilter, Penalised, fingerprint, load_methods
+from recon.study.methods import METHODS, LinearFilter, Misstated, Penalised, fingerprint, load_methods
 from torchpcct import VolumeGrid
 from torchpcct.cli import main
 
@@ -162,7 +164,7 @@ def synthetic(measured, slope, sd, n=1500, shift=0.0):
         contrast = slope * measured.facts[name].contrast_hu + shift
         roi = noise + np.array([-contrast / 2, contrast / 2]) + 70.0
         crop = rng.standard_normal((n, *scene_crop)).astype(np.float16)
-        shape = np.tile([4.0, 0.2], (n, 1))
+        shape = np.tile([4.0, 0.2, 4.1], (n, 1))
         samples["linear", name, 2.0] = {"roi": roi, "crop": crop, "shape": shape}
     return replace(measured, samples=samples, fbp={}, settings=replace(TINY, n=n, fast_noise=True))
 
@@ -198,7 +200,7 @@ def test_bias_is_reported_as_bias(measured):
 
 
 def problem_of(folder):
-    scene = study.StudyScene("paper", TINY, Store(folder))
+    scene = StudyScene("paper", TINY, Store(folder))
     return scene, scene.problem, torch.from_numpy(scene.facts().statistic)
 
 
@@ -235,7 +237,7 @@ def test_missing_weights_leave_mbir_out(monkeypatch, caplog):
         raise FileNotFoundError("no weights at nowhere")
 
     monkeypatch.setattr(recon.mbir.Mbir, "load", missing)
-    assert [m.name for m in load_methods(METHODS)] == [m for m in METHODS if "mbir" not in m]
+    assert [m.name for m in load_methods(METHODS)] == [m for m in METHODS if "mbir" not in m and m != "fbp_cnn"]
     assert "mbir is left out" in caplog.text
     with pytest.raises(ValueError, match="no method to run"):
         load_methods(["mbir"])
@@ -251,6 +253,74 @@ def test_a_method_that_fails_is_named(measured, folder):
     scene, _, b = problem_of(folder)
     with pytest.raises(ValueError, match=r"'broken'.*--methods"):
         study._timed(Broken(), scene, b[None], 2.0)
+
+
+def test_wider_rois(measured, folder, analysed):
+    scene = StudyScene("paper", TINY, Store(folder))
+    truth = np.array([measured.facts[name].contrast_hu for name in MAIN_SCENES])
+    x = scene.core_center[2]
+    for name in TINY.rois:
+        wide = Wide(measured, scene, name, truth)
+        paper = scene.rois.as_dict()
+        assert wide.rois.as_dict()["background_mm2"] > 2 * paper["background_mm2"]
+        # A linear ramp reads as the mean position of the mask.
+        grid = crop_window(scene.grid, scene.core_center)[1]
+        ramp = np.broadcast_to(grid.axes[2], grid.shape)
+        at = [np.mean(np.broadcast_to(wide.rois.image.axes[2], m.shape)[m])
+              for m in (wide.rois.foreground, wide.rois.background)]  # fmt: skip
+        np.testing.assert_allclose(wide.means(ramp, scene.grid.spacing[2]), at, atol=1e-9)
+        assert abs(at[0] - x) < 0.1 < abs(at[1] - x)
+        # More data in the ROI, less noise; never less than the limit.
+        rows = next(e["rows"] for e in analysed["wide_rois"] if e["roi"] == name)
+        sd = rows[0]["contrast_sd_hu"]["value"]
+        paper_sd = analysed["fbp"][0]["doses"][0]["contrast_sd_hu"]
+        assert analysed["ceiling"][0]["contrast_sd_hu"] < sd < paper_sd
+    with pytest.raises(ValueError, match="rois must be of section, tissue"):
+        scene.wide_rois("vessel")
+
+
+def test_exact_noise_of_wider_rois_is_that_of_fbp(measured, folder):
+    scene = StudyScene("paper", TINY, Store(folder))
+    wide = Wide(measured, scene, "tissue", np.array([measured.facts[k].contrast_hu for k in MAIN_SCENES]))
+    samples = wide.means(measured.fbp["paper", 2.0]["crop"], 0.25)
+    sd = np.sqrt(np.diag(wide.fbp("soft", 0.25)["covariance"]) / 2.0)
+    assert np.abs(samples.mean(0) - wide.fbp("soft", 0.25)["roi_hu"]).max() < 4 * sd.max() / math.sqrt(len(samples))
+    ratio = samples.std(0, ddof=1) / sd
+    assert (ratio > 0.3).all()
+    assert (ratio < 2.0).all()
+
+
+def test_pitch_of_the_scene():
+    fine, paper = (StudyScene(name, TINY, None).scanner.geometry for name in ("pitch_0.30mm:absent", "paper"))
+    assert (fine.pitch[1], paper.pitch[1]) == (0.30, 0.35)
+    assert (fine.pitch[0], fine.views, fine.sod) == (paper.pitch[0], paper.views, paper.sod)
+    bodies = [StudyScene(name, TINY, None).scene.bodies for name in ("pitch_0.30mm:absent", "absent_core")]
+    assert [b.name for b in bodies[0]] == [b.name for b in bodies[1]]
+
+
+def test_a_method_that_is_told_another_exposure(measured, folder):
+    _, problem, b = problem_of(folder)
+    linear = LinearFilter()
+    told = Misstated("told", linear, 4.0)
+    # The data are the same, their weights are not: as if they were those of four times the exposure.
+    torch.testing.assert_close(told(problem, 2.0 * b[None], 2.0), linear(problem, 8.0 * b[None], 8.0))
+    assert fingerprint(told) != fingerprint(linear)
+
+
+def test_an_fbp_image_as_data(measured, folder):
+    scene, problem, b = problem_of(folder)
+    noise = Realisations(TINY, Store(folder), lambda name: scene)
+    piece = noise.images("paper", 2.0, range(2))
+    assert piece["shape"].shape == (2, 3)
+    assert noise.image_statistic("paper", 2.0, range(2)).shape == (2, *b.shape)
+    x = torch.zeros_like(b)
+    x[10:18, 8:15, 8:15] = 200.0
+    hu = problem.mu_ref / 1000.0
+    volume = x + 1000.0 * (problem.level / problem.mu_ref - 1.0)
+    statistic = noise._as_statistic(scene, volume, 2.0)
+    torch.testing.assert_close(
+        statistic, problem.gram.scaled(2.0).apply(x * hu), rtol=1e-3, atol=1e-3 * float(b.abs().max())
+    )
 
 
 def test_tissue_groups_and_crop():
@@ -276,6 +346,7 @@ def test_tissue_groups_and_crop():
         ({"methods": ("magic",)}, "'magic' of methods"),
         ({"scenes": ("nowhere",)}, "'nowhere' of scenes"),
         ({"kernels": ("bone",)}, "FBP soft"),
+        ({"rois": ("vessel",)}, "'vessel' of rois"),
     ],
 )
 def test_bad_settings(changes, message):

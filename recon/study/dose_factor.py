@@ -4,7 +4,7 @@ Stages, each of them a set of files that are written whole and reused:
 
 1. scenes: noise-free scans, what FBP makes of them exactly (means, covariances, images without noise), the limit of
    the data by generalised least squares on exact path lengths;
-2. data: b = AᵀW y of every noise realisation, and FBP of the same readings;
+2. data: b = AᵀW y of every noise realisation, and FBP of the same readings (:mod:`recon.study.dose_factor_noise`);
 3. methods: ROI means, a crop about the core and segmentation figures of every reconstruction.
 
 Realisation k uses the noise seed ``seed + k`` in every scene, at every dose and for every method. The scenes with half
@@ -16,9 +16,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,15 +25,18 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.study import paper
-from recon.study.compare import inset_grid
-from recon.study.dose_factor_scene import SceneFacts, StudyScene, crop_window, segmentation
+from recon.study.dose_factor_noise import NOISY_SCENES, Realisations, joined
+from recon.study.dose_factor_scene import (
+    FBP_BASE,
+    MAIN_SCENES,
+    WIDE_ROIS,
+    SceneFacts,
+    StudyScene,
+    crop_window,
+    segmentation,
+)
 from recon.study.dose_factor_store import Store
-from recon.study.methods import METHODS, Method, fingerprint, load_methods
-from torchpcct.scene.variants import VARIANTS
-
-if TYPE_CHECKING:
-    from recon.inset import InsetFbp
-    from torchpcct.geometry import VolumeGrid
+from recon.study.methods import IMAGE_METHODS, METHODS, Method, fingerprint, load_methods
 
 __all__ = ["EXTRA_SCENES", "MAIN_SCENES", "Measured", "Settings", "estimate_seconds", "run"]
 
@@ -43,26 +45,18 @@ log = logging.getLogger(__name__)
 Floats = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
-MAIN_SCENES = ("paper", "absent_core", "half_contrast", "flipped_contrast")
-"""They share all shapes and differ in the core's contrast (1, 0, ½, −1): slope, false contrast, observer."""
-
-NOISY_SCENES = ("paper", "absent_core")
-"""Scenes with readings drawn in the sinogram; half and flipped contrast carry the paper scene's noise."""
-
 EXTRA_SCENES = (
     "moved_core", "mirrored", "turned", "half_size_core", "core_for_fibrous", "calcification", "stent", "textured",
-    "small_patient", "large_patient",
+    "small_patient", "large_patient", "pitch_0.30mm", "pitch_0.40mm",
 )  # fmt: skip
 """Scenes that can expose an invention."""
 
-SLOW_METHODS = ("quadratic", "qggmrf", "tv")
-"""Iterated to convergence: seconds a volume. Few realisations place a baseline well enough."""
+SLOW_METHODS = ("quadratic", "qggmrf", "tv", "fbp_cnn", "mbir_noise_half", "mbir_noise_double")
+"""Few realisations place them well enough: iterated to convergence, drawn anew as images, or a test of robustness."""
 
-FBP_BASE = ("soft", 0.25)
-"""Kernel and voxel size (mm) that factors are quoted against, and of the FBP realisations."""
-
-_SECONDS = {"scene": 45.0, "fbp": 90.0, "data": 3.0, "linear": 0.3, "quadratic": 1.5, "qggmrf": 5.0, "tv": 10.0,
-            "mbir_one_pass": 0.5, "mbir": 1.0}  # fmt: skip
+_SECONDS = {"scene": 45.0, "fbp": 90.0, "data": 3.0, "images": 3.0, "linear": 0.3, "linear_z": 0.3, "quadratic": 1.5,
+            "qggmrf": 5.0, "tv": 10.0, "fbp_cnn": 1.0, "mbir_one_pass": 0.5, "mbir": 1.0, "mbir_noise_half": 1.0,
+            "mbir_noise_double": 1.0}  # fmt: skip
 """Rough cost at 1968 views on two cores: one scene, exact FBP noise, one realisation, one volume of each method."""
 
 
@@ -72,7 +66,7 @@ class Settings:
 
     Args:
         n: paired realisations of each main scene and dose; claims need ≥ 200.
-        slow_n: realisations for the slow baselines (:data:`SLOW_METHODS`), at most ``n``.
+        slow_n: realisations for :data:`SLOW_METHODS` and for FBP's lumen and cap, at most ``n``.
         scene_n: realisations of each further scene and dose.
         doses: exposures in s.
         scene_doses: exposures of the further scenes.
@@ -84,6 +78,7 @@ class Settings:
         voxel_mm: of the methods' grid.
         kernels, voxels_mm: FBP that is analysed exactly.
         blurs_mm: σ of Gaussian filters after soft FBP, for FBP of the same resolution as a method.
+        rois: wider ROIs than the paper's, of :data:`recon.study.dose_factor_scene.WIDE_ROIS`.
         fast_noise: draw b = AᵀW y from the Gram's covariance instead of drawing the readings. The further scenes
             always do. There are no FBP realisations then; FBP's exact figures stay.
         block: realisations in one piece.
@@ -106,6 +101,7 @@ class Settings:
     kernels: tuple[str, ...] = paper.KERNELS
     voxels_mm: tuple[float, ...] = (0.25, 0.20)
     blurs_mm: tuple[float, ...] = (0.15, 0.25, 0.40, 0.60)
+    rois: tuple[str, ...] = WIDE_ROIS
     fast_noise: bool = False
     block: int = 8
 
@@ -123,7 +119,12 @@ class Settings:
                 raise ValueError(f"{name} must be different exposures greater than 0 s, got {values}")
         if not self.doses:
             raise ValueError("doses is empty: give at least one exposure in s")
-        for name, known in (("scenes", tuple(VARIANTS)), ("methods", METHODS), ("scene_methods", METHODS)):
+        for name, known in (
+            ("scenes", (*MAIN_SCENES, *EXTRA_SCENES)),
+            ("methods", METHODS),
+            ("scene_methods", METHODS),
+            ("rois", WIDE_ROIS),
+        ):
             values = tuple(getattr(self, name))
             object.__setattr__(self, name, values)
             for value in values:
@@ -141,7 +142,7 @@ class Settings:
         values: dict[str, Any] = {
             "n": 8, "scene_n": 4, "doses": (2.0,), "scene_doses": (2.0,), "views": 246, "fast_noise": True,
             "methods": ("linear", "mbir_one_pass", "mbir"), "scenes": ("half_size_core",),
-            "kernels": ("soft", "standard"), "voxels_mm": (0.25,), "blurs_mm": (0.25,),
+            "kernels": ("soft", "standard"), "voxels_mm": (0.25,), "blurs_mm": (0.25,), "rois": (),
         }  # fmt: skip
         return cls(**{**values, **changes})
 
@@ -162,10 +163,12 @@ class Measured:
         settings: of the study; ``methods``: names of the methods that ran, with their fingerprints.
         facts: scene → what holds without sampling error.
         scenes: further scenes; left_out: those that could not be simulated, with the reason.
-        fbp: (scene, dose) → FBP realisations (``roi (n, 2)``, ``crop``, ``lumen``, ``cap``); empty with fast noise.
-        samples: (method, scene, dose) → the same of each method.
+        fbp: (scene, dose) → FBP realisations (``roi (n, 2)``, ``crop``; of the paper's scene ``shape (slow_n, 3)``, see
+            :func:`recon.study.dose_factor_scene.segmentation`); empty with fast noise.
+        samples: (method, scene, dose) → the same of each method, ``shape`` of all of its realisations.
         extra: (method, scene, dose) → ``roi`` and, with the core replaced by fibrous tissue, ``absent`` ``(n, 2)``.
         volumes: (method or "fbp", scene, dose) → first realisation, HU.
+        wide: FBP variant → covariance of the means in the wider ROIs at 1 s.
         seconds: (method) → s per volume.
     """
 
@@ -178,6 +181,7 @@ class Measured:
     samples: dict[tuple[str, str, float], dict[str, Any]]
     extra: dict[tuple[str, str, float], dict[str, Any]]
     volumes: dict[tuple[str, str, float], Any]
+    wide: dict[str, Any]
     seconds: dict[str, float]
 
 
@@ -190,11 +194,17 @@ def estimate_seconds(settings: Settings) -> dict[str, float]:
     parts = {
         "scenes": share * ((len(MAIN_SCENES) + further) * _SECONDS["scene"] + _SECONDS["fbp"]),
         "data": share * drawn * _SECONDS["data"],
+        "images": share * _image_draws(settings) * _SECONDS["images"],
     }
     for name in settings.methods:
         volumes = len(MAIN_SCENES) * settings.realizations(name) * len(settings.doses)
         parts[name] = (volumes + (extra if name in settings.scene_methods else 0)) * _SECONDS[name]
     return parts
+
+
+def _image_draws(settings: Settings) -> int:
+    scenes = len(NOISY_SCENES) if set(settings.methods) & set(IMAGE_METHODS) else int(not settings.fast_noise)
+    return scenes * min(settings.n, settings.slow_n) * len(settings.doses)
 
 
 def run(settings: Settings, folder: str | Path, progress: Progress | None = None) -> Measured:
@@ -217,13 +227,7 @@ class _Study:
         self.methods = load_methods(settings.methods)
         self.seconds: dict[str, float] = {}
         self._scenes: dict[str, StudyScene] = {}
-        self._fbp: InsetFbp | None = None
-
-    @cached_property
-    def key(self) -> str:
-        """What all pieces depend on."""
-        s = self.settings
-        return f"views={s.views} voxel={s.voxel_mm:g} seed={s.seed} fast={s.fast_noise}"
+        self.noise = Realisations(settings, store, self.scene)
 
     def scene(self, name: str) -> StudyScene:
         """A scene with its scan; problems (Gram operators) are shared where grid, window and surround agree."""
@@ -239,11 +243,12 @@ class _Study:
         fbp = {} if s.fast_noise else self._data()
         samples, volumes = self._main()
         extra = self._extra()
+        wide = self.scene("paper").wide_covariance() if s.rois else {}
         for (name, dose), entry in fbp.items():
             volumes["fbp", name, dose] = entry.pop("first")
         if s.fast_noise:
             for name in NOISY_SCENES:
-                volumes["fbp", name, s.doses[-1]] = self._picture(name, s.doses[-1])
+                volumes["fbp", name, s.doses[-1]] = self.noise.picture(name, s.doses[-1])
         return Measured(
             settings=s,
             methods={m.name: fingerprint(m) for m in self.methods},
@@ -254,6 +259,7 @@ class _Study:
             samples=samples,
             extra=extra,
             volumes=volumes,
+            wide=wide,
             seconds=self.seconds,
         )
 
@@ -277,80 +283,20 @@ class _Study:
         self.scenes = tuple(n for n in self.settings.scenes if n not in left_out)
         return facts, left_out
 
-    # -- noise ----------------------------------------------------------------------------------------------------
-
-    def _base_fbp(self, scene: StudyScene, grid: VolumeGrid) -> InsetFbp:
-        """Reference FBP; the main scenes share geometry, window and surround."""
-        from recon.inset import InsetFbp
-
-        if self._fbp is None:
-            self._fbp = InsetFbp(scene.clean, [grid], [FBP_BASE[0]])
-        return self._fbp
-
-    def _picture(self, name: str, dose: float) -> Any:
-        """Reference FBP of the first realisation, for the figure."""
-        scene = self.scene(name)
-
-        def compute() -> dict[str, Any]:
-            fbp = self._base_fbp(scene, inset_grid(scene.plaque, FBP_BASE[1]))
-            volume = fbp(scene.clean.with_noise(dose, self.settings.seed))[0][0]
-            return {"first": volume.numpy().astype(np.float16)}
-
-        return self.store.piece(f"data/picture_{name}_{dose:g}s", self.key, compute)["first"]
-
-    def _data_piece(self, name: str, dose: float, block: range) -> dict[str, Any]:
-        """b and FBP of the realisations of one block, from noisy readings."""
-        scene = self.scene(name)
-
-        def compute() -> dict[str, Any]:
-            grid = inset_grid(scene.plaque, FBP_BASE[1])
-            fbp = self._base_fbp(scene, grid)
-            rois = scene.rois.on(grid)
-            crop = crop_window(grid, scene.core_center)[0]
-            b, means, crops, shapes, first = [], [], [], [], []
-            for k in block:
-                scan = scene.clean.with_noise(dose, self.settings.seed + k)
-                b.append(scene.statistic(scan))
-                volume = fbp(scan)[0][0]
-                means.append([float(r(volume)) for r in rois])
-                crops.append(volume[crop].numpy().astype(np.float16))
-                shapes.append(segmentation(scene, grid, volume))
-                if k == 0:
-                    first.append(volume.numpy().astype(np.float16))
-            return {
-                "b": torch.stack(b).numpy(), "roi": np.array(means), "crop": np.stack(crops),
-                "shape": np.array(shapes), **({"first": first[0]} if first else {}),
-            }  # fmt: skip
-
-        return self.store.piece(f"data/{name}_{dose:g}s_{block.start}-{block.stop}", self.key, compute)
-
     def _data(self) -> dict[tuple[str, float], dict[str, Any]]:
         s = self.settings
         jobs = [(name, dose, block) for name in NOISY_SCENES for dose in s.doses for block in s.blocks(s.n)]
         collected: dict[tuple[str, float], list[Any]] = {}
         for done, (name, dose, block) in enumerate(jobs):
             self.report("noise realisations, FBP", done / len(jobs))
-            piece = self._data_piece(name, dose, block)
-            collected.setdefault((name, dose), []).append({k: v for k, v in piece.items() if k != "b"})
+            piece = self.noise.data(name, dose, block)
+            collected.setdefault((name, dose), []).append({k: piece[k] for k in ("roi", "crop", "first") if k in piece})
         self.report("noise realisations, FBP", 1.0)
-        return {key: _joined(pieces) for key, pieces in collected.items()}
-
-    def _statistic(self, name: str, dose: float, block: range) -> Tensor:
-        """b of a main scene, ``(block, z, y, x)``."""
-        facts = self.scene(name).facts()
-        clean = torch.from_numpy(facts.statistic) * dose
-        if self.settings.fast_noise:
-            return clean + self._gram_noise(name, dose, block)
-        own = name if name in NOISY_SCENES else "paper"
-        noisy = torch.from_numpy(self._data_piece(own, dose, block)["b"])
-        if own == name:
-            return noisy
-        return noisy + (clean - torch.from_numpy(self.scene(own).facts().statistic) * dose)
-
-    def _gram_noise(self, name: str, dose: float, block: range) -> Tensor:
-        gram = self.scene(name).problem.gram.scaled(dose)
-        draws = [gram.noise(generator=torch.Generator().manual_seed(self.settings.seed + k)) for k in block]
-        return torch.stack(draws).to(torch.float32)
+        found = {key: joined(pieces) for key, pieces in collected.items()}
+        for dose in s.doses:
+            pieces = [self.noise.images("paper", dose, block) for block in s.blocks(min(s.n, s.slow_n))]
+            found["paper", dose]["shape"] = np.concatenate([p["shape"] for p in pieces])
+        return found
 
     # -- methods --------------------------------------------------------------------------------------------------
 
@@ -368,7 +314,7 @@ class _Study:
                 collected.setdefault((method.name, name, dose), []).append(piece)
             self.report(method.name, 1.0)
             for key, pieces in collected.items():
-                entry = _joined(pieces)
+                entry = joined(pieces)
                 volumes[key] = entry.pop("first")
                 samples[key] = entry
             spent = [p["seconds"] for pieces in collected.values() for p in pieces]
@@ -379,7 +325,8 @@ class _Study:
         scene = self.scene(name)
 
         def compute() -> dict[str, Any]:
-            volume, seconds = _timed(method, scene, self._statistic(name, dose, block), dose)
+            of = self.noise.image_statistic if method.name in IMAGE_METHODS else self.noise.statistic
+            volume, seconds = _timed(method, scene, of(name, dose, block), dose)
             rois = scene.rois.on(scene.grid)
             crop = crop_window(scene.grid, scene.core_center)[0]
             result = {
@@ -393,11 +340,11 @@ class _Study:
             return result
 
         place = f"methods/{method.name}/{name}_{dose:g}s_{block.start}-{block.stop}"
-        return self.store.piece(place, f"{self.key} {fingerprint(method)}", compute)
+        return self.store.piece(place, f"{self.noise.key} {fingerprint(method)} 2", compute)
 
     def _extra(self) -> dict[Any, Any]:
         s = self.settings
-        methods = [m for m in self.methods if m.name in s.scene_methods]
+        methods = [m for m in self.methods if m.name in s.scene_methods and m.name not in IMAGE_METHODS]
         jobs = [
             (method, name, dose, block)
             for name in self.scenes for dose in s.scene_doses for block in s.blocks(s.scene_n) for method in methods
@@ -409,14 +356,14 @@ class _Study:
             collected.setdefault((method.name, name, dose), []).append(piece)
         if jobs:
             self.report("further scenes", 1.0)
-        return {key: _joined(pieces) for key, pieces in collected.items()}
+        return {key: joined(pieces) for key, pieces in collected.items()}
 
     def _extra_piece(self, method: Method, name: str, dose: float, block: range) -> dict[str, Any]:
         """ROI means with the scene's core and, on the same noise, with fibrous tissue in its place."""
         scene = self.scene(name)
 
         def compute() -> dict[str, Any]:
-            noise = self._gram_noise(name, dose, block)
+            noise = self.noise.gram_noise(name, dose, block)
             rois = scene.rois.on(scene.grid)
             result: dict[str, Any] = {}
             for label, other in (("roi", name), ("absent", f"{name}:absent")):
@@ -430,7 +377,7 @@ class _Study:
             return result
 
         place = f"methods/{method.name}/{name}_{dose:g}s_{block.start}-{block.stop}"
-        return self.store.piece(place, f"{self.key} {fingerprint(method)}", compute)
+        return self.store.piece(place, f"{self.noise.key} {fingerprint(method)}", compute)
 
 
 def _with_twin(name: str) -> list[str]:
@@ -451,14 +398,3 @@ def _timed(method: Method, scene: StudyScene, b: Tensor, dose: float) -> tuple[T
             f"(scene {scene.name}, {dose:g} s): repair it or leave it out with --methods"
         )
     return volume.to(torch.float32), seconds
-
-
-def _joined(pieces: list[dict[str, Any]]) -> dict[str, Any]:
-    """Pieces one behind the other; what only the first holds is kept."""
-    joined: dict[str, Any] = {}
-    for name in pieces[0]:
-        if name == "first":
-            joined[name] = pieces[0][name]
-        elif name != "seconds":
-            joined[name] = np.concatenate([p[name] for p in pieces])
-    return joined

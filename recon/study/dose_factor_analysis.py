@@ -12,9 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.study.compare import inset_grid
-from recon.study.dose_factor import FBP_BASE, MAIN_SCENES, Measured
+from recon.study.dose_factor import Measured
+from recon.study.dose_factor_rois import Wide, sd_at
 from recon.study.dose_factor_scene import (
     DOG_CHANNELS,
+    FBP_BASE,
+    MAIN_SCENES,
     OBSERVERS,
     SceneFacts,
     StudyScene,
@@ -118,6 +121,7 @@ class _Analysis:
             "ceiling": [self._ceiling(dose) for dose in self.s.doses],
             "fbp": list(self.fbp.values()),
             "methods": methods,
+            "wide_rois": [self._wide(name) for name in self.s.rois],
             "scenes": self._scenes(),
             "scenes_left_out": self.m.left_out,
         }
@@ -255,7 +259,7 @@ class _Analysis:
         ratio = cnr(roi[:, 0], roi[:, 1])
         absent = samples["absent_core"]["roi"].astype(np.float64)
         false = absent[:, 1] - absent[:, 0]
-        reached = _attempt(lambda: _estimate(efficiency(limits["contrast_sd_hu"], contrast, slope, draws=_DRAWS)))
+        reached = self._efficiency(roi, slope, dose)
         entry: dict[str, Any] = {
             "method": name, "exposure_s": dose, "realizations": n,
             "seconds_per_volume": round(self.m.seconds.get(name, math.nan), 3),
@@ -284,6 +288,10 @@ class _Analysis:
         if ("paper", dose) in self.m.fbp:
             entry["fbp_shape"] = self._shape(self.m.fbp["paper", dose]["shape"][:n])
         return entry
+
+    def _efficiency(self, roi: Floats, slope: ContrastSlope, dose: float) -> dict[str, Any]:
+        ideal = self._limits(dose)["contrast_sd_hu"]
+        return _attempt(lambda: _estimate(efficiency(ideal, roi[:, 1] - roi[:, 0], slope, draws=_DRAWS)))
 
     def _observer(self, entry: dict[str, Any], samples: Any, dose: float, observer: str) -> Any:
         """Scores ``(realisations, 2)``, absent and present; None where there are too few realisations."""
@@ -376,7 +384,9 @@ class _Analysis:
         """Error of lumen area and cap thickness of single realisations."""
         truth = self._truth()
         result = {}
-        for name, values, true in (("lumen_mm2", shape[:, 0], "lumen_mm2"), ("cap_mm", shape[:, 1], "cap_mm")):
+        columns = (("lumen_mm2", 0, "lumen_mm2"), ("cap_mm", 1, "cap_mm"), ("lumen_half_mm2", 2, "lumen_mm2"))
+        for name, column, true in columns:
+            values = shape[:, column]
             v = values[np.isfinite(values)]
             error = np.abs(v - truth[true])
             result[name] = {
@@ -386,6 +396,43 @@ class _Analysis:
                 "lost": float(1 - v.size / len(values)),
             }
         return result
+
+    # -- wider ROIs -----------------------------------------------------------------------------------------------
+
+    def _wide(self, name: str) -> dict[str, Any]:
+        """Figures of every FBP variant and method in a wider ROI, at every dose."""
+        wide = Wide(self.m, self.scene, name, self.truth)
+        curves = wide.base_curves()
+        rows: list[dict[str, Any]] = []
+        for dose in self.s.doses:
+            limits = self._limits(dose)
+            for kernel, voxel, _ in self.variants:
+                f = wide.fbp(kernel, voxel)
+                sd, c = sd_at(f["covariance"], dose), f["covariance"] / dose
+                own = float(f["roi_hu"][1] - f["roi_hu"][0]) / math.sqrt(c[0, 0] + c[1, 1])
+                rows.append({
+                    "method": f"FBP {f['label']}", "exposure_s": dose, "exact": True, "slope": {"value": f["slope"]},
+                    "contrast_sd_hu": {"value": sd / f["slope"]}, "paper_cnr": {"value": own},
+                    "efficiency": {"value": (limits["contrast_sd_hu"] * f["slope"] / sd) ** 2},
+                    "limit_factors": {
+                        "paper_cnr": (limits["paper_cnr"] / own) ** 2,
+                        "contrast_variance": (sd / f["slope"] / limits["contrast_sd_hu"]) ** 2,
+                    },
+                })  # fmt: skip
+            for method in self.m.methods:
+                roi, slope = wide.samples(method, dose)
+                reached = self._efficiency(roi, slope, dose)
+                rows.append({
+                    "method": method, "exposure_s": dose, "exact": False, "realizations": len(roi),
+                    "slope": _estimate((slope.value, slope.low, slope.high)),
+                    "efficiency": reached, "contrast_sd_hu": _sd_of(reached, limits["contrast_sd_hu"]),
+                    "paper_cnr": _estimate((cnr(roi[:, 0], roi[:, 1]), *cnr_interval(roi[:, 0], roi[:, 1]))),
+                    "factors": {
+                        "paper_cnr": _factor(roi, curves["paper_cnr"], "paper_cnr"),
+                        "contrast_variance": _factor(roi, curves["contrast_variance"], "contrast_variance", slope),
+                    },
+                })  # fmt: skip
+        return {"roi": name, **wide.rois.as_dict(), "rows": rows}
 
     # -- further scenes -------------------------------------------------------------------------------------------
 

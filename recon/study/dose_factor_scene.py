@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import logging
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -24,7 +25,7 @@ from recon.study.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM, enclos
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.ceiling import information_matrix
 from torchpcct.metrics.observer import dog_channels
-from torchpcct.metrics.placement import RoiPair, place_rois
+from torchpcct.metrics.placement import RoiPair, place_rois, whole_rois
 from torchpcct.metrics.resolution import lumen_area
 from torchpcct.metrics.roi import axial_grid, sample_axial
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
@@ -32,6 +33,7 @@ from torchpcct.window import DetectorWindow, shadow
 
 if TYPE_CHECKING:
     from recon.study.dose_factor import Settings
+    from torchpcct.scanner import Scanner
     from torchpcct.scene import Scene
     from torchpcct.scene.plaque import Plaque
 
@@ -40,6 +42,20 @@ __all__ = ["DOG_CHANNELS", "OBSERVERS", "SceneFacts", "StudyScene", "crop_window
 log = logging.getLogger(__name__)
 
 Floats = NDArray[np.float64]
+
+MAIN_SCENES = ("paper", "absent_core", "half_contrast", "flipped_contrast")
+"""They share all shapes and differ in the core's contrast (1, 0, ½, −1): slope, false contrast, observer."""
+
+FBP_BASE = ("soft", 0.25)
+"""Kernel and voxel size (mm) that factors are quoted against, and of the FBP realisations."""
+
+WIDE_ROIS = ("section", "tissue")
+"""ROIs beyond the paper's: all of core and fibrous tissue in the axial image, and in all slices of the core."""
+
+LUMEN_HALF_HU = 293.0
+"""Half way between blood (482 HU as this scanner sees it) and fibrous tissue (105 HU). At the paper's 250 HU the
+contour lies outside the edge: the true volume, averaged over 0.2 mm voxels, has 4.24 mm² there and 4.04 mm² here, of
+4.11 mm²."""
 
 CROP_MM = 3.8
 """Edge of the cube about the core that is kept of every realisation: the core (1.97 mm) and the cap with a margin."""
@@ -51,6 +67,9 @@ _LOWEST_CHANNEL = 0.1
 
 _GLS_VIEWS = 246
 """Views that the limit is summed over, then scaled: path lengths change slowly from view to view."""
+
+_PITCH = re.compile(r"pitch_(\d\.\d+)mm")
+"""The paper's scene on a scanner of another column pitch."""
 
 _SUB_RAYS = 16
 _CAP_STEP_MM = 0.01
@@ -67,7 +86,6 @@ class SceneFacts:
         reference_hu: ROI means of noise-free standard FBP on 0.1 mm, ``(2,)``.
         labels: FBP variants; fbp_hu: their ROI means ``(variants, 2)``; fbp_covariance: label → ``(F, F)`` HU² of the
             ROI means and, where they were asked for, of the observer's channels; fbp_crop: label → image of the core.
-        fbp_shape: lumen area (mm²) and cap thickness (mm) of the noise-free reference FBP.
     """
 
     statistic: NDArray[np.float32]
@@ -79,7 +97,6 @@ class SceneFacts:
     fbp_hu: Floats
     fbp_covariance: dict[str, Floats]
     fbp_crop: dict[str, Any]
-    fbp_shape: Floats
 
     def tissue(self, name: str) -> int:
         """Index of a tissue."""
@@ -156,16 +173,17 @@ def observer_channels(scene: StudyScene, grid: VolumeGrid, observer: str) -> Flo
     return channels
 
 
-def segmentation(scene: StudyScene, grid: VolumeGrid, volume: Tensor) -> tuple[float, float]:
-    """Lumen area (mm²) and cap thickness (mm) in the protocol's axial image; NaN where the edges are lost.
+def segmentation(scene: StudyScene, grid: VolumeGrid, volume: Tensor) -> tuple[float, float, float]:
+    """Lumen area (mm²), cap thickness (mm) and lumen area at half maximum in the protocol's axial image.
 
-    The cap is measured on the line from the lumen's to the core's centre, between where the image first falls below
-    250 HU and below 70 HU: the core's whole contour at 70 HU runs into the thin wall (67 HU) beside it.
+    NaN where the edges are lost. The first area is the paper's, at 250 HU; the last at :data:`LUMEN_HALF_HU`. The cap
+    is measured on the line from the lumen's to the core's centre, between where the image first falls below 250 HU and
+    below 70 HU: the core's whole contour at 70 HU runs into the thin wall (67 HU) beside it.
     """
     image = scene.rois.image
     section = sample_axial(volume.to(torch.float64), grid, image)
     lumen, core = np.array(scene.lumen_center[1:]), np.array(scene.core_center[1:])
-    area = lumen_area(section, image, (float(lumen[0]), float(lumen[1])))
+    area, half = (lumen_area(section, image, (float(lumen[0]), float(lumen[1])), hu) for hu in (250.0, LUMEN_HALF_HU))
     length = float(np.hypot(*(core - lumen)))
     along = np.arange(0.0, length, _CAP_STEP_MM)
     points = lumen[:, None] + (core - lumen)[:, None] * along / length
@@ -174,8 +192,8 @@ def segmentation(scene: StudyScene, grid: VolumeGrid, volume: Tensor) -> tuple[f
     profile = map_coordinates(section[0].numpy(), index, order=1, mode="nearest")
     lumen_end, core_start = (np.flatnonzero(profile < hu) for hu in (250.0, 70.0))
     if not lumen_end.size or not core_start.size:
-        return area, float("nan")
-    return area, float(along[core_start[0]] - along[lumen_end[0]])
+        return area, float("nan"), half
+    return area, float(along[core_start[0]] - along[lumen_end[0]]), half
 
 
 class StudyScene:
@@ -201,7 +219,21 @@ class StudyScene:
         from torchpcct.scene.variants import plaque_variant
 
         variant, _, absent = self.name.partition(":")
+        if _PITCH.fullmatch(variant):
+            variant = "paper"
         return plaque_variant(variant, core_contrast=0.0) if absent else plaque_variant(variant)
+
+    @cached_property
+    def scanner(self) -> Scanner:
+        """The paper's, or one with the column pitch of the scene's name."""
+        from torchpcct.scanner import presets
+
+        scanner = presets.pcct(views=self.settings.views)
+        pitch = _PITCH.match(self.name)
+        if pitch is None:
+            return scanner
+        geometry = scanner.geometry
+        return replace(scanner, geometry=replace(geometry, pitch=(geometry.pitch[0], float(pitch[1]))))
 
     @property
     def scene(self) -> Scene:
@@ -244,6 +276,35 @@ class StudyScene:
         scene = self.scene if "calcification" in self.name else self.geometry
         return place_rois(scene, axial_grid(self.grid.center))
 
+    def wide_rois(self, name: str) -> RoiPair:
+        """The ROIs of :data:`WIDE_ROIS`, inside of the crop."""
+        z, y, x = self.core_center
+        if name == "section":
+            image = VolumeGrid((1, 80, 80), 0.04, (self.grid.center[0], y, x))
+        elif name == "tissue":
+            half = float(self.plaque.core.semi_axes[2])
+            image = VolumeGrid((max(1, math.floor(2 * half / 0.05)), 64, 64), 0.05, (z, y, x))
+        else:
+            raise ValueError(f"rois must be of {', '.join(WIDE_ROIS)}, got {name!r}")
+        return whole_rois(self.geometry, image)
+
+    def wide_covariance(self) -> dict[str, Floats]:
+        """Exact covariance at 1 s of the means in all wider ROIs of the settings, two each, of every FBP variant."""
+        s = self.settings
+        key = f"views={s.views} {s.kernels} {s.voxels_mm} {s.rois}"
+
+        def compute() -> dict[str, Any]:
+            fbp = InsetFbp(self.clean, [inset_grid(self.plaque, v) for v in s.voxels_mm], s.kernels)
+            rows = [[r for name in s.rois for r in self.wide_rois(name).on(grid)] for grid in fbp.grids]
+            found = roi_covariance(self.clean, fbp, cast(Any, rows), NOISE_FREE_EXPOSURE_S)
+            return {
+                fbp_label(kernel, grid.spacing[0]): matrix
+                for grid, matrices in zip(fbp.grids, found, strict=True)
+                for kernel, matrix in zip(fbp.kernels, matrices, strict=True)
+            }
+
+        return self.store.piece(f"scenes/{_file(self.name)}_rois", key, compute)
+
     # -- scan -----------------------------------------------------------------------------------------------------
 
     @property
@@ -268,13 +329,11 @@ class StudyScene:
 
     def _acquire(self) -> Scan:
         from torchpcct.acquisition import acquire
-        from torchpcct.scanner import presets
 
         views = self.settings.views
-        scanner = presets.pcct(views=views)
         grids = [inset_grid(self.plaque, v) for v in {*self.settings.voxels_mm, self.settings.voxel_mm, 0.1}]
         # Fewer views stand for the same scan, thinned out: the beam is on for as long as one of its views.
-        whole = acquire(self.scene, scanner, region=enclosing(grids), duty=min(1.0, views / 1968))
+        whole = acquire(self.scene, self.scanner, region=enclosing(grids), duty=min(1.0, views / 1968))
         assert whole.window is not None
         windows = [shadow(whole.geometry, g, margin=1) for g in grids]
         near = DetectorWindow.union(windows, whole.geometry.columns).widened(FILTER_MARGIN_COLUMNS, whole.window)
@@ -321,8 +380,6 @@ class StudyScene:
         return self._facts
 
     def _compute(self, full: bool) -> dict[str, Any]:
-        from recon.study.dose_factor import FBP_BASE, MAIN_SCENES
-
         clean, s = self.clean, self.settings
         tissues, amplitudes, information = self._least_squares()
         result: dict[str, Any] = {
@@ -343,8 +400,6 @@ class StudyScene:
 
     def _images(self, result: dict[str, Any], fbp: InsetFbp, clean: Scan) -> None:
         """ROI means and crops of every FBP variant."""
-        from recon.study.dose_factor import FBP_BASE
-
         labels, means = [], []
         for grid, volumes in zip(fbp.grids, fbp(clean), strict=True):
             pair, crop = self.rois.on(grid), crop_window(grid, self.core_center)[0]
@@ -355,13 +410,9 @@ class StudyScene:
                     labels.append(fbp_label(kernel, grid.spacing[0], blur))
                     means.append([float(r(image)) for r in pair])
                     result[f"crop {labels[-1]}"] = image[crop].numpy()
-                if base:
-                    result["fbp_shape"] = np.array(segmentation(self, grid, volume))
         result["labels"], result["fbp_hu"] = np.array(labels), np.array(means)
 
     def _covariances(self, result: dict[str, Any], fbp: InsetFbp, clean: Scan, full: bool) -> None:
-        from recon.study.dose_factor import FBP_BASE
-
         functionals = [self._functionals(grid, full) for grid in fbp.grids]
         found = roi_covariance(clean, fbp, cast(Any, functionals), NOISE_FREE_EXPOSURE_S)
         for grid, matrices in zip(fbp.grids, found, strict=True):
@@ -395,7 +446,6 @@ class StudyScene:
 
     def _least_squares(self) -> tuple[list[str], Floats, Floats]:
         """Tissues, their generalised least-squares values in HU, and the information at 1 s."""
-        from torchpcct.scanner import presets
         from torchpcct.scene.path_lengths import tissue_path_lengths
 
         clean = self.clean
@@ -405,7 +455,7 @@ class StudyScene:
         views = list(range(0, g.views, stride))
         groups = _tissue_groups([b.name for b in self.scene.bodies])
         window = DetectorWindow(w.first_column[views], w.columns, w.first_row, w.rows)
-        spot = presets.pcct(views=g.views).source.focal_spot
+        spot = self.scanner.source.focal_spot
         maps = tissue_path_lengths(
             self.scene, list(groups.values()), g.select(views), window, sub_rays=_SUB_RAYS, focal_spot=spot
         )
@@ -455,5 +505,4 @@ def _unpack(arrays: dict[str, Any]) -> SceneFacts:
         fbp_hu=arrays["fbp_hu"],
         fbp_covariance=all_of("covariance "),
         fbp_crop=all_of("crop "),
-        fbp_shape=arrays["fbp_shape"],
     )

@@ -34,7 +34,10 @@ log = logging.getLogger(__name__)
 class Method(Protocol):
     """A reconstruction from the sufficient statistic."""
 
-    name: str
+    @property
+    def name(self) -> str:
+        """One of :data:`METHODS`."""
+        ...
 
     def __call__(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> Tensor:
         """Volumes in HU.
@@ -52,10 +55,11 @@ class Method(Protocol):
 
 @dataclass(frozen=True)
 class LinearFilter:
-    """The linear 3-D filter (G + λ + μ f²)⁻¹ of the statistic, in noise-normalised units.
+    """The linear 3-D filter (G + λ + μ (f_xy² + κ f_z²))⁻¹ of the statistic, in noise-normalised units.
 
     It is the Wiener filter of a volume with the power spectrum 1 / (λ + μ f²): the best that a linear post-filter of
-    FBP can do with the statistics of the scan known. The Fourier filter alone (the spectrum of the nearest circulant
+    FBP can do with the statistics of the scan known. With κ > 1 it smooths more along z, which is the plaque's vessel:
+    a filter that knows where the vessel runs. The Fourier filter alone (the spectrum of the nearest circulant
     for G) shifts all of a small inset by some 30 HU, because the inset is not periodic; a few steps of conjugate
     gradients with it as preconditioner remove that.
 
@@ -63,12 +67,14 @@ class LinearFilter:
         name: of the method.
         lam: λ in noise units (:class:`recon.unrolled.NormalProblem`), where G is about 1 at 0.5 lp/mm at every dose.
         mu: μ in noise units, per (lp/mm)².
+        along: κ, 1 for an isotropic filter.
         steps: of conjugate gradients; the ROI means change by less than 0.1 HU beyond 12.
     """
 
     name: str = "linear"
     lam: float = 0.01
     mu: float = 0.8
+    along: float = 1.0
     steps: int = 12
 
     def __call__(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> Tensor:
@@ -77,7 +83,8 @@ class LinearFilter:
         normal = NormalProblem.from_statistic(problem.gram, b, exposure, problem.mu_ref / 1000.0, voxel)
         shape, axes = b.shape[-3:], (-3, -2, -1)
         f2 = squared_frequencies(shape, voxel).to(b)
-        prior = self.lam + self.mu * f2
+        fz2 = torch.fft.fftfreq(shape[0], voxel).to(b)[:, None, None] ** 2
+        prior = self.lam + self.mu * (f2 + (self.along - 1.0) * fz2)
 
         def filtered(v: Tensor, spectrum: Tensor) -> Tensor:
             return torch.fft.irfftn(torch.fft.rfftn(v, dim=axes) * spectrum, s=shape, dim=axes)
@@ -121,19 +128,47 @@ class Penalised:
         return to_hu(result.x + problem.level, problem.mu_ref)
 
 
+@dataclass(frozen=True)
+class Misstated:
+    """A method that is told an exposure ``factor`` times the true one, so that it takes the noise for 1/√factor of it.
+
+    Args:
+        name: of the method.
+        inner: the method.
+        factor: on the exposure, and with it on the weights W in b = AᵀW y.
+    """
+
+    name: str
+    inner: Method
+    factor: float
+
+    def __call__(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> Tensor:
+        return self.inner(problem, b * self.factor, exposure_s * self.factor)
+
+    def fingerprint(self) -> str:
+        return f"{self.factor:g} {fingerprint(self.inner)}"
+
+
 # Tuned on a held-out scene (the turned plaque, other side of the vessel): the least noise at which the contrast slope
 # is that of soft FBP on 0.25 mm, 0.78. More smoothing lowers the slope-corrected variance of every linear method
 # further, at the price of slope and edge width: the FBP variants with a Gaussian filter show how much.
 _BASELINES: dict[str, Any] = {
     "linear": LinearFilter(),
+    "linear_z": LinearFilter("linear_z", mu=0.25, along=25.0, steps=16),
     "quadratic": Penalised("quadratic", quadratic(0.25)),
     "qggmrf": Penalised("qggmrf", DEFAULT_PRIOR),
     # q = 1 with a threshold far below the gradients of the noise: |t| almost everywhere, rounded at 0.
     "tv": Penalised("tv", QGGMRF(strength=2.0, threshold=30.0)),
 }
 
-METHODS = (*_BASELINES, "mbir_one_pass", "mbir")
-"""Names, in the order of the tables."""
+_LEARNED = ("fbp_cnn", "mbir_one_pass", "mbir", "mbir_noise_half", "mbir_noise_double")
+
+METHODS = (*_BASELINES, *_LEARNED)
+"""Names, in the order of the tables. ``fbp_cnn`` is MBIR's prior on FBP images, ``mbir_noise_*`` MBIR that takes the
+noise for half or twice of what it is."""
+
+IMAGE_METHODS = ("fbp_cnn",)
+"""Methods of an image domain: in place of b = AᵀW y they are given G x of an FBP volume x."""
 
 
 def load_methods(names: Iterable[str]) -> list[Method]:
@@ -150,16 +185,23 @@ def load_methods(names: Iterable[str]) -> list[Method]:
             found.append(_BASELINES[name])
             continue
         try:
-            from recon.mbir import ADD_BACK, Mbir
-
-            prior = Mbir.load(add_back=ADD_BACK if name == "mbir" else None)
-            prior.name = name
-            found.append(prior)
+            found.append(_learned(name))
         except FileNotFoundError as error:
             log.warning("the method %s is left out, its weights are missing: %s", name, error)
     if not found:
         raise ValueError(f"no method to run: choose at least one of {', '.join(METHODS)}")
     return found
+
+
+def _learned(name: str) -> Method:
+    from recon.mbir import ADD_BACK, Mbir
+
+    prior = Mbir.load(add_back=None if name == "mbir_one_pass" else ADD_BACK)
+    factor = {"mbir_noise_half": 4.0, "mbir_noise_double": 0.25}.get(name)
+    if factor is not None:
+        return Misstated(name, prior, factor)
+    prior.name = name
+    return prior
 
 
 def fingerprint(method: Method) -> str:

@@ -20,7 +20,7 @@ from torchpcct.metrics.roi import RoiMean
 if TYPE_CHECKING:
     from torchpcct.scene import Scene
 
-__all__ = ["RoiPair", "RoiRule", "place_rois"]
+__all__ = ["RoiPair", "RoiRule", "place_rois", "whole_rois"]
 
 
 @dataclass(frozen=True)
@@ -110,3 +110,40 @@ def place_rois(
     sizes = ndimage.sum_labels(background[0], regions, np.arange(1, count + 1))
     background = (regions == 1 + int(np.argmax(sizes)))[None]
     return RoiPair(foreground, background, image, rule)
+
+
+def whole_rois(
+    scene: Scene,
+    image: VolumeGrid,
+    core: str = "core",
+    tissue: str = "fibrous",
+    lumen: str = "lumen",
+    margin: float = 0.10,
+    lumen_margin: float = 0.30,
+) -> RoiPair:
+    """All of the core and all of the tissue in an image of one or more slices, but for a margin at their edges.
+
+    The paper's two ROIs ask for a contrast in one small place; these ask how different the two tissues are.
+
+    Args:
+        scene, core, tissue, lumen: as for :func:`place_rois`.
+        image: ``(z, y, x)`` grid; with one slice distances are taken in the slice, else in space.
+        margin: both keep this far from every edge of their tissue, mm.
+        lumen_margin: the background keeps this far from the lumen, whose blood would spill into it, mm.
+
+    Raises:
+        ValueError: an unknown body, or a ROI that comes out empty.
+    """
+    labels = scene.labels(image)
+
+    def depth(mask: Any) -> Any:
+        if image.shape[0] == 1:
+            return ndimage.distance_transform_edt(mask[0], sampling=image.spacing[1:])[None]
+        return ndimage.distance_transform_edt(mask, sampling=image.spacing)
+
+    foreground = depth(labels == scene.index(core)) > margin
+    background = (depth(labels == scene.index(tissue)) > margin) & (depth(labels != scene.index(lumen)) > lumen_margin)
+    for name, mask in (("foreground", foreground), ("background", background)):
+        if not np.any(mask):
+            raise ValueError(f"the {name} ROI is empty: its margin of {margin} mm is wider than the tissue; reduce it")
+    return RoiPair(foreground, background, image, RoiRule(margin, margin, float("inf"), lumen_margin))
