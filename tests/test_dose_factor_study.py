@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 import torch
 
+from recon.mbir import average_onto
 from recon.qggmrf import quadratic
 from recon.study import dose_factor as study
+from recon.study.compare import inset_grid
 from recon.study.dose_factor import Settings, estimate_seconds, run
 from recon.study.dose_factor_analysis import analyse
 from recon.study.dose_factor_noise import Realisations
 from recon.study.dose_factor_report import build_report, headline
-from recon.study.dose_factor_rois import Wide
+from recon.study.dose_factor_rois import OtherVoxels, Wide
 from recon.study.dose_factor_scene import MAIN_SCENES, StudyScene, _tissue_groups, crop_window
 from recon.study.dose_factor_store import Store
 from recon.study.methods import METHODS, LinearFilter, Misstated, Penalised, fingerprint, load_methods
@@ -277,6 +279,25 @@ def test_wider_rois(measured, folder, analysed):
         assert analysed["ceiling"][0]["contrast_sd_hu"] < sd < paper_sd
     with pytest.raises(ValueError, match="rois must be of section, tissue"):
         scene.wide_rois("vessel")
+
+
+def test_rois_on_larger_voxels_are_those_of_the_averaged_volume(measured, folder):
+    settings = replace(TINY, voxel_mm=0.2)
+    scene = StudyScene("paper", settings, Store(folder))
+    coarse = inset_grid(scene.plaque, 0.35)
+    rois = OtherVoxels(replace(measured, settings=settings), scene, 0.35, np.zeros(4))
+    volume = torch.randn(scene.grid.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    place = crop_window(scene.grid, scene.core_center)[0]
+    expected = [float(r(average_onto(volume, scene.grid, coarse))) for r in scene.rois.on(coarse)]
+    np.testing.assert_allclose(rois.means(volume[place].numpy(), 0.2), expected, rtol=1e-9)
+
+
+def test_worst_case_gain_of_fbp(measured, analysed):
+    gains = analysed["worst_case_gains"]
+    assert [g["exposure_s"] for g in gains] == [2.0]
+    # A sharper kernel answers more.
+    soft, standard = (gains[0][f"FBP {k} 0.25 mm"] for k in ("soft", "standard"))
+    assert 0 < soft < standard
 
 
 def test_exact_noise_of_wider_rois_is_that_of_fbp(measured, folder):

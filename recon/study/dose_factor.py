@@ -78,6 +78,7 @@ class Settings:
         voxel_mm: of the methods' grid.
         kernels, voxels_mm: FBP that is analysed exactly.
         blurs_mm: σ of Gaussian filters after soft FBP, for FBP of the same resolution as a method.
+        gains: measure the worst-case response of FBP and of the learned methods.
         rois: wider ROIs than the paper's, of :data:`recon.study.dose_factor_scene.WIDE_ROIS`.
         fast_noise: draw b = AᵀW y from the Gram's covariance instead of drawing the readings. The further scenes
             always do. There are no FBP realisations then; FBP's exact figures stay.
@@ -101,6 +102,7 @@ class Settings:
     kernels: tuple[str, ...] = paper.KERNELS
     voxels_mm: tuple[float, ...] = (0.25, 0.20)
     blurs_mm: tuple[float, ...] = (0.15, 0.25, 0.40, 0.60)
+    gains: bool = True
     rois: tuple[str, ...] = WIDE_ROIS
     fast_noise: bool = False
     block: int = 8
@@ -142,7 +144,7 @@ class Settings:
         values: dict[str, Any] = {
             "n": 8, "scene_n": 4, "doses": (2.0,), "scene_doses": (2.0,), "views": 246, "fast_noise": True,
             "methods": ("linear", "mbir_one_pass", "mbir"), "scenes": ("half_size_core",),
-            "kernels": ("soft", "standard"), "voxels_mm": (0.25,), "blurs_mm": (0.25,), "rois": (),
+            "kernels": ("soft", "standard"), "voxels_mm": (0.25,), "blurs_mm": (0.25,), "gains": False, "rois": (),
         }  # fmt: skip
         return cls(**{**values, **changes})
 
@@ -169,6 +171,7 @@ class Measured:
         extra: (method, scene, dose) → ``roi`` and, with the core replaced by fibrous tissue, ``absent`` ``(n, 2)``.
         volumes: (method or "fbp", scene, dose) → first realisation, HU.
         wide: FBP variant → covariance of the means in the wider ROIs at 1 s.
+        gains: dose → method or FBP variant → worst-case response, HU mm^1.5.
         seconds: (method) → s per volume.
     """
 
@@ -182,6 +185,7 @@ class Measured:
     extra: dict[tuple[str, str, float], dict[str, Any]]
     volumes: dict[tuple[str, str, float], Any]
     wide: dict[str, Any]
+    gains: dict[float, dict[str, float]]
     seconds: dict[str, float]
 
 
@@ -260,6 +264,7 @@ class _Study:
             extra=extra,
             volumes=volumes,
             wide=wide,
+            gains=self._gains(),
             seconds=self.seconds,
         )
 
@@ -378,6 +383,18 @@ class _Study:
 
         place = f"methods/{method.name}/{name}_{dose:g}s_{block.start}-{block.stop}"
         return self.store.piece(place, f"{self.noise.key} {fingerprint(method)}", compute)
+
+    def _gains(self) -> dict[float, dict[str, float]]:
+        if not self.settings.gains:
+            return {}
+        from recon.study.dose_factor_stability import worst_case_gains
+
+        found = {}
+        for k, dose in enumerate(self.settings.doses):
+            self.report("worst-case response", k / len(self.settings.doses))
+            found[dose] = worst_case_gains(self.noise, self.methods, dose)
+        self.report("worst-case response", 1.0)
+        return found
 
 
 def _with_twin(name: str) -> list[str]:

@@ -1,0 +1,18 @@
+"""Tests run in two processes (``-n 2`` of pyproject.toml; ``-n 0`` runs them in one), which share the cores."""
+
+import os
+
+import pytest
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _cores_are_shared():
+    """Each process computes with its share of the cores: threads that wait for each other are slower than few."""
+    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    if workers > 1:
+        import numba
+        import torch
+
+        threads = max(1, (os.cpu_count() or 1) // workers)
+        numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+        torch.set_num_threads(threads)
