@@ -15,11 +15,14 @@ tells (:mod:`recon.steering`).
 
 Whatever smooths, shrinks. So the steps are passed through again with what the first pass left in the data added back,
 β ← β + w (β − H u): a Bregman iteration (Osher, Burger, Goldfarb, Xu, Yin 2005, Multiscale Model. Simul. 4:460), which
-restores contrast while the prior, sure of its edges by then, keeps the noise out.
+restores contrast while the prior, sure of its edges by then, keeps the noise out. Each pass has an energy of its own:
+that of the second is made with the volume that the first one ends at, and what steers S is fixed by the data of the
+first. :func:`minimise_passes` runs both to their stationary points.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -31,9 +34,9 @@ from torch import Tensor, nn
 from recon.prior import REFERENCE_SCALE_HU, LearnedPrior, PriorConfig
 from recon.steering import Steering
 
-__all__ = ["NormalProblem", "Unrolled", "energy", "minimise", "residual"]
+__all__ = ["NormalProblem", "Unrolled", "energy", "minimise", "minimise_passes", "residual"]
 
-LARGEST_ADD_BACK = 1.6
+LARGEST_ADD_BACK = 2.0
 FLOOR = 0.05
 """Smallest damping: frequencies that the scanner does not see are never divided by less."""
 
@@ -89,7 +92,7 @@ class Unrolled(nn.Module):
         config: of the prior.
         steps: K of each pass.
         add_back: ``(a, b)`` of the weight ``w = a + b ln(c / 200 HU)`` of the residual in a second pass, c the noise
-            scale; None: one pass, the minimiser of the energy.
+            scale; None: one pass.
     """
 
     def __init__(
@@ -120,19 +123,69 @@ class Unrolled(nn.Module):
             low, high = self.seen_scale_hu.unbind()
             least = scale.min() if not low else torch.minimum(low, scale.min())
             self.seen_scale_hu = torch.stack([least, torch.maximum(high, scale.max())])
-        steering = self.steering(problem)
-        u = self.descend(problem, steering, callback)
-        if self.add_back is None:
-            return u
-        a, b = self.add_back
-        weight = (a + b * torch.log(scale / REFERENCE_SCALE_HU)).clamp(0.0, LARGEST_ADD_BACK).reshape(-1, 1, 1, 1)
-        added = replace(problem, beta=problem.beta + weight * (problem.beta - problem.apply(u)))
-        return self.descend(added, steering, None if callback is None else lambda k, v: callback(k + self.steps, v))
+        return self.passes(problem, callback)[0]
 
     @property
     def iterations(self) -> int:
         """Steps of all passes."""
         return self.steps * (1 if self.add_back is None else 2)
+
+    def passes(
+        self, problem: NormalProblem, callback: Callable[[int, Tensor], None] | None = None
+    ) -> tuple[Tensor, NormalProblem, Steering]:
+        """The reconstruction with what its energy needs, for :func:`residual`.
+
+        Args:
+            problem: normalised problem.
+            callback: as for :meth:`forward`.
+
+        Returns:
+            The volume ``(batch, z, y, x)`` in noise units, the problem of the last pass and the steering of all passes.
+        """
+        count = itertools.count()
+
+        def solve(problem: NormalProblem, steering: Steering, _: Tensor | None) -> Tensor:
+            return self.descend(problem, steering, callback and (lambda _, u: callback(next(count), u)))
+
+        return self.in_turn(problem, solve)
+
+    def in_turn(
+        self, problem: NormalProblem, solve: Callable[[NormalProblem, Steering, Tensor | None], Tensor]
+    ) -> tuple[Tensor, NormalProblem, Steering]:
+        """Every pass of the reconstruction by a solver of one.
+
+        Args:
+            problem: of the data.
+            solve: gives the volume of one pass for its problem, the steering and the volume of the pass before (None
+                in the first).
+
+        Returns:
+            As for :meth:`passes`.
+        """
+        # One steering for all passes: directions are those of the data, not of data with a residual added.
+        steering = self.steering(problem)
+        u = solve(problem, steering, None)
+        if self.add_back is not None:
+            problem = self.added_back(problem, u)
+            u = solve(problem, steering, u)
+        return u, problem, steering
+
+    def added_back(self, problem: NormalProblem, u: Tensor) -> NormalProblem:
+        """The second pass's problem, β + w (β − H u) in place of β.
+
+        Args:
+            problem: of the first pass.
+            u: ``(batch, z, y, x)`` noise units, the volume that the first pass has ended at.
+
+        Raises:
+            ValueError: a model of one pass.
+        """
+        if self.add_back is None:
+            raise ValueError("this model has one pass: nothing is added back")
+        a, b = self.add_back
+        level = torch.log(problem.scale_hu / REFERENCE_SCALE_HU)
+        weight = (a + b * level).clamp(0.0, LARGEST_ADD_BACK).reshape(-1, 1, 1, 1)
+        return replace(problem, beta=problem.beta + weight * (problem.beta - problem.apply(u)))
 
     def _damping(self, scale: Tensor) -> Tensor:
         """λ_k of every step and, last, of the linear start: ``(steps + 1, batch, 1, 1, 1)``."""
@@ -186,7 +239,7 @@ def energy(model: Unrolled, problem: NormalProblem, u: Tensor, steering: Steerin
     Args:
         model, problem: whose energy.
         u: ``(batch, z, y, x)`` noise units.
-        steering: of the problem, where it is known already.
+        steering: None: that of the problem; for a second pass it must be given, that of the first pass's problem.
     """
     steering = steering or model.steering(problem)
     data = (u * (0.5 * problem.apply(u) - problem.beta)).sum(dim=(1, 2, 3), dtype=torch.float64)
@@ -198,10 +251,10 @@ def energy(model: Unrolled, problem: NormalProblem, u: Tensor, steering: Steerin
 class _Preconditioned:
     """∇Φ and its preconditioned form."""
 
-    def __init__(self, model: Unrolled, problem: NormalProblem) -> None:
+    def __init__(self, model: Unrolled, problem: NormalProblem, steering: Steering | None) -> None:
         self.model, self.problem = model, problem
         self.quadratic = model.prior.quadratic(problem.beta.shape[-3:], problem.voxel_mm, problem.scale_hu)
-        self.steering = model.steering(problem)
+        self.steering = steering or model.steering(problem)
         self.bound = model.prior.slope_bound(problem.scale_hu).reshape(-1, 1, 1, 1)
         self.weight = problem.spectrum() + self.quadratic + self.steering.spectrum() + self.bound + FLOOR
 
@@ -230,31 +283,43 @@ class _Preconditioned:
         return (gradient * self(gradient)).sum(dim=(1, 2, 3), dtype=torch.float64).clamp_min(0.0).sqrt()
 
 
-def residual(model: Unrolled, problem: NormalProblem, u: Tensor) -> Tensor:
-    """Norm of ∇Φ(u) over that of ∇Φ(0) = −β, in the metric of the preconditioner, ``(batch,)``."""
-    metric = _Preconditioned(model, problem)
+def residual(model: Unrolled, problem: NormalProblem, u: Tensor, steering: Steering | None = None) -> Tensor:
+    """Norm of ∇Φ(u) over that of ∇Φ(0) = −β, in the metric of the preconditioner, ``(batch,)``.
+
+    Args:
+        model, problem: whose energy, that of one pass.
+        u: ``(batch, z, y, x)`` noise units.
+        steering: as for :func:`energy`.
+    """
+    metric = _Preconditioned(model, problem, steering)
     return metric.size(metric.gradient(u)) / metric.size(problem.beta).clamp_min(torch.finfo(torch.float64).tiny)
 
 
 def minimise(
-    model: Unrolled, problem: NormalProblem, start: Tensor, tolerance: float = 1e-3, most: int = 400
+    model: Unrolled,
+    problem: NormalProblem,
+    start: Tensor,
+    tolerance: float = 1e-3,
+    most: int = 400,
+    steering: Steering | None = None,
 ) -> tuple[Tensor, dict[str, Any]]:
-    """Run the energy of the unrolled steps to a stationary point: preconditioned gradient descent with momentum.
+    """Run the energy of one pass to a stationary point: preconditioned gradient descent with momentum.
 
     The energy is not convex; from one start it falls monotonically (a step that would raise it is halved and loses its
     momentum), so the point that is reached belongs to the valley of the start.
 
     Args:
         model: whose prior is used.
-        problem: normalised problem.
+        problem: normalised problem of the pass.
         start: ``(batch, z, y, x)`` noise units.
         tolerance: of :func:`residual`, worst volume.
         most: largest number of iterations.
+        steering: as for :func:`energy`.
 
     Returns:
         The volumes, and ``iterations``, ``residual`` (list), ``converged``.
     """
-    metric = _Preconditioned(model, problem)
+    metric = _Preconditioned(model, problem, steering)
     reference = metric.size(problem.beta).clamp_min(torch.finfo(torch.float64).tiny)
     u, previous = start, start
     value = energy(model, problem, u, metric.steering)
@@ -282,3 +347,38 @@ def minimise(
         if count % 5 == 0 or count == most:
             sizes = metric.size(metric.gradient(u)) / reference
     return u, {"iterations": count, "residual": sizes.tolist(), "converged": bool((sizes <= tolerance).all())}
+
+
+def minimise_passes(
+    model: Unrolled, problem: NormalProblem, start: Tensor | None = None, tolerance: float = 1e-3, most: int = 400
+) -> tuple[Tensor, dict[str, Any]]:
+    """Run every pass to a stationary point of its energy, the second one from where the first has ended.
+
+    With the shipped weights the point does not depend on the start: from zero it is the same within 0.01 HU (root mean
+    square) at a tolerance of 1e-5, on the paper's plaque at 0.35 s and at 2 s.
+
+    Args:
+        model: with one pass or two.
+        problem: normalised problem of the data.
+        start: ``(batch, z, y, x)`` noise units, where the first pass starts; None: at the end of its unrolled steps.
+        tolerance, most: of each pass, as for :func:`minimise`.
+
+    Returns:
+        The volumes, and ``iterations`` (of all passes, with the unrolled steps that were made), ``residual`` (list, of
+        the last pass's energy), ``converged`` (every pass).
+    """
+    reports: list[dict[str, Any]] = []
+
+    def solve(problem: NormalProblem, steering: Steering, before: Tensor | None) -> Tensor:
+        begin = start if before is None else before
+        begin = model.descend(problem, steering) if begin is None else begin
+        u, report = minimise(model, problem, begin, tolerance, most, steering)
+        reports.append(report)
+        return u
+
+    u = model.in_turn(problem, solve)[0]
+    return u, {
+        "iterations": sum(r["iterations"] for r in reports) + (model.steps if start is None else 0),
+        "residual": reports[-1]["residual"],
+        "converged": all(r["converged"] for r in reports),
+    }

@@ -1,6 +1,7 @@
 """The unrolled reconstruction and its energy, against dense solutions and on hard cases."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -8,7 +9,7 @@ from test_gram import HU, problem, tissue
 
 from recon.gram import Gram
 from recon.prior import PriorConfig
-from recon.unrolled import NormalProblem, Unrolled, energy, minimise, residual
+from recon.unrolled import FLOOR, NormalProblem, Unrolled, energy, minimise, minimise_passes, residual
 
 SMALL = PriorConfig(levels=2, filters=12, units=4)
 
@@ -52,6 +53,28 @@ def dense(problem, net):
     smooth = torch.fft.irfftn(q * torch.fft.rfftn(eye, dim=(1, 2, 3)), s=eye.shape[1:], dim=(1, 2, 3))
     matrix = (h + smooth).reshape(n, n).double()
     return torch.linalg.solve(0.5 * (matrix + matrix.T), problem.beta[0].reshape(n).double()).reshape(eye.shape[1:])
+
+
+def second(net, p, u1):
+    """The second pass's problem from its definition."""
+    a, b = net.add_back
+    w = (a + b * (p.scale_hu / 200.0).log())[:, None, None, None]
+    return replace(p, beta=(1 + w) * p.beta - w * p.apply(u1))
+
+
+def certificate(net, p, u1, u):
+    """‖∇Φ₂(u)‖ / ‖∇Φ₂(0)‖ of the pass after u1 by automatic differentiation; S is that of the data ``p``."""
+    steering, last = net.steering(p), second(net, p, u1)
+    smooth = net.prior.quadratic(p.beta.shape[-3:], p.voxel_mm, p.scale_hu) + steering.spectrum()
+    weight = p.spectrum() + smooth + net.prior.slope_bound(p.scale_hu)[:, None, None, None] + FLOOR
+
+    def size(at):
+        at = at.detach().clone().requires_grad_()
+        (g,) = torch.autograd.grad(energy(net, last, at, steering).sum(), at)
+        filtered = torch.fft.irfftn(torch.fft.rfftn(g, dim=(1, 2, 3)) / weight, s=g.shape[1:], dim=(1, 2, 3))
+        return (g * filtered).sum(dim=(1, 2, 3), dtype=torch.float64).sqrt()
+
+    return size(u) / size(torch.zeros_like(u))
 
 
 def test_normalisation(scan):
@@ -181,3 +204,56 @@ def test_callback_sees_every_step(scan):
     last = net(normal(scan), lambda k, u: seen.append((k, u)))
     assert [k for k, _ in seen] == list(range(net.iterations))
     assert torch.equal(seen[-1][1], last)
+
+
+@pytest.fixture(scope="module")
+def two_passes():
+    """A prior and a smoothing along vessels strong enough that much is added back."""
+    torch.manual_seed(0)
+    net = Unrolled(SMALL, 6, (0.8, 0.3)).eval().requires_grad_(False)
+    net.prior.gain += 1.0
+    net.prior.along[0] = 2.0
+    return net
+
+
+def test_residual_of_the_second_pass(scan, two_passes):
+    """Two volumes of one batch; neither the energy of the first pass nor another steering has this gradient."""
+    net, p = two_passes, normal(scan, noise=1.0, batch=2)
+    u, last, steering = net.passes(p)
+    assert torch.equal(u, net(p))
+    expected = certificate(net, p, net.descend(p, net.steering(p)), u)
+    torch.testing.assert_close(residual(net, last, u, steering), expected, rtol=1e-3, atol=0)
+    assert float((residual(net, p, u) / expected).min()) > 1.5
+    assert float((residual(net, last, u) / expected - 1).abs().min()) > 0.1
+
+
+def test_every_pass_ends_at_its_stationary_point(scan, two_passes):
+    """Pass after pass by hand, from zero, against the whole from its unrolled steps and from their end."""
+    net, p = two_passes, normal(scan, noise=1.0)
+    zero, steering = torch.zeros_like(p.beta), net.steering(p)
+    u1, _ = minimise(net, p, zero, tolerance=1e-5, most=800)
+    u2, _ = minimise(net, second(net, p, u1), zero, tolerance=1e-5, most=800, steering=steering)
+    for start, steps in ((None, 6), (net(p), 0)):
+        found, report = minimise_passes(net, p, start, tolerance=1e-5, most=800)
+        assert report["converged"]
+        assert report["iterations"] > steps + 10
+        assert max(report["residual"]) <= 1e-5
+        assert float(certificate(net, p, u1, found)) <= 1e-4
+        assert float((found - u2).norm() / u2.norm()) < 1e-3
+        # What was added back stays.
+        assert float((found - u1).norm() / u2.norm()) > 0.1
+
+
+def test_first_pass_that_stopped_early_is_not_converged(scan):
+    """Here the second pass, which adds nothing back, only goes on with the first, and ends at the point."""
+    torch.manual_seed(0)
+    net, p = Unrolled(SMALL, 6, (0.0, 0.0)).eval().requires_grad_(False), normal(scan, noise=1.0)
+    _, report = minimise_passes(net, p, torch.zeros_like(p.beta), most=12)
+    assert max(report["residual"]) <= 1e-3
+    assert not report["converged"]
+
+
+def test_one_pass_adds_nothing_back(scan):
+    p = normal(scan)
+    with pytest.raises(ValueError, match="one pass"):
+        model().added_back(p, torch.zeros_like(p.beta))
