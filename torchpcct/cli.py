@@ -209,7 +209,7 @@ def _dose_factor(arguments: argparse.Namespace, progress: _Progress) -> None:
     import shlex
 
     from recon.study.dose_factor import Settings, estimate_seconds, run
-    from recon.study.dose_factor_report import build_report
+    from recon.study.dose_factor.report import build_report
 
     changes: dict[str, Any] = {"seed": arguments.seed}
     for name in ("n", "slow_n", "scene_n", "doses", "scene_doses", "methods", "scenes", "scene_methods"):

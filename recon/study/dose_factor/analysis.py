@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import asdict
 from functools import cache
 from typing import Any
@@ -12,19 +11,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.study.compare import inset_grid
-from recon.study.dose_factor import Measured
-from recon.study.dose_factor_rois import OTHER_VOXELS_MM, OtherVoxels, Wide, sd_at
-from recon.study.dose_factor_scene import (
-    DOG_CHANNELS,
-    FBP_BASE,
-    MAIN_SCENES,
-    OBSERVERS,
-    SceneFacts,
-    StudyScene,
-    crop_window,
-    fbp_label,
-    observer_channels,
+from recon.study.dose_factor.estimates import (
+    DRAWS,
+    attempt,
+    estimate,
+    factor,
+    observer_factor,
+    paired,
+    sd_of,
+    slope_corrected,
+    squared_cnr,
 )
+from recon.study.dose_factor.facts import SceneFacts, fbp_label
+from recon.study.dose_factor.further import Further
+from recon.study.dose_factor.measures import DOG_CHANNELS, OBSERVERS, crop_window, observer_channels
+from recon.study.dose_factor.scene import StudyScene
+from recon.study.dose_factor.settings import FBP_BASE, MAIN_SCENES
+from recon.study.dose_factor.study import Measured
 from torchpcct.metrics import (
     ContrastSlope,
     DoseCurve,
@@ -36,7 +39,6 @@ from torchpcct.metrics import (
     cnr_interval,
     contrast_slope,
     d_prime,
-    dose_factor,
     efficiency,
     ellipsoid_distance,
     false_positive_difference,
@@ -47,56 +49,31 @@ from torchpcct.metrics import (
     sd_interval,
     task_transfer,
 )
-from torchpcct.metrics._bootstrap import bca_interval, leave_one_out, resampling
 from torchpcct.metrics.dose_factor import DOSES
 
-__all__ = ["ASSUMED_FACTOR", "analyse"]
+__all__ = ["ASSUMED_FACTOR", "Analysis", "analyse"]
 
 Floats = NDArray[np.float64]
 
 ASSUMED_FACTOR = 5.7
 """Dose that the paper assumes denoising to save."""
 
-_DRAWS = 2000
 _REACH_MM = (0.5, 1.0)
 _BIN_MM = 0.05
 
 
 def analyse(measured: Measured) -> dict[str, Any]:
     """All figures of the study as JSON values."""
-    return _Analysis(measured).result()
+    return Analysis(measured).result()
 
 
-def _estimate(value: Any) -> dict[str, float | None]:
-    v, low, high = (float(x) for x in (value[0], value[1], value[2]))
-    return {k: (x if math.isfinite(x) else None) for k, x in (("value", v), ("low", low), ("high", high))}
+class Analysis:
+    """Figures of the main scenes.
 
+    Args:
+        measured: of the study.
+    """
 
-def _attempt(compute: Callable[[], Any]) -> Any:
-    """The figure, or why there is none."""
-    try:
-        return compute()
-    except ValueError as error:
-        return {"value": None, "low": None, "high": None, "why": str(error)}
-
-
-def _factor(samples: Any, curve: DoseCurve, figure: str, slope: Any = 1.0) -> Any:
-    def compute() -> Any:
-        f = dose_factor(samples, curve, figure, slope=slope, draws=_DRAWS)
-        return {**_estimate(f), "text": str(f)}
-
-    return _attempt(compute)
-
-
-def _observer_factor(scores: Any, curve: DoseCurve, figure: str) -> Any:
-    if scores is None:
-        return {"value": None, "low": None, "high": None, "why": "too few realisations"}
-    if figure == "auc" and float(scores[:, 1].min()) > float(scores[:, 0].max()):
-        return {"value": None, "low": None, "high": None, "why": "AUC is 1: look at d′"}
-    return _factor(scores, curve, figure)
-
-
-class _Analysis:
     def __init__(self, measured: Measured) -> None:
         self.m, self.s = measured, measured.settings
         self.facts = measured.facts
@@ -112,6 +89,7 @@ class _Analysis:
     def result(self) -> dict[str, Any]:
         for variant in [*self.variants, *self.blurred]:
             self.fbp[fbp_label(*variant)] = self._fbp(*variant)
+        further = Further(self)
         methods = [self._method(name, dose) for dose in self.s.doses for name in self.m.methods]
         return {
             "settings": asdict(self.s),
@@ -121,10 +99,15 @@ class _Analysis:
             "ceiling": [self._ceiling(dose) for dose in self.s.doses],
             "fbp": list(self.fbp.values()),
             "methods": methods,
-            "wide_rois": [self._wide(name) for name in self.s.rois],
-            "other_voxels": self._other_voxels(),
+            "wide_rois": [further.wide(name) for name in self.s.rois],
+            "other_voxels": further.other_voxels(),
+            "shape_limits": [
+                {"exposure_s": dose, "displacement_mm": d, "contrast_sd_hu": sd, **self._shape_limit(sd, dose)}
+                for dose, sds in self.m.shape_limits.items()
+                for d, sd in sds.items()
+            ],
             "worst_case_gains": [{"exposure_s": dose, **gains} for dose, gains in self.m.gains.items()],
-            "scenes": self._scenes(),
+            "scenes": further.scenes(),
             "scenes_left_out": self.m.left_out,
         }
 
@@ -141,7 +124,7 @@ class _Analysis:
             "cap_mm": float(plaque.cap_thickness),
         }
 
-    def _limits(self, dose: float) -> dict[str, float]:
+    def limits(self, dose: float) -> dict[str, float]:
         """Figures of the best unbiased estimate at an exposure, the surrounding fat known from the rest of the scan."""
         keep = [k for k, t in enumerate(self.paper.tissues) if t != "patient"]
         information = self.paper.information[np.ix_(keep, keep)]
@@ -161,7 +144,7 @@ class _Analysis:
         }
 
     def _ceiling(self, dose: float) -> dict[str, Any]:
-        limits = self._limits(dose)
+        limits = self.limits(dose)
         factors = {}
         for variant in self.variants:
             f = self._at(fbp_label(*variant), dose)
@@ -174,6 +157,11 @@ class _Analysis:
                 **entry, "assumed_below": {k: bool(v >= ASSUMED_FACTOR) for k, v in entry.items()}
             }  # fmt: skip
         return {"exposure_s": dose, **limits, "factors": factors}
+
+    def _shape_limit(self, sd: float, dose: float) -> dict[str, float]:
+        """Share of the limit with known shapes, and the largest factor against the reference FBP."""
+        ideal, base = self.limits(dose)["contrast_sd_hu"], self._at(self.base, dose)["contrast_sd_hu"]
+        return {"share": (ideal / sd) ** 2, "factor": (base / sd) ** 2}
 
     def _fbp(self, kernel: str, voxel: float, blur: float) -> dict[str, Any]:
         label = fbp_label(kernel, voxel, blur)
@@ -238,7 +226,7 @@ class _Analysis:
             found = {"edge_width_mm": t.edge_width, "f50_lp_mm": t.f50, "f10_lp_mm": t.f10, "contrast_hu": t.contrast}
             return {k: v if math.isfinite(v) else None for k, v in found.items()}
 
-        found = _attempt(compute)
+        found = attempt(compute)
         return found if "edge_width_mm" in found else {"edge_width_mm": None, **found}
 
     # -- methods --------------------------------------------------------------------------------------------------
@@ -248,7 +236,7 @@ class _Analysis:
 
     def _slope(self, name: str, dose: float, n: int | None = None) -> ContrastSlope:
         roi = [self.m.samples[name, scene, dose]["roi"][:n] for scene in MAIN_SCENES]
-        return contrast_slope(self.truth, np.stack([r[:, 1] - r[:, 0] for r in roi]), draws=_DRAWS)
+        return contrast_slope(self.truth, np.stack([r[:, 1] - r[:, 0] for r in roi]), draws=DRAWS)
 
     def _method(self, name: str, dose: float) -> dict[str, Any]:
         samples = self._samples(name, dose)
@@ -256,25 +244,25 @@ class _Analysis:
         contrast = roi[:, 1] - roi[:, 0]
         n = len(roi)
         slope = self._slope(name, dose)
-        limits = self._limits(dose)
+        limits = self.limits(dose)
         sd = float(contrast.std(ddof=1))
         ratio = cnr(roi[:, 0], roi[:, 1])
         absent = samples["absent_core"]["roi"].astype(np.float64)
         false = absent[:, 1] - absent[:, 0]
-        reached = self._efficiency(roi, slope, dose)
+        reached = self.reached(roi, slope, dose)
         entry: dict[str, Any] = {
             "method": name, "exposure_s": dose, "realizations": n,
             "seconds_per_volume": round(self.m.seconds.get(name, math.nan), 3),
             "roi_hu": roi.mean(0).tolist(),
-            "paper_cnr": _estimate((ratio, *cnr_interval(roi[:, 0], roi[:, 1]))),
-            "bias_hu": [_estimate(e) for e in roi_bias(roi, self.paper.truth_hu)],
-            "bias_to_reference_hu": [_estimate(e) for e in roi_bias(roi, self.paper.reference_hu)],
-            "slope": _estimate((slope.value, slope.low, slope.high)),
+            "paper_cnr": estimate((ratio, *cnr_interval(roi[:, 0], roi[:, 1]))),
+            "bias_hu": [estimate(e) for e in roi_bias(roi, self.paper.truth_hu)],
+            "bias_to_reference_hu": [estimate(e) for e in roi_bias(roi, self.paper.reference_hu)],
+            "slope": estimate((slope.value, slope.low, slope.high)),
             "contrasts_hu": {k: float((v["roi"][:, 1] - v["roi"][:, 0]).mean()) for k, v in samples.items()},
-            "contrast_sd_raw_hu": _estimate((sd, *sd_interval(sd, n))),
+            "contrast_sd_raw_hu": estimate((sd, *sd_interval(sd, n))),
             "efficiency": reached,
-            "contrast_sd_hu": _sd_of(reached, limits["contrast_sd_hu"]),
-            "false_contrast_hu": _estimate((false.mean(), *mean_interval(false))),
+            "contrast_sd_hu": sd_of(reached, limits["contrast_sd_hu"]),
+            "false_contrast_hu": estimate((false.mean(), *mean_interval(false))),
         }  # fmt: skip
         entry["observer"] = {}
         scores = {o: self._observer(entry, samples, dose, o) for o in OBSERVERS}
@@ -291,9 +279,10 @@ class _Analysis:
             entry["fbp_shape"] = self._shape(self.m.fbp["paper", dose]["shape"][:n])
         return entry
 
-    def _efficiency(self, roi: Floats, slope: ContrastSlope, dose: float) -> dict[str, Any]:
-        ideal = self._limits(dose)["contrast_sd_hu"]
-        return _attempt(lambda: _estimate(efficiency(ideal, roi[:, 1] - roi[:, 0], slope, draws=_DRAWS)))
+    def reached(self, roi: Floats, slope: ContrastSlope, dose: float) -> dict[str, Any]:
+        """Share of the limit: ideal over slope-corrected variance of the contrast, with interval."""
+        ideal = self.limits(dose)["contrast_sd_hu"]
+        return attempt(lambda: estimate(efficiency(ideal, roi[:, 1] - roi[:, 0], slope, draws=DRAWS)))
 
     def _observer(self, entry: dict[str, Any], samples: Any, dose: float, observer: str) -> Any:
         """Scores ``(realisations, 2)``, absent and present; None where there are too few realisations."""
@@ -307,19 +296,19 @@ class _Analysis:
 
         def compute() -> Any:
             present, absent = hotelling_scores(*pair)
-            found["d_prime"] = _estimate(d_prime(present, absent, draws=_DRAWS))
-            found["auc"] = _estimate(auc(present, absent))
+            found["d_prime"] = estimate(d_prime(present, absent, draws=DRAWS))
+            found["auc"] = estimate(auc(present, absent))
             if all(f is not None for f in fbp):
                 own = self._channels(FBP_BASE[1], observer)[:count]
                 reference = hotelling_scores(*[channel_responses(f["crop"][:n], own) for f in fbp if f is not None])
-                found["d_prime_fbp"] = _estimate(d_prime(*reference, draws=_DRAWS))
-                found["auc_fbp"] = _estimate(auc(*reference))
-                found["false_positives_to_fbp"] = _estimate(
-                    false_positive_difference((present, absent), reference, draws=_DRAWS)
+                found["d_prime_fbp"] = estimate(d_prime(*reference, draws=DRAWS))
+                found["auc_fbp"] = estimate(auc(*reference))
+                found["false_positives_to_fbp"] = estimate(
+                    false_positive_difference((present, absent), reference, draws=DRAWS)
                 )
             return np.stack([absent, present], axis=-1)
 
-        scores = _attempt(compute)
+        scores = attempt(compute)
         if isinstance(scores, dict):
             found["d_prime"] = found["auc"] = scores
             return None
@@ -333,15 +322,15 @@ class _Analysis:
             fbp, c = self.fbp[label], self._covariance(label, dose)[:2, :2]
             exact = self._at(label, dose)
             found[label] = entry = {
-                "paper_cnr": _factor(roi, DoseCurve.paper_cnr(fbp["roi_hu"], c), "paper_cnr"),
-                "contrast_variance": _factor(
+                "paper_cnr": factor(roi, DoseCurve.paper_cnr(fbp["roi_hu"], c), "paper_cnr"),
+                "contrast_variance": factor(
                     roi, DoseCurve.contrast_variance(c, fbp["slope"]), "contrast_variance", slope
                 ),
             }
             for observer, values in scores.items():
                 curve = DoseCurve(DOSES, exact[f"d_prime_{observer}"] * np.sqrt(DOSES))
                 for figure in ("d_prime", "auc"):
-                    entry[f"{figure}_{observer}"] = _observer_factor(values, curve, figure)
+                    entry[f"{figure}_{observer}"] = observer_factor(values, curve, figure)
         return found
 
     def _matched(self, entry: dict[str, Any], contrast: Floats, slope: ContrastSlope, dose: float) -> Any:
@@ -360,7 +349,7 @@ class _Analysis:
             why = f"edge width {width:.2f} mm outside {widths[0]:.2f}…{widths[-1]:.2f} mm of FBP"
             return {"value": None, "low": None, "high": None, "why": why}
         sd = float(np.exp(np.interp(width, widths, np.log(sds))))
-        found = _attempt(lambda: _estimate(efficiency(sd, contrast, slope, draws=_DRAWS)))
+        found = attempt(lambda: estimate(efficiency(sd, contrast, slope, draws=DRAWS)))
         return {**found, "fbp_contrast_sd_hu": sd}
 
     def _to_linear(self, name: str, dose: float) -> Any:
@@ -375,11 +364,11 @@ class _Analysis:
                 roi = self.m.samples[k, "paper", dose]["roi"][:n].astype(np.float64)
                 pair.append((roi, self._slope(k, dose, n)))
             return {
-                "contrast_variance": _paired(pair, n, _slope_corrected),
-                "paper_cnr": _paired(pair, n, _squared_cnr),
+                "contrast_variance": paired(pair, n, slope_corrected),
+                "paper_cnr": paired(pair, n, squared_cnr),
             }
 
-        found = _attempt(compute)
+        found = attempt(compute)
         return found if "paper_cnr" in found else {"contrast_variance": found, "paper_cnr": found}
 
     def _shape(self, shape: Floats) -> dict[str, Any]:
@@ -394,146 +383,7 @@ class _Analysis:
             result[name] = {
                 "true": truth[true],
                 "mean": float(v.mean()) if v.size else None,
-                "absolute_error": _estimate((error.mean(), *mean_interval(error))) if v.size > 2 else None,
+                "absolute_error": estimate((error.mean(), *mean_interval(error))) if v.size > 2 else None,
                 "lost": float(1 - v.size / len(values)),
             }
         return result
-
-    # -- wider ROIs -----------------------------------------------------------------------------------------------
-
-    def _wide(self, name: str) -> dict[str, Any]:
-        """Figures of every FBP variant and method in a wider ROI, at every dose."""
-        wide = Wide(self.m, self.scene, name, self.truth)
-        curves = wide.base_curves()
-        rows: list[dict[str, Any]] = []
-        for dose in self.s.doses:
-            limits = self._limits(dose)
-            for kernel, voxel, _ in self.variants:
-                f = wide.fbp(kernel, voxel)
-                sd, c = sd_at(f["covariance"], dose), f["covariance"] / dose
-                own = float(f["roi_hu"][1] - f["roi_hu"][0]) / math.sqrt(c[0, 0] + c[1, 1])
-                rows.append({
-                    "method": f"FBP {f['label']}", "exposure_s": dose, "exact": True, "slope": {"value": f["slope"]},
-                    "contrast_sd_hu": {"value": sd / f["slope"]}, "paper_cnr": {"value": own},
-                    "efficiency": {"value": (limits["contrast_sd_hu"] * f["slope"] / sd) ** 2},
-                    "limit_factors": {
-                        "paper_cnr": (limits["paper_cnr"] / own) ** 2,
-                        "contrast_variance": (sd / f["slope"] / limits["contrast_sd_hu"]) ** 2,
-                    },
-                })  # fmt: skip
-            for method in self.m.methods:
-                roi, slope = wide.samples(method, dose)
-                reached = self._efficiency(roi, slope, dose)
-                rows.append({
-                    "method": method, "exposure_s": dose, "exact": False, "realizations": len(roi),
-                    "slope": _estimate((slope.value, slope.low, slope.high)),
-                    "efficiency": reached, "contrast_sd_hu": _sd_of(reached, limits["contrast_sd_hu"]),
-                    "paper_cnr": _estimate((cnr(roi[:, 0], roi[:, 1]), *cnr_interval(roi[:, 0], roi[:, 1]))),
-                    "factors": {
-                        "paper_cnr": _factor(roi, curves["paper_cnr"], "paper_cnr"),
-                        "contrast_variance": _factor(roi, curves["contrast_variance"], "contrast_variance", slope),
-                    },
-                })  # fmt: skip
-        return {"roi": name, **wide.rois.as_dict(), "rows": rows}
-
-    def _other_voxels(self) -> list[dict[str, Any]]:
-        """MBIR's figures in the paper's ROIs on larger voxels."""
-        rows: list[dict[str, Any]] = []
-        if "mbir" not in self.m.methods:
-            return rows
-        for voxel in (self.s.voxel_mm, *(v for v in OTHER_VOXELS_MM if v > self.s.voxel_mm)):
-            rois = OtherVoxels(self.m, self.scene, voxel, self.truth)
-            for dose in self.s.doses:
-                roi, slope = rois.samples("mbir", dose)
-                reached = self._efficiency(roi, slope, dose)
-                rows.append({
-                    "voxel_mm": voxel, "exposure_s": dose, "slope": _estimate((slope.value, slope.low, slope.high)),
-                    "bias_hu": [_estimate(e) for e in roi_bias(roi, self.paper.truth_hu)],
-                    "contrast_sd_hu": _sd_of(reached, self._limits(dose)["contrast_sd_hu"]), "efficiency": reached,
-                    "paper_cnr": _estimate((cnr(roi[:, 0], roi[:, 1]), *cnr_interval(roi[:, 0], roi[:, 1]))),
-                })  # fmt: skip
-        return rows
-
-    # -- further scenes -------------------------------------------------------------------------------------------
-
-    def _scenes(self) -> list[dict[str, Any]]:
-        rows = []
-        for name in self.m.scenes:
-            facts = self.facts[name]
-            twin = self.facts.get(f"{name}:absent")
-            for dose in self.s.scene_doses:
-                c = facts.fbp_covariance[self.base] / dose
-                variance = float(c[0, 0] + c[1, 1] - 2 * c[0, 1])
-                fg, bg = facts.fbp_hu[facts.labels.index(self.base)]
-                row: dict[str, Any] = {
-                    "scene": name, "exposure_s": dose, "method": f"FBP {self.base}", "exact": True,
-                    "truth_hu": facts.truth_hu.tolist(), "true_contrast_hu": facts.contrast_hu,
-                    "bias_hu": [{"value": float(v)} for v in (fg, bg) - facts.truth_hu],
-                    "contrast_hu": {"value": float(bg - fg)}, "contrast_sd_raw_hu": math.sqrt(variance),
-                    "paper_cnr": {"value": float((bg - fg) / math.sqrt(c[0, 0] + c[1, 1]))},
-                }  # fmt: skip
-                if twin is not None:
-                    without = twin.fbp_contrast(self.base)
-                    row["false_contrast_hu"] = {"value": without}
-                    row["auc"] = {"value": auc_from_d_prime(abs(bg - fg - without) / math.sqrt(variance))}
-                elif abs(facts.contrast_hu) < 1.0:
-                    row["false_contrast_hu"] = row["contrast_hu"]
-                rows.append(row)
-                for method in self.m.methods:
-                    if (method, name, dose) in self.m.extra:
-                        rows.append(self._scene(method, name, dose))
-        return rows
-
-    def _scene(self, method: str, name: str, dose: float) -> dict[str, Any]:
-        facts, entry = self.facts[name], self.m.extra[method, name, dose]
-        roi = entry["roi"].astype(np.float64)
-        contrast = roi[:, 1] - roi[:, 0]
-        row: dict[str, Any] = {
-            "scene": name, "exposure_s": dose, "method": method, "exact": False, "realizations": len(roi),
-            "truth_hu": facts.truth_hu.tolist(), "true_contrast_hu": facts.contrast_hu,
-            "bias_hu": [_estimate(e) for e in roi_bias(roi, facts.truth_hu)],
-            "contrast_hu": _estimate((contrast.mean(), *mean_interval(contrast))),
-            "contrast_sd_raw_hu": float(contrast.std(ddof=1)),
-            "paper_cnr": _estimate((cnr(roi[:, 0], roi[:, 1]), *cnr_interval(roi[:, 0], roi[:, 1]))),
-        }  # fmt: skip
-        if "absent" in entry:
-            without = entry["absent"].astype(np.float64)
-            false = without[:, 1] - without[:, 0]
-            row["false_contrast_hu"] = _estimate((false.mean(), *mean_interval(false)))
-            sign = 1.0 if facts.contrast_hu > 0 else -1.0
-            row["auc"] = _estimate(auc(sign * contrast, sign * false))
-        elif abs(facts.contrast_hu) < 1.0:
-            row["false_contrast_hu"] = row["contrast_hu"]
-        return row
-
-
-def _sd_of(reached: dict[str, Any], ideal: float) -> dict[str, Any]:
-    """Slope-corrected SD from an efficiency: the ends change places."""
-
-    def turned(name: str) -> float | None:
-        return ideal / math.sqrt(reached[name]) if reached.get(name) else None
-
-    return {"value": turned("value"), "low": turned("high"), "high": turned("low")}
-
-
-def _slope_corrected(roi: Floats, slope: Any) -> Floats:
-    return np.square(slope) / (roi[..., 1] - roi[..., 0]).var(-1, ddof=1)
-
-
-def _squared_cnr(roi: Floats, slope: Any) -> Floats:
-    mean, variance = roi.mean(-2), roi.var(-2, ddof=1)
-    return np.square(mean[..., 1] - mean[..., 0]) / variance.sum(-1)
-
-
-def _paired(pair: Any, n: int, figure: Callable[[Floats, Any], Floats]) -> dict[str, float | None]:
-    (a, slope_a), (b, slope_b) = pair
-
-    def ratio(index: Any, draws: bool | None) -> Floats:
-        slopes = [{None: s.value, True: s.draws, False: s.jackknife}[draws] for s in (slope_a, slope_b)]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return figure(a[index], slopes[0]) / figure(b[index], slopes[1])
-
-    value = float(ratio(np.arange(n)[None], None)[0])
-    with np.errstate(divide="ignore"):
-        jackknife = np.log(ratio(leave_one_out(n), False))
-    return _estimate((value, *bca_interval(value, ratio(resampling(n, _DRAWS, 0), True), jackknife)))

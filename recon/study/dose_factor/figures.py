@@ -8,8 +8,10 @@ import numpy as np
 import torch
 
 from recon.study.compare import inset_grid
-from recon.study.dose_factor import Measured
-from recon.study.dose_factor_scene import FBP_BASE, StudyScene, fbp_label
+from recon.study.dose_factor.facts import fbp_label
+from recon.study.dose_factor.scene import StudyScene
+from recon.study.dose_factor.settings import FBP_BASE
+from recon.study.dose_factor.study import Measured
 from torchpcct.metrics.dose_factor import DOSES
 from torchpcct.metrics.roi import sample_axial
 from torchpcct.viz import Panel, panels

@@ -11,17 +11,16 @@ from torch import Tensor
 
 from recon.inset import InsetFbp
 from recon.study.compare import inset_grid
-from recon.study.dose_factor_scene import FBP_BASE, StudyScene, crop_window, segmentation
+from recon.study.dose_factor.measures import crop_window, segmentation
+from recon.study.dose_factor.scene import StudyScene
+from recon.study.dose_factor.settings import FBP_BASE, NOISY_SCENES, Settings
 
 if TYPE_CHECKING:
-    from recon.study.dose_factor import Settings
-    from recon.study.dose_factor_store import Store
+    from recon.study.dose_factor.store import Store
+    from recon.study.dose_factor.study import Settings
     from torchpcct.scan import Scan
 
-__all__ = ["NOISY_SCENES", "Realisations", "joined"]
-
-NOISY_SCENES = ("paper", "absent_core")
-"""Scenes with readings drawn in the sinogram; half and flipped contrast carry the paper scene's noise."""
+__all__ = ["Realisations", "joined"]
 
 FILTERED_KERNEL = "bone"
 """FBP that an image-domain prior starts from: the sharpest kernel, which has taken the least away."""

@@ -5,10 +5,13 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from recon.study.dose_factor import Measured
-from recon.study.dose_factor_analysis import ASSUMED_FACTOR, analyse
-from recon.study.dose_factor_figures import curves_figure, images_figure
-from recon.study.dose_factor_scene import FBP_BASE, LUMEN_HALF_HU, MAIN_SCENES, OBSERVERS, fbp_label
+from recon.study.dose_factor.analysis import ASSUMED_FACTOR, analyse
+from recon.study.dose_factor.facts import fbp_label
+from recon.study.dose_factor.figures import curves_figure, images_figure
+from recon.study.dose_factor.measures import LUMEN_HALF_HU, OBSERVERS
+from recon.study.dose_factor.settings import FBP_BASE, MAIN_SCENES
+from recon.study.dose_factor.shape_limits import CORRELATION_MM
+from recon.study.dose_factor.study import Measured
 from recon.study.report import Report, environment, markdown_table
 
 __all__ = ["build_report", "headline_method"]
@@ -59,6 +62,7 @@ def build_report(measured: Measured, seconds: float | None = None, command: str 
         *(_methods_table(data, dose) for dose in data["settings"]["doses"]),
         _factor_tables(data),
         _limit_table(data),
+        _shape_limit_table(data),
         *(_wide_table(data, entry) for entry in data["wide_rois"]),
         _voxel_table(data),
         _fbp_table(data),
@@ -232,6 +236,28 @@ def _reached(f: dict[str, Any]) -> str:
     if low >= ASSUMED_FACTOR:
         return "reached"
     return "not reached" if high < ASSUMED_FACTOR else "undecided"
+
+
+def _shape_limit_table(data: dict[str, Any]) -> str:
+    if not data["shape_limits"]:
+        return ""
+    rows = [
+        [
+            f"{e['exposure_s']:g} s, {e['displacement_mm']:g} mm",
+            f"{e['contrast_sd_hu']:.1f}",
+            f"{100 * e['share']:.0f}",
+            f"{e['factor']:.1f}",
+        ]
+        for e in data["shape_limits"]
+    ]
+    return (
+        "## What not knowing the shapes costs\n\nThe limit takes every outline as known. Here all outlines are "
+        "displaced along their normals by a smooth random field of the given standard deviation (correlation "
+        f"{CORRELATION_MM:g} mm), which the data must tell together with the tissues "
+        "(`recon.limits.deformation_limit`; 0 mm: shapes known). The factor is the largest by contrast variance "
+        f"against FBP {fbp_label(*FBP_BASE)}.\n\n"
+        + markdown_table(["displacement, SD", "contrast SD, HU", "% of the limit", "largest factor"], rows)
+    )
 
 
 _WIDE_TITLES = {

@@ -16,8 +16,11 @@ from numpy.typing import NDArray
 
 from recon.mbir import average_onto
 from recon.study.compare import inset_grid
-from recon.study.dose_factor import Measured
-from recon.study.dose_factor_scene import FBP_BASE, MAIN_SCENES, StudyScene, crop_window, fbp_label
+from recon.study.dose_factor.facts import fbp_label
+from recon.study.dose_factor.measures import crop_window
+from recon.study.dose_factor.scene import StudyScene
+from recon.study.dose_factor.settings import FBP_BASE, MAIN_SCENES
+from recon.study.dose_factor.study import Measured
 from torchpcct.metrics import ContrastSlope, DoseCurve, contrast_slope
 
 __all__ = ["OTHER_VOXELS_MM", "OtherVoxels", "Wide", "sd_at"]
@@ -85,7 +88,7 @@ class Wide(_CropRois):
     Args:
         measured: of the study.
         scene: its geometry.
-        name: of :data:`recon.study.dose_factor_scene.WIDE_ROIS`.
+        name: of :data:`recon.study.dose_factor.settings.WIDE_ROIS`.
         truth: contrasts of the main scenes, HU.
     """
 

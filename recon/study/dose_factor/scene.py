@@ -14,56 +14,34 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from recon.exact_noise import FILTER_MARGIN_COLUMNS, line_integral_variance, roi_covariance
 from recon.inset import InsetFbp
 from recon.roi import InsetProblem
-from recon.study.dose_factor_store import Store
+from recon.study.dose_factor.facts import SceneFacts, fbp_label
+from recon.study.dose_factor.measures import OBSERVERS, crop_window, observer_channels
+from recon.study.dose_factor.settings import FBP_BASE, MAIN_SCENES, WIDE_ROIS, Settings
+from recon.study.dose_factor.store import Store
 from recon.study.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM, enclosing, inset_grid
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.ceiling import information_matrix
-from torchpcct.metrics.observer import dog_channels
 from torchpcct.metrics.placement import RoiPair, place_rois, whole_rois
-from torchpcct.metrics.resolution import lumen_area
-from torchpcct.metrics.roi import axial_grid, sample_axial
+from torchpcct.metrics.roi import axial_grid
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
 from torchpcct.window import DetectorWindow, shadow
 
 if TYPE_CHECKING:
-    from recon.study.dose_factor import Settings
     from torchpcct.scanner import Scanner
     from torchpcct.scene import Scene
     from torchpcct.scene.plaque import Plaque
 
-__all__ = ["DOG_CHANNELS", "OBSERVERS", "SceneFacts", "StudyScene", "crop_window", "observer_channels", "segmentation"]
+__all__ = ["StudyScene"]
 
 log = logging.getLogger(__name__)
 
 Floats = NDArray[np.float64]
-
-MAIN_SCENES = ("paper", "absent_core", "half_contrast", "flipped_contrast")
-"""They share all shapes and differ in the core's contrast (1, 0, ½, −1): slope, false contrast, observer."""
-
-FBP_BASE = ("soft", 0.25)
-"""Kernel and voxel size (mm) that factors are quoted against, and of the FBP realisations."""
-
-WIDE_ROIS = ("section", "tissue")
-"""ROIs beyond the paper's: all of core and fibrous tissue in the axial image, and in all slices of the core."""
-
-LUMEN_HALF_HU = 293.0
-"""Half way between blood (482 HU as this scanner sees it) and fibrous tissue (105 HU). At the paper's 250 HU the
-contour lies outside the edge: the true volume, averaged over 0.2 mm voxels, has 4.24 mm² there and 4.04 mm² here, of
-4.11 mm²."""
-
-CROP_MM = 3.8
-"""Edge of the cube about the core that is kept of every realisation: the core (1.97 mm) and the cap with a margin."""
-
-OBSERVERS = ("axial", "volume")
-DOG_CHANNELS = 6
-_LOWEST_CHANNEL = 0.1
-"""Difference-of-Gaussians channels from 0.1 line pairs per mm (the crop holds no lower ones) to 0.5."""
 
 _GLS_VIEWS = 246
 """Views that the limit is summed over, then scaled: path lengths change slowly from view to view."""
@@ -72,50 +50,6 @@ _PITCH = re.compile(r"pitch_(\d\.\d+)mm")
 """The paper's scene on a scanner of another column pitch."""
 
 _SUB_RAYS = 16
-_CAP_STEP_MM = 0.01
-
-
-@dataclass(frozen=True)
-class SceneFacts:
-    """What holds without sampling error, at 1 s.
-
-    Attributes:
-        statistic: ``(z, y, x)`` AᵀW y of the noise-free scan.
-        tissues: names; amplitudes_hu: their values as the scanner sees them (generalised least squares on exact path
-            lengths of the noise-free scan), ``(tissues,)``; information: ``(tissues, tissues)`` HU⁻².
-        reference_hu: ROI means of noise-free standard FBP on 0.1 mm, ``(2,)``.
-        labels: FBP variants; fbp_hu: their ROI means ``(variants, 2)``; fbp_covariance: label → ``(F, F)`` HU² of the
-            ROI means and, where they were asked for, of the observer's channels; fbp_crop: label → image of the core.
-    """
-
-    statistic: NDArray[np.float32]
-    tissues: list[str]
-    amplitudes_hu: Floats
-    information: Floats
-    reference_hu: Floats
-    labels: list[str]
-    fbp_hu: Floats
-    fbp_covariance: dict[str, Floats]
-    fbp_crop: dict[str, Any]
-
-    def tissue(self, name: str) -> int:
-        """Index of a tissue."""
-        return self.tissues.index(name)
-
-    @property
-    def contrast_hu(self) -> float:
-        """True contrast, fibrous tissue minus core, HU."""
-        return float(self.amplitudes_hu[self.tissue("fibrous")] - self.amplitudes_hu[self.tissue("core")])
-
-    @property
-    def truth_hu(self) -> Floats:
-        """``(foreground, background)``."""
-        return self.amplitudes_hu[[self.tissue("core"), self.tissue("fibrous")]]
-
-    def fbp_contrast(self, label: str) -> float:
-        """Noise-free contrast of an FBP variant, HU."""
-        fg, bg = self.fbp_hu[self.labels.index(label)]
-        return float(bg - fg)
 
 
 @dataclass(frozen=True)
@@ -123,77 +57,6 @@ class _Functional:
     """A linear functional of a volume, as :func:`roi_covariance` takes ROIs."""
 
     weights: Tensor
-
-
-def fbp_label(kernel: str, voxel_mm: float, blur_mm: float = 0.0) -> str:
-    """Name of an FBP variant."""
-    return f"{kernel} {voxel_mm:.2f} mm" + (f" + {blur_mm:.2f} mm Gauss" if blur_mm else "")
-
-
-def crop_window(grid: VolumeGrid, center: tuple[float, float, float]) -> tuple[tuple[slice, ...], VolumeGrid]:
-    """The cube about ``center`` (z, y, x in mm): its place in a volume, and its grid.
-
-    Raises:
-        ValueError: the cube leaves the grid.
-    """
-    places, middle = [], []
-    for n, step, axis, c in zip(grid.shape, grid.spacing, grid.axes, center, strict=True):
-        half = round(CROP_MM / step / 2)
-        k = round((c - axis[0]) / step)
-        if k - half < 0 or k + half >= n:
-            raise ValueError(f"the crop of {CROP_MM} mm about {center} mm leaves the inset: enlarge the inset")
-        places.append(slice(k - half, k + half + 1))
-        middle.append(float(axis[k]))
-    shape = tuple(p.stop - p.start for p in places)
-    return tuple(places), VolumeGrid(shape, grid.spacing, tuple(middle))
-
-
-def observer_channels(scene: StudyScene, grid: VolumeGrid, observer: str) -> Floats:
-    """Channels on the crop, ``(1 + DOG_CHANNELS, *crop)``: the core's own shape, then difference-of-Gaussians.
-
-    Args:
-        scene: where the core is.
-        grid: of the volumes.
-        observer: ``"axial"`` looks at the protocol's axial image (linear interpolation between two slices), as the
-            paper does; ``"volume"`` at all slices of the core.
-    """
-    z, y, x = scene.core_center
-    crop = crop_window(grid, scene.core_center)[1]
-    if observer == "axial":
-        image = VolumeGrid((1, *crop.shape[1:]), crop.spacing, (z, *crop.center[1:]))
-        dogs = dog_channels(image.slice, (y, x), DOG_CHANNELS, lowest=_LOWEST_CHANNEL)[:, None]
-        depth = np.clip(1.0 - np.abs(crop.axes[0] - z) / crop.spacing[0], 0.0, None)[:, None, None]
-    elif observer == "volume":
-        image, depth = crop, np.ones((1, 1, 1))
-        dogs = dog_channels(crop, scene.core_center, DOG_CHANNELS, lowest=_LOWEST_CHANNEL)
-    else:
-        raise ValueError(f"observer must be one of {', '.join(OBSERVERS)}, got {observer!r}")
-    core = (scene.geometry.labels(image) == scene.geometry.index("core")).astype(np.float64)
-    channels: Floats = np.concatenate([core[None] / np.sqrt(core.sum()), dogs]) * depth
-    return channels
-
-
-def segmentation(scene: StudyScene, grid: VolumeGrid, volume: Tensor) -> tuple[float, float, float]:
-    """Lumen area (mm²), cap thickness (mm) and lumen area at half maximum in the protocol's axial image.
-
-    NaN where the edges are lost. The first area is the paper's, at 250 HU; the last at :data:`LUMEN_HALF_HU`. The cap
-    is measured on the line from the lumen's to the core's centre, between where the image first falls below 250 HU and
-    below 70 HU: the core's whole contour at 70 HU runs into the thin wall (67 HU) beside it.
-    """
-    image = scene.rois.image
-    section = sample_axial(volume.to(torch.float64), grid, image)
-    lumen, core = np.array(scene.lumen_center[1:]), np.array(scene.core_center[1:])
-    area, half = (lumen_area(section, image, (float(lumen[0]), float(lumen[1])), hu) for hu in (250.0, LUMEN_HALF_HU))
-    length = float(np.hypot(*(core - lumen)))
-    along = np.arange(0.0, length, _CAP_STEP_MM)
-    points = lumen[:, None] + (core - lumen)[:, None] * along / length
-    origin = np.array([a[0] for a in image.axes[1:]])
-    index = (points - origin[:, None]) / np.array(image.spacing[1:])[:, None]
-    profile = map_coordinates(section[0].numpy(), index, order=1, mode="nearest")
-    lumen_end, core_start = (np.flatnonzero(profile < hu) for hu in (250.0, 70.0))
-    if not lumen_end.size or not core_start.size:
-        return area, float("nan"), half
-    return area, float(along[core_start[0]] - along[lumen_end[0]]), half
 
 
 class StudyScene:
@@ -376,7 +239,9 @@ class StudyScene:
             s = self.settings
             full = self.name == "paper"
             key = f"views={s.views} voxel={s.voxel_mm:g} {s.kernels} {s.voxels_mm} {s.blurs_mm} 2"
-            self._facts = _unpack(self.store.piece(f"scenes/{_file(self.name)}", key, lambda: self._compute(full)))
+            self._facts = SceneFacts.of(
+                self.store.piece(f"scenes/{_file(self.name)}", key, lambda: self._compute(full))
+            )
         return self._facts
 
     def _compute(self, full: bool) -> dict[str, Any]:
@@ -489,20 +354,3 @@ def _blurred(volume: Tensor, grid: VolumeGrid, blur_mm: float) -> Tensor:
 
 def _file(name: str) -> str:
     return name.replace(":", "_core_")
-
-
-def _unpack(arrays: dict[str, Any]) -> SceneFacts:
-    def all_of(prefix: str) -> dict[str, Any]:
-        return {k[len(prefix) :]: v for k, v in arrays.items() if k.startswith(prefix)}
-
-    return SceneFacts(
-        statistic=arrays["statistic"],
-        tissues=[str(t) for t in arrays["tissues"]],
-        amplitudes_hu=arrays["amplitudes_hu"],
-        information=arrays["information"],
-        reference_hu=arrays["reference_hu"],
-        labels=[str(v) for v in arrays["labels"]],
-        fbp_hu=arrays["fbp_hu"],
-        fbp_covariance=all_of("covariance "),
-        fbp_crop=all_of("crop "),
-    )

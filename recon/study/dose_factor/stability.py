@@ -14,9 +14,10 @@ from recon.inset import InsetFbp
 from recon.mbir import Mbir
 from recon.sensitivity import worst_case_gain
 from recon.study.compare import inset_grid
-from recon.study.dose_factor_noise import Realisations
-from recon.study.dose_factor_scene import FBP_BASE, fbp_label
-from recon.study.methods import Method, fingerprint
+from recon.study.dose_factor.facts import fbp_label
+from recon.study.dose_factor.methods import Method, fingerprint
+from recon.study.dose_factor.noise import Realisations
+from recon.study.dose_factor.settings import FBP_BASE
 
 __all__ = ["FBP_KERNELS", "worst_case_gains"]
 

@@ -1,0 +1,12 @@
+"""The measured dose factor: every method on the same noise realisations of the paper's scan.
+
+``settings`` say what is measured; ``scene`` simulates a scene and keeps its ``facts`` (what holds exactly), ``noise``
+draws its realisations, ``methods`` reconstruct them, ``study`` runs all of that in resumable pieces (``store``).
+``analysis``, ``further``, ``rois`` and ``stability`` turn samples into figures, ``report`` and ``figures`` into text
+and pictures.
+"""
+
+from recon.study.dose_factor.settings import Settings, estimate_seconds
+from recon.study.dose_factor.study import Measured, run
+
+__all__ = ["Measured", "Settings", "estimate_seconds", "run"]
