@@ -1,23 +1,42 @@
-"""What the data give when shapes are known only so well: the limit between the ideal and a method that must find them.
+"""What the data give when shapes are known only so well: limits between the ideal and a method that must find them.
 
-:mod:`torchpcct.metrics.ceiling` takes the outlines of all tissues as known. Here only the inside of each tissue is
-known: voxels that an outline crosses, and those within a few rings of it, may hold anything. With
+:mod:`torchpcct.metrics.ceiling` takes the outlines of all tissues as known. Here they are not:
 
-    x = Σ_k a_k m_k + z,      m_k: the inside of tissue k,   z: free voxels, z ~ N(0, s²) each,
+* :func:`contrast_limit` knows only the inside of each tissue; voxels that an outline crosses, and those within a few
+  rings of it, may hold anything;
+* :func:`deformation_limit` knows the outlines up to a smooth displacement of a given size, as a method does that has
+  found them roughly.
 
-the covariance of the a_k is the inverse of the Schur complement of AᵀWA; one conjugate-gradient solve per contrast.
+Both write the volume as
+
+    x = Σ_k a_k m_k + B z,      z ~ N(0, 1) each,
+
+m_k the tissues' maps and B z what is unknown beside their values a_k. The covariance of the a_k is the inverse of the
+Schur complement of AᵀWA; one conjugate-gradient solve per contrast.
 """
 
 from __future__ import annotations
 
+import itertools
+import math
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn import functional as F
 
-__all__ = ["contrast_limit", "known_inside"]
+__all__ = ["contrast_limit", "deformation_limit", "known_inside", "outline_maps"]
+
+
+_CROFTON = {
+    step: {1: 0.0915558, 2: 0.0739613, 3: 0.0703913}[sum(map(abs, step))]
+    for step in itertools.product((-1, 0, 1), repeat=3)
+    if step > (0, 0, 0)
+}
+"""Each direction to a neighbouring voxel, one of two opposite ones, and its share of the sphere."""
 
 
 def known_inside(fractions: NDArray[np.float64], rings: int = 0) -> NDArray[np.bool_]:
@@ -50,7 +69,7 @@ def contrast_limit(
     iterations: int = 400,
     tolerance: float = 1e-6,
 ) -> float:
-    """Smallest standard deviation in HU of the difference of two tissues.
+    """Smallest standard deviation in HU of the difference of two tissues of which only the inside is known.
 
     Args:
         gram: AᵀWA of the inset at the exposure in question (``apply``), in mm⁻¹.
@@ -58,7 +77,7 @@ def contrast_limit(
             in no mask are free.
         contrast: indices of the two tissues.
         hu: 1 HU in mm⁻¹.
-        free_sd_hu: s.
+        free_sd_hu: standard deviation of each free voxel.
         iterations, tolerance: of the conjugate gradients.
 
     Raises:
@@ -70,23 +89,142 @@ def contrast_limit(
             raise ValueError(f"tissue {k} has no voxel that is inside for sure: take smaller voxels or fewer rings")
     present = [k for k in range(len(masks)) if masks[k].any()]
     masks = masks[present]
-    first, second = (present.index(k) for k in contrast)
-    free = 1.0 - masks.sum(0)
+    free = (1.0 - masks.sum(0)) * free_sd_hu
+    pair = (present.index(contrast[0]), present.index(contrast[1]))
+    return _smallest_sd(
+        gram, masks, (lambda z: free * z, lambda y: free * y), tuple(free.shape), pair, hu, iterations, tolerance
+    )
+
+
+def outline_maps(
+    labels: NDArray[np.integer[Any]], values: Sequence[float], factor: int, fine_mm: float
+) -> NDArray[np.float32]:
+    """What a displacement of each outline by 1 mm changes in each voxel.
+
+    The areas are Crofton's: twice the mean number of crossings of lines in 13 directions (Lehmann, Legland 2012,
+    Insight Journal, "Efficient N-dimensional surface estimation using Crofton formula"); up to 7 % off for a plane.
+
+    An outline lies between two tissues; where it moves by d along its normal, a voxel changes by the difference of the
+    two values times d times the outline's area in it over the voxel's volume.
+
+    Args:
+        labels: ``(factor·z, factor·y, factor·x)`` index of the tissue in each fine voxel.
+        values: HU of each tissue.
+        factor: fine voxels along each edge of a voxel.
+        fine_mm: edge of a fine voxel, less than the thinnest tissue.
+
+    Returns:
+        ``(outlines, z, y, x)`` HU per mm, one for each two tissues that touch and differ.
+
+    Raises:
+        ValueError: a shape that is no multiple of ``factor``.
+    """
+    if any(n % factor for n in labels.shape):
+        raise ValueError(f"labels of shape {labels.shape} are no multiple of factor {factor}")
+    shape = tuple(n // factor for n in labels.shape)
+    count = len(values)
+    areas = np.zeros((count * count, *shape))
+    for step, weight in _CROFTON.items():
+        first = tuple(slice(max(0, -d), n - max(0, d)) for d, n in zip(step, labels.shape, strict=True))
+        second = tuple(slice(max(0, d), n - max(0, -d)) for d, n in zip(step, labels.shape, strict=True))
+        a, b = labels[first], labels[second]
+        at = np.nonzero(a != b)
+        one, other = a[at], b[at]
+        pair = np.minimum(one, other) * count + np.maximum(one, other)
+        voxel = tuple((k + f.start) // factor for k, f in zip(at, first, strict=True))
+        index = np.ravel_multi_index((pair, *voxel), areas.shape)
+        crossed = np.bincount(index, minlength=areas.size).reshape(areas.shape)
+        areas += 2.0 * weight * crossed * fine_mm**2 / math.sqrt(sum(d * d for d in step))
+    maps = [
+        (values[b] - values[a]) * areas[a * count + b] / (factor * fine_mm) ** 3
+        for a, b in itertools.combinations(range(count), 2)
+        if values[a] != values[b] and areas[a * count + b].any()
+    ]
+    return np.asarray(maps, dtype=np.float32).reshape(-1, *shape)
+
+
+def deformation_limit(
+    gram: Any,
+    fractions: NDArray[np.float64],
+    outlines: NDArray[np.float32],
+    contrast: tuple[int, int],
+    *,
+    hu: float,
+    voxel_mm: float,
+    displacement_mm: float,
+    correlation_mm: float = 0.5,
+    iterations: int = 600,
+    tolerance: float = 1e-5,
+) -> float:
+    """Smallest standard deviation in HU of the difference of two tissues whose outlines are known up to a smooth error.
+
+    Each outline is displaced along its normal by a Gaussian random field; its effect on the volume is taken to first
+    order, so the displacement should be smaller than the tissues are thick.
+
+    Args:
+        gram: AᵀWA of the inset at the exposure in question (``apply``), in mm⁻¹.
+        fractions: ``(tissues, z, y, x)`` volume fractions of the tissues whose values are unknown.
+        outlines: ``(outlines, z, y, x)`` HU per mm of displacement (:func:`outline_maps`).
+        contrast: indices of the two tissues in ``fractions``.
+        hu: 1 HU in mm⁻¹.
+        voxel_mm: edge of the cubic voxels.
+        displacement_mm: standard deviation of the displacement; 0: the shapes are known.
+        correlation_mm: ℓ of its correlation exp(−r² / 2ℓ²).
+        iterations, tolerance: of the conjugate gradients.
+
+    Raises:
+        ValueError: a displacement or correlation out of range.
+    """
+    if not displacement_mm >= 0 or not correlation_mm > 0:
+        raise ValueError(
+            f"displacement_mm must be at least 0 and correlation_mm greater than 0, got {displacement_mm} and "
+            f"{correlation_mm}"
+        )
+    masks = torch.from_numpy(np.asarray(fractions, dtype=np.float32))
+    change = torch.from_numpy(np.asarray(outlines, dtype=np.float32)) * displacement_mm
+    # White noise through a kernel of unit norm and σ = ℓ/√2 has unit variance and the correlation exp(−r²/2ℓ²).
+    sd = correlation_mm / math.sqrt(2.0) / voxel_mm
+    reach = math.ceil(4 * sd)
+    kernel = torch.exp(-0.5 * (torch.arange(-reach, reach + 1) / sd) ** 2)
+    kernel = kernel / kernel.norm()
+
+    def smooth(v: Tensor) -> Tensor:
+        v = v[:, None]
+        for axis in range(3):
+            shape, pad = [1] * 5, [0] * 3
+            shape[2 + axis], pad[axis] = len(kernel), reach
+            v = F.conv3d(v, kernel.reshape(shape), padding=tuple(pad))
+        return v[:, 0]
+
+    unknown = (lambda z: (change * smooth(z)).sum(0), lambda y: smooth(change * y))
+    return _smallest_sd(gram, masks, unknown, tuple(change.shape), contrast, hu, iterations, tolerance)
+
+
+def _smallest_sd(
+    gram: Any,
+    masks: Tensor,
+    unknown: tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]],
+    shape: tuple[int, ...],
+    contrast: tuple[int, int],
+    hu: float,
+    iterations: int,
+    tolerance: float,
+) -> float:
+    """√(tᵀ C t), C the covariance of the values of ``masks``, t the contrast; ``unknown``: B and Bᵀ."""
+    forward, transposed = unknown
 
     def curve(a: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
-        y = gram.apply((torch.einsum("k,kzyx->zyx", a, masks) + free * z) * hu) * hu
-        return torch.einsum("kzyx,zyx->k", masks, y), free * y + free * z / free_sd_hu**2
+        y = gram.apply((torch.einsum("k,kzyx->zyx", a, masks) + forward(z)) * hu) * hu
+        return torch.einsum("kzyx,zyx->k", masks, y), transposed(y) + z
 
     diagonal = torch.stack([(m * gram.apply(m * hu)).sum() * hu for m in masks])
-    # A voxel's own information, the same everywhere but for a slow drift.
-    one = torch.zeros(masks.shape[1:])
-    centre = tuple(n // 2 for n in one.shape)
-    one[centre] = 1.0
-    own = float(gram.apply(one * hu)[centre]) * hu + 1.0 / free_sd_hu**2
+    # The mean of the other diagonal, from a random vector of signs (Hutchinson).
+    signs = torch.randint(0, 2, shape, generator=torch.Generator().manual_seed(0)).to(torch.float32) * 2 - 1
+    own = float((signs * curve(torch.zeros(len(masks)), signs)[1]).mean().clamp_min(1.0))
     target = torch.zeros(len(masks))
-    target[first], target[second] = 1.0, -1.0
-    a, z = torch.zeros_like(target), torch.zeros_like(free)
-    ra, rz = target.clone(), torch.zeros_like(free)
+    target[contrast[0]], target[contrast[1]] = 1.0, -1.0
+    a, z = torch.zeros_like(target), torch.zeros(shape)
+    ra, rz = target.clone(), torch.zeros(shape)
     pa, pz = ra / diagonal, rz / own
     size = _dot(ra, pa) + _dot(rz, pz)
     start = size
