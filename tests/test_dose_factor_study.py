@@ -12,10 +12,19 @@ import torch
 from recon.mbir import average_onto
 from recon.qggmrf import quadratic
 from recon.study.compare import inset_grid
-from recon.study.dose_factor import Settings, estimate_seconds, run, study
+from recon.study.dose_factor import Settings, estimate_seconds, figures, run, study
 from recon.study.dose_factor.analysis import analyse
+from recon.study.dose_factor.estimates import controlled
 from recon.study.dose_factor.measures import crop_window
-from recon.study.dose_factor.methods import METHODS, LinearFilter, Misstated, Penalised, fingerprint, load_methods
+from recon.study.dose_factor.methods import (
+    METHOD_NAMES,
+    METHODS,
+    LinearFilter,
+    Misstated,
+    Penalised,
+    fingerprint,
+    load_methods,
+)
 from recon.study.dose_factor.noise import Realisations
 from recon.study.dose_factor.report import build_report, headline
 from recon.study.dose_factor.rois import OtherVoxels, Wide
@@ -233,6 +242,23 @@ def test_method_registry(caplog):
         load_methods(["magic"])
 
 
+def test_control_variates():
+    rng = np.random.default_rng(3)
+    noise = rng.standard_normal((200, 2))
+    values = np.array([5.0, -2.0]) + noise @ np.array([[2.0, 0.3], [0.1, 1.0]]) + 0.1 * rng.standard_normal((200, 2))
+    found = controlled(values, 7.0 + 3.0 * noise, [7.0, 7.0])
+    np.testing.assert_allclose(found.mean(0), [5.0, -2.0], atol=4 * 0.1 / math.sqrt(200))
+    assert found.std(0).max() < 0.15 < 5 * 0.15 < values.std(0).min()
+    # Noise that has nothing to do with the control stays.
+    free = rng.standard_normal((200, 2))
+    np.testing.assert_allclose(controlled(free, noise, [0.0, 0.0]).mean(0), free.mean(0), atol=0.03)
+
+
+def test_every_method_has_a_name_and_a_colour():
+    assert set(METHOD_NAMES) == set(METHODS)
+    assert set(METHODS) - set(figures._COLORS) == {"mbir_noise_half", "mbir_noise_double"}
+
+
 def test_missing_weights_leave_mbir_out(monkeypatch, caplog):
     import recon.mbir
 
@@ -278,6 +304,10 @@ def test_wider_rois(measured, folder, analysed):
         sd = rows[0]["contrast_sd_hu"]["value"]
         paper_sd = analysed["fbp"][0]["doses"][0]["contrast_sd_hu"]
         assert analysed["ceiling"][0]["contrast_sd_hu"] < sd < paper_sd
+        # The factor is the ratio of variances at the study's dose.
+        method = next(r for r in rows if not r["exact"])
+        ratio = (sd / method["contrast_sd_hu"]["value"]) ** 2
+        assert method["factors"]["contrast_variance"]["value"] == pytest.approx(ratio, rel=0.02)
     with pytest.raises(ValueError, match="rois must be of section, tissue"):
         scene.wide_rois("vessel")
 

@@ -15,6 +15,7 @@ from torchpcct.metrics._bootstrap import bca_interval, leave_one_out, resampling
 __all__ = [
     "DRAWS",
     "attempt",
+    "controlled",
     "estimate",
     "factor",
     "observer_factor",
@@ -57,6 +58,23 @@ def observer_factor(scores: Any, curve: DoseCurve, figure: str) -> Any:
     if figure == "auc" and float(scores[:, 1].min()) > float(scores[:, 0].max()):
         return {"value": None, "low": None, "high": None, "why": "AUC is 1: look at d′"}
     return factor(scores, curve, figure)
+
+
+def controlled(values: Floats, control: Floats, expectation: Any) -> Floats:
+    """Samples whose mean is that of ``values`` with less sampling error (control variates).
+
+    Args:
+        values: ``(n, k)`` of a method.
+        control: ``(n, m)`` of a method with a known expectation, on the same noise.
+        expectation: ``(m,)``.
+
+    Returns:
+        ``(n, k)``, ``values`` less what the control's deviation from its expectation explains by linear regression.
+    """
+    deviation = control - control.mean(0)
+    slopes = np.linalg.lstsq(deviation, values - values.mean(0), rcond=None)[0]
+    result: Floats = values - (control - np.asarray(expectation)) @ slopes
+    return result
 
 
 def sd_of(reached: dict[str, Any], ideal: float) -> dict[str, Any]:

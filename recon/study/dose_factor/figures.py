@@ -9,6 +9,7 @@ import torch
 
 from recon.study.compare import inset_grid
 from recon.study.dose_factor.facts import fbp_label
+from recon.study.dose_factor.methods import METHOD_NAMES
 from recon.study.dose_factor.scene import StudyScene
 from recon.study.dose_factor.settings import FBP_BASE
 from recon.study.dose_factor.study import Measured
@@ -19,10 +20,10 @@ from torchpcct.viz import Panel, panels
 __all__ = ["curves_figure", "images_figure"]
 
 _COLORS = {
-    "linear": "tab:brown", "quadratic": "tab:olive", "qggmrf": "tab:green", "tv": "tab:purple",
-    "mbir_one_pass": "tab:orange",
-    "mbir": "tab:red",
+    "linear": "tab:brown", "linear_z": "tab:cyan", "quadratic": "tab:olive", "qggmrf": "tab:green", "tv": "tab:purple",
+    "fbp_cnn": "tab:pink", "mbir_one_pass": "tab:orange", "mbir": "tab:red",
 }  # fmt: skip
+"""What is drawn; methods that are told a wrong noise are not."""
 _ASSUMED = 5.7
 
 
@@ -71,7 +72,11 @@ def _draw(ax: Any, data: dict[str, Any], limit: dict[str, Any], key: str, value:
     def met(level: float) -> float:
         return (level / at_one) ** (2.0 if rising else -2.0)
 
-    readings = [e for e in data["methods"] if e["exposure_s"] == exposure and e[value].get("value") is not None]
+    readings = [
+        e
+        for e in data["methods"]
+        if e["method"] in _COLORS and e["exposure_s"] == exposure and e[value].get("value") is not None
+    ]
     for k, e in enumerate(readings):
         # Beside each other, so that no interval hides another.
         at = 2.0 ** (0.22 * (k - (len(readings) - 1) / 2))
@@ -81,7 +86,9 @@ def _draw(ax: Any, data: dict[str, Any], limit: dict[str, Any], key: str, value:
         ax.plot([at, end], [v, v], color=color, linewidth=1.0)
         ax.plot([end], [v], "|", color=color, markersize=9)
         spread = [[v - low], [high - v]] if low is not None and high is not None else None
-        ax.errorbar([at], [v], yerr=spread, fmt="o", color=color, markersize=4, capsize=2, label=e["method"])
+        ax.errorbar(
+            [at], [v], yerr=spread, fmt="o", color=color, markersize=4, capsize=2, label=METHOD_NAMES[e["method"]]
+        )
     top = limit[key]
     reach = float(np.clip(met(top), relative[0], relative[-1]))
     ax.plot([1.0, reach], [top, top], color="black", linewidth=1.6, label="limit of the data")
@@ -108,7 +115,7 @@ def images_figure(measured: Measured, data: dict[str, Any]) -> Any:
     half_y, half_x = image.extent[1] / 2, image.extent[2] / 2
     extent = (-half_x, half_x, -half_y, half_y)
     columns: list[tuple[str, Any]] = [("fbp", f"FBP {fbp_label(*FBP_BASE)}")]
-    columns += [(m, m) for m in measured.methods]
+    columns += [(m, METHOD_NAMES[m]) for m in measured.methods if m in _COLORS]
     rows: list[list[Panel]] = []
     outlines = ((scene.rois.foreground[0], "deepskyblue"), (scene.rois.background[0], "tomato"))
     for name in ("paper", "absent_core"):

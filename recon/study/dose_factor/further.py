@@ -38,10 +38,9 @@ class Further:
     def wide(self, name: str) -> dict[str, Any]:
         """Figures of every FBP variant and method in a wider ROI, at every dose."""
         wide = Wide(self.m, self.scene, name, self.truth)
-        curves = wide.base_curves()
         rows: list[dict[str, Any]] = []
         for dose in self.s.doses:
-            limits = self.limits(dose)
+            limits, curves = self.limits(dose), wide.base_curves(dose)
             for kernel, voxel, _ in self.variants:
                 f = wide.fbp(kernel, voxel)
                 sd, c = sd_at(f["covariance"], dose), f["covariance"] / dose

@@ -26,7 +26,16 @@ from recon.unrolled import NormalProblem
 if TYPE_CHECKING:
     from recon.roi import InsetProblem
 
-__all__ = ["METHODS", "LinearFilter", "Method", "Penalised", "fingerprint", "load_methods"]
+__all__ = [
+    "IMAGE_METHODS",
+    "METHODS",
+    "METHOD_NAMES",
+    "LinearFilter",
+    "Method",
+    "Penalised",
+    "fingerprint",
+    "load_methods",
+]
 
 log = logging.getLogger(__name__)
 
@@ -166,6 +175,20 @@ _LEARNED = ("fbp_cnn", "mbir_one_pass", "mbir", "mbir_noise_half", "mbir_noise_d
 METHODS = (*_BASELINES, *_LEARNED)
 """Names, in the order of the tables. ``fbp_cnn`` is MBIR's prior on FBP images, ``mbir_noise_*`` MBIR that takes the
 noise for half or twice of what it is."""
+
+METHOD_NAMES = {
+    "linear": "linear 3-D filter",
+    "linear_z": "linear filter along z",
+    "quadratic": "quadratic PWLS",
+    "qggmrf": "q-GGMRF PWLS",
+    "tv": "smoothed TV",
+    "fbp_cnn": "FBP + MBIR's prior",
+    "mbir_one_pass": "MBIR, one pass",
+    "mbir": "MBIR, two passes",
+    "mbir_noise_half": "MBIR, noise taken for ½",
+    "mbir_noise_double": "MBIR, noise taken for 2×",
+}
+"""As reports call them."""
 
 IMAGE_METHODS = ("fbp_cnn",)
 """Methods of an image domain: in place of b = AᵀW y they are given G x of an FBP volume x."""

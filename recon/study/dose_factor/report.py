@@ -9,6 +9,7 @@ from recon.study.dose_factor.analysis import ASSUMED_FACTOR, analyse
 from recon.study.dose_factor.facts import fbp_label
 from recon.study.dose_factor.figures import curves_figure, images_figure
 from recon.study.dose_factor.measures import LUMEN_HALF_HU, OBSERVERS
+from recon.study.dose_factor.methods import METHOD_NAMES
 from recon.study.dose_factor.settings import FBP_BASE, MAIN_SCENES
 from recon.study.dose_factor.shape_limits import CORRELATION_MM
 from recon.study.dose_factor.study import Measured
@@ -23,19 +24,6 @@ FIGURE_NAMES = {
     "auc_axial": "AUC, axial image",
     "d_prime_volume": "d′, volume",
     "auc_volume": "AUC, volume",
-}
-
-METHOD_NAMES = {
-    "linear": "linear 3-D filter",
-    "linear_z": "linear filter along z",
-    "quadratic": "quadratic PWLS",
-    "qggmrf": "q-GGMRF PWLS",
-    "tv": "smoothed TV",
-    "fbp_cnn": "FBP + MBIR's prior",
-    "mbir_one_pass": "MBIR, one pass",
-    "mbir": "MBIR, two passes",
-    "mbir_noise_half": "MBIR, noise taken for ½",
-    "mbir_noise_double": "MBIR, noise taken for 2×",
 }
 
 
@@ -137,6 +125,8 @@ def _intro(data: dict[str, Any]) -> str:
         f"(generalised least squares on exact path lengths, noise-free readings), HU: {tissues}; noise-free FBP "
         f"standard 0.10 mm reads {t['reference_hu'][0]:.1f} / {t['reference_hu'][1]:.1f} in the ROIs.\n\n"
         "Square brackets: 95 % interval, bootstrap over paired realisations. FBP's figures are exact (adjoint passes). "
+        "Biases and false contrasts are means with FBP of the same noise, whose expectation is exact, as control "
+        "variate. "
         "The limit is the best unbiased estimate with all shapes known (generalised least squares, the fat around the "
         "vessel known); for d′ it is the ideal observer, which knows all but whether the core is there. A figure above "
         "the limit is bias, not skill. Contrast SD is corrected by the contrast slope over cores of contrast 1, ½, 0 "

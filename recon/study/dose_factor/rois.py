@@ -115,12 +115,13 @@ class Wide(_CropRois):
         part = slice(self._place, self._place + 2)
         return {"label": label, "slope": slope, "roi_hu": means[0], "covariance": self.m.wide[label][part, part]}
 
-    def base_curves(self) -> dict[str, DoseCurve]:
-        """Dose curves of the reference FBP."""
+    def base_curves(self, dose: float) -> dict[str, DoseCurve]:
+        """Dose curves of the reference FBP about an exposure."""
         base = self.fbp(*FBP_BASE)
+        covariance = base["covariance"] / dose
         return {
-            "paper_cnr": DoseCurve.paper_cnr(base["roi_hu"], base["covariance"]),
-            "contrast_variance": DoseCurve.contrast_variance(base["covariance"], base["slope"]),
+            "paper_cnr": DoseCurve.paper_cnr(base["roi_hu"], covariance),
+            "contrast_variance": DoseCurve.contrast_variance(covariance, base["slope"]),
         }
 
 
