@@ -38,6 +38,8 @@ ADD_BACK = (1.29, 0.42)
 """Weight of the residual that the second pass adds back, see :class:`recon.unrolled.Unrolled`: chosen on held-out
 plaques (see the training card) for a contrast slope of 1.0 between small ROIs, at 0.35 s and at 2 s. One pass leaves
 0.6 and 0.8."""
+LARGEST_HU = 2000.0
+"""Above the densest calcification of the training, 1800 HU: what reads more is metal."""
 CHI2_RANGE = (0.85, 1.2)
 """Weighted squared residual per reading that a scan of the stated noise level can have; 1 is perfect."""
 
@@ -127,8 +129,14 @@ class Mbir:
         square = (volumes[:draws] - volumes[draws:]).square().mean(0)
         return torch.nn.functional.avg_pool3d(square[None, None], 3, 1, 1, count_include_pad=False)[0, 0].sqrt()
 
-    def check(self, scale: float, chi2: float) -> list[str]:
-        """What speaks against trusting the network at a noise scale in HU and a misfit; also logged as warnings."""
+    def check(self, scale: float, chi2: float, peak: float) -> list[str]:
+        """What speaks against trusting the network; also logged as warnings.
+
+        Args:
+            scale: noise scale of the scan, HU.
+            chi2: weighted squared residual per reading.
+            peak: largest value of the volume, HU.
+        """
         found = []
         low, high = self.model.seen_scale_hu.tolist()
         if not 0.98 * low <= scale <= 1.02 * high:
@@ -140,6 +148,11 @@ class Mbir:
             found.append(
                 f"the data differ from the volume by {chi2:.3g} times their stated noise variance: exposure, geometry "
                 "or surround are not those of the scan, or something outside of the grid was left out"
+            )
+        if peak > LARGEST_HU:
+            found.append(
+                f"the volume reaches {peak:.0f} HU, more than the {LARGEST_HU:.0f} HU of the training: metal shades the "
+                "tissue beside it, and the prior has not learned that"
             )
         for text in found:
             _LOG.warning("%s", text)
@@ -237,7 +250,7 @@ def reconstruct_mbir(
         for k, (volume, statistic) in enumerate(zip(hu, statistics, strict=True)):
             chi2 = (statistic.energy + float(misfit[k])) / statistic.readings
             info = {**report, "residual": residuals[k], "chi2": chi2, "seconds": round(seconds, 3)}
-            info["warnings"] = prior.check(float(normal.scale_hu[k]), chi2)
+            info["warnings"] = prior.check(float(normal.scale_hu[k]), chi2, float(volume.max()))
             if not report.get("converged", True):
                 info["warnings"].append(f"the energy has not converged, its residual is {residuals[k]:.2g}")
                 _LOG.warning("%s", info["warnings"][-1])

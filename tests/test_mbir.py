@@ -186,3 +186,9 @@ def test_shadow_of_dead_readings(clean, problem, prior):  # noqa: F811
     assert torch.isfinite(volume.data).all()
     assert volume.report["warnings"]
     assert math.isfinite(volume.report["chi2"])
+
+
+def test_metal_is_outside_of_what_the_prior_knows(prior):
+    scale = float(prior.model.seen_scale_hu.mean())
+    assert prior.check(scale, 1.0, 1800.0) == []
+    assert any("metal" in text for text in prior.check(scale, 1.0, 3000.0))

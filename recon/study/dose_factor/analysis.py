@@ -216,8 +216,8 @@ class Analysis:
         return observer_channels(self.scene, inset_grid(self.scene.plaque, voxel), observer)
 
     def _channel_count(self, n: int) -> int:
-        """As many channels as the realisations can train: the core's shape first."""
-        return max(1, min(1 + DOG_CHANNELS, n // 2 - 1))
+        """As many channels as the realisations can train, 8 for each: the core's shape first."""
+        return max(1, min(1 + DOG_CHANNELS, n // 8))
 
     def _resolution(self, difference: Any, voxel: float) -> dict[str, Any]:
         """Edge width and transfer function of the core's own edge, on present minus absent."""
@@ -300,8 +300,7 @@ class Analysis:
 
     def _observer(self, entry: dict[str, Any], samples: Any, dose: float, observer: str) -> Any:
         """Scores ``(realisations, 2)``, absent and present; None where there are too few realisations."""
-        n = entry["realizations"]
-        count = self._channel_count(n)
+        n, count = entry["realizations"], self._channel_count(self.s.n)
         channels = self._channels(self.s.voxel_mm, observer)[:count]
         pair = [channel_responses(samples[k]["crop"], channels) for k in ("paper", "absent_core")]
         fbp = [self.m.fbp.get((k, dose)) for k in ("paper", "absent_core")]
@@ -309,6 +308,8 @@ class Analysis:
         entry["observer"][observer] = found
 
         def compute() -> Any:
+            if self._channel_count(n) < count:
+                raise ValueError(f"{n} realisations are too few to train {count} channels")
             present, absent = hotelling_scores(*pair)
             found["d_prime"] = estimate(d_prime(present, absent, draws=DRAWS))
             found["auc"] = estimate(auc(present, absent))

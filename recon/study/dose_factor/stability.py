@@ -15,7 +15,7 @@ from recon.mbir import Mbir
 from recon.sensitivity import worst_case_gain
 from recon.study.compare import inset_grid
 from recon.study.dose_factor.facts import fbp_label
-from recon.study.dose_factor.methods import Method, fingerprint
+from recon.study.dose_factor.methods import IMAGE_METHODS, Method, fingerprint
 from recon.study.dose_factor.noise import Realisations
 from recon.study.dose_factor.settings import FBP_BASE
 
@@ -31,7 +31,7 @@ def worst_case_gains(noise: Realisations, methods: list[Method], dose: float) ->
 
     Args:
         noise: realisations of the study.
-        methods: of the study; those without a network are left out.
+        methods: of the study; those without a network, or on images, are left out.
         dose: exposure in s.
     """
     scene = noise.scene("paper")
@@ -61,7 +61,7 @@ def worst_case_gains(noise: Realisations, methods: list[Method], dose: float) ->
         piece = noise.store.piece(f"gains/fbp_{kernel}_{dose:g}s", f"{noise.key} {_FBP_ITERATIONS}", compute)
         found[f"FBP {label}"] = float(piece["gain"])
     for method in methods:
-        if isinstance(method, Mbir):
+        if isinstance(method, Mbir) and method.name not in IMAGE_METHODS:
             found[method.name] = _learned_gain(noise, method, dose)
     return found
 
