@@ -151,8 +151,8 @@ class Mbir:
             )
         if peak > LARGEST_HU:
             found.append(
-                f"the volume reaches {peak:.0f} HU, more than the {LARGEST_HU:.0f} HU of the training: metal shades the "
-                "tissue beside it, and the prior has not learned that"
+                f"the volume reaches {peak:.0f} HU, more than the {LARGEST_HU:.0f} HU of the training: metal shades "
+                "the tissue beside it, and the prior has not learned that"
             )
         for text in found:
             _LOG.warning("%s", text)
