@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from torchpcct.acquisition import acquire, plan
+from torchpcct.acquisition.acquire import acquire, plan
+from torchpcct.acquisition.transmission import SUB_RAY_COUNTS, compress, sub_rays
 from torchpcct.geometry import ConeBeam, VolumeGrid, full_turn
 from torchpcct.scanner import presets
 from torchpcct.scene import Body, Ellipsoid, EllipticCylinder, Scene, SinusoidalMotion, chord_lengths
 from torchpcct.scene.phantoms import water_cylinder
 from torchpcct.scene.plaque import plaque_scene
 from torchpcct.scene.variants import plaque_variant
-from torchpcct.transmission import SUB_RAY_COUNTS, compress, sub_rays
 
 INSET = VolumeGrid((57, 45, 45), 0.2, (0.0, -30.38, -29.63))
 

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchpcct import ConeBeam, full_turn
+from torchpcct.acquisition.path_lengths import tissue_path_lengths
 from torchpcct.metrics import ceiling, information_matrix, paper_cnr_ceiling
 from torchpcct.scene import Body, Ellipsoid, EllipticCylinder, Scene, SinusoidalMotion
-from torchpcct.scene.path_lengths import tissue_path_lengths
 from torchpcct.scene.plaque import plaque_scene
 from torchpcct.window import DetectorWindow
 
@@ -176,7 +176,7 @@ def test_path_lengths_add_up_and_average_over_the_beam():
 
 def test_mass_is_kept_by_every_blur(monkeypatch):
     """The core's path lengths, summed over a fine detector, are its volume in every view, whatever the beam's width."""
-    monkeypatch.setattr("torchpcct.scene.path_lengths._LINES", 1000)
+    monkeypatch.setattr("torchpcct.acquisition.path_lengths._LINES", 1000)
     g = ConeBeam(full_turn(3, 0.1), 600.0, 900.0, 60, 60, 0.2)
     scene = Scene([Body("ball", Ellipsoid((2.0, 1.5, 1.0)), "fibrous_tissue")])
     for beam in ({"sub_rays": 32}, {"sub_rays": 32, "focal_spot": (0.9, 0.7), "view_step": 0.01}):
@@ -187,8 +187,8 @@ def test_mass_is_kept_by_every_blur(monkeypatch):
 
 def test_path_lengths_see_the_beam_of_the_readings():
     """Readings of one energy and a weak contrast are the path lengths times that contrast, finite beam included."""
+    from torchpcct.acquisition.transmission import Beam, BodySet, expected_readings, sub_rays
     from torchpcct.scene.chords import pack
-    from torchpcct.transmission import Beam, BodySet, expected_readings, sub_rays
 
     g, views = GEOMETRY, GEOMETRY.views
     kinds, params = pack([SCENE["core"].shape])

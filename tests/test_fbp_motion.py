@@ -14,7 +14,7 @@ from recon.fbp import fbp
 from recon.inset import InsetFbp, view_motion
 from recon.qggmrf import QGGMRF
 from recon.roi import InsetProblem
-from torchpcct.acquisition import acquire
+from torchpcct.acquisition.acquire import acquire
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
 from torchpcct.projector.analytic import Gaussian, line_integrals
 from torchpcct.scanner import presets

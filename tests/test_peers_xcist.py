@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from torchpcct.acquisition import acquire
+from torchpcct.acquisition.acquire import acquire
 from torchpcct.geometry import ConeBeam
 from torchpcct.scanner import presets
 from torchpcct.scanner.detector import Scintillator

@@ -8,7 +8,7 @@ import pytest
 
 from recon.study import registry
 from recon.study.checks import Check, around, checks_section, effects_section
-from torchpcct.plan import Effect
+from torchpcct.acquisition.plan import Effect
 
 
 def test_a_check_is_inside_its_closed_range_only():

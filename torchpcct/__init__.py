@@ -10,7 +10,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
 
 if TYPE_CHECKING:
-    from torchpcct.acquisition import acquire
+    from torchpcct.acquisition.acquire import acquire
     from torchpcct.projector import Projector
     from torchpcct.scan import Scan
     from torchpcct.volume import Volume
@@ -33,7 +33,7 @@ _LAZY = {
     "Projector": "torchpcct.projector",
     "Scan": "torchpcct.scan",
     "Volume": "torchpcct.volume",
-    "acquire": "torchpcct.acquisition",
+    "acquire": "torchpcct.acquisition.acquire",
 }
 
 

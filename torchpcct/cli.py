@@ -250,7 +250,7 @@ def _study(arguments: argparse.Namespace, progress: _Progress) -> None:
 
 def _simulate(arguments: argparse.Namespace, progress: _Progress) -> None:
     from recon.study.compare import inset_grid
-    from torchpcct.acquisition import acquire
+    from torchpcct.acquisition.acquire import acquire
     from torchpcct.scanner import presets
     from torchpcct.scene.plaque import plaque_scene
     from torchpcct.volume import require_folder

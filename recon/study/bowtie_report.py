@@ -14,7 +14,7 @@ from recon.study.bowtie_figures import draw
 from recon.study.bowtie_scan import BOWTIES
 from recon.study.checks import Check, around, checks_section, effects_section
 from recon.study.report import Report, environment, markdown_table
-from torchpcct.plan import Effect
+from torchpcct.acquisition.plan import Effect
 
 if TYPE_CHECKING:
     from recon.study.dose import Measured

@@ -19,9 +19,9 @@ from torch import Tensor
 
 from recon.inset import to_hu
 from torchpcct import noise
+from torchpcct.acquisition.transmission import Beam, BodySet, expected_readings, sub_rays
 from torchpcct.geometry import FanBeam, VolumeGrid
 from torchpcct.scanner.linearisation import WaterLinearisation
-from torchpcct.transmission import Beam, BodySet, expected_readings, sub_rays
 from torchpcct.window import DetectorWindow
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from recon.study.report import markdown_table
-from torchpcct.plan import Effect
+from torchpcct.acquisition.plan import Effect
 
 __all__ = ["Check", "around", "checks_section", "effects_section"]
 
@@ -84,7 +84,7 @@ def effects_section(effects: Iterable[Effect], tolerance_hu: float | None = None
     """Markdown section that states which effects were modelled, which left out, and what leaving them out costs.
 
     Args:
-        effects: from :attr:`torchpcct.plan.Plan.effects`, and what the study itself adds to them.
+        effects: from :attr:`torchpcct.acquisition.plan.Plan.effects`, and what the study itself adds to them.
         tolerance_hu: of the plan; None where several plans with several tolerances were joined.
     """
     rows = [

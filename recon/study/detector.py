@@ -20,7 +20,7 @@ from recon.study.detector_rate import (
     pile_up_section,
 )
 from recon.study.report import Report, environment, markdown_table
-from torchpcct.plan import Effect
+from torchpcct.acquisition.plan import Effect
 from torchpcct.scanner import SiliconDetector, presets
 from torchpcct.scanner.transport import Stack, efficiency, follow
 from torchpcct.scene.materials import PLAQUE_MATERIALS, material

@@ -176,7 +176,7 @@ def measure_all(settings: Settings, progress: Callable[[str, float], None] | Non
 
 def simulate(settings: Settings, scanner: Scanner, name: str, fraction: float, grid: VolumeGrid) -> Scan:
     """Noise-free scan of the vessel with ``fraction`` of the motion, windowed about the inset."""
-    from torchpcct.acquisition import acquire
+    from torchpcct.acquisition.acquire import acquire
     from torchpcct.scene.plaque import plaque_scene
 
     scene = plaque_scene(motion=settings.motion.scaled(fraction))[0]

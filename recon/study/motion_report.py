@@ -15,7 +15,7 @@ from recon.study.motion import METHODS, Measured
 from recon.study.motion_figures import curves_figure, images_figure
 from recon.study.motion_measures import Observed
 from recon.study.report import Report, environment, markdown_table
-from torchpcct.plan import Effect
+from torchpcct.acquisition.plan import Effect
 
 __all__ = ["build_report"]
 

@@ -16,8 +16,8 @@ from recon.study.noise_ranking import claims_data, claims_section, pairs_data, p
 from recon.study.noise_statistics import Table, measured_table
 from recon.study.report import Report, environment, markdown_table
 from recon.study.tables import published, table_checks
+from torchpcct.acquisition.plan import Effect
 from torchpcct.metrics.cnr import cnr_interval, cnr_range, sd_interval
-from torchpcct.plan import Effect
 
 __all__ = ["build_report"]
 

@@ -88,7 +88,7 @@ def prepare(
         ValueError: ROIs that come out empty; an inset outside the field of view.
     """
     from recon.inset import InsetFbp
-    from torchpcct.acquisition import acquire
+    from torchpcct.acquisition.acquire import acquire
 
     bodies, plaque = scene
     grids = [inset_grid(plaque, v) for v in voxels_mm]

@@ -271,7 +271,7 @@ def _smooth(m: Measured, kept: dict[str, _Kept]) -> Smoothed:
 def _middle_slices(scene: Scene, plaque: Plaque, scanner: Scanner, duty: float) -> tuple[VolumeGrid, Tensor]:
     """The middle of the inset by the reference FBP, from the detector's middle rows: grid and ``(z, y, x)`` HU."""
     from recon.inset import InsetFbp
-    from torchpcct.acquisition import acquire
+    from torchpcct.acquisition.acquire import acquire
 
     x, y, z = plaque.position
     grid = VolumeGrid((_MIDDLE_SLICES, 90, 90), REFERENCE_VOXEL_MM, (z, y, x))

@@ -70,7 +70,7 @@ def wire_width(scanner: Scanner, position: tuple[float, float], kernel: str, *, 
     """
     from dataclasses import replace
 
-    from torchpcct.acquisition import acquire
+    from torchpcct.acquisition.acquire import acquire
     from torchpcct.scene import Body, EllipticCylinder, Scene
     from torchpcct.scene.plaque import PATIENT_DIAMETER
 

@@ -13,8 +13,8 @@ from recon.study.checks import Check, around, checks_section, effects_section
 from recon.study.report import Report, environment, markdown_table
 from recon.study.resolution import Imaged, Measured
 from recon.study.resolution_measures import FWHM_PER_SIGMA, Blurred, crossing
+from torchpcct.acquisition.plan import Effect
 from torchpcct.metrics.roi import PROTOCOL_PIXEL_MM
-from torchpcct.plan import Effect
 from torchpcct.viz import Panel, panels
 
 __all__ = ["build_report", "limits"]

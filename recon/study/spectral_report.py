@@ -13,7 +13,7 @@ from recon.study.report import Report, environment, markdown_table
 from recon.study.spectral_figures import curves_figure, tissue_figure
 from recon.study.spectral_scan import PlaqueScan
 from recon.study.spectral_tissue import Tissues
-from torchpcct.plan import Effect
+from torchpcct.acquisition.plan import Effect
 from torchpcct.spectral import MMD_TISSUES
 
 __all__ = ["VISIBLE_DICE", "build_report", "checks_of"]

@@ -15,9 +15,9 @@ from torch import Tensor
 
 from recon.channel_fbp import ChannelFbp, static_fbp
 from recon.study.compare import inset_grid
-from torchpcct.acquisition import acquire
+from torchpcct.acquisition.acquire import acquire
+from torchpcct.acquisition.plan import Effect
 from torchpcct.geometry import VolumeGrid
-from torchpcct.plan import Effect
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
 from torchpcct.scanner import presets
 from torchpcct.scene.bodies import EllipticCylinder

@@ -172,7 +172,7 @@ def primary_dose(
     per_gram = mass_energy_absorption if quantity == "absorbed" else mass_interaction
     deposit = np.stack([per_gram(m, energies) * energies for m in media]) * MGY_PER_KEV_PER_G
 
-    from torchpcct.transmission import compress
+    from torchpcct.acquisition.transmission import compress
 
     kinds, params = scene.pack()
     coefficients, basis = compress(scene.contrast(energies), tolerance=1e-6)

@@ -191,7 +191,7 @@ class StudyScene:
             return None
 
     def _acquire(self) -> Scan:
-        from torchpcct.acquisition import acquire
+        from torchpcct.acquisition.acquire import acquire
 
         views = self.settings.views
         grids = [inset_grid(self.plaque, v) for v in {*self.settings.voxels_mm, self.settings.voxel_mm, 0.1}]
@@ -311,7 +311,7 @@ class StudyScene:
 
     def _least_squares(self) -> tuple[list[str], Floats, Floats]:
         """Tissues, their generalised least-squares values in HU, and the information at 1 s."""
-        from torchpcct.scene.path_lengths import tissue_path_lengths
+        from torchpcct.acquisition.path_lengths import tissue_path_lengths
 
         clean = self.clean
         w, g = clean.window, clean.geometry

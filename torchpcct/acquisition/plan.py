@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from torchpcct.acquisition.transmission import SUB_RAY_COUNTS, Beam, BodySet, expected_readings, sub_rays
 from torchpcct.geometry import ConeBeam, VolumeGrid
-from torchpcct.transmission import SUB_RAY_COUNTS, Beam, BodySet, expected_readings, sub_rays
 from torchpcct.window import DetectorWindow, shadow
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ class Plan:
 
     Attributes:
         effects: every effect with its cost in HU (rms over the shadow of the inset, per its mean chord).
-        points: ``(sub-rays, 5)`` beam samples of :func:`torchpcct.transmission.sub_rays`.
+        points: ``(sub-rays, 5)`` beam samples of :func:`torchpcct.acquisition.transmission.sub_rays`.
         active: the readings that see the varying bodies; None: no view differs from another.
         kept: the readings that the scan will hold; None: the whole detector.
         sampling_error: rms error of a line integral by the finite number of sub-rays, relative to the inset's peak.

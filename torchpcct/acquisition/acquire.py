@@ -10,12 +10,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchpcct.acquisition.plan import Plan, active_window, make_plan
+from torchpcct.acquisition.transmission import SUB_RAY_COUNTS, Beam, BodySet, expected_readings
+from torchpcct.acquisition.transmission import sub_rays as sub_rays_of
 from torchpcct.geometry import ConeBeam, VolumeGrid
-from torchpcct.plan import Plan, active_window, make_plan
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan, check_exposure
 from torchpcct.scanner.pileup import PileUpMap
-from torchpcct.transmission import SUB_RAY_COUNTS, Beam, BodySet, expected_readings
-from torchpcct.transmission import sub_rays as sub_rays_of
 from torchpcct.window import DetectorWindow, shadow
 
 if TYPE_CHECKING:

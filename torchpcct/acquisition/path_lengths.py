@@ -45,7 +45,7 @@ def tissue_path_lengths(
             inside a body does not count to it.
         geometry: cone beam.
         window: the cells to compute; None: the whole detector.
-        sub_rays: beam samples a reading, one of :data:`torchpcct.transmission.SUB_RAY_COUNTS`.
+        sub_rays: beam samples a reading, one of :data:`torchpcct.acquisition.transmission.SUB_RAY_COUNTS`.
         focal_spot: ``(width, length)`` in mm, along ``e_t`` and z; 0: a point.
         view_step: rad that the gantry turns while a view is read; 0: standing still.
         dtype: of the result; the chords are computed in float64.
@@ -57,8 +57,8 @@ def tissue_path_lengths(
         ValueError: no names, an unknown or repeated body, a moving scene, a window of other views, a bad ``sub_rays``.
         TypeError: a geometry that is not a cone beam.
     """
+    from torchpcct.acquisition.transmission import sub_rays as sub_rays_of
     from torchpcct.scene.chords import chord_lengths
-    from torchpcct.transmission import sub_rays as sub_rays_of
 
     if not isinstance(geometry, ConeBeam):
         raise TypeError(f"geometry must be a ConeBeam, got {type(geometry).__name__}")

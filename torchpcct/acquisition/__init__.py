@@ -1,0 +1,1 @@
+"""From a scene and a scanner to a scan."""
