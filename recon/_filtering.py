@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.windows import fast_length, ramp_kernel
+from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam
-from torchpcct.window import DetectorWindow
 
 __all__ = ["CHUNK_BYTES", "FilterPlan"]
 

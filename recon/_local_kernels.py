@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import ConeBeam, Geometry, VolumeGrid
-from torchpcct.window import DetectorWindow, shadow
 
 __all__ = ["Nodes", "kernel_at", "node_positions", "slice_reach"]
 

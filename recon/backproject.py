@@ -12,9 +12,9 @@ from torch import Tensor
 
 from recon._filtering import full_window
 from recon._operator import apply_linear
+from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
 from torchpcct.projector.rays import check_motion
-from torchpcct.window import DetectorWindow
 
 __all__ = ["BackprojectionPlan", "backproject", "check_data", "data_shape"]
 

@@ -16,8 +16,8 @@ from recon._filtering import FilterPlan
 from recon.angular_weights import angular_weights
 from recon.backproject import BackprojectionPlan
 from recon.fbp import backproject, filter_sinogram, filter_windowed
+from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import ConeBeam, VolumeGrid
-from torchpcct.window import DetectorWindow, shadow
 
 __all__ = ["ChannelFbp", "static_fbp"]
 

@@ -22,10 +22,10 @@ from recon._filtering import FilterPlan
 from recon.angular_weights import angular_weights
 from recon.backproject import BackprojectionPlan
 from recon.inset import InsetFbp
+from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.roi import RoiMean
 from torchpcct.scan import Scan
-from torchpcct.window import DetectorWindow
 
 __all__ = ["RoiAdjoints", "line_integral_variance", "roi_adjoints", "roi_covariance"]
 

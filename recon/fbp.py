@@ -15,8 +15,8 @@ from recon._filtering import FilterPlan, full_window, kernel_names
 from recon._operator import apply_linear
 from recon.angular_weights import angular_weights
 from recon.backproject import BackprojectionPlan, backproject, check_data, data_shape
+from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import ConeBeam, Geometry, VolumeGrid
-from torchpcct.window import DetectorWindow, shadow
 
 __all__ = ["backproject", "fbp", "filter_sinogram", "filter_windowed", "interleave", "memory_estimate"]
 

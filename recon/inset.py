@@ -14,10 +14,10 @@ from torch import Tensor
 
 from recon.angular_weights import angular_weights
 from recon.fbp import backproject, fbp, filter_sinogram, filter_windowed
+from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import Geometry, VolumeGrid
 from torchpcct.scan import Scan
 from torchpcct.scene.motion import SinusoidalMotion
-from torchpcct.window import DetectorWindow, shadow
 
 __all__ = ["InsetFbp", "to_hu", "view_motion"]
 

@@ -12,11 +12,11 @@ from recon.channel_fbp import static_fbp
 from recon.gram import Gram
 from recon.joint import Whitening, joint_pwls, mean_weights
 from recon.qggmrf import QGGMRF
+from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import VolumeGrid
 from torchpcct.projector import Projector
 from torchpcct.scan import Scan
 from torchpcct.spectral import SpectralModel, cramer_rao, decompose_surround, inverse, vmi_weights
-from torchpcct.window import DetectorWindow, shadow
 
 __all__ = ["DEFAULT_JOINT_PRIOR", "REFERENCE_KEV", "BasisProblem"]
 

@@ -16,11 +16,11 @@ from recon.gram import Gram
 from recon.inset import InsetFbp, to_hu
 from recon.pwls import pwls
 from recon.qggmrf import QGGMRF
+from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import VolumeGrid
 from torchpcct.projector import Projector
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
 from torchpcct.volume import Volume
-from torchpcct.window import DetectorWindow, shadow
 
 __all__ = ["DEFAULT_PRIOR", "InsetProblem", "Statistic", "reconstruct_pwls"]
 

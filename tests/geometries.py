@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid, full_turn
-from torchpcct.window import DetectorWindow, shadow
 
 Case = tuple[Geometry, VolumeGrid, DetectorWindow | None]
 REGISTRY: dict[str, Callable[[], Case]] = {}

@@ -10,8 +10,8 @@ import torch
 from recon.exact_noise import line_integral_variance, roi_covariance
 from recon.inset import InsetFbp
 from torchpcct import Scan, VolumeGrid, acquire
+from torchpcct.counting_noise import compound_poisson, normal, poisson
 from torchpcct.metrics.roi import RoiMean, axial_grid
-from torchpcct.noise import compound_poisson, normal, poisson
 from torchpcct.scanner import Scintillator, presets
 from torchpcct.scene.materials import material
 from torchpcct.scene.phantoms import water_cylinder

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from recon.fbp import backproject, fbp, filter_sinogram, filter_windowed, interleave
 from recon.windows import KERNELS
+from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid, full_turn
-from torchpcct.window import DetectorWindow, shadow
 
 MU = 0.02
 

@@ -12,8 +12,8 @@ from recon._filtering import FilterPlan, full_window
 from recon.angular_weights import angular_weights
 from recon.backproject import BackprojectionPlan, backproject
 from recon.fbp import fbp, filter_sinogram, filter_windowed
+from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid, full_turn
-from torchpcct.window import DetectorWindow, shadow
 
 SHORT = np.arange(16) * (math.pi + 0.9) / 16 + 0.3
 CASES: dict[str, tuple[Geometry, VolumeGrid]] = {

@@ -15,12 +15,12 @@ from recon.inset import InsetFbp, view_motion
 from recon.qggmrf import QGGMRF
 from recon.roi import InsetProblem
 from torchpcct.acquisition.acquire import acquire
+from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
 from torchpcct.projector.analytic import Gaussian, line_integrals
 from torchpcct.scanner import presets
 from torchpcct.scene import Body, Scene, SinusoidalMotion
 from torchpcct.scene.bodies import Ellipsoid, EllipticCylinder
-from torchpcct.window import DetectorWindow, shadow
 
 ANGLES = full_turn(12, 0.2)
 PLANE, VOLUME = VolumeGrid((9, 7), 0.9, (6.0, -12.0)), VolumeGrid((6, 9, 7), 0.9, (0.5, 6.0, -12.0))

@@ -8,8 +8,8 @@ import torch
 
 from recon.gram import Gram
 from torchpcct import ConeBeam, FanBeam, Projector, VolumeGrid
+from torchpcct.detector_window import shadow
 from torchpcct.geometry import full_turn
-from torchpcct.window import shadow
 
 HU = 2e-5
 CENTER = (0.0, -30.38, -29.63)

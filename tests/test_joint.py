@@ -17,10 +17,10 @@ from recon.joint_prior import JointPrior
 from recon.pwls import pwls
 from recon.qggmrf import QGGMRF, quadratic
 from torchpcct import VolumeGrid, acquire
+from torchpcct.detector_window import shadow
 from torchpcct.scanner import presets
 from torchpcct.scene import Body, Ellipsoid, EllipticCylinder, Scene
 from torchpcct.spectral import SpectralModel, decompose_scan, decompose_surround
-from torchpcct.window import shadow
 
 EDGE = QGGMRF(0.15, 100.0)
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy import stats
 
-from torchpcct.noise import normal, poisson
+from torchpcct.counting_noise import normal, poisson
 
 
 @pytest.mark.parametrize("mean", [0.03, 0.7, 4.0, 9.99, 10.0, 37.3, 115.0, 16070.0, 3e6])

@@ -10,10 +10,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from torchpcct.detector_window import shadow
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
 from torchpcct.projector import Projector
 from torchpcct.projector.analytic import Ellipsoid, Gaussian, line_integrals, rasterize
-from torchpcct.window import shadow
 
 
 def _error(geometry, grid, bodies, window=None, sub=1, dtype=torch.float64):

@@ -11,10 +11,10 @@ import pytest
 import torch
 from geometries import REGISTRY
 
+from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
 from torchpcct.projector import Projector, plane
 from torchpcct.projector.analytic import Gaussian, line_integrals, rasterize
-from torchpcct.window import DetectorWindow, shadow
 
 NAMES = sorted(REGISTRY)
 SOME = [

@@ -13,9 +13,9 @@ if "triton" not in sys.modules:
 pytest.importorskip("triton")
 from triton import knobs
 
+from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid
 from torchpcct.projector import Projector, gpu
-from torchpcct.window import DetectorWindow
 
 pytestmark = [
     pytest.mark.skipif(not knobs.runtime.interpret, reason="triton was imported without TRITON_INTERPRET=1"),

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from torchpcct.window import DetectorWindow
+from torchpcct.detector_window import DetectorWindow
 
 
 def test_union_is_the_smallest_window_that_holds_all():

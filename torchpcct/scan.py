@@ -12,11 +12,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpcct import noise
+from torchpcct import counting_noise as noise
+from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam
 from torchpcct.scanner.linearisation import WaterLinearisation
 from torchpcct.volume import written_whole
-from torchpcct.window import DetectorWindow
 
 __all__ = ["NOISE_FREE_EXPOSURE_S", "Scan"]
 
@@ -127,7 +127,7 @@ class Scan:
 
         The noise of a reading depends only on ``seed`` and the reading's place on the full detector, so a windowed
         scan carries the same noise as the full one. Counts are Poisson; an energy-integrating signal is compound
-        Poisson with the second moment of the transmitted spectrum (:func:`torchpcct.noise.compound_poisson`), and
+        Poisson with the second moment of the transmitted spectrum (:func:`torchpcct.counting_noise.compound_poisson`), and
         electronic noise is added.
 
         Raises:

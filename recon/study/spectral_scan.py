@@ -17,6 +17,7 @@ from recon.channel_fbp import ChannelFbp, static_fbp
 from recon.study.compare import inset_grid
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.acquisition.plan import Effect
+from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
 from torchpcct.scanner import presets
@@ -32,7 +33,6 @@ from torchpcct.spectral import (
     decompose_surround,
     vmi,
 )
-from torchpcct.window import DetectorWindow, shadow
 
 if TYPE_CHECKING:
     from recon.study.spectral import Settings

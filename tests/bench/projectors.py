@@ -27,10 +27,10 @@ import numba
 import numpy as np
 import torch
 
+from torchpcct.detector_window import shadow
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
 from torchpcct.projector import Projector
 from torchpcct.projector.analytic import Ellipsoid, Gaussian, line_integrals, rasterize
-from torchpcct.window import shadow
 
 Pass = Callable[[], Any]
 

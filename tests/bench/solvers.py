@@ -26,9 +26,9 @@ from recon.pwls import pwls
 from recon.roi import DEFAULT_PRIOR, InsetProblem
 from recon.study.compare import inset_grid
 from torchpcct import Projector, acquire
+from torchpcct.detector_window import DetectorWindow
 from torchpcct.scanner import presets
 from torchpcct.scene.plaque import plaque_scene
-from torchpcct.window import DetectorWindow
 
 EXPOSURE_S = 2.0
 SUBSETS = 12

@@ -13,10 +13,10 @@ from torch import Tensor
 from torchpcct.acquisition.plan import Plan, active_window, make_plan
 from torchpcct.acquisition.transmission import SUB_RAY_COUNTS, Beam, BodySet, expected_readings
 from torchpcct.acquisition.transmission import sub_rays as sub_rays_of
+from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import ConeBeam, VolumeGrid
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan, check_exposure
 from torchpcct.scanner.pileup import PileUpMap
-from torchpcct.window import DetectorWindow, shadow
 
 if TYPE_CHECKING:
     from collections.abc import Callable

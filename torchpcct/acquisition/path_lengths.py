@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam
-from torchpcct.window import DetectorWindow
 
 if TYPE_CHECKING:
     from torchpcct.scene.scene import Scene

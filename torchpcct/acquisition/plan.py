@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from torchpcct.acquisition.transmission import SUB_RAY_COUNTS, Beam, BodySet, expected_readings, sub_rays
+from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import ConeBeam, VolumeGrid
-from torchpcct.window import DetectorWindow, shadow
 
 if TYPE_CHECKING:
     from torchpcct.scanner import Scanner

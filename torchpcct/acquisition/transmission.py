@@ -28,9 +28,9 @@ from numba import njit, prange
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam
 from torchpcct.scene.chords import interval
-from torchpcct.window import DetectorWindow
 
 __all__ = ["SUB_RAY_COUNTS", "Beam", "BodySet", "compress", "expected_readings", "sub_rays"]
 

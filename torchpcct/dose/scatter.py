@@ -135,8 +135,8 @@ def monte_carlo_dose(
     Raises:
         ValueError: a moving scene, voxels that are not square, a body outside of the grid, a bad length or count.
     """
+    from torchpcct.counting_noise import _key
     from torchpcct.dose._transport import BATCHES, transport
-    from torchpcct.noise import _key
 
     check_static(scene)
     points = plane_points(grid)

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import Geometry, VolumeGrid, _number, _per_axis
 from torchpcct.projector.rays import rays_of
-from torchpcct.window import DetectorWindow
 
 __all__ = ["Ellipsoid", "Gaussian", "line_integrals", "rasterize"]
 

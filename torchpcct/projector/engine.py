@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import Geometry, VolumeGrid
 from torchpcct.projector.layers import layer_spacing, running_sums
 from torchpcct.projector.plane import PlanePasses
@@ -26,7 +27,6 @@ from torchpcct.projector.rays import (
     slab_lattice,
     split,
 )
-from torchpcct.window import DetectorWindow
 
 if TYPE_CHECKING:
     from torchpcct.projector.gpu import GpuPasses

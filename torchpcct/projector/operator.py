@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import Geometry, VolumeGrid
 from torchpcct.projector import gpu
 from torchpcct.projector.engine import Engine
-from torchpcct.window import DetectorWindow
 
 __all__ = ["Projector"]
 

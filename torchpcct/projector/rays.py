@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
-from torchpcct.window import DetectorWindow
 
 __all__ = ["Rays", "Segments", "check_motion", "check_pair", "check_source", "rays_of", "slab_lattice", "split"]
 

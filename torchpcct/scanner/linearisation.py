@@ -17,7 +17,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from torchpcct.window import DetectorWindow
+from torchpcct.detector_window import DetectorWindow
 
 __all__ = ["WaterLinearisation"]
 

@@ -25,12 +25,12 @@ from recon.study.dose_factor.measures import OBSERVERS, crop_window, observer_ch
 from recon.study.dose_factor.settings import FBP_BASE, MAIN_SCENES, WIDE_ROIS, Settings
 from recon.study.dose_factor.store import Store
 from recon.study.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM, enclosing, inset_grid
+from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.ceiling import information_matrix
 from torchpcct.metrics.placement import RoiPair, place_rois, whole_rois
 from torchpcct.metrics.roi import axial_grid
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
-from torchpcct.window import DetectorWindow, shadow
 
 if TYPE_CHECKING:
     from torchpcct.scanner import Scanner
