@@ -13,8 +13,9 @@ from geometries import REGISTRY
 
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
-from torchpcct.projector import Projector, plane
+from torchpcct.projector import Projector
 from torchpcct.projector.analytic import Gaussian, line_integrals, rasterize
+from torchpcct.projector.cpu import plane_passes as plane
 
 NAMES = sorted(REGISTRY)
 SOME = [
@@ -416,7 +417,7 @@ def test_nan_and_inf_do_not_leak_into_other_cells_of_slabs_far_apart():
 @pytest.mark.parametrize("tasks", [1, 2, 6, 12, 13, 64, 100])
 def test_tasks_of_the_plane_adjoint_are_mixed(tasks):
     # Threads take runs of tasks; rows come first, and with symmetric views nearly all work is in the rows.
-    from torchpcct.projector.plane_kernels import _mixing_stride
+    from torchpcct.projector.cpu.plane_kernels import _mixing_stride
 
     order = np.arange(tasks) * _mixing_stride(tasks) % tasks
     assert sorted(order) == list(range(tasks))

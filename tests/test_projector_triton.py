@@ -15,7 +15,8 @@ from triton import knobs
 
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid
-from torchpcct.projector import Projector, gpu
+from torchpcct.projector import Projector
+from torchpcct.projector.cuda import passes as gpu
 
 pytestmark = [
     pytest.mark.skipif(not knobs.runtime.interpret, reason="triton was imported without TRITON_INTERPRET=1"),

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import Geometry, VolumeGrid
-from torchpcct.projector import gpu
-from torchpcct.projector.engine import Engine
+from torchpcct.projector.cpu.engine import Engine
+from torchpcct.projector.cuda import passes as gpu
 
 __all__ = ["Projector"]
 

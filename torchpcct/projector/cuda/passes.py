@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 if TYPE_CHECKING:
-    from torchpcct.projector.engine import Engine
+    from torchpcct.projector.cpu.engine import Engine
 
 __all__ = ["GpuPasses", "agrees", "available", "workspace"]
 
@@ -68,7 +68,7 @@ class GpuPasses:
     """
 
     def __init__(self, engine: Engine, device: torch.device) -> None:
-        from torchpcct.projector import volume_kernels
+        from torchpcct.projector.cpu import cone_kernels as volume_kernels
 
         self.engine, self.device = engine, device
         cells, axes = cell_table(engine)
@@ -100,7 +100,7 @@ class GpuPasses:
         return out.reshape(batch, *self.engine.range_shape)
 
     def _forward_slice(self, x: Tensor, out: Tensor) -> None:
-        from torchpcct.projector.triton_kernels import project_kernel
+        from torchpcct.projector.cuda.kernels import project_kernel
 
         nz, ny, nx = self._shape()
         rays, batch = self.engine.rays, x.shape[0]
@@ -127,7 +127,7 @@ class GpuPasses:
 
     def _adjoint_slice(self, y: Tensor, views: int) -> Tensor:
         """The whole sum, ``views`` at a time: each voxel's sum goes on where the views before left it."""
-        from torchpcct.projector.triton_kernels import backproject_kernel
+        from torchpcct.projector.cuda.kernels import backproject_kernel
 
         nz, ny, nx = self._shape()
         rays, batch, start = self.engine.rays, y.shape[0], self.engine.segments.start
@@ -240,7 +240,7 @@ def agrees(engine: Engine, device: torch.device, dtype: torch.dtype) -> bool:
 def trusted(engine: Engine, device: torch.device, dtype: torch.dtype) -> bool:
     """:func:`agrees`, checked once per device, dtype and kind of scan, on a scan of a few views and voxels."""
     from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid
-    from torchpcct.projector.engine import Engine as Small
+    from torchpcct.projector.cpu.engine import Engine as Small
 
     kind = type(engine.geometry).__name__
     key = (f"{device} {kind}", dtype)

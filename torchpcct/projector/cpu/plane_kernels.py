@@ -15,8 +15,8 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from torchpcct.projector.lanes import add_edges, sum_edges
-from torchpcct.projector.volume_kernels import _FLAGS, _depth_line, _edge_line
+from torchpcct.projector.cpu.cone_kernels import _FLAGS, _depth_line, _edge_line
+from torchpcct.projector.cpu.simd import add_edges, sum_edges
 
 __all__ = ["backproject", "cell_values", "collect", "deal", "load_image", "project", "tabulate"]
 

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpcct.geometry import Geometry, VolumeGrid
+from torchpcct.projector.cpu.symmetry import Orbits, address, find_orbits, no_orbits, place
 from torchpcct.projector.rays import Rays, Segments, slab_lattice, split
-from torchpcct.projector.symmetry import Orbits, address, find_orbits, no_orbits, place
 
 __all__ = ["PlanePasses"]
 
@@ -25,7 +25,7 @@ class _Tables:
     """
 
     def __init__(self, passes: PlanePasses, dtype: np.dtype, width: int, steepest: float) -> None:
-        from torchpcct.projector import plane_kernels
+        from torchpcct.projector.cpu import plane_kernels
 
         n = int(passes.entries)
         self.p, self.q, self.gain = (np.empty(n, dtype=dtype) for _ in range(3))
@@ -130,7 +130,7 @@ class PlanePasses:
         return itemsize * (lanes * (knots + readings) + 3 * self.entries + weights)
 
     def forward(self, x: NDArray) -> NDArray:
-        from torchpcct.projector import plane_kernels as kernels
+        from torchpcct.projector.cpu import plane_kernels as kernels
 
         ny, nx = self.grid.shape
         images = x.reshape(x.shape[0], ny * nx)
@@ -157,7 +157,7 @@ class PlanePasses:
         return y
 
     def adjoint(self, y: NDArray) -> NDArray:
-        from torchpcct.projector import plane_kernels as kernels
+        from torchpcct.projector.cpu import plane_kernels as kernels
 
         ny, nx = self.grid.shape
         x = np.empty((y.shape[0], ny, nx), dtype=y.dtype)

@@ -13,7 +13,7 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
-from torchpcct.projector.lanes import _Code
+from torchpcct.projector.cpu.simd import _Code
 
 __all__ = ["read_even"]
 

@@ -18,8 +18,8 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from torchpcct.projector.even_knots import read_even
-from torchpcct.projector.lanes import add_lines, spread_lines
+from torchpcct.projector.cpu.simd import add_lines, spread_lines
+from torchpcct.projector.cpu.simd_interpolation import read_even
 
 __all__ = ["backproject", "padded", "project"]
 

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import Geometry, VolumeGrid
-from torchpcct.projector.layers import layer_spacing, running_sums
-from torchpcct.projector.plane import PlanePasses
+from torchpcct.projector.cpu.depth_layers import layer_spacing, running_sums
+from torchpcct.projector.cpu.plane_passes import PlanePasses
 from torchpcct.projector.rays import (
     Rays,
     Segments,
@@ -29,7 +29,7 @@ from torchpcct.projector.rays import (
 )
 
 if TYPE_CHECKING:
-    from torchpcct.projector.gpu import GpuPasses
+    from torchpcct.projector.cuda.passes import GpuPasses
 
 __all__ = ["Engine"]
 
@@ -72,7 +72,7 @@ class Engine:
     def on(self, device: Any) -> GpuPasses:
         """The CUDA passes of this engine, with their tables on ``device``."""
         if device not in self._devices:
-            from torchpcct.projector.gpu import GpuPasses
+            from torchpcct.projector.cuda.passes import GpuPasses
 
             self._devices[device] = GpuPasses(self, device)
         return self._devices[device]
@@ -152,7 +152,7 @@ class Engine:
         return (z - dz / 2, dz, self.rays.row_edge + self.rays.first_row * self.rays.row_pitch, self.rays.row_pitch)
 
     def _forward_volume(self, x: NDArray) -> NDArray:
-        from torchpcct.projector import volume_kernels
+        from torchpcct.projector.cpu import cone_kernels as volume_kernels
 
         r, seg = self.rays, self.segments
         _, ny, nx = self.grid.shape
@@ -166,7 +166,7 @@ class Engine:
         return y
 
     def _adjoint_volume(self, y: NDArray) -> NDArray:
-        from torchpcct.projector import volume_kernels
+        from torchpcct.projector.cpu import cone_kernels as volume_kernels
 
         r, seg = self.rays, self.segments
         x = np.empty((y.shape[0], *self.grid.shape), dtype=y.dtype)

@@ -1,0 +1,1 @@
+"""CPU passes of the projector."""

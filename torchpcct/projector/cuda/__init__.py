@@ -1,0 +1,1 @@
+"""CUDA passes of the projector."""
