@@ -11,9 +11,9 @@ from torchpcct.acquisition.transmission import SUB_RAY_COUNTS, compress, sub_ray
 from torchpcct.geometry import ConeBeam, VolumeGrid, full_turn
 from torchpcct.scanner import presets
 from torchpcct.scene import Body, Ellipsoid, EllipticCylinder, Scene, SinusoidalMotion, chord_lengths
-from torchpcct.scene.phantoms import water_cylinder
-from torchpcct.scene.plaque import plaque_scene
-from torchpcct.scene.variants import plaque_variant
+from torchpcct.scene.phantoms.quality import water_cylinder
+from torchpcct.scene.plaque.plaque import plaque_scene
+from torchpcct.scene.plaque.variants import plaque_variant
 
 INSET = VolumeGrid((57, 45, 45), 0.2, (0.0, -30.38, -29.63))
 

@@ -13,7 +13,7 @@ from torchpcct.scanner.compton import mean_recoil_fraction
 from torchpcct.scanner.pileup import PileUpMap, pulse_heights, recorded_rates
 from torchpcct.scanner.transport import Stack, efficiency, follow
 from torchpcct.scene.materials import material
-from torchpcct.scene.phantoms import water_cylinder
+from torchpcct.scene.phantoms.quality import water_cylinder
 
 ENERGIES = np.array([25.0, 45.0, 70.0, 95.0])
 QUANTA = np.array([2e6, 8e6, 6e6, 1e6])
@@ -128,7 +128,7 @@ def test_scans_with_pile_up_lose_counts_and_stay_linear_in_water():
 
 def test_a_window_sees_the_pile_up_of_the_whole():
     from torchpcct import VolumeGrid
-    from torchpcct.scene.plaque import plaque_scene
+    from torchpcct.scene.plaque.plaque import plaque_scene
 
     scene, _ = plaque_scene(vessel_length=4.0)
     system = presets.pcct(views=6, mode="spectral", detector=SiliconDetector("spectral", dead_time_ns=50.0))

@@ -19,7 +19,7 @@ from torchpcct.scanner import Source, presets
 from torchpcct.scanner.compton import recoil
 from torchpcct.scene import Body, Ellipsoid, EllipticCylinder, Scene, SinusoidalMotion
 from torchpcct.scene.materials import material
-from torchpcct.scene.phantoms import ctdi, water_cylinder
+from torchpcct.scene.phantoms.quality import ctdi, water_cylinder
 
 # NIST (Hubbell and Seltzer 1995), cm²/g at these energies in keV.
 NIST_KEV = (15, 20, 30, 40, 50, 60, 80, 100, 150)

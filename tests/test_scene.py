@@ -23,7 +23,7 @@ from torchpcct.scene import (
     rotation_matrix,
 )
 from torchpcct.scene.materials import MATERIALS
-from torchpcct.scene.phantoms import CTDI_HOLES, ctdi, random_ellipsoids, water_cylinder
+from torchpcct.scene.phantoms.quality import CTDI_HOLES, ctdi, random_ellipsoids, water_cylinder
 
 TILT = rotation_matrix((1.0, 2.0, -0.5), 0.7)
 SHAPES = [

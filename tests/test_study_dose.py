@@ -26,7 +26,7 @@ from torchpcct.dose import CtdiDose
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scene import SinusoidalMotion
 from torchpcct.scene.materials import material
-from torchpcct.scene.phantoms import water_cylinder
+from torchpcct.scene.phantoms.quality import water_cylinder
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,8 @@ import pytest
 
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scene import Scene
-from torchpcct.scene.plaque import Plaque
-from torchpcct.scene.thorax import RIB_ANGLES_DEG, thorax
+from torchpcct.scene.phantoms.thorax import RIB_ANGLES_DEG, thorax
+from torchpcct.scene.plaque.plaque import Plaque
 
 IN_THE_WALL = Plaque(position=(47.0, -4.0, 0.0))
 

@@ -4,7 +4,7 @@ A scene (:class:`Scene`) is drawn in mm and HU, without a grid (:mod:`train.draw
 area-averaged voxel values, and :mod:`train.held_out` a family of its own to select checkpoints with.
 It holds either vessels (bent, tilted tubes: wall, fibrous layer, eccentric and narrowing lumen; soft inclusions, called
 cores, and calcifications in the fibrous layer) or free-standing bodies of random contrast, in fat or in a tissue like
-muscle. Cores have contrasts of both signs. The plaque of the paper (:mod:`torchpcct.scene.plaque`) is never drawn:
+muscle. Cores have contrasts of both signs. The plaque of the paper (:mod:`torchpcct.scene.plaque.plaque`) is never drawn:
 outer sections are centred on a smooth centreline, with no ``cos²`` bulge to one side, and :func:`is_paper_family`
 rejects what comes close in the parameters that both constructions share.
 

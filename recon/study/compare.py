@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from torchpcct.scan import Scan
     from torchpcct.scanner import Scanner
     from torchpcct.scene import Scene
-    from torchpcct.scene.plaque import Plaque
+    from torchpcct.scene.plaque.plaque import Plaque
 
 __all__ = ["FULL_VIEWS", "INSET_MM", "Compared", "Settings", "Statistics", "inset_grid", "run"]
 
@@ -204,7 +204,7 @@ def run(
 
     Args:
         settings: axes and size; None: the paper's.
-        scene: a scene and its plaque, as :func:`torchpcct.scene.plaque.plaque_scene` gives; None: the paper's.
+        scene: a scene and its plaque, as :func:`torchpcct.scene.plaque.plaque.plaque_scene` gives; None: the paper's.
         scanner: None: the deep-silicon PCCT in counting mode.
         progress: called with the name of the step and its finished fraction.
 
@@ -214,7 +214,7 @@ def run(
     from recon.exact_noise import roi_covariance
     from recon.inset import InsetFbp
     from torchpcct.scanner import presets
-    from torchpcct.scene.plaque import plaque_scene
+    from torchpcct.scene.plaque.plaque import plaque_scene
 
     settings = settings or Settings()
     scanner = scanner or presets.pcct(views=settings.views)

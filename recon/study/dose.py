@@ -164,8 +164,8 @@ def measure(settings: Settings, progress: Progress | None = None) -> Measured:
 
 
 def _scenes() -> dict[str, Scene]:
-    from torchpcct.scene.phantoms import ctdi
-    from torchpcct.scene.thorax import thorax
+    from torchpcct.scene.phantoms.quality import ctdi
+    from torchpcct.scene.phantoms.thorax import thorax
 
     return {"ctdi": ctdi(), "thorax": thorax()}
 
@@ -179,7 +179,7 @@ def _grid(name: str, spacing: float) -> VolumeGrid:
 def _dose(m: Measured, report: Callable[[float], None]) -> None:
     from recon.study import bowtie_dose as part
     from torchpcct.dose import monte_carlo_dose, primary_dose
-    from torchpcct.scene.phantoms import water_cylinder
+    from torchpcct.scene.phantoms.quality import water_cylinder
 
     s = m.settings
     scanners = {b: wide_scanner(b, 8) for b in BOWTIES}
@@ -263,7 +263,7 @@ def _noise(m: Measured, report: Callable[[float], None]) -> None:
 
 def _cupping(m: Measured, report: Callable[[float], None]) -> None:
     """Largest difference between ring means of a water cylinder of 32 cm, 5 mm rings out to 95 % of its radius."""
-    from torchpcct.scene.phantoms import water_cylinder
+    from torchpcct.scene.phantoms.quality import water_cylinder
 
     radius = 160.0
     # Round about the axis: every view is the same, a few are enough.

@@ -17,7 +17,7 @@ from torchpcct.metrics.segmentation import PlaqueSegmentation, basin_depth, cap_
 
 if TYPE_CHECKING:
     from torchpcct.scene import Scene
-    from torchpcct.scene.plaque import Plaque
+    from torchpcct.scene.plaque.plaque import Plaque
 
 __all__ = ["Observed", "Reference", "observe"]
 

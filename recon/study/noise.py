@@ -162,7 +162,7 @@ def measure(settings: Settings, progress: Progress | None = None) -> Measured:
     from recon.exact_noise import roi_adjoints
     from recon.inset import InsetFbp
     from torchpcct.scanner import presets
-    from torchpcct.scene.plaque import plaque_scene
+    from torchpcct.scene.plaque.plaque import plaque_scene
 
     report = progress or (lambda step, fraction: None)
     seconds: dict[str, float] = {}

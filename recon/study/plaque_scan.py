@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from torchpcct.scan import Scan
     from torchpcct.scanner import Scanner
     from torchpcct.scene import Scene
-    from torchpcct.scene.plaque import Plaque
+    from torchpcct.scene.plaque.plaque import Plaque
 
 __all__ = [
     "INSET_MM",
@@ -78,7 +78,7 @@ def prepare(
 
     Args:
         kernels, voxels_mm: of the study.
-        scene: a scene and its plaque, as :func:`torchpcct.scene.plaque.plaque_scene` gives.
+        scene: a scene and its plaque, as :func:`torchpcct.scene.plaque.plaque.plaque_scene` gives.
         scanner: with the number of views to simulate.
         full_views: views of the complete scan. Fewer views stand for the same scan, thinned out: the beam is on for as
             long as in one of its views.

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from torchpcct.dose.primary import primary_dose
 from torchpcct.geometry import VolumeGrid
-from torchpcct.scene.phantoms import CTDI_HOLES, ctdi
+from torchpcct.scene.phantoms.quality import CTDI_HOLES, ctdi
 
 if TYPE_CHECKING:
     from torchpcct.scanner import Scanner
@@ -91,7 +91,7 @@ def ctdi_dose(
     Args:
         scanner: its fan must cover the phantom, or the outer bores are partly shaded.
         exposure_s: duration of the rotation in s at the source's current.
-        phantom: scene with the bodies of :func:`torchpcct.scene.phantoms.ctdi`; None: the 32 cm body phantom with
+        phantom: scene with the bodies of :func:`torchpcct.scene.phantoms.quality.ctdi`; None: the 32 cm body phantom with
             water in its bores.
         axial, quantity: see :func:`torchpcct.dose.primary_dose`; the default is the primary part of CTDI100.
         histories: photons of the Monte Carlo for the scattered part (:func:`torchpcct.dose.monte_carlo_dose`); 0: no

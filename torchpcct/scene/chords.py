@@ -25,8 +25,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from torchpcct.scene._rays import BOX, BULGED, CYLINDER, ELLIPSOID, NARROWED, chords, interval
 from torchpcct.scene.bodies import Box, Ellipsoid, EllipticCylinder, Shape
+from torchpcct.scene.chord_kernels import BOX, BULGED, CYLINDER, ELLIPSOID, NARROWED, chords, interval
 from torchpcct.scene.tubes import BulgedTube, NarrowedTube
 
 __all__ = ["PARAMETERS", "chord_lengths", "interval", "pack"]

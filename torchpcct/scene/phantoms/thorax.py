@@ -15,7 +15,7 @@ import math
 from typing import Any
 
 from torchpcct.scene.bodies import EllipticCylinder, number, numbers
-from torchpcct.scene.plaque import Plaque
+from torchpcct.scene.plaque.plaque import Plaque
 from torchpcct.scene.scene import Body, Scene
 
 __all__ = ["HEART_CENTER_MM", "RIB_ANGLES_DEG", "thorax"]
@@ -85,11 +85,11 @@ def thorax(
     Returns:
         A scene of endless cylinders: ``"skin"``, ``"fat"``, ``"muscle"``, ``"lungs"``, ``"heart"`` and its chambers,
         ``"rib_left_0"``… with ``"…_marrow"``, ``"vertebra"``, ``"sternum"`` and others; with a plaque also
-        ``"coronary_fat"`` and the bodies of :func:`~torchpcct.scene.plaque.plaque_scene`.
+        ``"coronary_fat"`` and the bodies of :func:`~torchpcct.scene.plaque.plaque.plaque_scene`.
 
     Raises:
         ValueError: a plaque whose pocket leaves the heart's wall or touches a chamber; unknown materials.
-        TypeError: ``plaque`` is no :class:`~torchpcct.scene.plaque.Plaque`.
+        TypeError: ``plaque`` is no :class:`~torchpcct.scene.plaque.plaque.Plaque`.
     """
     x0, y0 = numbers("center", center, 2)
     bodies = []

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from torchpcct.scene.bodies import Ellipsoid, EllipticCylinder, number
-from torchpcct.scene.plaque import PAPER_POSITION, Plaque, interpolate_material, plaque_scene
+from torchpcct.scene.plaque.plaque import PAPER_POSITION, Plaque, interpolate_material, plaque_scene
 from torchpcct.scene.scene import Body, Scene
 
 __all__ = ["VARIANTS", "calcification_bodies", "plaque_variant", "stent_bodies", "textured"]
@@ -217,7 +217,7 @@ def plaque_variant(name: str, **options: Any) -> tuple[Scene, Plaque]:
 
     Args:
         name: of the variant, a key of :data:`VARIANTS`.
-        **options: of :func:`~torchpcct.scene.plaque.plaque_scene`, on top of the variant's own.
+        **options: of :func:`~torchpcct.scene.plaque.plaque.plaque_scene`, on top of the variant's own.
 
     Raises:
         ValueError: an unknown name, options that make bodies overlap.

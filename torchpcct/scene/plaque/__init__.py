@@ -1,0 +1,1 @@
+"""The coronary plaque of the paper, and its variants."""
