@@ -11,7 +11,7 @@ from torchpcct import acquire
 from torchpcct.scanner import SiliconDetector, presets
 from torchpcct.scanner.compton import mean_recoil_fraction
 from torchpcct.scanner.pileup import PileUpMap, pulse_heights, recorded_rates
-from torchpcct.scanner.transport import Stack, efficiency, follow
+from torchpcct.scanner.silicon_transport import Stack, efficiency, follow
 from torchpcct.scene.materials import material
 from torchpcct.scene.phantoms.quality import water_cylinder
 

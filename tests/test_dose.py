@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchpcct.dose import air_fluence, ctdi_dose, mass_energy_absorption, monte_carlo_dose, primary_dose
-from torchpcct.dose._transport import _compton, _rayleigh, _turned
 from torchpcct.dose.coefficients import MGY_PER_KEV_PER_G, fan_half_angle
 from torchpcct.dose.ctdi import CtdiDose, disc_samples
 from torchpcct.dose.scatter import _form_factor
+from torchpcct.dose.transport_kernels import _compton, _rayleigh, _turned
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scanner import Source, presets
 from torchpcct.scanner.compton import recoil

@@ -22,7 +22,7 @@ from recon.study.detector_rate import (
 from recon.study.report import Report, environment, markdown_table
 from torchpcct.acquisition.plan import Effect
 from torchpcct.scanner import SiliconDetector, presets
-from torchpcct.scanner.transport import Stack, efficiency, follow
+from torchpcct.scanner.silicon_transport import Stack, efficiency, follow
 from torchpcct.scene.materials import PLAQUE_MATERIALS, material
 
 __all__ = ["Settings", "run"]

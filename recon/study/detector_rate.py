@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from recon.study.report import markdown_table
 from torchpcct.scanner import Scanner, SiliconDetector, presets
 from torchpcct.scanner.pileup import PileUpMap, recorded_rates
-from torchpcct.scanner.transport import efficiency, follow
+from torchpcct.scanner.silicon_transport import efficiency, follow
 from torchpcct.scene.materials import PLAQUE_MATERIALS, material
 
 __all__ = ["FAT_MM", "beam_behind", "charge_sharing", "charge_sharing_section", "pile_up", "pile_up_section"]

@@ -136,7 +136,7 @@ def monte_carlo_dose(
         ValueError: a moving scene, voxels that are not square, a body outside of the grid, a bad length or count.
     """
     from torchpcct.counting_noise import _key
-    from torchpcct.dose._transport import BATCHES, transport
+    from torchpcct.dose.transport_kernels import BATCHES, transport
 
     check_static(scene)
     points = plane_points(grid)

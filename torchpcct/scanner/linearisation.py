@@ -81,7 +81,7 @@ class WaterLinearisation:
         return cls(coefficients, scale, mu_ref)
 
     def _evaluate(self, p: Tensor, window: DetectorWindow | None, *, slope: bool) -> Tensor:
-        from torchpcct.scanner._linearisation_kernel import evaluate
+        from torchpcct.scanner.linearisation_kernel import evaluate
 
         columns = self.scale.size if window is None else window.columns
         if p.shape[-1] != columns:

@@ -3,7 +3,7 @@
 Every ray by itself, by maximum likelihood of its Poisson counts (Alvarez 2011 for the problem; no linearisation, no
 calibration table): Newton's method on the exact model of :class:`~torchpcct.spectral.model.SpectralModel`. The
 estimate is asymptotically efficient, its bias of order 1 / counts is removed by pseudo-counts (Firth 1993), which
-also keep rays without any count finite; see :mod:`torchpcct.spectral._kernel` for the formulas.
+also keep rays without any count finite; see :mod:`torchpcct.spectral.decompose_kernels` for the formulas.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ class _Decompose(torch.autograd.Function):
         ctx: Any, counts: Tensor, model: SpectralModel, column: Any, intensity: Any, reduce_bias: bool,
         tolerance: float, box: Any,
     ) -> Any:  # fmt: skip
-        from torchpcct.spectral._kernel import solve
+        from torchpcct.spectral.decompose_kernels import solve
 
         n = counts.detach().contiguous().reshape(model.bins, -1)
         rays = column.size
@@ -152,7 +152,7 @@ class _Decompose(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad: Tensor, *_: Any) -> Any:
-        from torchpcct.spectral._kernel import sensitivity
+        from torchpcct.spectral.decompose_kernels import sensitivity
 
         counts, out = ctx.saved_tensors
         model, column, intensity, reduce_bias, box = ctx.rest

@@ -244,7 +244,7 @@ def evaluate(model: SpectralModel, line_integrals: Tensor, column: Any, intensit
 
     The derivatives λ₁, λ₂ (per mm), λ₁₁, λ₁₂, λ₂₂ (per mm²) stand in ``(5, bins, rays)``.
     """
-    from torchpcct.spectral._kernel import expected
+    from torchpcct.spectral.decompose_kernels import expected
 
     a = line_integrals.detach().to(torch.float64).reshape(2, -1).numpy()
     counts = np.empty((model.bins, column.size))
