@@ -1,6 +1,6 @@
 """What the data give when shapes are known only so well: limits between the ideal and a method that must find them.
 
-:mod:`torchpcct.metrics.ceiling` takes the outlines of all tissues as known. Here they are not:
+:mod:`torchpcct.metrics.data_limit` takes the outlines of all tissues as known. Here they are not:
 
 * :func:`contrast_limit` knows only the inside of each tissue; voxels that an outline crosses, and those within a few
   rings of it, may hold anything;

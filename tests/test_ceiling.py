@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from torchpcct import ConeBeam, full_turn
 from torchpcct.acquisition.path_lengths import tissue_path_lengths
 from torchpcct.detector_window import DetectorWindow
-from torchpcct.metrics import ceiling, information_matrix, paper_cnr_ceiling
+from torchpcct.metrics import data_limit as ceiling
+from torchpcct.metrics import information_matrix, paper_cnr_ceiling
 from torchpcct.scene import Body, Ellipsoid, EllipticCylinder, Scene, SinusoidalMotion
 from torchpcct.scene.plaque.plaque import plaque_scene
 
@@ -25,7 +26,7 @@ def system(seed, tissues=4, shape=(3, 5, 7)):
 @pytest.mark.parametrize("kind", ["stack", "list", "tensors", "float32"])
 def test_information_against_dense_algebra(kind, monkeypatch):
     # The package's attribute of that name is the function.
-    monkeypatch.setattr(sys.modules["torchpcct.metrics.ceiling"], "_CHUNK", 16)
+    monkeypatch.setattr(sys.modules["torchpcct.metrics.data_limit"], "_CHUNK", 16)
     maps, weight = system(0)
     a = maps.reshape(4, -1).T
     expected = 0.02**2 * a.T @ np.diag(weight.ravel()) @ a

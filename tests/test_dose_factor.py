@@ -15,7 +15,7 @@ from torchpcct.metrics import (
     efficiency,
     roi_bias,
 )
-from torchpcct.metrics._bootstrap import bca_interval, leave_one_out, resampling
+from torchpcct.metrics.bootstrap import bca_interval, leave_one_out, resampling
 from torchpcct.metrics.dose_factor import DOSES, FIGURES
 
 MEANS, COVARIANCE = (40.0, 100.0), np.array([[100.0, 40.0], [40.0, 300.0]])

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchpcct.geometry import VolumeGrid
+from torchpcct.metrics.plaque_measures import basin_depth, cap_on_line, dice, segment_plaque
 from torchpcct.metrics.resolution import ellipsoid_distance
-from torchpcct.metrics.segmentation import basin_depth, cap_on_line, dice, segment_plaque
 
 GRID = VolumeGrid((160, 180), (0.03, 0.025), (-30.0, -29.0))
 HALF = {"lumen_hu": 300.0, "core_hu": (10.0, 70.0)}

@@ -21,7 +21,7 @@ from recon.study.noise_statistics import (
     resampled_tables,
 )
 from recon.study.tables import published, table_checks
-from torchpcct.metrics._bootstrap import resampling
+from torchpcct.metrics.bootstrap import resampling
 
 TINY = noise.Settings(
     realizations=24,

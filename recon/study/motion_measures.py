@@ -12,8 +12,8 @@ from torch import Tensor
 from recon.study.resolution_measures import centers, truth
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.placement import RoiPair, place_rois
+from torchpcct.metrics.plaque_measures import PlaqueSegmentation, basin_depth, cap_on_line, dice, segment_plaque
 from torchpcct.metrics.roi import axial_grid, sample_axial
-from torchpcct.metrics.segmentation import PlaqueSegmentation, basin_depth, cap_on_line, dice, segment_plaque
 
 if TYPE_CHECKING:
     from torchpcct.scene import Scene

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from recon.inset import InsetFbp
 from torchpcct.geometry import VolumeGrid
-from torchpcct.metrics.segmentation import PlaqueSegmentation, basin_depth, cap_on_line, dice, segment_plaque
+from torchpcct.metrics.plaque_measures import PlaqueSegmentation, basin_depth, cap_on_line, dice, segment_plaque
 
 if TYPE_CHECKING:
     from torchpcct.scanner import Scanner
@@ -147,7 +147,7 @@ class Blurred:
         segmentation: of the image.
         cap_line: cap thickness in mm along the line from the lumen's to the core's centre.
         core_dice, lumen_dice: overlap with the true tissue.
-        depth: of the core's basin in HU (:func:`torchpcct.metrics.segmentation.basin_depth`).
+        depth: of the core's basin in HU (:func:`torchpcct.metrics.plaque_measures.basin_depth`).
     """
 
     sigma_px: float

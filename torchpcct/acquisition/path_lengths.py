@@ -2,7 +2,7 @@
 
 A tissue is a body WITHOUT what lies inside it, so the tissues of a scene are disjoint and their path lengths add up to
 the chord of the outermost body. They are the columns of the linear model that the limit of
-:mod:`torchpcct.metrics.ceiling` rests on.
+:mod:`torchpcct.metrics.data_limit` rests on.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Figures of merit: CNR, the limit of the data, dose factor, observer, resolution, noise."""
 
-from torchpcct.metrics._bootstrap import Estimate
-from torchpcct.metrics.ceiling import Ceiling, ceiling, information_matrix, paper_cnr_ceiling
+from torchpcct.metrics.bootstrap import Estimate
 from torchpcct.metrics.cnr import Interval, cnr, cnr_from_moments, cnr_interval, cnr_range, mean_interval, sd_interval
+from torchpcct.metrics.data_limit import Ceiling, ceiling, information_matrix, paper_cnr_ceiling
 from torchpcct.metrics.dose_factor import (
     ContrastSlope,
     DoseCurve,

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from torchpcct.metrics._bootstrap import Estimate, bca_interval, evaluate, leave_one_out, resampling
+from torchpcct.metrics.bootstrap import Estimate, bca_interval, evaluate, leave_one_out, resampling
 
 __all__ = [
     "DOSES",
@@ -435,7 +435,7 @@ def efficiency(
     """Ideal variance over the method's slope-corrected variance of the contrast: 1 for the best unbiased method.
 
     Args:
-        ideal_sd: SD of the contrast by :func:`torchpcct.metrics.ceiling`, HU, at the dose of ``contrasts``.
+        ideal_sd: SD of the contrast by :func:`torchpcct.metrics.data_limit`, HU, at the dose of ``contrasts``.
         contrasts: ``(realisations,)`` background minus foreground, HU; at least 3.
         slope: the method's contrast slope, as in :func:`dose_factor`.
         level, draws, seed: of the bootstrap over realisations.

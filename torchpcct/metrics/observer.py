@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchpcct.geometry import VolumeGrid
-from torchpcct.metrics._bootstrap import Estimate, bca_interval, evaluate, leave_one_out, resampling
+from torchpcct.metrics.bootstrap import Estimate, bca_interval, evaluate, leave_one_out, resampling
 
 __all__ = [
     "ObserverResult",

@@ -34,7 +34,6 @@ from torchpcct.metrics import (
     DoseCurve,
     auc,
     auc_from_d_prime,
-    ceiling,
     channel_responses,
     cnr,
     cnr_interval,
@@ -50,6 +49,7 @@ from torchpcct.metrics import (
     sd_interval,
     task_transfer,
 )
+from torchpcct.metrics import data_limit as ceiling
 from torchpcct.metrics.dose_factor import DOSES
 
 __all__ = ["ASSUMED_FACTOR", "Analysis", "analyse"]

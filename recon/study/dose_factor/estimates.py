@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpcct.metrics import DoseCurve, dose_factor
-from torchpcct.metrics._bootstrap import bca_interval, leave_one_out, resampling
+from torchpcct.metrics.bootstrap import bca_interval, leave_one_out, resampling
 
 __all__ = [
     "DRAWS",

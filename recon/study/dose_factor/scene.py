@@ -27,7 +27,7 @@ from recon.study.dose_factor.store import Store
 from recon.study.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM, enclosing, inset_grid
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import VolumeGrid
-from torchpcct.metrics.ceiling import information_matrix
+from torchpcct.metrics.data_limit import information_matrix
 from torchpcct.metrics.placement import RoiPair, place_rois, whole_rois
 from torchpcct.metrics.roi import axial_grid
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
