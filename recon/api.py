@@ -9,7 +9,7 @@ from typing import Any, overload
 
 import torch
 
-from recon.inset import InsetFbp
+from recon.fbp.inset import InsetFbp
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
 from torchpcct.volume import Volume

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recon.channel_fbp import static_fbp
+from recon.fbp.channels import static_fbp
 from recon.gram import Gram
 from recon.joint import Whitening, joint_pwls, mean_weights
 from recon.qggmrf import QGGMRF

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recon.inset import to_hu
+from recon.fbp.inset import to_hu
 from recon.prior import PriorConfig
 from recon.roi import InsetProblem
 from recon.unrolled import NormalProblem, Unrolled, minimise_passes, residual

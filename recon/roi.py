@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from recon.fbp.inset import InsetFbp, to_hu
 from recon.gram import Gram
-from recon.inset import InsetFbp, to_hu
 from recon.pwls import pwls
 from recon.qggmrf import QGGMRF
 from torchpcct.detector_window import DetectorWindow, shadow
@@ -53,7 +53,7 @@ class InsetProblem:
         grid: ``(z, y, x)`` grid that holds everything the background does not.
         nodes: of the Gram operator. Linear in position (5) is enough for solvers: what the model lacks, the exact
             pairs repair, and each step costs half of that with 9.
-        motion: displacement of the inset in every view, ``(views, 3)`` z, y, x mm (:func:`recon.inset.view_motion`);
+        motion: displacement of the inset in every view, ``(views, 3)`` z, y, x mm (:func:`recon.fbp.inset.view_motion`);
             None: at rest. The background stands still; it is taken off before, so that only what moves is projected.
             The Gram is that of a grid at rest with the weights that the moving one meets; exact pairs use the moving
             projector.
@@ -78,7 +78,7 @@ class InsetProblem:
         self.background = scan.surround_line_integrals()
         # The background's own value inside the inset, from the same data by FBP.
         assert fbp.surround is not None
-        from recon.backproject import backproject
+        from recon.fbp.backproject import backproject
 
         self.level = float(backproject(fbp.surround[0], scan.geometry, grid, fbp.shadow).mean())
         polychromatic = scan.air.log() - scan.surround.log()

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from recon.exact_noise import line_integral_variance, roi_covariance
-from recon.inset import InsetFbp
+from recon.fbp.exact_noise import line_integral_variance, roi_covariance
+from recon.fbp.inset import InsetFbp
 from torchpcct import Scan, VolumeGrid, acquire
 from torchpcct.counting_noise import compound_poisson, normal, poisson
 from torchpcct.metrics.roi import RoiMean, axial_grid

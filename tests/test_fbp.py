@@ -12,8 +12,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recon.fbp import backproject, fbp, filter_sinogram, filter_windowed, interleave
-from recon.windows import KERNELS
+from recon.fbp.fbp import backproject, fbp, filter_sinogram, filter_windowed, interleave
+from recon.fbp.ramp import KERNELS
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid, full_turn
 

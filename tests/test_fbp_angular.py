@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recon.angular_weights import angular_weights, arc, parker_share, view_steps
+from recon.fbp.angular_weights import angular_weights, arc, parker_share, view_steps
 from torchpcct.geometry import FanBeam, ParallelBeam, full_turn
 
 FAN = dict(sod=570.0, sdd=1040.0, columns=81, pitch=8.0)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from recon._filtering import FilterPlan, full_window
-from recon.angular_weights import angular_weights
-from recon.backproject import BackprojectionPlan, backproject
-from recon.fbp import fbp, filter_sinogram, filter_windowed
+from recon.fbp.angular_weights import angular_weights
+from recon.fbp.backproject import BackprojectionPlan, backproject
+from recon.fbp.fbp import fbp, filter_sinogram, filter_windowed
+from recon.fbp.filter_plan import FilterPlan, full_window
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid, full_turn
 
@@ -227,7 +227,7 @@ def test_chunks_change_nothing(monkeypatch):
     geometry, _ = CASES["cone-curved"]
     data = torch.randn((2, *geometry.shape), dtype=torch.float64)
     whole = filter_sinogram(data, geometry)
-    monkeypatch.setattr("recon._filtering.CHUNK_BYTES", 1)
+    monkeypatch.setattr("recon.fbp.filter_plan.CHUNK_BYTES", 1)
     torch.testing.assert_close(filter_sinogram(data, geometry), whole, rtol=0, atol=1e-12)
     gradient = torch.randn_like(whole)
     window = full_window(geometry)

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from recon.backproject import BackprojectionPlan, backproject
-from recon.fbp import fbp
-from recon.inset import InsetFbp, view_motion
+from recon.fbp.backproject import BackprojectionPlan, backproject
+from recon.fbp.fbp import fbp
+from recon.fbp.inset import InsetFbp, view_motion
 from recon.qggmrf import QGGMRF
 from recon.roi import InsetProblem
 from torchpcct.acquisition.acquire import acquire

@@ -8,8 +8,8 @@ import pytest
 import torch
 from test_gram import matrix, problem
 
-from recon.channel_fbp import ChannelFbp, static_fbp
-from recon.fbp import fbp
+from recon.fbp.channels import ChannelFbp, static_fbp
+from recon.fbp.fbp import fbp
 from recon.gram import Gram
 from recon.joint import Whitening, joint_pwls, mean_weights, weigh
 from recon.joint_inset import BasisProblem

@@ -10,7 +10,7 @@ from test_roi_pwls import CENTER, GRID, clean, problem, scanner  # noqa: F401
 from test_unrolled import certificate
 
 from recon import reconstruct
-from recon.inset import to_hu
+from recon.fbp.inset import to_hu
 from recon.mbir import Mbir, average_onto, working_grid
 from recon.prior import PriorConfig
 from recon.roi import InsetProblem

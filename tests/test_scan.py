@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from recon import reconstruct
-from recon.inset import InsetFbp
+from recon.fbp.inset import InsetFbp
 from torchpcct import Scan, VolumeGrid, acquire, full_turn
 from torchpcct.scanner import presets
 from torchpcct.scene.plaque.plaque import plaque_scene
@@ -175,7 +175,7 @@ def test_noise_falls_with_the_square_root_of_dose():
 
 
 def test_exact_roi_covariance_matches_monte_carlo():
-    from recon.exact_noise import roi_covariance
+    from recon.fbp.exact_noise import roi_covariance
     from torchpcct.metrics.roi import RoiMean, axial_grid
 
     clean = acquire(SCENE, scanner(120), region=REGION, duty=0.05, sub_rays=16)

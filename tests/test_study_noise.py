@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from recon.exact_noise import roi_adjoints, roi_covariance
+from recon.fbp.exact_noise import roi_adjoints, roi_covariance
 from recon.study import noise, paper, registry
 from recon.study.noise_statistics import (
     CLAIMS,

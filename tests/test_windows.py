@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recon.windows import KERNELS, apodization, fast_length, ramp_filter, ramp_kernel
+from recon.fbp.ramp import KERNELS, apodization, fast_length, ramp_filter, ramp_kernel
 
 POINTS = {
     "soft": [1, 0.815, 0.4564, 0.1636, 0],

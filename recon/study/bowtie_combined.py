@@ -72,7 +72,7 @@ def combine(
     Returns:
         Figures of each exposure, and the plan of the simulation.
     """
-    from recon.exact_noise import roi_covariance
+    from recon.fbp.exact_noise import roi_covariance
     from recon.mbir import Mbir, working_grid
     from recon.roi import InsetProblem
 

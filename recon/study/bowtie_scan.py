@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.inset import to_hu
+from recon.fbp.inset import to_hu
 from torchpcct import counting_noise as noise
 from torchpcct.acquisition.transmission import Beam, BodySet, expected_readings, sub_rays
 from torchpcct.detector_window import DetectorWindow
@@ -181,7 +181,7 @@ def polynomial_linearisation(
 
 def slice_image(scan: SliceScan, grid: VolumeGrid, kernel: str, seed: int | None = None) -> Floats:
     """FBP of a slice in HU, ``grid.shape`` float64."""
-    from recon.fbp import fbp
+    from recon.fbp.fbp import fbp
 
     image = fbp(scan.line_integrals(seed), scan.geometry, grid, kernel)
     return np.asarray(to_hu(image, scan.linearisation.mu_ref).numpy(), dtype=np.float64)

@@ -211,8 +211,8 @@ def run(
     Raises:
         ValueError: settings out of range; ROIs that come out empty; an inset outside the field of view.
     """
-    from recon.exact_noise import roi_covariance
-    from recon.inset import InsetFbp
+    from recon.fbp.exact_noise import roi_covariance
+    from recon.fbp.inset import InsetFbp
     from torchpcct.scanner import presets
     from torchpcct.scene.plaque.plaque import plaque_scene
 

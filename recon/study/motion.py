@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from torch import Tensor
 
-from recon.inset import InsetFbp, view_motion
+from recon.fbp.inset import InsetFbp, view_motion
 from recon.study import paper
 from recon.study.motion_measures import Observed, Reference, observe
 from recon.study.plaque_scan import inset_grid

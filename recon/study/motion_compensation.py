@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
-from recon.inset import InsetFbp, view_motion
+from recon.fbp.inset import InsetFbp, view_motion
 from recon.roi import InsetProblem, reconstruct_pwls
 from recon.study.motion import KERNEL, Measured
 from recon.study.motion_measures import Observed, Reference, observe

@@ -1,6 +1,6 @@
 """The noise study: FBP of the plaque with every kernel, voxel size and dose, and what the paper's tables establish.
 
-The ROI means of FBP are inner products of the line integrals with adjoint vectors (:mod:`recon.exact_noise`). So their
+The ROI means of FBP are inner products of the line integrals with adjoint vectors (:mod:`recon.fbp.exact_noise`). So their
 joint covariance is exact, and hundreds of realisations cost one noisy scan each instead of a reconstruction per kernel
 and voxel size; a few are reconstructed in full beside, which must give the same ROI means.
 """
@@ -159,8 +159,8 @@ def run(settings: Settings | None = None, progress: Progress | None = None) -> R
 
 def measure(settings: Settings, progress: Progress | None = None) -> Measured:
     """Simulate, take exact moments, draw realisations, reconstruct a few in full."""
-    from recon.exact_noise import roi_adjoints
-    from recon.inset import InsetFbp
+    from recon.fbp.exact_noise import roi_adjoints
+    from recon.fbp.inset import InsetFbp
     from torchpcct.scanner import presets
     from torchpcct.scene.plaque.plaque import plaque_scene
 
@@ -253,7 +253,7 @@ def _roi_means(scanned: PlaqueScan, volumes: Any) -> Any:
 
 @dataclass(frozen=True)
 class _Weights:
-    """A functional of a volume, as :func:`recon.exact_noise.roi_covariance` takes ROIs."""
+    """A functional of a volume, as :func:`recon.fbp.exact_noise.roi_covariance` takes ROIs."""
 
     weights: torch.Tensor
 
@@ -261,8 +261,8 @@ class _Weights:
 def _averaging(scanned: PlaqueScan, kernels: tuple[str, ...]) -> dict[tuple[str, float], Any]:
     """SDs of the ROI means on large voxels that average over their volume: the mean of 2 × 2 × 2 voxels of half the
     size. FBP samples the filtered image at points; where the voxels are wider than its detail, noise aliases."""
-    from recon.exact_noise import roi_covariance
-    from recon.inset import InsetFbp
+    from recon.fbp.exact_noise import roi_covariance
+    from recon.fbp.inset import InsetFbp
 
     chosen = [(g, p) for g, p in zip(scanned.grids, scanned.pairs, strict=True) if g.spacing[0] >= AVERAGED_FROM_MM]
     if not chosen:
@@ -292,7 +292,7 @@ def _eid_rows(
     The spectrum in front of the patient is the same, so equal dose is equal fluence at the isocentre: the exposure of
     the scanner whose tube is nearer falls with the square of the distance.
     """
-    from recon.exact_noise import roi_adjoints
+    from recon.fbp.exact_noise import roi_adjoints
     from torchpcct.scanner import presets
 
     kernels = [k for k in EID_KERNELS if k in settings.kernels]

@@ -12,7 +12,7 @@ from torchpcct.metrics.placement import RoiPair, place_rois
 from torchpcct.metrics.roi import axial_grid
 
 if TYPE_CHECKING:
-    from recon.inset import InsetFbp
+    from recon.fbp.inset import InsetFbp
     from torchpcct.scan import Scan
     from torchpcct.scanner import Scanner
     from torchpcct.scene import Scene
@@ -87,7 +87,7 @@ def prepare(
     Raises:
         ValueError: ROIs that come out empty; an inset outside the field of view.
     """
-    from recon.inset import InsetFbp
+    from recon.fbp.inset import InsetFbp
     from torchpcct.acquisition.acquire import acquire
 
     bodies, plaque = scene

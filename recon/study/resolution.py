@@ -194,7 +194,7 @@ def _image(
     exposure_s: float,
     progress: Callable[[float], None],
 ) -> tuple[Imaged, _Kept]:
-    from recon.exact_noise import roi_covariance
+    from recon.fbp.exact_noise import roi_covariance
     from torchpcct.scene.plaque.plaque import plaque_scene
 
     scene, plaque = bodies
@@ -235,7 +235,7 @@ class _Kept:
 
 @dataclass(frozen=True)
 class _Functional:
-    """A linear functional of a volume, as :func:`recon.exact_noise.roi_covariance` takes ROIs."""
+    """A linear functional of a volume, as :func:`recon.fbp.exact_noise.roi_covariance` takes ROIs."""
 
     weights: Tensor
 
@@ -245,7 +245,7 @@ def _smooth(m: Measured, kept: dict[str, _Kept]) -> Smoothed:
     z that of the detector rows at the isocentre (as uniform ones: variance width² / 12)."""
     from scipy.ndimage import gaussian_filter
 
-    from recon.exact_noise import roi_covariance
+    from recon.fbp.exact_noise import roi_covariance
 
     wide, narrow = m.scanners["EID-CT"].width.area, m.scanners["PCCT"].width.area
     plane = math.sqrt(max(wide**2 - narrow**2, 0.0)) / FWHM_PER_SIGMA
@@ -270,7 +270,7 @@ def _smooth(m: Measured, kept: dict[str, _Kept]) -> Smoothed:
 
 def _middle_slices(scene: Scene, plaque: Plaque, scanner: Scanner, duty: float) -> tuple[VolumeGrid, Tensor]:
     """The middle of the inset by the reference FBP, from the detector's middle rows: grid and ``(z, y, x)`` HU."""
-    from recon.inset import InsetFbp
+    from recon.fbp.inset import InsetFbp
     from torchpcct.acquisition.acquire import acquire
 
     x, y, z = plaque.position

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.inset import InsetFbp
+from recon.fbp.inset import InsetFbp
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.plaque_measures import PlaqueSegmentation, basin_depth, cap_on_line, dice, segment_plaque
 

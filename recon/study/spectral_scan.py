@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.channel_fbp import ChannelFbp, static_fbp
+from recon.fbp.channels import ChannelFbp, static_fbp
 from recon.study.compare import inset_grid
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.acquisition.plan import Effect

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from recon._model_solver import dot
-from recon.inset import to_hu
+from recon.fbp.inset import to_hu
 from recon.prior import squared_frequencies
 from recon.pwls import solve_normal
 from recon.qggmrf import QGGMRF, quadratic

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recon.inset import InsetFbp
+from recon.fbp.inset import InsetFbp
 from recon.study.compare import inset_grid
 from recon.study.dose_factor.measures import crop_window, segmentation
 from recon.study.dose_factor.scene import StudyScene

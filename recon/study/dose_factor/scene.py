@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
-from recon.exact_noise import FILTER_MARGIN_COLUMNS, line_integral_variance, roi_covariance
-from recon.inset import InsetFbp
+from recon.fbp.exact_noise import FILTER_MARGIN_COLUMNS, line_integral_variance, roi_covariance
+from recon.fbp.inset import InsetFbp
 from recon.roi import InsetProblem
 from recon.study.dose_factor.facts import SceneFacts, fbp_label
 from recon.study.dose_factor.measures import OBSERVERS, crop_window, observer_channels

@@ -7,10 +7,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from recon.backproject import backproject
-from recon.exact_noise import line_integral_variance
-from recon.fbp import filter_windowed
-from recon.inset import InsetFbp
+from recon.fbp.backproject import backproject
+from recon.fbp.exact_noise import line_integral_variance
+from recon.fbp.fbp import filter_windowed
+from recon.fbp.inset import InsetFbp
 from recon.mbir import Mbir
 from recon.sensitivity import worst_case_gain
 from recon.study.compare import inset_grid

@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.windows import fast_length, ramp_kernel
+from recon.fbp.ramp import fast_length, ramp_kernel
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam
 
@@ -147,7 +147,7 @@ class FilterPlan:
 
     def forward(self, data: Tensor) -> Tensor:
         """Weight and filter: ``(..., V, rows_in, width_in)`` to ``(..., K, V, rows_out, width_out)``."""
-        from recon._filter_kernels import align
+        from recon.fbp.filter_kernels import align
 
         a, b = self.window_in, self.window_out
         lead = data.shape[:-3]
@@ -178,7 +178,7 @@ class FilterPlan:
 
     def transpose(self, gradient: Tensor) -> Tensor:
         """Transpose of :meth:`forward`: ``(..., K, V, rows_out, width_out)`` to ``(..., V, rows_in, width_in)``."""
-        from recon._filter_kernels import unalign
+        from recon.fbp.filter_kernels import unalign
 
         a, b = self.window_in, self.window_out
         lead = gradient.shape[:-4]

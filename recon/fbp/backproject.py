@@ -10,8 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon._filtering import full_window
-from recon._operator import apply_linear
+from recon.fbp.filter_plan import full_window
+from recon.linear_operator import apply_linear
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
 from torchpcct.projector.rays import check_motion
@@ -180,7 +180,7 @@ class BackprojectionPlan:
 
     def forward(self, data: Tensor) -> Tensor:
         """``(..., views, [rows,] columns)`` to ``(..., [z,] y, x)``."""
-        from recon import _backproject as kernels
+        from recon.fbp import backproject_kernels as kernels
 
         n = 3 if self.cone else 2
         lead, shape = data.shape[:-n], data.shape[-n:]
@@ -198,7 +198,7 @@ class BackprojectionPlan:
 
     def transpose(self, volume: Tensor) -> Tensor:
         """``(..., [z,] y, x)`` to ``(..., views, [rows,] columns)``: the exact transpose of :meth:`forward`."""
-        from recon import _backproject as kernels
+        from recon.fbp import backproject_kernels as kernels
 
         n = self.grid.ndim
         lead = volume.shape[:-n]
@@ -254,7 +254,7 @@ def backproject(
         motion: displacement of the grid in every view, ``(views, 2)`` (y, x) or ``(views, 3)`` (z, y, x) mm as for
             :class:`torchpcct.projector.Projector`, or None: everything that the data hold moves with the grid, and the
             image shows it at rest. What stands still must be backprojected on its own, without motion (see
-            :class:`recon.inset.InsetFbp`).
+            :class:`recon.fbp.inset.InsetFbp`).
 
     Returns:
         ``(..., *grid.shape)`` mm⁻¹, dtype and device of ``filtered``. Differentiable to any order.

@@ -12,8 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.angular_weights import angular_weights
-from recon.fbp import backproject, fbp, filter_sinogram, filter_windowed
+from recon.fbp.angular_weights import angular_weights
+from recon.fbp.fbp import backproject, fbp, filter_sinogram, filter_windowed
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import Geometry, VolumeGrid
 from torchpcct.scan import Scan

@@ -11,10 +11,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon._filtering import FilterPlan, full_window, kernel_names
-from recon._operator import apply_linear
-from recon.angular_weights import angular_weights
-from recon.backproject import BackprojectionPlan, backproject, check_data, data_shape
+from recon.fbp.angular_weights import angular_weights
+from recon.fbp.backproject import BackprojectionPlan, backproject, check_data, data_shape
+from recon.fbp.filter_plan import FilterPlan, full_window, kernel_names
+from recon.linear_operator import apply_linear
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import ConeBeam, Geometry, VolumeGrid
 
@@ -64,14 +64,14 @@ def filter_sinogram(
         sinogram: line integrals ``(..., views, [rows,] columns)``, float32 or float64. Data of another device are
             filtered on the CPU and sent back.
         geometry: parallel, fan or cone beam.
-        kernel: reconstruction kernel (:data:`recon.windows.KERNELS`) or a sequence of them.
+        kernel: reconstruction kernel (:data:`recon.fbp.ramp.KERNELS`) or a sequence of them.
         window: return only these readings of every view (rows and columns); default: all.
         weights: angular weights ``(views,)`` or ``(views, columns)`` in rad that replace
-            :func:`recon.angular_weights.angular_weights`.
+            :func:`recon.fbp.angular_weights.angular_weights`.
 
     Returns:
         ``(..., views, [rows,] columns)`` on the window, mm⁻¹; with a sequence of kernels a leading axis of kernels.
-        Differentiable to any order. Temporary memory is bounded by :data:`recon._filtering.CHUNK_BYTES` or one view.
+        Differentiable to any order. Temporary memory is bounded by :data:`recon.fbp.filter_plan.CHUNK_BYTES` or one view.
 
     Raises:
         ValueError: a wrong shape, an unknown kernel, a window beyond the detector, views that do not suffice.
@@ -119,7 +119,7 @@ def interleave(sinogram: Tensor, geometry: G) -> tuple[Tensor, G]:
 
     The opposite ray of a detector shifted by a quarter column falls between two columns. Filtering every view on a
     grid of half the pitch, zeros between the readings, reaches up to twice the Nyquist frequency of one view; what one
-    view aliases there, its opposite cancels. The windows of :mod:`recon.windows` then refer to the doubled Nyquist
+    view aliases there, its opposite cancels. The windows of :mod:`recon.fbp.ramp` then refer to the doubled Nyquist
     frequency. Without the offset nothing cancels: details near the isocentre come out aliased.
 
     Args:

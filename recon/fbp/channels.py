@@ -1,6 +1,6 @@
 """FBP of several channels of line integrals (basis materials, energy bins) on a window, with a static surround.
 
-As :class:`recon.inset.InsetFbp` does for counting-mode scans: the surround, the same in every view and noise free, is
+As :class:`recon.fbp.inset.InsetFbp` does for counting-mode scans: the surround, the same in every view and noise free, is
 filtered once; what differs from it inside the window is filtered from the window alone. The sum equals the FBP of the
 whole rows.
 """
@@ -12,10 +12,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon._filtering import FilterPlan
-from recon.angular_weights import angular_weights
-from recon.backproject import BackprojectionPlan
-from recon.fbp import backproject, filter_sinogram, filter_windowed
+from recon.fbp.angular_weights import angular_weights
+from recon.fbp.backproject import BackprojectionPlan
+from recon.fbp.fbp import backproject, filter_sinogram, filter_windowed
+from recon.fbp.filter_plan import FilterPlan
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import ConeBeam, VolumeGrid
 

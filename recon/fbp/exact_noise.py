@@ -18,10 +18,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon._filtering import FilterPlan
-from recon.angular_weights import angular_weights
-from recon.backproject import BackprojectionPlan
-from recon.inset import InsetFbp
+from recon.fbp.angular_weights import angular_weights
+from recon.fbp.backproject import BackprojectionPlan
+from recon.fbp.filter_plan import FilterPlan
+from recon.fbp.inset import InsetFbp
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.roi import RoiMean
