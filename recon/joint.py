@@ -8,7 +8,7 @@ itself throws away what one says about the other. F is the information matrix of
 
 The channels are mixed first so that the mean of F over the rays is a multiple of the identity
 (:class:`Whitening`). In these coordinates noise is isotropic, which is what R needs, and AᵀFA is nearly the same scalar
-operator in each channel: one FFT model (:class:`recon.gram.Gram`) with the weights ½ tr F serves as the
+operator in each channel: one FFT model (:class:`recon.gram.gram.Gram`) with the weights ½ tr F serves as the
 preconditioner of all. What it leaves out (F's change from ray to ray) the exact projections repair, as in
 :mod:`recon.pwls`, whose iteration this is.
 """
@@ -25,7 +25,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from recon.gram import Gram
+from recon.gram.gram import Gram
 from recon.joint_prior import JointPrior
 from recon.pwls import PwlsResult, solve_normal
 from recon.qggmrf import QGGMRF

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from recon.fbp.channels import static_fbp
-from recon.gram import Gram
+from recon.gram.gram import Gram
 from recon.joint import Whitening, joint_pwls, mean_weights
 from recon.qggmrf import QGGMRF
 from torchpcct.detector_window import DetectorWindow, shadow
@@ -37,7 +37,7 @@ class BasisProblem:
         scan: windowed spectral scan; its noise does not matter.
         model: of its scanner and exposure.
         grid: ``(z, y, x)`` grid that holds everything the surround does not.
-        nodes: of the FFT model (:class:`recon.gram.Gram`).
+        nodes: of the FFT model (:class:`recon.gram.gram.Gram`).
 
     The Fisher information of every ray is that of the expected counts behind the SURROUND: information from the noisy
     counts would bias the result, and a small inset changes it by a few per cent only.

@@ -2,7 +2,7 @@
 
     Φ(x) = ½ ‖y − A x‖²_W + R(x)
 
-The FFT model of AᵀWA (:class:`recon.gram.Gram`) carries the inner iterations; each outer iteration measures the true
+The FFT model of AᵀWA (:class:`recon.gram.gram.Gram`) carries the inner iterations; each outer iteration measures the true
 gradient with one exact projection pair (A, Aᵀ) and lets the model solve for what is left (defect correction, as a
 flexible conjugate gradient method with exact line search, Notay 2000, SIAM J. Sci. Comput. 22:1444). So the result is
 the minimum of Φ itself, not of the model, and the exact gradient certifies it.
@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from recon._model_solver import ModelSolver, dot
-from recon.gram import Gram, check_weights
+from recon.gram.gram import Gram, check_weights
 from recon.qggmrf import QGGMRF, BoundPrior
 
 __all__ = ["PwlsResult", "pwls", "solve_normal"]
@@ -69,7 +69,7 @@ def pwls(
         A: the exact operator (:class:`torchpcct.projector.Projector`).
         prior: a prior in noise-normalised units, or one that is bound already.
         hu: 1 HU in mm⁻¹ (μ_ref / 1000).
-        gram: model of AᵀWA with these weights (:class:`recon.gram.Gram`, kept from an earlier call); default: made
+        gram: model of AᵀWA with these weights (:class:`recon.gram.gram.Gram`, kept from an earlier call); default: made
             here.
         start: first volume ``(..., *grid.shape)`` mm⁻¹, default 0. It costs one exact pair and does not change the
             result.

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from recon.fbp.inset import InsetFbp, to_hu
-from recon.gram import Gram
+from recon.gram.gram import Gram
 from recon.pwls import pwls
 from recon.qggmrf import QGGMRF
 from torchpcct.detector_window import DetectorWindow, shadow

@@ -1,7 +1,7 @@
 """Unrolled model-based reconstruction: a few preconditioned data steps, each with a step of the learned prior.
 
 The problem is normalised before the network sees it. With the data's information I at 0.5 lp/mm (1/(HU² mm³), see
-:meth:`recon.gram.Gram.information`) and the voxel volume V, the noise scale is c = (I V)^(−1/2) HU, and
+:meth:`recon.gram.gram.Gram.information`) and the voxel volume V, the noise scale is c = (I V)^(−1/2) HU, and
 
     u = x / c,      H = c² G  (about 1 at 0.5 lp/mm),      β = c b,      β = H u + noise of covariance H.
 
@@ -46,7 +46,7 @@ class NormalProblem:
     """A batch of normalised problems that share one Gram operator.
 
     Args:
-        gram: ``apply`` and ``periodic_spectrum`` of G at unit exposure, in mm⁻¹ units (:class:`recon.gram.Gram`).
+        gram: ``apply`` and ``periodic_spectrum`` of G at unit exposure, in mm⁻¹ units (:class:`recon.gram.gram.Gram`).
         beta: ``(batch, z, y, x)``, c·b in HU units.
         scale_hu: ``(batch,)`` noise scales c.
         factor: ``(batch,)`` so that H = factor · G.

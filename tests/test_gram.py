@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from recon.gram import Gram
+from recon.gram.gram import Gram
 from torchpcct import ConeBeam, FanBeam, Projector, VolumeGrid
 from torchpcct.detector_window import shadow
 from torchpcct.geometry import full_turn

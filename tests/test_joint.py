@@ -10,7 +10,7 @@ from test_gram import matrix, problem
 
 from recon.fbp.channels import ChannelFbp, static_fbp
 from recon.fbp.fbp import fbp
-from recon.gram import Gram
+from recon.gram.gram import Gram
 from recon.joint import Whitening, joint_pwls, mean_weights, weigh
 from recon.joint_inset import BasisProblem
 from recon.joint_prior import JointPrior

@@ -7,7 +7,7 @@ import pytest
 import torch
 from test_gram import HU, problem
 
-from recon.gram import Gram
+from recon.gram.gram import Gram
 from recon.limits import contrast_limit, deformation_limit, known_inside, outline_maps
 
 

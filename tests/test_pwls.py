@@ -6,7 +6,7 @@ import pytest
 import torch
 from test_gram import HU, matrix, problem, tissue
 
-from recon.gram import Gram
+from recon.gram.gram import Gram
 from recon.pwls import pwls, solve_normal
 from recon.qggmrf import QGGMRF, quadratic
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from test_gram import HU, problem, tissue
 
-from recon.gram import Gram
+from recon.gram.gram import Gram
 from recon.prior import PriorConfig
 from recon.unrolled import FLOOR, NormalProblem, Unrolled, energy, minimise, minimise_passes, residual
 

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recon.gram import Gram
+from recon.gram.gram import Gram
 from recon.pwls import pwls
 from recon.roi import DEFAULT_PRIOR, InsetProblem
 from recon.study.compare import inset_grid

@@ -32,7 +32,7 @@ def cholesky(kernel: Tensor) -> tuple[Tensor, NDArray[np.bool_]]:
 
 
 def _factor(flat: Any, least: float = LEAST_PIVOT) -> tuple[Any, NDArray[np.bool_]]:
-    from recon._gram_kernels import banded_cholesky
+    from recon.gram.kernels import banded_cholesky
 
     lower = np.zeros_like(flat)
     definite = np.zeros(flat.shape[2], dtype=np.bool_)
@@ -53,7 +53,7 @@ def make_definite(spectra: Tensor) -> Tensor:
     terms, bands, nz = spectra.shape[:3]
     flat = spectra.reshape(terms, bands, nz, -1).to(torch.complex128).numpy().copy()
     level = np.abs(flat[0, 0].real).mean(axis=0)
-    from recon._gram_kernels import stiffen
+    from recon.gram.kernels import stiffen
 
     plain = flat.copy()
     definite = np.zeros(flat.shape[-1], dtype=np.bool_)

@@ -1,13 +1,13 @@
 """AᵀWA of a small inset by FFT: fast enough for hundreds of applications, close enough to correct exactly.
 
 For an inset much smaller than its distance to the source, AᵀWA is nearly shift invariant in the plane: FFT in (y, x),
-a banded matrix along z for every frequency (see :mod:`recon._local_kernels`). Its slow change across the inset (path
+a banded matrix along z for every frequency (see :mod:`recon.gram.impulse_response`). Its slow change across the inset (path
 lengths, bowtie, magnification) is taken to first or second order in position at the midpoint of the two voxels:
 
     G x = K₀x + ½ Σ_c [ b_c · (K_c x) + K_c (b_c · x) ],      b = y, x (, y², yx, x²),
 
 with the K_c fitted to exact impulse responses at a few nodes. The form is self-adjoint, and its local spectra are
-kept positive definite (:mod:`recon._definite`). What it cannot hold is the
+kept positive definite (:mod:`recon.gram.positive_definite`). What it cannot hold is the
 irregular beat of the voxel lattice with the detector's cells: 2–3 % on white noise at 0.2 mm voxels, 0.1 % on tissue
 shapes. It is a model: :func:`recon.pwls.pwls` removes its error with exact projections.
 """
@@ -21,8 +21,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from recon._definite import cholesky, make_definite
-from recon._local_kernels import Nodes, kernel_at, node_positions, slice_reach
+from recon.gram.impulse_response import Nodes, kernel_at, node_positions, slice_reach
+from recon.gram.positive_definite import cholesky, make_definite
 
 __all__ = ["Gram", "check_weights"]
 
@@ -291,7 +291,7 @@ def _banded_add(kernel: Tensor, x: Tensor, scale: float, out: Tensor) -> None:
     """out += scale · K x, K Hermitian and banded along z: lower bands ``(reach + 1, nz, fy, fx)``."""
     nz = x.shape[-3]
     if x.device.type == "cpu":
-        from recon._gram_kernels import banded_add
+        from recon.gram.kernels import banded_add
 
         real = kernel.real.numpy().dtype.type
         shape = (-1, *x.shape[-3:])

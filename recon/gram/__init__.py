@@ -1,0 +1,1 @@
+"""The Gram operator of a small inset."""
