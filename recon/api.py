@@ -45,7 +45,7 @@ def reconstruct(
         scan: one scan, or several realisations of one scan (same geometry, window and exposure).
         grid: ``(z, y, x)`` grid inside the field of view.
         method: ``"fbp"`` (FDK; option ``kernel``) or ``"pwls"`` (penalised weighted least squares with a q-GGMRF
-            prior, to convergence; options of :func:`recon.roi.reconstruct_pwls`) or ``"mbir"`` (unrolled steps with the
+            prior, to convergence; options of :func:`recon.pwls.inset_problem.reconstruct_pwls`) or ``"mbir"`` (unrolled steps with the
             learned prior that ships with the package; options of :func:`recon.mbir.reconstruct_mbir`).
         progress: called with the finished fraction, 0…1.
         device: where the returned volumes lie.
@@ -77,7 +77,7 @@ def reconstruct(
 
         volumes = reconstruct_mbir(scans, grid, progress=progress, **options)
     elif method == "pwls":
-        from recon.roi import reconstruct_pwls
+        from recon.pwls.inset_problem import reconstruct_pwls
 
         volumes = reconstruct_pwls(scans, grid, progress=progress, **options)
     else:

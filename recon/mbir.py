@@ -22,7 +22,7 @@ from torch import Tensor
 
 from recon.fbp.inset import to_hu
 from recon.prior import PriorConfig
-from recon.roi import InsetProblem
+from recon.pwls.inset_problem import InsetProblem
 from recon.unrolled import NormalProblem, Unrolled, minimise_passes, residual
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
@@ -104,7 +104,7 @@ class Mbir:
 
         Args:
             problem: of the scan, on voxels of ``voxel_mm``.
-            b: ``(batch, z, y, x)``, :meth:`recon.roi.InsetProblem.statistic` of each scan.
+            b: ``(batch, z, y, x)``, :meth:`recon.pwls.inset_problem.InsetProblem.statistic` of each scan.
             exposure_s: of the scans.
         """
         normal = self.problem(problem, b, exposure_s)
@@ -219,7 +219,7 @@ def reconstruct_mbir(
         ``converged``: whether every pass has.
 
     Raises:
-        ValueError, TypeError: see :class:`recon.roi.InsetProblem`; a problem that was made for another grid.
+        ValueError, TypeError: see :class:`recon.pwls.inset_problem.InsetProblem`; a problem that was made for another grid.
         FileNotFoundError: the package has no weights.
     """
     start = time.perf_counter()

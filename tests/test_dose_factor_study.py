@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from recon.mbir import average_onto
-from recon.qggmrf import quadratic
+from recon.pwls.qggmrf import quadratic
 from recon.study.compare import inset_grid
 from recon.study.dose_factor import Settings, estimate_seconds, figures, run, study
 from recon.study.dose_factor.analysis import analyse

@@ -12,8 +12,8 @@ import torch
 from recon.fbp.backproject import BackprojectionPlan, backproject
 from recon.fbp.fbp import fbp
 from recon.fbp.inset import InsetFbp, view_motion
-from recon.qggmrf import QGGMRF
-from recon.roi import InsetProblem
+from recon.pwls.inset_problem import InsetProblem
+from recon.pwls.qggmrf import QGGMRF
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn

@@ -11,11 +11,11 @@ from test_gram import matrix, problem
 from recon.fbp.channels import ChannelFbp, static_fbp
 from recon.fbp.fbp import fbp
 from recon.gram.gram import Gram
-from recon.joint import Whitening, joint_pwls, mean_weights, weigh
-from recon.joint_inset import BasisProblem
-from recon.joint_prior import JointPrior
-from recon.pwls import pwls
-from recon.qggmrf import QGGMRF, quadratic
+from recon.pwls.basis_problem import BasisProblem
+from recon.pwls.joint import Whitening, joint_pwls, mean_weights, weigh
+from recon.pwls.joint_prior import JointPrior
+from recon.pwls.pwls import pwls
+from recon.pwls.qggmrf import QGGMRF, quadratic
 from torchpcct import VolumeGrid, acquire
 from torchpcct.detector_window import shadow
 from torchpcct.scanner import presets

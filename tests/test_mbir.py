@@ -13,7 +13,7 @@ from recon import reconstruct
 from recon.fbp.inset import to_hu
 from recon.mbir import Mbir, average_onto, working_grid
 from recon.prior import PriorConfig
-from recon.roi import InsetProblem
+from recon.pwls.inset_problem import InsetProblem
 from recon.unrolled import Unrolled, minimise, minimise_passes
 from torchpcct import VolumeGrid
 

@@ -7,8 +7,8 @@ import torch
 from test_gram import HU, matrix, problem, tissue
 
 from recon.gram.gram import Gram
-from recon.pwls import pwls, solve_normal
-from recon.qggmrf import QGGMRF, quadratic
+from recon.pwls.pwls import pwls, solve_normal
+from recon.pwls.qggmrf import QGGMRF, quadratic
 
 EDGE = QGGMRF(0.15, 100.0)
 

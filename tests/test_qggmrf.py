@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recon.qggmrf import QGGMRF, BoundPrior, quadratic
+from recon.pwls.qggmrf import QGGMRF, BoundPrior, quadratic
 
 HU = 2e-5
 FORMS = [(2.0, 1.0, 200.0), (2.0, 1.2, 200.0), (1.6, 1.1, 200.0), (2.0, 1.0, math.inf)]

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from recon import reconstruct
-from recon.qggmrf import QGGMRF
-from recon.roi import InsetProblem
+from recon.pwls.inset_problem import InsetProblem
+from recon.pwls.qggmrf import QGGMRF
 from torchpcct import VolumeGrid, acquire
 from torchpcct.scanner import presets
 from torchpcct.scene import Body, Ellipsoid, EllipticCylinder, Scene

@@ -162,7 +162,7 @@ class Data:
 
 def situation_gram(situation: Situation, config: DataConfig) -> tuple[Gram, float]:
     """The Gram operator of the training inset in one situation, per second of exposure, and 1 HU in mm⁻¹."""
-    from recon.roi import InsetProblem
+    from recon.pwls.inset_problem import InsetProblem
     from torchpcct.acquisition.acquire import acquire
     from torchpcct.scanner import presets
     from torchpcct.scene import Body, EllipticCylinder, Scene

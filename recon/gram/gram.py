@@ -9,7 +9,7 @@ lengths, bowtie, magnification) is taken to first or second order in position at
 with the K_c fitted to exact impulse responses at a few nodes. The form is self-adjoint, and its local spectra are
 kept positive definite (:mod:`recon.gram.positive_definite`). What it cannot hold is the
 irregular beat of the voxel lattice with the detector's cells: 2–3 % on white noise at 0.2 mm voxels, 0.1 % on tissue
-shapes. It is a model: :func:`recon.pwls.pwls` removes its error with exact projections.
+shapes. It is a model: :func:`recon.pwls.pwls.pwls` removes its error with exact projections.
 """
 
 from __future__ import annotations

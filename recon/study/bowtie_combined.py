@@ -74,7 +74,7 @@ def combine(
     """
     from recon.fbp.exact_noise import roi_covariance
     from recon.mbir import Mbir, working_grid
-    from recon.roi import InsetProblem
+    from recon.pwls.inset_problem import InsetProblem
 
     prior = Mbir.load()
     scans: dict[tuple[str, bool], PlaqueScan] = {}

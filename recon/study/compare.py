@@ -290,7 +290,7 @@ def _run_pwls(
     shown_dose: float, report: Progress,
 ) -> None:  # fmt: skip
     from recon import reconstruct
-    from recon.roi import InsetProblem
+    from recon.pwls.inset_problem import InsetProblem
 
     problems: dict[float, InsetProblem] = {}
     jobs = [

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from torch import Tensor
 
 from recon.fbp.inset import InsetFbp, view_motion
-from recon.roi import InsetProblem, reconstruct_pwls
+from recon.pwls.inset_problem import InsetProblem, reconstruct_pwls
 from recon.study.motion import KERNEL, Measured
 from recon.study.motion_measures import Observed, Reference, observe
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan

@@ -24,7 +24,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.joint_inset import DEFAULT_JOINT_PRIOR, BasisProblem
+from recon.pwls.basis_problem import DEFAULT_JOINT_PRIOR, BasisProblem
 from recon.study.report import Report
 from recon.study.spectral_scan import PlaqueScan, second_order_bound, starved_rays, water_hu
 from recon.study.spectral_tissue import RULES, Tissues

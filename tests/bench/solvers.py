@@ -22,8 +22,8 @@ import torch
 from torch import Tensor
 
 from recon.gram.gram import Gram
-from recon.pwls import pwls
-from recon.roi import DEFAULT_PRIOR, InsetProblem
+from recon.pwls.inset_problem import DEFAULT_PRIOR, InsetProblem
+from recon.pwls.pwls import pwls
 from recon.study.compare import inset_grid
 from torchpcct import Projector, acquire
 from torchpcct.detector_window import DetectorWindow

@@ -15,16 +15,16 @@ from typing import TYPE_CHECKING, Any, Protocol
 import torch
 from torch import Tensor
 
-from recon._model_solver import dot
 from recon.fbp.inset import to_hu
 from recon.prior import squared_frequencies
-from recon.pwls import solve_normal
-from recon.qggmrf import QGGMRF, quadratic
-from recon.roi import DEFAULT_PRIOR
+from recon.pwls.inset_problem import DEFAULT_PRIOR
+from recon.pwls.model_solver import dot
+from recon.pwls.pwls import solve_normal
+from recon.pwls.qggmrf import QGGMRF, quadratic
 from recon.unrolled import NormalProblem
 
 if TYPE_CHECKING:
-    from recon.roi import InsetProblem
+    from recon.pwls.inset_problem import InsetProblem
 
 __all__ = [
     "IMAGE_METHODS",

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from recon.fbp.exact_noise import FILTER_MARGIN_COLUMNS, line_integral_variance, roi_covariance
 from recon.fbp.inset import InsetFbp
-from recon.roi import InsetProblem
+from recon.pwls.inset_problem import InsetProblem
 from recon.study.dose_factor.facts import SceneFacts, fbp_label
 from recon.study.dose_factor.measures import OBSERVERS, crop_window, observer_channels
 from recon.study.dose_factor.settings import FBP_BASE, MAIN_SCENES, WIDE_ROIS, Settings

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from recon.fbp.channels import static_fbp
 from recon.gram.gram import Gram
-from recon.joint import Whitening, joint_pwls, mean_weights
-from recon.qggmrf import QGGMRF
+from recon.pwls.joint import Whitening, joint_pwls, mean_weights
+from recon.pwls.qggmrf import QGGMRF
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import VolumeGrid
 from torchpcct.projector import Projector
@@ -25,7 +25,7 @@ REFERENCE_KEV = 52.0
 in Li et al.; whatever else the two basis images hold counts in units of equal noise."""
 
 DEFAULT_JOINT_PRIOR = QGGMRF(strength=0.3, threshold=16.0, relative=True)
-"""The strength of the counting-mode default, :data:`recon.roi.DEFAULT_PRIOR`, with a threshold that follows the noise:
+"""The strength of the counting-mode default, :data:`recon.pwls.inset_problem.DEFAULT_PRIOR`, with a threshold that follows the noise:
 1200 HU/mm at 2 s and 0.2 mm voxels, 300 HU/mm at a quarter of the noise. Basis images are noisier than counting-mode
 images of the same scan; below about 1000 HU/mm at 2 s single voxels of noise pass as edges."""
 
@@ -88,7 +88,7 @@ class BasisProblem:
             lines, window: decomposed line integrals, see :meth:`data`.
             prior: None: :data:`DEFAULT_JOINT_PRIOR`.
             dose: of the data relative to the model's exposure; it scales the information.
-            options: ``tolerance``, ``max_exact``, ``callback`` of :func:`recon.joint.joint_pwls`.
+            options: ``tolerance``, ``max_exact``, ``callback`` of :func:`recon.pwls.joint.joint_pwls`.
 
         Returns:
             ``(..., 2, z, y, x)`` basis coefficients (dimensionless), and the solver's report.

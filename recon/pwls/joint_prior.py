@@ -5,7 +5,7 @@
 One edge in one channel relaxes the penalty of all channels there: basis images share the edges of the tissues
 (vectorial regularisation, Sapiro and Ringach 1996; for spectral CT Rigie and La Rivière 2015). The Euclidean length
 treats all directions in the space of channels alike, so the channels must be of equal, uncorrelated noise: see
-:class:`recon.joint.Whitening`. Formula of ρ and its units: :mod:`recon.qggmrf`.
+:class:`recon.pwls.joint.Whitening`. Formula of ρ and its units: :mod:`recon.pwls.qggmrf`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.qggmrf import QGGMRF, BoundPrior, _pair
+from recon.pwls.qggmrf import QGGMRF, BoundPrior, _pair
 
 __all__ = ["JointPrior"]
 
@@ -27,12 +27,12 @@ class JointPrior(BoundPrior):
     """A vectorial q-GGMRF energy of images ``(..., channels, *grid.shape)``.
 
     Args:
-        lam, threshold, p, q, neighbors: see :class:`recon.qggmrf.BoundPrior`.
+        lam, threshold, p, q, neighbors: see :class:`recon.pwls.qggmrf.BoundPrior`.
         spacing: 1 for the axis of channels, which has no neighbours, then the voxel size per axis in mm.
         hu: the value of the channels that counts as 1 HU.
     """
 
-    _KERNELS: ClassVar[str] = "recon._joint_kernels"
+    _KERNELS: ClassVar[str] = "recon.pwls.joint_kernels"
 
     def __post_init__(self) -> None:
         if len(self.spacing) not in (3, 4) or self.spacing[0] != 1.0:

@@ -1,4 +1,4 @@
-"""CPU kernels of the q-GGMRF: the passes of :class:`recon.qggmrf.BoundPrior`, fused over all neighbours.
+"""CPU kernels of the q-GGMRF: the passes of :class:`recon.pwls.qggmrf.BoundPrior`, fused over all neighbours.
 
 The curvature formula is that of ``BoundPrior.curvature``, to which the tests compare these kernels. Rows of voxels are
 independent of each other in every pass, so results do not depend on the number of threads. Inner loops run over slices

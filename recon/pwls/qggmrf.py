@@ -109,7 +109,7 @@ class BoundPrior:
         hu: 1 HU in mm⁻¹.
     """
 
-    _KERNELS: ClassVar[str] = "recon._qggmrf_kernels"
+    _KERNELS: ClassVar[str] = "recon.pwls.qggmrf_kernels"
 
     lam: float
     threshold: float

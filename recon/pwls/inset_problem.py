@@ -14,8 +14,8 @@ from torch import Tensor
 
 from recon.fbp.inset import InsetFbp, to_hu
 from recon.gram.gram import Gram
-from recon.pwls import pwls
-from recon.qggmrf import QGGMRF
+from recon.pwls.pwls import pwls
+from recon.pwls.qggmrf import QGGMRF
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import VolumeGrid
 from torchpcct.projector import Projector
@@ -171,13 +171,13 @@ def reconstruct_pwls(
         problem: kept from an earlier call with the same scan and grid; None: made here.
         batch: volumes solved at a time; they iterate until the slowest has converged.
         tolerance: stop within so many HU (root mean square) of the exact minimum.
-        options: ``max_exact``, ``callback`` of :func:`recon.pwls.pwls`.
+        options: ``max_exact``, ``callback`` of :func:`recon.pwls.pwls.pwls`.
 
     Returns:
         Volumes in HU with the solver's report.
 
     Raises:
-        ValueError, TypeError: see :class:`InsetProblem` and :func:`recon.pwls.pwls`.
+        ValueError, TypeError: see :class:`InsetProblem` and :func:`recon.pwls.pwls.pwls`.
     """
     start = time.perf_counter()
     problem = problem or InsetProblem(scans[0], grid)

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from recon.qggmrf import BoundPrior
+from recon.pwls.qggmrf import BoundPrior
 
 __all__ = ["ModelSolver", "dot"]
 

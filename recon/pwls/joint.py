@@ -4,13 +4,13 @@
 
 The line integrals of two basis materials, decomposed ray by ray, are strongly anticorrelated: reconstructing each by
 itself throws away what one says about the other. F is the information matrix of the decomposition
-(:class:`torchpcct.spectral.Decomposition`), R the vectorial q-GGMRF (:mod:`recon.joint_prior`).
+(:class:`torchpcct.spectral.Decomposition`), R the vectorial q-GGMRF (:mod:`recon.pwls.joint_prior`).
 
 The channels are mixed first so that the mean of F over the rays is a multiple of the identity
 (:class:`Whitening`). In these coordinates noise is isotropic, which is what R needs, and AᵀFA is nearly the same scalar
 operator in each channel: one FFT model (:class:`recon.gram.gram.Gram`) with the weights ½ tr F serves as the
 preconditioner of all. What it leaves out (F's change from ray to ray) the exact projections repair, as in
-:mod:`recon.pwls`, whose iteration this is.
+:mod:`recon.pwls.pwls`, whose iteration this is.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from recon.gram.gram import Gram
-from recon.joint_prior import JointPrior
-from recon.pwls import PwlsResult, solve_normal
-from recon.qggmrf import QGGMRF
+from recon.pwls.joint_prior import JointPrior
+from recon.pwls.pwls import PwlsResult, solve_normal
+from recon.pwls.qggmrf import QGGMRF
 
 __all__ = ["Whitening", "joint_pwls"]
 
@@ -101,7 +101,7 @@ def _mix(matrix: Floats, x: Tensor) -> Tensor:
 
 
 class _ChannelGram:
-    """One scalar FFT model for every channel, as :func:`recon.pwls.solve_normal` takes it."""
+    """One scalar FFT model for every channel, as :func:`recon.pwls.pwls.solve_normal` takes it."""
 
     def __init__(self, gram: Gram, channels: int) -> None:
         self.gram, self.channels = gram, channels
@@ -164,10 +164,10 @@ def joint_pwls(
         gram: FFT model of Aᵀ diag(½ tr F) A, kept from an earlier call; None: made here.
         tolerance: stop when the images are this close to the minimum: root mean square over both channels, in HU.
         max_exact: largest number of exact projection pairs (each of two channels).
-        callback: see :func:`recon.pwls.pwls`.
+        callback: see :func:`recon.pwls.pwls.pwls`.
 
     Returns:
-        Images ``(..., 2, *grid.shape)`` in the dtype of y, and the report of :func:`recon.pwls.pwls`: ``gradient`` is
+        Images ``(..., 2, *grid.shape)`` in the dtype of y, and the report of :func:`recon.pwls.pwls.pwls`: ``gradient`` is
         the norm of the exact gradient of Φ over that of the zero images.
 
     Raises:

@@ -19,9 +19,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from recon._model_solver import ModelSolver, dot
 from recon.gram.gram import Gram, check_weights
-from recon.qggmrf import QGGMRF, BoundPrior
+from recon.pwls.model_solver import ModelSolver, dot
+from recon.pwls.qggmrf import QGGMRF, BoundPrior
 
 __all__ = ["PwlsResult", "pwls", "solve_normal"]
 

@@ -1,4 +1,4 @@
-"""CPU kernels of the vectorial q-GGMRF (:mod:`recon.joint_prior`): as :mod:`recon._qggmrf_kernels`, several channels.
+"""CPU kernels of the vectorial q-GGMRF (:mod:`recon.pwls.joint_prior`): as :mod:`recon.pwls.qggmrf_kernels`, several channels.
 
 The potential acts on the length of the difference of two voxels' channel vectors, so one curvature serves all channels
 of a pair. Rows of voxels are independent of each other: results do not depend on the number of threads.
@@ -59,7 +59,7 @@ def majorize(x: Any, v: Any, steps: Any, scales: Any, factors: Any, kind: int, f
     Args:
         x, v: ``(batch, channels, nz, ny, nx)`` contiguous.
         steps: ``(neighbours, 3)`` int64, ALL neighbours (both signs).
-        scales, factors, kind, form: see :func:`recon._qggmrf_kernels.majorize`.
+        scales, factors, kind, form: see :func:`recon.pwls.qggmrf_kernels.majorize`.
         out: like x.
     """
     batch, channels, nz, ny, nx = x.shape

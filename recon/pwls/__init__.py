@@ -1,0 +1,1 @@
+"""Penalised weighted least squares."""
