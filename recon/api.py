@@ -46,7 +46,7 @@ def reconstruct(
         grid: ``(z, y, x)`` grid inside the field of view.
         method: ``"fbp"`` (FDK; option ``kernel``) or ``"pwls"`` (penalised weighted least squares with a q-GGMRF
             prior, to convergence; options of :func:`recon.pwls.inset_problem.reconstruct_pwls`) or ``"mbir"`` (unrolled steps with the
-            learned prior that ships with the package; options of :func:`recon.mbir.reconstruct_mbir`).
+            learned prior that ships with the package; options of :func:`recon.mbir.mbir.reconstruct_mbir`).
         progress: called with the finished fraction, 0…1.
         device: where the returned volumes lie.
         options: of the method.
@@ -73,7 +73,7 @@ def reconstruct(
     if method == "fbp":
         volumes = _fbp(scans, grid, progress, **options)
     elif method == "mbir":
-        from recon.mbir import reconstruct_mbir
+        from recon.mbir.mbir import reconstruct_mbir
 
         volumes = reconstruct_mbir(scans, grid, progress=progress, **options)
     elif method == "pwls":

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from recon.mbir import average_onto
+from recon.mbir.mbir import average_onto
 from recon.pwls.qggmrf import quadratic
 from recon.study.compare import inset_grid
 from recon.study.dose_factor import Settings, estimate_seconds, figures, run, study
@@ -260,7 +260,7 @@ def test_every_method_has_a_name_and_a_colour():
 
 
 def test_missing_weights_leave_mbir_out(monkeypatch, caplog):
-    import recon.mbir
+    import recon.mbir.mbir
 
     def missing(**options):
         raise FileNotFoundError("no weights at nowhere")

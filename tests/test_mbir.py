@@ -11,10 +11,10 @@ from test_unrolled import certificate
 
 from recon import reconstruct
 from recon.fbp.inset import to_hu
-from recon.mbir import Mbir, average_onto, working_grid
-from recon.prior import PriorConfig
+from recon.mbir.mbir import Mbir, average_onto, working_grid
+from recon.mbir.prior import PriorConfig
+from recon.mbir.unrolled import Unrolled, minimise, minimise_passes
 from recon.pwls.inset_problem import InsetProblem
-from recon.unrolled import Unrolled, minimise, minimise_passes
 from torchpcct import VolumeGrid
 
 
@@ -85,7 +85,7 @@ def test_residual_is_that_of_the_last_pass(clean, problem, twice):  # noqa: F811
 
 
 def test_a_run_that_stops_early_says_so(clean, problem, twice, monkeypatch, caplog):  # noqa: F811
-    monkeypatch.setattr("recon.mbir.minimise_passes", partial(minimise_passes, most=2))
+    monkeypatch.setattr("recon.mbir.mbir.minimise_passes", partial(minimise_passes, most=2))
     scan = clean.with_noise(1.0, 0)
     report = reconstruct(scan, GRID, "mbir", prior=twice, problem=problem, converge=True).report
     assert not report["converged"]

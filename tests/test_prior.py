@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from recon.prior import LearnedPrior, PriorConfig, from_blocks, to_blocks
+from recon.mbir.prior import LearnedPrior, PriorConfig, from_blocks, to_blocks
 
 
 def prior(seed=0, **config):

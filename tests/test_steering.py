@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from recon.steering import Steering
+from recon.mbir.along_vessel import Steering
 
 VOXEL = 0.2
 

@@ -8,8 +8,8 @@ import torch
 from test_gram import HU, problem, tissue
 
 from recon.gram.gram import Gram
-from recon.prior import PriorConfig
-from recon.unrolled import FLOOR, NormalProblem, Unrolled, energy, minimise, minimise_passes, residual
+from recon.mbir.prior import PriorConfig
+from recon.mbir.unrolled import FLOOR, NormalProblem, Unrolled, energy, minimise, minimise_passes, residual
 
 SMALL = PriorConfig(levels=2, filters=12, units=4)
 

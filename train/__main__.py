@@ -47,8 +47,8 @@ def build(config: TrainConfig) -> tuple[Any, Any, Any]:
     """Model with its starting weights, data, and objective."""
     import torch
 
-    from recon.prior import PriorConfig
-    from recon.unrolled import Unrolled
+    from recon.mbir.prior import PriorConfig
+    from recon.mbir.unrolled import Unrolled
     from train.data import Data
     from train.objective import Objective
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from torch import Tensor
 
-from recon.mbir import WEIGHTS_FORMAT
+from recon.mbir.mbir import WEIGHTS_FORMAT
 from train.checkpoint import digest, read_tensors, write_atomically, write_tensors
 from train.config import TrainConfig
 

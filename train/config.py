@@ -58,8 +58,8 @@ class TrainConfig:
         checkpoint_seconds: time between checkpoints in s, ≤ 120.
         validate_every: steps between validations; the last step is always validated.
         log_every: steps between rows of the log.
-        prior: arguments of :class:`recon.prior.PriorConfig`.
-        unroll: steps K of :class:`recon.unrolled.Unrolled`.
+        prior: arguments of :class:`recon.mbir.prior.PriorConfig`.
+        unroll: steps K of :class:`recon.mbir.unrolled.Unrolled`.
         data, objective: of :mod:`train.data` and :mod:`train.objective`; their defaults if left out.
 
     Raises:
@@ -99,7 +99,7 @@ class TrainConfig:
             raise ValueError(f"final_fraction must be from 0 to 1, got {self.final_fraction!r}")
         if not 0 <= self.ema < 1:
             raise ValueError(f"ema must be from 0 to below 1, got {self.ema!r}")
-        from recon.prior import PriorConfig
+        from recon.mbir.prior import PriorConfig
 
         _build(PriorConfig, self.prior, "prior")
 

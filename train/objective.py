@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from recon.unrolled import NormalProblem
+from recon.mbir.unrolled import NormalProblem
 from train.data import Batch, Data, seed_of
 from train.held_out import validation_scenes
 

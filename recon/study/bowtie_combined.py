@@ -73,7 +73,7 @@ def combine(
         Figures of each exposure, and the plan of the simulation.
     """
     from recon.fbp.exact_noise import roi_covariance
-    from recon.mbir import Mbir, working_grid
+    from recon.mbir.mbir import Mbir, working_grid
     from recon.pwls.inset_problem import InsetProblem
 
     prior = Mbir.load()

@@ -15,7 +15,7 @@ from recon.study.motion_measures import Observed, Reference, observe
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
 
 if TYPE_CHECKING:
-    from recon.mbir import Mbir
+    from recon.mbir.mbir import Mbir
 
 __all__ = ["compensate"]
 
@@ -66,7 +66,7 @@ def _pwls(scan: Scan, m: Measured, motion: Any, problem: InsetProblem | None) ->
 
 @lru_cache(maxsize=1)
 def _learned() -> Mbir:
-    from recon.mbir import Mbir
+    from recon.mbir.mbir import Mbir
 
     return Mbir.load()
 

@@ -16,12 +16,12 @@ import torch
 from torch import Tensor
 
 from recon.fbp.inset import to_hu
-from recon.prior import squared_frequencies
+from recon.mbir.prior import squared_frequencies
+from recon.mbir.unrolled import NormalProblem
 from recon.pwls.inset_problem import DEFAULT_PRIOR
 from recon.pwls.model_solver import dot
 from recon.pwls.pwls import solve_normal
 from recon.pwls.qggmrf import QGGMRF, quadratic
-from recon.unrolled import NormalProblem
 
 if TYPE_CHECKING:
     from recon.pwls.inset_problem import InsetProblem
@@ -74,7 +74,7 @@ class LinearFilter:
 
     Args:
         name: of the method.
-        lam: λ in noise units (:class:`recon.unrolled.NormalProblem`), where G is about 1 at 0.5 lp/mm at every dose.
+        lam: λ in noise units (:class:`recon.mbir.unrolled.NormalProblem`), where G is about 1 at 0.5 lp/mm at every dose.
         mu: μ in noise units, per (lp/mm)².
         along: κ, 1 for an isotropic filter.
         steps: of conjugate gradients; the ROI means change by less than 0.1 HU beyond 12.
@@ -217,7 +217,7 @@ def load_methods(names: Iterable[str]) -> list[Method]:
 
 
 def _learned(name: str) -> Method:
-    from recon.mbir import ADD_BACK, Mbir
+    from recon.mbir.mbir import ADD_BACK, Mbir
 
     prior = Mbir.load(add_back=None if name == "mbir_one_pass" else ADD_BACK)
     factor = {"mbir_noise_half": 4.0, "mbir_noise_double": 0.25}.get(name)

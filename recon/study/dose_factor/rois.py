@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from recon.mbir import average_onto
+from recon.mbir.mbir import average_onto
 from recon.study.compare import inset_grid
 from recon.study.dose_factor.facts import fbp_label
 from recon.study.dose_factor.measures import crop_window

@@ -11,7 +11,7 @@ from recon.fbp.backproject import backproject
 from recon.fbp.exact_noise import line_integral_variance
 from recon.fbp.fbp import filter_windowed
 from recon.fbp.inset import InsetFbp
-from recon.mbir import Mbir
+from recon.mbir.mbir import Mbir
 from recon.sensitivity import worst_case_gain
 from recon.study.compare import inset_grid
 from recon.study.dose_factor.facts import fbp_label

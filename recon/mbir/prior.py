@@ -5,7 +5,7 @@
 
 plus a quadratic term ½ Σ_f Q(f) |û(f)|² that holds down what the filters do not see (the highest frequencies).
 
-The volume u is in units of its own noise (see :mod:`recon.unrolled`), so one set of weights serves every dose: what
+The volume u is in units of its own noise (see :mod:`recon.mbir.unrolled`), so one set of weights serves every dose: what
 the noise level adds is only a slow change of the a_gj. The potentials are of the Lorentzian (Geman-McClure, Student-t)
 family: below τ_j they smooth, far above they let go, so a large contrast is not shrunk (Roth, Black 2009, Int. J.
 Comput. Vis. 82:205, fields of experts; Chen, Pock 2017, IEEE TPAMI 39:1256, as unrolled steps). Filters come in groups
@@ -28,7 +28,7 @@ from torch.nn import functional as F
 __all__ = ["LearnedPrior", "PriorConfig", "squared_frequencies"]
 
 REFERENCE_SCALE_HU = 200.0
-"""Noise scale at which the conditioning variable is 0 (see :class:`recon.unrolled.NormalProblem`): about 1 s."""
+"""Noise scale at which the conditioning variable is 0 (see :class:`recon.mbir.unrolled.NormalProblem`): about 1 s."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ class LearnedPrior(nn.Module):
         return first.reshape(-1, 1, 1, 1) * f2 + second.reshape(-1, 1, 1, 1) * f2 * f2
 
     def along_strength(self, scale_hu: Tensor) -> Tensor:
-        """Strength of the smoothing along vessels (:class:`recon.steering.Steering`), ``(batch,)``."""
+        """Strength of the smoothing along vessels (:class:`recon.mbir.along_vessel.Steering`), ``(batch,)``."""
         level = torch.log(scale_hu / REFERENCE_SCALE_HU).clamp(-3.0, 3.0)
         return torch.exp(self.along[0] + self.along[1] * level)
 

@@ -21,9 +21,9 @@ import torch
 from torch import Tensor
 
 from recon.fbp.inset import to_hu
-from recon.prior import PriorConfig
+from recon.mbir.prior import PriorConfig
+from recon.mbir.unrolled import NormalProblem, Unrolled, minimise_passes, residual
 from recon.pwls.inset_problem import InsetProblem
-from recon.unrolled import NormalProblem, Unrolled, minimise_passes, residual
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
 from torchpcct.volume import Volume
@@ -35,7 +35,7 @@ _LOG = logging.getLogger(__name__)
 SHIPPED = "mbir.safetensors"
 WEIGHTS_FORMAT = "torchpcct unrolled weights 1"
 ADD_BACK = (1.29, 0.42)
-"""Weight of the residual that the second pass adds back, see :class:`recon.unrolled.Unrolled`: chosen on held-out
+"""Weight of the residual that the second pass adds back, see :class:`recon.mbir.unrolled.Unrolled`: chosen on held-out
 plaques (see the training card) for a contrast slope of 1.0 between small ROIs, at 0.35 s and at 2 s. One pass leaves
 0.6 and 0.8."""
 LARGEST_HU = 2000.0
@@ -63,7 +63,7 @@ class Mbir:
 
         Args:
             path: of the file.
-            add_back: see :class:`recon.unrolled.Unrolled`.
+            add_back: see :class:`recon.mbir.unrolled.Unrolled`.
 
         Raises:
             FileNotFoundError: no such file.
@@ -93,7 +93,7 @@ class Mbir:
         if max(abs(s / self.voxel_mm - 1.0) for s in spacing) > 0.01:
             raise ValueError(
                 f"the network works on cubic voxels of {self.voxel_mm:g} mm, got {spacing}: make the problem on "
-                "recon.mbir.working_grid and average the result onto the grid"
+                "recon.mbir.mbir.working_grid and average the result onto the grid"
             )
         exposure = torch.full((b.shape[0],), float(exposure_s))
         return NormalProblem.from_statistic(problem.gram, b, exposure, problem.mu_ref / 1000.0, self.voxel_mm)
@@ -208,7 +208,7 @@ def reconstruct_mbir(
         noise_map: add an estimate of each voxel's standard deviation, ``report["noise_sd_hu"]``; that of the unrolled
             steps, also with ``converge``.
         converge: run every pass to the stationary point of its energy, about ten times the work
-            (:func:`recon.unrolled.minimise_passes`). ``report["residual"]`` of at most 1e-3 certifies it: within 1 HU
+            (:func:`recon.mbir.unrolled.minimise_passes`). ``report["residual"]`` of at most 1e-3 certifies it: within 1 HU
             (root mean square) of the limit, on the paper's plaque. The unrolled steps end 10 HU from it at 0.35 s and
             5 HU at 2 s.
 

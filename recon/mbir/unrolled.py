@@ -11,7 +11,7 @@ Each step k of the K unrolled ones reads
     u ← u − η_k M_k (H u − β + ∇R(u) + ∇S(u)) + θ_k (u − u_previous),    M_k = (circulant of H, S + λ_k)^(−1) by FFT,
 
 with the learned prior R and the smoothing S along vessels, whose direction the linear solution before the first step
-tells (:mod:`recon.steering`).
+tells (:mod:`recon.mbir.along_vessel`).
 
 Whatever smooths, shrinks. So the steps are passed through again with what the first pass left in the data added back,
 β ← β + w (β − H u): a Bregman iteration (Osher, Burger, Goldfarb, Xu, Yin 2005, Multiscale Model. Simul. 4:460), which
@@ -31,8 +31,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from recon.prior import REFERENCE_SCALE_HU, LearnedPrior, PriorConfig
-from recon.steering import Steering
+from recon.mbir.along_vessel import Steering
+from recon.mbir.prior import REFERENCE_SCALE_HU, LearnedPrior, PriorConfig
 
 __all__ = ["NormalProblem", "Unrolled", "energy", "minimise", "minimise_passes", "residual"]
 
