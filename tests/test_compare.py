@@ -5,12 +5,12 @@ import json
 import numpy as np
 import pytest
 
+from recon.cli import main
 from recon.study import paper
 from recon.study.compare import Settings, inset_grid, run
 from recon.study.compare_report import build_report
 from recon.study.report import markdown_table
 from torchpcct import Volume
-from torchpcct.cli import main
 from torchpcct.metrics.placement import RoiRule, place_rois
 from torchpcct.metrics.roi import axial_grid
 from torchpcct.scene.plaque.plaque import plaque_scene

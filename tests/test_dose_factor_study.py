@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from recon.cli import main
 from recon.mbir.mbir import average_onto
 from recon.pwls.qggmrf import quadratic
 from recon.study.compare import inset_grid
@@ -32,7 +33,6 @@ from recon.study.dose_factor.scene import StudyScene, _tissue_groups
 from recon.study.dose_factor.settings import MAIN_SCENES
 from recon.study.dose_factor.store import Store
 from torchpcct import VolumeGrid
-from torchpcct.cli import main
 
 TINY = Settings(
     n=6, slow_n=3, scene_n=3, doses=(2.0,), scene_doses=(2.0,), methods=("linear",), scenes=("half_size_core",),
