@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recon.study import paper
+from recon.study.paper import facts as paper
 from torchpcct.metrics import cnr, cnr_from_moments, cnr_interval, mean_interval, sd_interval
 
 

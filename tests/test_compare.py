@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from recon.cli import main
-from recon.study import paper
 from recon.study.compare import Settings, inset_grid, run
 from recon.study.compare_report import build_report
+from recon.study.paper import facts as paper
 from recon.study.report import markdown_table
 from torchpcct import Volume
 from torchpcct.metrics.placement import RoiRule, place_rois

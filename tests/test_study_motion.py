@@ -12,7 +12,7 @@ from recon.study import registry
 from recon.study.motion import Settings, measure_all
 from recon.study.motion_measures import Reference, observe
 from recon.study.motion_report import build_report
-from recon.study.plaque_scan import inset_grid
+from recon.study.paper.plaque_scan import inset_grid
 from torchpcct.scene.plaque.plaque import plaque_scene
 
 TISSUES = {"patient": -100.0, "wall": 60.0, "fibrous": 100.0, "lumen": 470.0, "core": 40.0}

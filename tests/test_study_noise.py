@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from recon.fbp.exact_noise import roi_adjoints, roi_covariance
-from recon.study import noise, paper, registry
+from recon.study import noise, registry
 from recon.study.noise_statistics import (
     CLAIMS,
     Table,
@@ -20,7 +20,8 @@ from recon.study.noise_statistics import (
     pair_differences,
     resampled_tables,
 )
-from recon.study.tables import published, table_checks
+from recon.study.paper import facts as paper
+from recon.study.paper.tables import published, table_checks
 from torchpcct.metrics.bootstrap import resampling
 
 TINY = noise.Settings(

@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from recon.study.bowtie_scan import BOWTIES
-from recon.study.plaque_scan import PlaqueScan, inset_grid, prepare
+from recon.study.paper.plaque_scan import PlaqueScan, inset_grid, prepare
 from torchpcct.metrics import ContrastSlope, DoseCurve, DoseFactor, contrast_slope, dose_factor
 from torchpcct.scanner import presets
 from torchpcct.scene.plaque.plaque import plaque_scene

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from recon.study import paper
 from recon.study.bowtie_dose import ratios
 from recon.study.bowtie_figures import draw
 from recon.study.bowtie_scan import BOWTIES
 from recon.study.checks import Check, around, checks_section, effects_section
+from recon.study.paper import facts as paper
 from recon.study.report import Report, environment, markdown_table
 from torchpcct.acquisition.plan import Effect
 

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from recon.study import paper
-from recon.study.plaque_scan import (
+from recon.study.paper import facts as paper
+from recon.study.paper.plaque_scan import (
     INSET_MM,
     REFERENCE_KERNEL,
     REFERENCE_VOXEL_MM,

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from recon.study import paper
 from recon.study.checks import Check, checks_section
 from recon.study.compare import Compared
-from recon.study.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM
+from recon.study.paper import facts as paper
+from recon.study.paper.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM
+from recon.study.paper.tables import published, table_checks
 from recon.study.report import Report, environment, markdown_table
-from recon.study.tables import published, table_checks
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.roi import sample_axial
 from torchpcct.viz import Panel, panels

@@ -21,9 +21,9 @@ import numpy as np
 from torch import Tensor
 
 from recon.fbp.inset import InsetFbp, view_motion
-from recon.study import paper
 from recon.study.motion_measures import Observed, Reference, observe
-from recon.study.plaque_scan import inset_grid
+from recon.study.paper import facts as paper
+from recon.study.paper.plaque_scan import inset_grid
 from torchpcct.scan import Scan
 
 if TYPE_CHECKING:

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from recon.study import paper
 from recon.study.checks import Check, checks_section, effects_section
 from recon.study.motion import METHODS, Measured
 from recon.study.motion_figures import curves_figure, images_figure
 from recon.study.motion_measures import Observed
+from recon.study.paper import facts as paper
 from recon.study.report import Report, environment, markdown_table
 from torchpcct.acquisition.plan import Effect
 

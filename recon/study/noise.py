@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from recon.study import paper
 from recon.study.compare import FULL_VIEWS
 from recon.study.noise_statistics import Table, exact_table
-from recon.study.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM, PlaqueScan, prepare, roi_entry
+from recon.study.paper import facts as paper
+from recon.study.paper.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM, PlaqueScan, prepare, roi_entry
 from torchpcct.geometry import VolumeGrid
 
 if TYPE_CHECKING:

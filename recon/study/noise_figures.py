@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from recon.study import paper
 from recon.study.noise import Measured
 from recon.study.noise_statistics import measured_table
-from recon.study.tables import published
+from recon.study.paper import facts as paper
+from recon.study.paper.tables import published
 from torchpcct.metrics.cnr import cnr_interval, cnr_range
 from torchpcct.metrics.roi import sample_axial
 from torchpcct.viz import Panel, panels

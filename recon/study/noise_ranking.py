@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from recon.study import paper
 from recon.study.noise import Measured
 from recon.study.noise_statistics import CLAIMS, few_run_tables, kendall, pair_differences, resampled_tables
+from recon.study.paper import facts as paper
+from recon.study.paper.tables import published
 from recon.study.report import markdown_table
-from recon.study.tables import published
 
 __all__ = ["claims_data", "claims_section", "pairs_data", "pairs_section"]
 

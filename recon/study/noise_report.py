@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from recon.study import paper
 from recon.study.checks import Check, around, checks_section, effects_section
 from recon.study.noise import Measured, as_dict
 from recon.study.noise_figures import cnr_figure, images_figure
 from recon.study.noise_ranking import claims_data, claims_section, pairs_data, pairs_section
 from recon.study.noise_statistics import Table, measured_table
+from recon.study.paper import facts as paper
+from recon.study.paper.tables import published, table_checks
 from recon.study.report import Report, environment, markdown_table
-from recon.study.tables import published, table_checks
 from torchpcct.acquisition.plan import Effect
 from torchpcct.metrics.cnr import cnr_interval, cnr_range, sd_interval
 

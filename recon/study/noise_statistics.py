@@ -242,7 +242,7 @@ def _kernel_order(table: Table, settings: Sequence[Setting]) -> NDArray[np.bool_
 
 
 def _closest(table: Table, settings: Sequence[Setting]) -> NDArray[np.bool_]:
-    from recon.study import paper
+    from recon.study.paper import facts as paper
 
     reference = np.array([paper.NOISE_FREE_ROI_HU["foreground"], paper.NOISE_FREE_ROI_HU["background"]])
     return _smallest_at_quarter(np.abs(table.mean - reference).sum(-1), settings, ("soft", "standard"))

@@ -23,8 +23,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recon.study import paper
-from recon.study.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM, PlaqueScan, prepare
+from recon.study.paper import facts as paper
+from recon.study.paper.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM, PlaqueScan, prepare
 from recon.study.resolution_measures import FWHM_PER_SIGMA, Blurred, SystemWidth, centers, measure, truth, wire_width
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.roi import PROTOCOL_PIXEL_MM, PROTOCOL_PIXELS, axial_grid, sample_axial

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from recon.study import paper
 from recon.study.checks import Check, around, checks_section, effects_section
+from recon.study.paper import facts as paper
 from recon.study.report import Report, environment, markdown_table
 from recon.study.resolution import Imaged, Measured
 from recon.study.resolution_measures import FWHM_PER_SIGMA, Blurred, crossing

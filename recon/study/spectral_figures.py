@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from recon.study import paper
+from recon.study.paper import facts as paper
 from recon.study.spectral_scan import PlaqueScan
 from recon.study.spectral_tissue import Tissues
 from torchpcct.spectral import MMD_TISSUES, vmi

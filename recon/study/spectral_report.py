@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from recon.study import paper
 from recon.study.checks import Check, around, checks_section, effects_section
+from recon.study.paper import facts as paper
 from recon.study.report import Report, environment, markdown_table
 from recon.study.spectral_figures import curves_figure, tissue_figure
 from recon.study.spectral_scan import PlaqueScan

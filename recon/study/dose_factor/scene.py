@@ -24,7 +24,7 @@ from recon.study.dose_factor.facts import SceneFacts, fbp_label
 from recon.study.dose_factor.measures import OBSERVERS, crop_window, observer_channels
 from recon.study.dose_factor.settings import FBP_BASE, MAIN_SCENES, WIDE_ROIS, Settings
 from recon.study.dose_factor.store import Store
-from recon.study.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM, enclosing, inset_grid
+from recon.study.paper.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM, enclosing, inset_grid
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.data_limit import information_matrix

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from recon.study import paper
 from recon.study.dose_factor.methods import IMAGE_METHODS, METHODS
+from recon.study.paper import facts as paper
 
 __all__ = [
     "EXTRA_SCENES",

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from recon.study import paper
 from recon.study.checks import Check
+from recon.study.paper import facts as paper
 from torchpcct.metrics.cnr import cnr_range
 
 __all__ = ["published", "table_checks"]
