@@ -189,8 +189,8 @@ def _check_device(device: str) -> None:
 
 
 def _compare(arguments: argparse.Namespace, progress: _Progress) -> None:
-    from recon.study.compare import Settings, run
-    from recon.study.compare_report import build_report
+    from recon.study.compare.measure import Settings, run
+    from recon.study.compare.report import build_report
 
     changes: dict[str, Any] = {"seed": arguments.seed, "pwls": not arguments.no_pwls}
     if arguments.realizations is not None:
@@ -249,7 +249,7 @@ def _study(arguments: argparse.Namespace, progress: _Progress) -> None:
 
 
 def _simulate(arguments: argparse.Namespace, progress: _Progress) -> None:
-    from recon.study.compare import inset_grid
+    from recon.study.compare.measure import inset_grid
     from torchpcct.acquisition.acquire import acquire
     from torchpcct.scanner import presets
     from torchpcct.scene.plaque.plaque import plaque_scene
@@ -284,7 +284,7 @@ def _reconstruct(arguments: argparse.Namespace, progress: _Progress) -> None:
     import math
 
     from recon import reconstruct
-    from recon.study.compare import INSET_MM
+    from recon.study.compare.measure import INSET_MM
     from torchpcct.geometry import VolumeGrid
     from torchpcct.scan import Scan
     from torchpcct.scene.plaque.plaque import PAPER_POSITION

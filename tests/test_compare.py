@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from recon.cli import main
-from recon.study.compare import Settings, inset_grid, run
-from recon.study.compare_report import build_report
+from recon.study.compare.measure import Settings, inset_grid, run
+from recon.study.compare.report import build_report
 from recon.study.paper import facts as paper
 from recon.study.report import markdown_table
 from torchpcct import Volume

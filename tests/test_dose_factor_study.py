@@ -12,7 +12,7 @@ import torch
 from recon.cli import main
 from recon.mbir.mbir import average_onto
 from recon.pwls.qggmrf import quadratic
-from recon.study.compare import inset_grid
+from recon.study.compare.measure import inset_grid
 from recon.study.dose_factor import Settings, estimate_seconds, figures, run, study
 from recon.study.dose_factor.analysis import analyse
 from recon.study.dose_factor.estimates import controlled

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from recon.study.compare import FULL_VIEWS
+from recon.study.compare.measure import FULL_VIEWS
 from recon.study.noise_statistics import Table, exact_table
 from recon.study.paper import facts as paper
 from recon.study.paper.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM, PlaqueScan, prepare, roi_entry

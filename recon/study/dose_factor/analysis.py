@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.study.compare import inset_grid
+from recon.study.compare.measure import inset_grid
 from recon.study.dose_factor.estimates import (
     DRAWS,
     attempt,

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from recon.study.compare import inset_grid
+from recon.study.compare.measure import inset_grid
 from recon.study.dose_factor.facts import fbp_label
 from recon.study.dose_factor.methods import METHOD_NAMES
 from recon.study.dose_factor.scene import StudyScene

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from recon.fbp.inset import InsetFbp
-from recon.study.compare import inset_grid
+from recon.study.compare.measure import inset_grid
 from recon.study.dose_factor.measures import crop_window, segmentation
 from recon.study.dose_factor.scene import StudyScene
 from recon.study.dose_factor.settings import FBP_BASE, NOISY_SCENES, Settings

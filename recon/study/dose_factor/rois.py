@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from recon.mbir.mbir import average_onto
-from recon.study.compare import inset_grid
+from recon.study.compare.measure import inset_grid
 from recon.study.dose_factor.facts import fbp_label
 from recon.study.dose_factor.measures import crop_window
 from recon.study.dose_factor.scene import StudyScene

@@ -13,7 +13,7 @@ from recon.fbp.fbp import filter_windowed
 from recon.fbp.inset import InsetFbp
 from recon.mbir.mbir import Mbir
 from recon.sensitivity import worst_case_gain
-from recon.study.compare import inset_grid
+from recon.study.compare.measure import inset_grid
 from recon.study.dose_factor.facts import fbp_label
 from recon.study.dose_factor.methods import IMAGE_METHODS, Method, fingerprint
 from recon.study.dose_factor.noise import Realisations

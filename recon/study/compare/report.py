@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from recon.study.checks import Check, checks_section
-from recon.study.compare import Compared
+from recon.study.compare.measure import Compared
 from recon.study.paper import facts as paper
 from recon.study.paper.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM
 from recon.study.paper.tables import published, table_checks
@@ -20,7 +20,7 @@ __all__ = ["build_report"]
 
 
 def build_report(result: Compared) -> Report:
-    """Report of :func:`recon.study.compare.run`: ``report.json``, ``report.md``, ``compare.png``."""
+    """Report of :func:`recon.study.compare.measure.run`: ``report.json``, ``report.md``, ``compare.png``."""
     checks = _checks(result)
     data = {
         "study": "compare",
