@@ -9,8 +9,9 @@ import pytest
 import torch
 
 from recon.fbp.exact_noise import roi_adjoints, roi_covariance
-from recon.study import noise, registry
-from recon.study.noise_statistics import (
+from recon.study import registry
+from recon.study.noise import measure as noise
+from recon.study.noise.few_runs import (
     CLAIMS,
     Table,
     exact_table,
@@ -111,7 +112,7 @@ def test_energy_integrating_rows_are_at_equal_dose(measured):
 
 
 def test_report_files(measured, tmp_path):
-    from recon.study.noise_report import build_report
+    from recon.study.noise.report import build_report
 
     build_report(measured).save(tmp_path)
     data = json.loads((tmp_path / "report.json").read_text())

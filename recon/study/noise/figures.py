@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from recon.study.noise import Measured
-from recon.study.noise_statistics import measured_table
+from recon.study.noise.few_runs import measured_table
+from recon.study.noise.measure import Measured
 from recon.study.paper import facts as paper
 from recon.study.paper.tables import published
 from torchpcct.metrics.cnr import cnr_interval, cnr_range

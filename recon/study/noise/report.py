@@ -9,10 +9,10 @@ import numpy as np
 from scipy import stats
 
 from recon.study.checks import Check, around, checks_section, effects_section
-from recon.study.noise import Measured, as_dict
-from recon.study.noise_figures import cnr_figure, images_figure
-from recon.study.noise_ranking import claims_data, claims_section, pairs_data, pairs_section
-from recon.study.noise_statistics import Table, measured_table
+from recon.study.noise.few_runs import Table, measured_table
+from recon.study.noise.figures import cnr_figure, images_figure
+from recon.study.noise.measure import Measured, as_dict
+from recon.study.noise.ranking import claims_data, claims_section, pairs_data, pairs_section
 from recon.study.paper import facts as paper
 from recon.study.paper.tables import published, table_checks
 from recon.study.report import Report, environment, markdown_table
@@ -23,7 +23,7 @@ __all__ = ["build_report"]
 
 
 def build_report(m: Measured) -> Report:
-    """Report of :func:`recon.study.noise.measure`: ``report.json``, ``report.md`` and two figures."""
+    """Report of :func:`recon.study.noise.measure.measure`: ``report.json``, ``report.md`` and two figures."""
     exposure = m.settings.table_exposure_s
     tables = {name: _dose_table(m, dose) for name, dose in m.settings.doses.items()}
     claims, shares = claims_data(m, exposure)

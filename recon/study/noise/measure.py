@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from recon.study.compare.measure import FULL_VIEWS
-from recon.study.noise_statistics import Table, exact_table
+from recon.study.noise.few_runs import Table, exact_table
 from recon.study.paper import facts as paper
 from recon.study.paper.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM, PlaqueScan, prepare, roi_entry
 from torchpcct.geometry import VolumeGrid
@@ -152,7 +152,7 @@ class Measured:
 
 def run(settings: Settings | None = None, progress: Progress | None = None) -> Report:
     """Measure, and write the report."""
-    from recon.study.noise_report import build_report
+    from recon.study.noise.report import build_report
 
     return build_report(measure(settings or Settings(), progress))
 

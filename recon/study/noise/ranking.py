@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from recon.study.noise import Measured
-from recon.study.noise_statistics import CLAIMS, few_run_tables, kendall, pair_differences, resampled_tables
+from recon.study.noise.few_runs import CLAIMS, few_run_tables, kendall, pair_differences, resampled_tables
+from recon.study.noise.measure import Measured
 from recon.study.paper import facts as paper
 from recon.study.paper.tables import published
 from recon.study.report import markdown_table
