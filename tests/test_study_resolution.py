@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from recon.study import registry
-from recon.study.resolution import Imaged, Measured, Settings
-from recon.study.resolution_measures import (
+from recon.study.resolution.blur import (
     FWHM_PER_SIGMA,
     blur,
     centers,
@@ -20,7 +19,8 @@ from recon.study.resolution_measures import (
     point_width,
     truth,
 )
-from recon.study.resolution_report import build_report, limits
+from recon.study.resolution.measure import Imaged, Measured, Settings
+from recon.study.resolution.report import build_report, limits
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.resolution import ellipsoid_distance
 from torchpcct.metrics.roi import axial_grid
@@ -137,7 +137,7 @@ def test_a_disc_is_found_where_it_is():
 def test_report(plaque, series):
     """Every row of the list is there; a core that is lost early names its cause."""
     image, sharp = _ideal(plaque)
-    from recon.study.resolution_measures import SystemWidth
+    from recon.study.resolution.blur import SystemWidth
 
     plan = {"effects": [{"name": "focal spot", "modelled": True, "cost_hu": 3.0, "note": ""}], "tolerance_hu": 0.5}
     tall = torch.zeros(200, 256, dtype=torch.float64)

@@ -11,8 +11,8 @@ import numpy as np
 from recon.study.checks import Check, around, checks_section, effects_section
 from recon.study.paper import facts as paper
 from recon.study.report import Report, environment, markdown_table
-from recon.study.resolution import Imaged, Measured
-from recon.study.resolution_measures import FWHM_PER_SIGMA, Blurred, crossing
+from recon.study.resolution.blur import FWHM_PER_SIGMA, Blurred, crossing
+from recon.study.resolution.measure import Imaged, Measured
 from torchpcct.acquisition.plan import Effect
 from torchpcct.metrics.roi import PROTOCOL_PIXEL_MM
 from torchpcct.viz import Panel, panels
@@ -48,7 +48,7 @@ def limits(series: list[Blurred], tolerance: float) -> dict[str, Any]:
 
 
 def build_report(m: Measured) -> Report:
-    """Report of :func:`recon.study.resolution.measure_all`: ``report.json``, ``report.md`` and two figures."""
+    """Report of :func:`recon.study.resolution.measure.measure_all`: ``report.json``, ``report.md`` and two figures."""
     pcct = m.scanners["PCCT"]
     found = limits(pcct.blurred, m.settings.tolerance)
     margin = _PX_FWHM * min(found["cap"], found["lumen"])
@@ -312,7 +312,7 @@ def _or(value: float, digits: int) -> str:
 
 def _images(m: Measured) -> Any:
     """First row: both scanners; second: PCCT under blur with its segmentation; third: the same, along the vessel."""
-    from recon.study.resolution_measures import blur
+    from recon.study.resolution.blur import blur
 
     half = 0.5 * PROTOCOL_PIXEL_MM
     p = m.scanners["PCCT"]

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from recon.study.paper import facts as paper
 from recon.study.paper.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM, PlaqueScan, prepare
-from recon.study.resolution_measures import FWHM_PER_SIGMA, Blurred, SystemWidth, centers, measure, truth, wire_width
+from recon.study.resolution.blur import FWHM_PER_SIGMA, Blurred, SystemWidth, centers, measure, truth, wire_width
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.roi import PROTOCOL_PIXEL_MM, PROTOCOL_PIXELS, axial_grid, sample_axial
 
@@ -147,7 +147,7 @@ class Measured:
 
 def run(settings: Settings, progress: Callable[[str, float], None] | None = None) -> Report:
     """Simulate, blur, segment, measure; see :mod:`recon.study.registry`."""
-    from recon.study.resolution_report import build_report
+    from recon.study.resolution.report import build_report
 
     return build_report(measure_all(settings, progress))
 
