@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from recon.study import registry
-from recon.study.motion import Settings, measure_all
-from recon.study.motion_measures import Reference, observe
-from recon.study.motion_report import build_report
+from recon.study.motion.measure import Settings, measure_all
+from recon.study.motion.observed import Reference, observe
+from recon.study.motion.report import build_report
 from recon.study.paper.plaque_scan import inset_grid
 from torchpcct.scene.plaque.plaque import plaque_scene
 

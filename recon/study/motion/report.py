@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from recon.study.checks import Check, checks_section, effects_section
-from recon.study.motion import METHODS, Measured
-from recon.study.motion_figures import curves_figure, images_figure
-from recon.study.motion_measures import Observed
+from recon.study.motion.figures import curves_figure, images_figure
+from recon.study.motion.measure import METHODS, Measured
+from recon.study.motion.observed import Observed
 from recon.study.paper import facts as paper
 from recon.study.report import Report, environment, markdown_table
 from torchpcct.acquisition.plan import Effect
@@ -27,7 +27,7 @@ _DICE = 0.5
 
 
 def build_report(m: Measured) -> Report:
-    """Report of :func:`recon.study.motion.measure_all`: ``report.json``, ``report.md`` and two figures."""
+    """Report of :func:`recon.study.motion.measure.measure_all`: ``report.json``, ``report.md`` and two figures."""
     checks = _checks(m)
     data: dict[str, Any] = {
         "study": "motion",

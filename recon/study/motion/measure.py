@@ -21,7 +21,7 @@ import numpy as np
 from torch import Tensor
 
 from recon.fbp.inset import InsetFbp, view_motion
-from recon.study.motion_measures import Observed, Reference, observe
+from recon.study.motion.observed import Observed, Reference, observe
 from recon.study.paper import facts as paper
 from recon.study.paper.plaque_scan import inset_grid
 from torchpcct.scan import Scan
@@ -144,7 +144,7 @@ class Measured:
 
 def run(settings: Settings, progress: Callable[[str, float], None] | None = None) -> Report:
     """Simulate, reconstruct, compensate, measure; see :mod:`recon.study.registry`."""
-    from recon.study.motion_report import build_report
+    from recon.study.motion.report import build_report
 
     return build_report(measure_all(settings, progress))
 
@@ -166,7 +166,7 @@ def measure_all(settings: Settings, progress: Callable[[str, float], None] | Non
         m.seconds[f"{name}, residual motion"] = time.perf_counter() - start
         if name == "PCCT":
             start = time.perf_counter()
-            from recon.study.motion_compensation import compensate
+            from recon.study.motion.compensation import compensate
 
             m.plan = dict(kept[1].info["plan"])
             compensate(m, *kept, reference, partial(report, "compensation"))

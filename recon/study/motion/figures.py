@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from recon.study.motion import METHODS, Measured
-from recon.study.motion_measures import Observed
+from recon.study.motion.measure import METHODS, Measured
+from recon.study.motion.observed import Observed
 from torchpcct.metrics.roi import PROTOCOL_PIXEL_MM
 from torchpcct.viz import WINDOW_HU, Panel, panels
 

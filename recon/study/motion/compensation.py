@@ -10,8 +10,8 @@ from torch import Tensor
 
 from recon.fbp.inset import InsetFbp, view_motion
 from recon.pwls.inset_problem import InsetProblem, reconstruct_pwls
-from recon.study.motion import KERNEL, Measured
-from recon.study.motion_measures import Observed, Reference, observe
+from recon.study.motion.measure import KERNEL, Measured
+from recon.study.motion.observed import Observed, Reference, observe
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
 
 if TYPE_CHECKING:
