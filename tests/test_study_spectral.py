@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from recon.study import registry
-from recon.study.spectral import Settings, run
-from recon.study.spectral_report import checks_of
-from recon.study.spectral_tissue import BODIES, truth_labels
+from recon.study.spectral.measure import Settings, run
+from recon.study.spectral.report import checks_of
+from recon.study.spectral.tissues import BODIES, truth_labels
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scene.plaque.plaque import plaque_scene
 from torchpcct.spectral import MMD_TISSUES, dice, pe_pvc, vmi

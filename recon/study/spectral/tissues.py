@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.study.spectral_scan import PlaqueScan
+from recon.study.spectral.scan import PlaqueScan
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scene.raster import volume_fractions
 from torchpcct.scene.scene import Scene

@@ -8,8 +8,8 @@ import numpy as np
 from torch import Tensor
 
 from recon.study.paper import facts as paper
-from recon.study.spectral_scan import PlaqueScan
-from recon.study.spectral_tissue import Tissues
+from recon.study.spectral.scan import PlaqueScan
+from recon.study.spectral.tissues import Tissues
 from torchpcct.spectral import MMD_TISSUES, vmi
 from torchpcct.viz import WINDOW_HU
 

@@ -26,8 +26,8 @@ from torch import Tensor
 
 from recon.pwls.basis_problem import DEFAULT_JOINT_PRIOR, BasisProblem
 from recon.study.report import Report
-from recon.study.spectral_scan import PlaqueScan, second_order_bound, starved_rays, water_hu
-from recon.study.spectral_tissue import RULES, Tissues
+from recon.study.spectral.scan import PlaqueScan, second_order_bound, starved_rays, water_hu
+from recon.study.spectral.tissues import RULES, Tissues
 from torchpcct.metrics.placement import place_rois
 from torchpcct.metrics.roi import axial_grid
 from torchpcct.spectral import MMD_TISSUES, VMI_ENERGIES_KEV, VmiCurve, vmi, vmi_curve
@@ -107,7 +107,7 @@ def run(settings: Settings, progress: Progress | None = None) -> Report:
         settings: see :class:`Settings`.
         progress: called with the name of the step and its finished fraction.
     """
-    from recon.study.spectral_report import build_report
+    from recon.study.spectral.report import build_report
 
     started, spent = time.perf_counter(), time.process_time()
 

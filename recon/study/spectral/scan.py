@@ -35,7 +35,7 @@ from torchpcct.spectral import (
 )
 
 if TYPE_CHECKING:
-    from recon.study.spectral import Settings
+    from recon.study.spectral.measure import Settings
 
 __all__ = ["PlaqueScan", "RayStatistics", "second_order_bound", "starved_rays", "water_hu"]
 
