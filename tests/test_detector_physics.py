@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from recon.study import detector as study
+from recon.study.detector import measure as study
 from torchpcct import acquire
 from torchpcct.scanner import SiliconDetector, presets
 from torchpcct.scanner.compton import mean_recoil_fraction

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.study.checks import Check, checks_section, effects_section
-from recon.study.detector_rate import (
+from recon.study.detector.rate import (
     FAT_MM,
     beam_behind,
     charge_sharing,
@@ -78,7 +78,7 @@ class Settings:
 
 def run(settings: Settings | None = None, progress: Progress | None = None) -> Report:
     """Compute all figures and write the report."""
-    from recon.study.detector_figure import figure
+    from recon.study.detector.figures import figure
 
     s = settings or Settings()
     report = progress or (lambda step, fraction: None)
