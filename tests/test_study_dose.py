@@ -11,9 +11,10 @@ import pytest
 import torch
 
 from recon.study import registry
-from recon.study.bowtie_combined import _variance_ratio
-from recon.study.bowtie_dose import dose_maps, ramp_figures, ratios, region_ratio, transmission
-from recon.study.bowtie_scan import (
+from recon.study.bowtie.combined import _variance_ratio
+from recon.study.bowtie.dose_maps import dose_maps, ramp_figures, ratios, region_ratio, transmission
+from recon.study.bowtie.measure import Settings, run
+from recon.study.bowtie.slice_scan import (
     BOWTIES,
     polynomial_linearisation,
     radial_profile,
@@ -21,7 +22,6 @@ from recon.study.bowtie_scan import (
     slice_scans,
     wide_scanner,
 )
-from recon.study.dose import Settings, run
 from torchpcct.dose import CtdiDose
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scene import SinusoidalMotion

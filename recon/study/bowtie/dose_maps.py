@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.study.bowtie_scan import BOWTIES
+from recon.study.bowtie.slice_scan import BOWTIES
 from torchpcct.dose import CtdiDose, ctdi_dose, monte_carlo_dose, primary_dose
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scanner.filters import large_bowtie, roi_bowtie

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from recon.study.bowtie_scan import BOWTIES
+from recon.study.bowtie.slice_scan import BOWTIES
 from recon.study.paper.plaque_scan import PlaqueScan, inset_grid, prepare
 from torchpcct.metrics import ContrastSlope, DoseCurve, DoseFactor, contrast_slope, dose_factor
 from torchpcct.scanner import presets

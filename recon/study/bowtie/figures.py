@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from recon.study.dose import Measured
+    from recon.study.bowtie.measure import Measured
 
 __all__ = ["draw"]
 

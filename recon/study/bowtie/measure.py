@@ -17,12 +17,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.study.bowtie_scan import BOWTIES, radial_profile, slice_image, slice_scans, wide_scanner
+from recon.study.bowtie.slice_scan import BOWTIES, radial_profile, slice_image, slice_scans, wide_scanner
 from torchpcct.geometry import VolumeGrid
 
 if TYPE_CHECKING:
-    from recon.study.bowtie_combined import Combined
-    from recon.study.bowtie_dose import DoseMaps
+    from recon.study.bowtie.combined import Combined
+    from recon.study.bowtie.dose_maps import DoseMaps
     from recon.study.report import Report
     from torchpcct.scene import Scene
 
@@ -52,7 +52,7 @@ class Settings:
         views: of the slices' scans.
         kernel: reconstruction kernel of the slices (the paper does not name it).
         realizations: of the slices' noise.
-        detector: ``"eid"`` as the paper, or ``"silicon"``; see :func:`recon.study.bowtie_scan.wide_scanner`.
+        detector: ``"eid"`` as the paper, or ``"silicon"``; see :func:`recon.study.bowtie.slice_scan.wide_scanner`.
         map_mm: voxels of the thorax's dose map; that of the phantom has half of them, at least 1 mm.
         histories: photons of each Monte Carlo run; 0: no scatter.
         plaque_views: of the plaque's scans; fewer than 1968 keep the tube load.
@@ -143,7 +143,7 @@ def run(settings: Settings, progress: Progress | None = None) -> Report:
         settings: of the study.
         progress: called with the name of the step and its finished fraction.
     """
-    from recon.study.bowtie_report import build_report
+    from recon.study.bowtie.report import build_report
 
     return build_report(measure(settings, progress))
 
@@ -177,7 +177,7 @@ def _grid(name: str, spacing: float) -> VolumeGrid:
 
 
 def _dose(m: Measured, report: Callable[[float], None]) -> None:
-    from recon.study import bowtie_dose as part
+    from recon.study.bowtie import dose_maps as part
     from torchpcct.dose import monte_carlo_dose, primary_dose
     from torchpcct.scene.phantoms.quality import water_cylinder
 
@@ -276,7 +276,7 @@ def _cupping(m: Measured, report: Callable[[float], None]) -> None:
 
 
 def _plaque(m: Measured, report: Callable[[float], None]) -> None:
-    from recon.study.bowtie_combined import combine
+    from recon.study.bowtie.combined import combine
 
     s = m.settings
     m.combined, m.plan = combine(s.plaque_doses, s.plaque_realizations, s.plaque_views, s.seed, report)

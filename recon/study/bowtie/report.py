@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from recon.study.bowtie_dose import ratios
-from recon.study.bowtie_figures import draw
-from recon.study.bowtie_scan import BOWTIES
+from recon.study.bowtie.dose_maps import ratios
+from recon.study.bowtie.figures import draw
+from recon.study.bowtie.slice_scan import BOWTIES
 from recon.study.checks import Check, around, checks_section, effects_section
 from recon.study.paper import facts as paper
 from recon.study.report import Report, environment, markdown_table
 from torchpcct.acquisition.plan import Effect
 
 if TYPE_CHECKING:
-    from recon.study.dose import Measured
+    from recon.study.bowtie.measure import Measured
 
 __all__ = ["build_report"]
 
