@@ -13,7 +13,8 @@ from recon.cli import main
 from recon.mbir.mbir import average_onto
 from recon.pwls.qggmrf import quadratic
 from recon.study.compare.measure import inset_grid
-from recon.study.dose_factor import Settings, estimate_seconds, figures, run, study
+from recon.study.dose_factor import Settings, estimate_seconds, figures, run
+from recon.study.dose_factor import measure as study
 from recon.study.dose_factor.analysis import analyse
 from recon.study.dose_factor.estimates import controlled
 from recon.study.dose_factor.measures import crop_window
@@ -26,7 +27,7 @@ from recon.study.dose_factor.methods import (
     fingerprint,
     load_methods,
 )
-from recon.study.dose_factor.noise import Realisations
+from recon.study.dose_factor.realisations import Realisations
 from recon.study.dose_factor.report import build_report, headline
 from recon.study.dose_factor.rois import OtherVoxels, Wide
 from recon.study.dose_factor.scene import StudyScene, _tissue_groups

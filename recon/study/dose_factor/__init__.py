@@ -6,7 +6,7 @@ draws its realisations, ``methods`` reconstruct them, ``study`` runs all of that
 and pictures.
 """
 
+from recon.study.dose_factor.measure import Measured, run
 from recon.study.dose_factor.settings import Settings, estimate_seconds
-from recon.study.dose_factor.study import Measured, run
 
 __all__ = ["Measured", "Settings", "estimate_seconds", "run"]

@@ -25,10 +25,10 @@ from recon.study.dose_factor.estimates import (
 )
 from recon.study.dose_factor.facts import SceneFacts, fbp_label
 from recon.study.dose_factor.further import Further
+from recon.study.dose_factor.measure import Measured
 from recon.study.dose_factor.measures import DOG_CHANNELS, OBSERVERS, crop_window, observer_channels
 from recon.study.dose_factor.scene import StudyScene
 from recon.study.dose_factor.settings import FBP_BASE, MAIN_SCENES
-from recon.study.dose_factor.study import Measured
 from torchpcct.metrics import (
     ContrastSlope,
     DoseCurve,

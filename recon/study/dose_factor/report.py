@@ -8,11 +8,11 @@ from typing import Any
 from recon.study.dose_factor.analysis import ASSUMED_FACTOR, analyse
 from recon.study.dose_factor.facts import fbp_label
 from recon.study.dose_factor.figures import curves_figure, images_figure
+from recon.study.dose_factor.measure import Measured
 from recon.study.dose_factor.measures import LUMEN_HALF_HU, OBSERVERS
 from recon.study.dose_factor.methods import METHOD_NAMES
 from recon.study.dose_factor.settings import FBP_BASE, MAIN_SCENES
-from recon.study.dose_factor.shape_limits import CORRELATION_MM
-from recon.study.dose_factor.study import Measured
+from recon.study.dose_factor.shape_limit import CORRELATION_MM
 from recon.study.report import Report, environment, markdown_table
 
 __all__ = ["build_report", "headline_method"]

@@ -16,7 +16,7 @@ from recon.sensitivity import worst_case_gain
 from recon.study.compare.measure import inset_grid
 from recon.study.dose_factor.facts import fbp_label
 from recon.study.dose_factor.methods import IMAGE_METHODS, Method, fingerprint
-from recon.study.dose_factor.noise import Realisations
+from recon.study.dose_factor.realisations import Realisations
 from recon.study.dose_factor.settings import FBP_BASE
 
 __all__ = ["FBP_KERNELS", "worst_case_gains"]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from recon.limits import deformation_limit, outline_maps
-from recon.study.dose_factor.noise import Realisations
+from recon.study.dose_factor.realisations import Realisations
 from torchpcct.geometry import VolumeGrid
 
 __all__ = ["CORRELATION_MM", "DISPLACEMENTS_MM", "shape_limits"]

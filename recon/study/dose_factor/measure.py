@@ -4,7 +4,7 @@ Stages, each of them a set of files that are written whole and reused:
 
 1. scenes: noise-free scans, what FBP makes of them exactly (means, covariances, images without noise), the limit of
    the data by generalised least squares on exact path lengths;
-2. data: b = AᵀW y of every noise realisation, and FBP of the same readings (:mod:`recon.study.dose_factor.noise`);
+2. data: b = AᵀW y of every noise realisation, and FBP of the same readings (:mod:`recon.study.dose_factor.realisations`);
 3. methods: ROI means, a crop about the core and segmentation figures of every reconstruction.
 
 Realisation k uses the noise seed ``seed + k`` in every scene, at every dose and for every method. The scenes with half
@@ -27,10 +27,10 @@ from torch import Tensor
 from recon.study.dose_factor.facts import SceneFacts
 from recon.study.dose_factor.measures import crop_window, segmentation
 from recon.study.dose_factor.methods import IMAGE_METHODS, Method, fingerprint, load_methods
-from recon.study.dose_factor.noise import Realisations, joined
+from recon.study.dose_factor.realisations import Realisations, joined
 from recon.study.dose_factor.scene import StudyScene
 from recon.study.dose_factor.settings import MAIN_SCENES, NOISY_SCENES, Settings, with_twin
-from recon.study.dose_factor.shape_limits import shape_limits
+from recon.study.dose_factor.shape_limit import shape_limits
 from recon.study.dose_factor.stability import worst_case_gains
 from recon.study.dose_factor.store import Store
 

@@ -16,8 +16,8 @@ from recon.study.dose_factor.scene import StudyScene
 from recon.study.dose_factor.settings import FBP_BASE, NOISY_SCENES, Settings
 
 if TYPE_CHECKING:
+    from recon.study.dose_factor.measure import Settings
     from recon.study.dose_factor.store import Store
-    from recon.study.dose_factor.study import Settings
     from torchpcct.scan import Scan
 
 __all__ = ["Realisations", "joined"]
