@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from train.drawing import draw_scene
-from train.held_out import validation_scenes
-from train.rasterise import random_scene, rasterise
-from train.scenes import Scene, SceneConfig, Texture, Vessel, Volume, is_paper_family
+from train.scenes.drawing import draw_scene
+from train.scenes.held_out import validation_scenes
+from train.scenes.rasterise import random_scene, rasterise
+from train.scenes.scene import Scene, SceneConfig, Texture, Vessel, Volume, is_paper_family
 
 EXTENT = (9.0, 9.0, 11.2)
 SMALL = (15, 15, 19)
@@ -171,7 +171,7 @@ def test_paper_family_is_never_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
         free_probability=0.0,
     )
     assert not any(is_paper_family(draw_scene(seed, EXTENT, config)) for seed in range(200))
-    monkeypatch.setattr("train.drawing.is_paper_family", lambda scene: False)
+    monkeypatch.setattr("train.scenes.drawing.is_paper_family", lambda scene: False)
     assert any(is_paper_family(draw_scene(seed, EXTENT, config)) for seed in range(200))
 
 

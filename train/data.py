@@ -19,8 +19,8 @@ from torch import Tensor
 from recon.gram.gram import Gram
 from recon.mbir.unrolled import NormalProblem
 from torchpcct.geometry import VolumeGrid
-from train.rasterise import random_scene
-from train.scenes import SceneConfig
+from train.scenes.rasterise import random_scene
+from train.scenes.scene import SceneConfig
 
 __all__ = ["Batch", "Data", "DataConfig", "Situation", "seed_of"]
 
@@ -61,7 +61,7 @@ class DataConfig:
         exposure_s: range of the exposure, log-uniform.
         views: views of the scans whose Gram operators are taken (their exposure is that of the whole scan).
         situations: one Gram operator each; one is drawn per step.
-        scenes: changes of :class:`train.scenes.SceneConfig`.
+        scenes: changes of :class:`train.scenes.scene.SceneConfig`.
         core_roi, tissue_roi: ranges of the radii of the random ROIs, mm.
         flat_roi: share of ROIs that are discs of one slice, as in an axial image, instead of balls.
     """

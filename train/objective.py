@@ -24,7 +24,7 @@ from torch import Tensor, nn
 
 from recon.mbir.unrolled import NormalProblem
 from train.data import Batch, Data, seed_of
-from train.held_out import validation_scenes
+from train.scenes.held_out import validation_scenes
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

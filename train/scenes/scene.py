@@ -1,7 +1,7 @@
 """The 3-D scenes in HU that a learned prior is trained with: what they consist of, and how they are distributed.
 
-A scene (:class:`Scene`) is drawn in mm and HU, without a grid (:mod:`train.drawing`); :mod:`train.rasterise` gives its
-area-averaged voxel values, and :mod:`train.held_out` a family of its own to select checkpoints with.
+A scene (:class:`Scene`) is drawn in mm and HU, without a grid (:mod:`train.scenes.drawing`); :mod:`train.scenes.rasterise` gives its
+area-averaged voxel values, and :mod:`train.scenes.held_out` a family of its own to select checkpoints with.
 It holds either vessels (bent, tilted tubes: wall, fibrous layer, eccentric and narrowing lumen; soft inclusions, called
 cores, and calcifications in the fibrous layer) or free-standing bodies of random contrast, in fat or in a tissue like
 muscle. Cores have contrasts of both signs. The plaque of the paper (:mod:`torchpcct.scene.plaque.plaque`) is never drawn:
@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from train._shapes import TABLE_ROWS
+from train.scenes.paint_kernels import TABLE_ROWS
 
 __all__ = ["Bump", "Scene", "SceneConfig", "Texture", "Vessel", "Volume", "is_paper_family"]
 

@@ -1,4 +1,4 @@
-"""Random drawing of training scenes (:mod:`train.scenes`), a pure function of the seed."""
+"""Random drawing of training scenes (:mod:`train.scenes.scene`), a pure function of the seed."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from train.scenes import Bump, Range, Scene, SceneConfig, Texture, Triple, Vessel, Volume, is_paper_family
+from train.scenes.scene import Bump, Range, Scene, SceneConfig, Texture, Triple, Vessel, Volume, is_paper_family
 
 __all__ = ["Draw", "draw_scene"]
 

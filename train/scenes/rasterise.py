@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from train._shapes import KINDS, QUADRIC_COLUMNS, TABLE_ROWS, TUBE_COLUMNS, paint
-from train.drawing import draw_scene
-from train.scenes import Scene, SceneConfig, Triple, Volume
+from train.scenes.drawing import draw_scene
+from train.scenes.paint_kernels import KINDS, QUADRIC_COLUMNS, TABLE_ROWS, TUBE_COLUMNS, paint
+from train.scenes.scene import Scene, SceneConfig, Triple, Volume
 
 __all__ = ["SceneBatch", "check_grid", "random_scene", "rasterise"]
 

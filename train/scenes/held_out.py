@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from train.drawing import Draw
-from train.rasterise import check_grid, rasterise
-from train.scenes import Scene, Triple, Vessel, Volume
+from train.scenes.drawing import Draw
+from train.scenes.rasterise import check_grid, rasterise
+from train.scenes.scene import Scene, Triple, Vessel, Volume
 
 __all__ = ["ValidationScenes", "validation_scenes"]
 
