@@ -45,8 +45,9 @@ def reconstruct(
         scan: one scan, or several realisations of one scan (same geometry, window and exposure).
         grid: ``(z, y, x)`` grid inside the field of view.
         method: ``"fbp"`` (FDK; option ``kernel``) or ``"pwls"`` (penalised weighted least squares with a q-GGMRF
-            prior, to convergence; options of :func:`recon.pwls.inset_problem.reconstruct_pwls`) or ``"mbir"`` (unrolled steps with the
-            learned prior that ships with the package; options of :func:`recon.mbir.mbir.reconstruct_mbir`).
+            prior, to convergence; options of :func:`recon.pwls.inset_problem.reconstruct_pwls`) or ``"mbir"`` (unrolled
+            steps with the learned prior that ships with the package; options of
+            :func:`recon.mbir.mbir.reconstruct_mbir`).
         progress: called with the finished fraction, 0…1.
         device: where the returned volumes lie.
         options: of the method.
@@ -88,7 +89,7 @@ def reconstruct(
 
 def _fbp(scans: Sequence[Scan], grid: VolumeGrid, progress: Progress | None, kernel: str = "standard") -> list[Volume]:
     if not isinstance(kernel, str):
-        raise TypeError(f"kernel must be one name, got {kernel!r}; recon.inset.InsetFbp takes several at once")
+        raise TypeError(f"kernel must be one name, got {kernel!r}; recon.fbp.inset.InsetFbp takes several at once")
     start = time.perf_counter()
     run = InsetFbp(scans[0], [grid], [kernel])
     volumes = []

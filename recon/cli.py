@@ -252,7 +252,7 @@ def _simulate(arguments: argparse.Namespace, progress: _Progress) -> None:
     from recon.study.compare.measure import inset_grid
     from torchpcct.acquisition.acquire import acquire
     from torchpcct.scanner import presets
-    from torchpcct.scene.plaque.plaque import plaque_scene
+    from torchpcct.scene.plaque import plaque_scene
     from torchpcct.volume import require_folder
 
     require_folder(arguments.out)
@@ -287,7 +287,7 @@ def _reconstruct(arguments: argparse.Namespace, progress: _Progress) -> None:
     from recon.study.compare.measure import INSET_MM
     from torchpcct.geometry import VolumeGrid
     from torchpcct.scan import Scan
-    from torchpcct.scene.plaque.plaque import PAPER_POSITION
+    from torchpcct.scene.plaque import PAPER_POSITION
     from torchpcct.volume import check_volume_name, require_folder
 
     require_folder(arguments.out)

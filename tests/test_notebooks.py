@@ -14,7 +14,7 @@ FOLDER = Path(__file__).parents[1] / "notebooks"
 NAMES = sorted(p.name for p in FOLDER.glob("*.ipynb"))
 
 needs_weights = pytest.mark.skipif(
-    not resources.files("recon").joinpath("weights", "mbir.safetensors").is_file(),
+    not resources.files("recon").joinpath("mbir", "weights", "mbir.safetensors").is_file(),
     reason="the package has no weights yet",
 )
 

@@ -127,8 +127,8 @@ class Scan:
 
         The noise of a reading depends only on ``seed`` and the reading's place on the full detector, so a windowed
         scan carries the same noise as the full one. Counts are Poisson; an energy-integrating signal is compound
-        Poisson with the second moment of the transmitted spectrum (:func:`torchpcct.counting_noise.compound_poisson`), and
-        electronic noise is added.
+        Poisson with the second moment of the transmitted spectrum (:func:`torchpcct.counting_noise.compound_poisson`),
+        and electronic noise is added.
 
         Raises:
             ValueError: the scan is noisy already; ``exposure_s`` ≤ 0; a negative seed; an energy-integrating scan that

@@ -1,7 +1,8 @@
 """Training data without a projector in the loop: random scenes, and the statistic AᵀW y drawn through Gram operators.
 
 For a scene x and an exposure, β = H x + noise of covariance H is distributed as AᵀW y of a scan (up to the model error
-of the Gram operator, see :mod:`recon.gram.gram`), so thousands of scans a minute cost a few FFTs. The Gram operators are
+of the Gram operator, see :mod:`recon.gram.gram`), so thousands of scans a minute cost a few FFTs. The Gram operators
+are
 those of real scanners: several inset positions, patient sizes and pitches, each made when it is first asked for.
 """
 

@@ -1,8 +1,8 @@
 """FBP of several channels of line integrals (basis materials, energy bins) on a window, with a static surround.
 
-As :class:`recon.fbp.inset.InsetFbp` does for counting-mode scans: the surround, the same in every view and noise free, is
-filtered once; what differs from it inside the window is filtered from the window alone. The sum equals the FBP of the
-whole rows.
+As :class:`recon.fbp.inset.InsetFbp` does for counting-mode scans: the surround, the same in every view and noise free,
+is filtered once; what differs from it inside the window is filtered from the window alone. The sum equals the FBP of
+the whole rows.
 """
 
 from __future__ import annotations

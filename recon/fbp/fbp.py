@@ -71,7 +71,8 @@ def filter_sinogram(
 
     Returns:
         ``(..., views, [rows,] columns)`` on the window, mm⁻¹; with a sequence of kernels a leading axis of kernels.
-        Differentiable to any order. Temporary memory is bounded by :data:`recon.fbp.filter_plan.CHUNK_BYTES` or one view.
+        Differentiable to any order. Temporary memory is bounded by :data:`recon.fbp.filter_plan.CHUNK_BYTES` or one
+        view.
 
     Raises:
         ValueError: a wrong shape, an unknown kernel, a window beyond the detector, views that do not suffice.

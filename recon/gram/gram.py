@@ -1,8 +1,8 @@
 """AᵀWA of a small inset by FFT: fast enough for hundreds of applications, close enough to correct exactly.
 
 For an inset much smaller than its distance to the source, AᵀWA is nearly shift invariant in the plane: FFT in (y, x),
-a banded matrix along z for every frequency (see :mod:`recon.gram.impulse_response`). Its slow change across the inset (path
-lengths, bowtie, magnification) is taken to first or second order in position at the midpoint of the two voxels:
+a banded matrix along z for every frequency (see :mod:`recon.gram.impulse_response`). Its slow change across the inset
+(path lengths, bowtie, magnification) is taken to first or second order in position at the midpoint of the two voxels:
 
     G x = K₀x + ½ Σ_c [ b_c · (K_c x) + K_c (b_c · x) ],      b = y, x (, y², yx, x²),
 

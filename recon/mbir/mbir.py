@@ -2,7 +2,7 @@
 
 The network works on cubic voxels of one size (the one it was trained at); other grids are reconstructed on such voxels
 over the same extent and averaged onto the grid that was asked for. Weights and their training card ship in
-``recon/weights``.
+``recon/mbir/weights``.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Mbir:
             FileNotFoundError: no such file.
             ValueError: a file that holds no weights of this model.
         """
-        source = Path(path) if path is not None else Path(str(resources.files("recon") / "weights" / SHIPPED))
+        source = Path(path) if path is not None else Path(str(resources.files("recon") / "mbir" / "weights" / SHIPPED))
         if not source.is_file():
             raise FileNotFoundError(f"no weights at {source}: train them (python -m train) or name a file")
         from safetensors import SafetensorError, safe_open
@@ -208,9 +208,9 @@ def reconstruct_mbir(
         noise_map: add an estimate of each voxel's standard deviation, ``report["noise_sd_hu"]``; that of the unrolled
             steps, also with ``converge``.
         converge: run every pass to the stationary point of its energy, about ten times the work
-            (:func:`recon.mbir.unrolled.minimise_passes`). ``report["residual"]`` of at most 1e-3 certifies it: within 1 HU
-            (root mean square) of the limit, on the paper's plaque. The unrolled steps end 10 HU from it at 0.35 s and
-            5 HU at 2 s.
+            (:func:`recon.mbir.unrolled.minimise_passes`). ``report["residual"]`` of at most 1e-3 certifies it: within 1
+            HU (root mean square) of the limit, on the paper's plaque. The unrolled steps end 10 HU from it at 0.35 s
+            and 5 HU at 2 s.
 
     Returns:
         Volumes in HU. Report: ``iterations`` (of all passes), ``residual`` (norm of the preconditioned gradient of the
@@ -219,7 +219,8 @@ def reconstruct_mbir(
         ``converged``: whether every pass has.
 
     Raises:
-        ValueError, TypeError: see :class:`recon.pwls.inset_problem.InsetProblem`; a problem that was made for another grid.
+        ValueError, TypeError: see :class:`recon.pwls.inset_problem.InsetProblem`; a problem that was made for another
+        grid.
         FileNotFoundError: the package has no weights.
     """
     start = time.perf_counter()

@@ -5,8 +5,9 @@
 
 plus a quadratic term ½ Σ_f Q(f) |û(f)|² that holds down what the filters do not see (the highest frequencies).
 
-The volume u is in units of its own noise (see :mod:`recon.mbir.unrolled`), so one set of weights serves every dose: what
-the noise level adds is only a slow change of the a_gj. The potentials are of the Lorentzian (Geman-McClure, Student-t)
+The volume u is in units of its own noise (see :mod:`recon.mbir.unrolled`), so one set of weights serves every dose:
+what the noise level adds is only a slow change of the a_gj. The potentials are of the Lorentzian (Geman-McClure,
+Student-t)
 family: below τ_j they smooth, far above they let go, so a large contrast is not shrunk (Roth, Black 2009, Int. J.
 Comput. Vis. 82:205, fields of experts; Chen, Pock 2017, IEEE TPAMI 39:1256, as unrolled steps). Filters come in groups
 whose joint magnitude is penalised, as the three derivatives are in isotropic total variation.

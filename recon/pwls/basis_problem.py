@@ -25,9 +25,9 @@ REFERENCE_KEV = 52.0
 in Li et al.; whatever else the two basis images hold counts in units of equal noise."""
 
 DEFAULT_JOINT_PRIOR = QGGMRF(strength=0.3, threshold=16.0, relative=True)
-"""The strength of the counting-mode default, :data:`recon.pwls.inset_problem.DEFAULT_PRIOR`, with a threshold that follows the noise:
-1200 HU/mm at 2 s and 0.2 mm voxels, 300 HU/mm at a quarter of the noise. Basis images are noisier than counting-mode
-images of the same scan; below about 1000 HU/mm at 2 s single voxels of noise pass as edges."""
+"""The strength of the counting-mode default, :data:`recon.pwls.inset_problem.DEFAULT_PRIOR`, with a threshold that
+follows the noise: 1200 HU/mm at 2 s and 0.2 mm voxels, 300 HU/mm at a quarter of the noise. Basis images are noisier
+than counting-mode images of the same scan; below about 1000 HU/mm at 2 s single voxels of noise pass as edges."""
 
 
 class BasisProblem:

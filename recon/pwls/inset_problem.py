@@ -53,7 +53,8 @@ class InsetProblem:
         grid: ``(z, y, x)`` grid that holds everything the background does not.
         nodes: of the Gram operator. Linear in position (5) is enough for solvers: what the model lacks, the exact
             pairs repair, and each step costs half of that with 9.
-        motion: displacement of the inset in every view, ``(views, 3)`` z, y, x mm (:func:`recon.fbp.inset.view_motion`);
+        motion: displacement of the inset in every view, ``(views, 3)`` z, y, x mm
+        (:func:`recon.fbp.inset.view_motion`);
             None: at rest. The background stands still; it is taken off before, so that only what moves is projected.
             The Gram is that of a grid at rest with the weights that the moving one meets; exact pairs use the moving
             projector.

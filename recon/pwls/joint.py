@@ -167,8 +167,8 @@ def joint_pwls(
         callback: see :func:`recon.pwls.pwls.pwls`.
 
     Returns:
-        Images ``(..., 2, *grid.shape)`` in the dtype of y, and the report of :func:`recon.pwls.pwls.pwls`: ``gradient`` is
-        the norm of the exact gradient of Φ over that of the zero images.
+        Images ``(..., 2, *grid.shape)`` in the dtype of y, and the report of :func:`recon.pwls.pwls.pwls`: ``gradient``
+        is the norm of the exact gradient of Φ over that of the zero images.
 
     Raises:
         ValueError: shapes that do not fit, data that are not finite, F not positive semi-definite or all 0, a

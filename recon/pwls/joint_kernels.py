@@ -1,4 +1,5 @@
-"""CPU kernels of the vectorial q-GGMRF (:mod:`recon.pwls.joint_prior`): as :mod:`recon.pwls.qggmrf_kernels`, several channels.
+"""CPU kernels of the vectorial q-GGMRF (:mod:`recon.pwls.joint_prior`): as :mod:`recon.pwls.qggmrf_kernels`, several
+channels.
 
 The potential acts on the length of the difference of two voxels' channel vectors, so one curvature serves all channels
 of a pair. Rows of voxels are independent of each other: results do not depend on the number of threads.

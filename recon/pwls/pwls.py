@@ -2,8 +2,8 @@
 
     Φ(x) = ½ ‖y − A x‖²_W + R(x)
 
-The FFT model of AᵀWA (:class:`recon.gram.gram.Gram`) carries the inner iterations; each outer iteration measures the true
-gradient with one exact projection pair (A, Aᵀ) and lets the model solve for what is left (defect correction, as a
+The FFT model of AᵀWA (:class:`recon.gram.gram.Gram`) carries the inner iterations; each outer iteration measures the
+true gradient with one exact projection pair (A, Aᵀ) and lets the model solve for what is left (defect correction, as a
 flexible conjugate gradient method with exact line search, Notay 2000, SIAM J. Sci. Comput. 22:1444). So the result is
 the minimum of Φ itself, not of the model, and the exact gradient certifies it.
 """

@@ -21,19 +21,19 @@ __all__ = ["STUDIES", "build_settings", "run"]
 
 STUDIES: dict[str, str] = {
     "detector": "the silicon detector: counts, DQE beside the published one, pile-up, charge sharing",
-    "dose": "ROI bowtie: CTDI and thorax dose, noise inside and outside, and its product with MBIR",
+    "bowtie": "ROI bowtie: CTDI and thorax dose, noise inside and outside, and its product with MBIR",
     "motion": "residual motion in PCCT and EID-CT, and reconstruction with the motion known, exactly or not",
     "noise": "FBP with every kernel, voxel size and dose: CNR tables, and which rankings they establish",
     "resolution": "PCCT and EID-CT without noise, blurred step by step: lumen, cap and core by thresholds",
     "spectral": "energy bins into PE and PVC: monochromatic images, best energy, tissue maps, by FBP and joint MBIR",
 }
-"""Name → one line of help. The module is ``recon.study.<name>``."""
+"""Name → one line of help. The module is ``recon.study.<name>.measure``."""
 
 
 def _module(name: str) -> Any:
     if name not in STUDIES:
         raise ValueError(f"unknown study {name!r}: use one of {', '.join(STUDIES)}")
-    return importlib.import_module(f"recon.study.{name}")
+    return importlib.import_module(f"recon.study.{name}.measure")
 
 
 def build_settings(name: str, *, quick: bool = False, seed: int | None = None, changes: Sequence[str] = ()) -> Any:

@@ -28,7 +28,7 @@ from recon.study.compare.measure import inset_grid
 from torchpcct import Projector, acquire
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.scanner import presets
-from torchpcct.scene.plaque.plaque import plaque_scene
+from torchpcct.scene.plaque import plaque_scene
 
 EXPOSURE_S = 2.0
 SUBSETS = 12

@@ -91,8 +91,8 @@ def ctdi_dose(
     Args:
         scanner: its fan must cover the phantom, or the outer bores are partly shaded.
         exposure_s: duration of the rotation in s at the source's current.
-        phantom: scene with the bodies of :func:`torchpcct.scene.phantoms.quality.ctdi`; None: the 32 cm body phantom with
-            water in its bores.
+        phantom: scene with the bodies of :func:`torchpcct.scene.phantoms.quality.ctdi`; None: the 32 cm body phantom
+            with water in its bores.
         axial, quantity: see :func:`torchpcct.dose.primary_dose`; the default is the primary part of CTDI100.
         histories: photons of the Monte Carlo for the scattered part (:func:`torchpcct.dose.monte_carlo_dose`); 0: no
             scatter. 4 million give 1.5 % in the central bore.

@@ -154,7 +154,7 @@ class DoseCurve:
 
         Args:
             means: ``(foreground, background)`` expectations in HU.
-            covariance: ``(2, 2)`` of the two ROI means at dose 1, HU² (e.g. ``recon.exact_noise.roi_covariance``).
+            covariance: ``(2, 2)`` of the two ROI means at dose 1, HU² (e.g. ``recon.fbp.exact_noise.roi_covariance``).
             doses: range of the curve.
 
         Raises:

@@ -86,7 +86,7 @@ class Projector(nn.Module):
     Args:
         geometry: ``ParallelBeam`` or ``FanBeam`` with a 2-D grid, ``ConeBeam`` with a 3-D grid.
         grid: the voxel grid.
-        window: the part of the detector to compute (``torchpcct.window.shadow``), or None for all of it.
+        window: the part of the detector to compute (``torchpcct.detector_window.shadow``), or None for all of it.
         motion: displacement of the grid in every view, ``(views, 2)`` (y, x) or ``(views, 3)`` (z, y, x) mm, or None:
             a volume that moves rigidly with its object is projected and reconstructed at rest.
         memory: bytes of working memory that a pass may hold besides its input and output (see

@@ -1,12 +1,13 @@
 """The 3-D scenes in HU that a learned prior is trained with: what they consist of, and how they are distributed.
 
-A scene (:class:`Scene`) is drawn in mm and HU, without a grid (:mod:`train.scenes.drawing`); :mod:`train.scenes.rasterise` gives its
-area-averaged voxel values, and :mod:`train.scenes.held_out` a family of its own to select checkpoints with.
-It holds either vessels (bent, tilted tubes: wall, fibrous layer, eccentric and narrowing lumen; soft inclusions, called
-cores, and calcifications in the fibrous layer) or free-standing bodies of random contrast, in fat or in a tissue like
-muscle. Cores have contrasts of both signs. The plaque of the paper (:mod:`torchpcct.scene.plaque.plaque`) is never drawn:
-outer sections are centred on a smooth centreline, with no ``cos²`` bulge to one side, and :func:`is_paper_family`
-rejects what comes close in the parameters that both constructions share.
+A scene (:class:`Scene`) is drawn in mm and HU, without a grid (:mod:`train.scenes.drawing`);
+:mod:`train.scenes.rasterise` gives its area-averaged voxel values, and :mod:`train.scenes.held_out` a family of its own
+to select checkpoints with. It holds either vessels (bent, tilted tubes: wall, fibrous layer, eccentric and narrowing
+lumen; soft inclusions, called cores, and calcifications in the fibrous layer) or free-standing bodies of random
+contrast, in fat or in a tissue like muscle. Cores have contrasts of both signs. The plaque of the paper
+(:mod:`torchpcct.scene.plaque.plaque`) is never
+drawn: outer sections are centred on a smooth centreline, with no ``cos²`` bulge to one side, and
+:func:`is_paper_family` rejects what comes close in the parameters that both constructions share.
 
 A vessel scene without a core still has a *virtual* one where it could have been: a core of contrast 0 that leaves no
 trace in the image but has a mask, so that a loss on ROI contrast also sees true contrasts of 0.

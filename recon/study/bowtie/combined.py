@@ -20,7 +20,7 @@ from recon.study.bowtie.slice_scan import BOWTIES
 from recon.study.paper.plaque_scan import PlaqueScan, inset_grid, prepare
 from torchpcct.metrics import ContrastSlope, DoseCurve, DoseFactor, contrast_slope, dose_factor
 from torchpcct.scanner import presets
-from torchpcct.scene.plaque.plaque import plaque_scene
+from torchpcct.scene.plaque import plaque_scene
 
 __all__ = ["Combined", "combine"]
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from torchpcct.scan import Scan
     from torchpcct.scanner import Scanner
     from torchpcct.scene import Scene
-    from torchpcct.scene.plaque.plaque import Plaque
+    from torchpcct.scene.plaque import Plaque
 
 __all__ = ["FULL_VIEWS", "INSET_MM", "Compared", "Settings", "Statistics", "inset_grid", "run"]
 
@@ -214,7 +214,7 @@ def run(
     from recon.fbp.exact_noise import roi_covariance
     from recon.fbp.inset import InsetFbp
     from torchpcct.scanner import presets
-    from torchpcct.scene.plaque.plaque import plaque_scene
+    from torchpcct.scene.plaque import plaque_scene
 
     settings = settings or Settings()
     scanner = scanner or presets.pcct(views=settings.views)

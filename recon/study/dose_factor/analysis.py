@@ -34,6 +34,7 @@ from torchpcct.metrics import (
     DoseCurve,
     auc,
     auc_from_d_prime,
+    ceiling,
     channel_responses,
     cnr,
     cnr_interval,
@@ -49,7 +50,6 @@ from torchpcct.metrics import (
     sd_interval,
     task_transfer,
 )
-from torchpcct.metrics import data_limit as ceiling
 from torchpcct.metrics.dose_factor import DOSES
 
 __all__ = ["ASSUMED_FACTOR", "Analysis", "analyse"]

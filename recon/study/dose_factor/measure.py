@@ -4,7 +4,8 @@ Stages, each of them a set of files that are written whole and reused:
 
 1. scenes: noise-free scans, what FBP makes of them exactly (means, covariances, images without noise), the limit of
    the data by generalised least squares on exact path lengths;
-2. data: b = AᵀW y of every noise realisation, and FBP of the same readings (:mod:`recon.study.dose_factor.realisations`);
+2. data: b = AᵀW y of every noise realisation, and FBP of the same readings
+(:mod:`recon.study.dose_factor.realisations`);
 3. methods: ROI means, a crop about the core and segmentation figures of every reconstruction.
 
 Realisation k uses the noise seed ``seed + k`` in every scene, at every dose and for every method. The scenes with half

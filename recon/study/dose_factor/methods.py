@@ -74,7 +74,8 @@ class LinearFilter:
 
     Args:
         name: of the method.
-        lam: λ in noise units (:class:`recon.mbir.unrolled.NormalProblem`), where G is about 1 at 0.5 lp/mm at every dose.
+        lam: λ in noise units (:class:`recon.mbir.unrolled.NormalProblem`), where G is about 1 at 0.5 lp/mm at every
+        dose.
         mu: μ in noise units, per (lp/mm)².
         along: κ, 1 for an isotropic filter.
         steps: of conjugate gradients; the ROI means change by less than 0.1 HU beyond 12.

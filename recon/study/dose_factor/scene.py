@@ -35,7 +35,7 @@ from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
 if TYPE_CHECKING:
     from torchpcct.scanner import Scanner
     from torchpcct.scene import Scene
-    from torchpcct.scene.plaque.plaque import Plaque
+    from torchpcct.scene.plaque import Plaque
 
 __all__ = ["StudyScene"]
 
@@ -111,7 +111,7 @@ class StudyScene:
     @cached_property
     def geometry(self) -> Scene:
         """The plain plaque of the same geometry, without extra bodies: where tissues are, whatever fills them."""
-        from torchpcct.scene.plaque.plaque import plaque_scene
+        from torchpcct.scene.plaque import plaque_scene
 
         return plaque_scene(self.plaque)[0]
 

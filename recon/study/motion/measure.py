@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from torchpcct.geometry import VolumeGrid
     from torchpcct.scanner import Scanner
     from torchpcct.scene import SinusoidalMotion
-    from torchpcct.scene.plaque.plaque import Plaque
+    from torchpcct.scene.plaque import Plaque
 
 __all__ = ["FULL_VIEWS", "KERNEL", "METHODS", "Measured", "Settings", "measure_all", "run"]
 
@@ -152,7 +152,7 @@ def run(settings: Settings, progress: Callable[[str, float], None] | None = None
 def measure_all(settings: Settings, progress: Callable[[str, float], None] | None = None) -> Measured:
     """The study without its report."""
     from torchpcct.scanner import presets
-    from torchpcct.scene.plaque.plaque import plaque_scene
+    from torchpcct.scene.plaque import plaque_scene
 
     report = progress or (lambda step, fraction: None)
     scene, plaque = plaque_scene()
@@ -177,7 +177,7 @@ def measure_all(settings: Settings, progress: Callable[[str, float], None] | Non
 def simulate(settings: Settings, scanner: Scanner, name: str, fraction: float, grid: VolumeGrid) -> Scan:
     """Noise-free scan of the vessel with ``fraction`` of the motion, windowed about the inset."""
     from torchpcct.acquisition.acquire import acquire
-    from torchpcct.scene.plaque.plaque import plaque_scene
+    from torchpcct.scene.plaque import plaque_scene
 
     scene = plaque_scene(motion=settings.motion.scaled(fraction))[0]
     duty = min(1.0, scanner.geometry.views / FULL_VIEWS[name])

@@ -17,7 +17,7 @@ from torchpcct.metrics.roi import axial_grid, sample_axial
 
 if TYPE_CHECKING:
     from torchpcct.scene import Scene
-    from torchpcct.scene.plaque.plaque import Plaque
+    from torchpcct.scene.plaque import Plaque
 
 __all__ = ["Observed", "Reference", "observe"]
 

@@ -1,8 +1,8 @@
 """The noise study: FBP of the plaque with every kernel, voxel size and dose, and what the paper's tables establish.
 
-The ROI means of FBP are inner products of the line integrals with adjoint vectors (:mod:`recon.fbp.exact_noise`). So their
-joint covariance is exact, and hundreds of realisations cost one noisy scan each instead of a reconstruction per kernel
-and voxel size; a few are reconstructed in full beside, which must give the same ROI means.
+The ROI means of FBP are inner products of the line integrals with adjoint vectors (:mod:`recon.fbp.exact_noise`). So
+their joint covariance is exact, and hundreds of realisations cost one noisy scan each instead of a reconstruction per
+kernel and voxel size; a few are reconstructed in full beside, which must give the same ROI means.
 """
 
 from __future__ import annotations
@@ -162,7 +162,7 @@ def measure(settings: Settings, progress: Progress | None = None) -> Measured:
     from recon.fbp.exact_noise import roi_adjoints
     from recon.fbp.inset import InsetFbp
     from torchpcct.scanner import presets
-    from torchpcct.scene.plaque.plaque import plaque_scene
+    from torchpcct.scene.plaque import plaque_scene
 
     report = progress or (lambda step, fraction: None)
     seconds: dict[str, float] = {}

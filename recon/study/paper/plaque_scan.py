@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from torchpcct.scan import Scan
     from torchpcct.scanner import Scanner
     from torchpcct.scene import Scene
-    from torchpcct.scene.plaque.plaque import Plaque
+    from torchpcct.scene.plaque import Plaque
 
 __all__ = [
     "INSET_MM",

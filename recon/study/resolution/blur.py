@@ -17,7 +17,7 @@ from torchpcct.metrics.plaque_measures import PlaqueSegmentation, basin_depth, c
 if TYPE_CHECKING:
     from torchpcct.scanner import Scanner
     from torchpcct.scene import Scene
-    from torchpcct.scene.plaque.plaque import Plaque
+    from torchpcct.scene.plaque import Plaque
 
 __all__ = [
     "FWHM_PER_SIGMA",
@@ -72,7 +72,7 @@ def wire_width(scanner: Scanner, position: tuple[float, float], kernel: str, *, 
 
     from torchpcct.acquisition.acquire import acquire
     from torchpcct.scene import Body, EllipticCylinder, Scene
-    from torchpcct.scene.plaque.plaque import PATIENT_DIAMETER
+    from torchpcct.scene.plaque import PATIENT_DIAMETER
 
     x, y = position
     scene = Scene(

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from recon.study.report import Report
     from torchpcct.scanner import Scanner
     from torchpcct.scene import Scene
-    from torchpcct.scene.plaque.plaque import Plaque
+    from torchpcct.scene.plaque import Plaque
 
 __all__ = ["FULL_VIEWS", "Imaged", "Measured", "Settings", "Smoothed", "measure_all", "run"]
 
@@ -155,7 +155,7 @@ def run(settings: Settings, progress: Callable[[str, float], None] | None = None
 def measure_all(settings: Settings, progress: Callable[[str, float], None] | None = None) -> Measured:
     """The study without its report."""
     from torchpcct.scanner import presets
-    from torchpcct.scene.plaque.plaque import plaque_scene
+    from torchpcct.scene.plaque import plaque_scene
 
     report = progress or (lambda step, fraction: None)
     scene, plaque = plaque_scene()
@@ -195,7 +195,7 @@ def _image(
     progress: Callable[[float], None],
 ) -> tuple[Imaged, _Kept]:
     from recon.fbp.exact_noise import roi_covariance
-    from torchpcct.scene.plaque.plaque import plaque_scene
+    from torchpcct.scene.plaque import plaque_scene
 
     scene, plaque = bodies
     scanned = prepare([REFERENCE_KERNEL], [REFERENCE_VOXEL_MM], bodies, scanner, FULL_VIEWS[name], progress)
@@ -283,7 +283,7 @@ def _middle_slices(scene: Scene, plaque: Plaque, scanner: Scanner, duty: float) 
 def _variant(bulge: float, settings: Settings) -> tuple[float, list[Blurred]]:
     """Fibrous tissue between core and wall, and the blur series of the plaque with another bulge, middle slice."""
     from torchpcct.scanner import presets
-    from torchpcct.scene.plaque.plaque import plaque_scene
+    from torchpcct.scene.plaque import plaque_scene
 
     scene, plaque = plaque_scene(bulge=bulge)
     x, y, z = plaque.position

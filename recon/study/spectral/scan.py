@@ -22,7 +22,7 @@ from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
 from torchpcct.scanner import presets
 from torchpcct.scene.bodies import EllipticCylinder
-from torchpcct.scene.plaque.plaque import PAPER_POSITION, PATIENT_DIAMETER, plaque_scene
+from torchpcct.scene.plaque import PAPER_POSITION, PATIENT_DIAMETER, plaque_scene
 from torchpcct.scene.scene import Body, Scene
 from torchpcct.spectral import (
     Decomposition,

@@ -1,1 +1,16 @@
-"""The coronary plaque of the paper, and its variants."""
+"""The coronary plaque of the paper and scenes that can expose an invention.
+
+Read :mod:`~torchpcct.scene.plaque.plaque` (geometry and scene), then :mod:`~torchpcct.scene.plaque.variants` (without a
+core, moved, mirrored, calcified, stented, textured …).
+"""
+
+from torchpcct.scene.plaque.plaque import (
+    PAPER_POSITION,
+    PATIENT_DIAMETER,
+    Plaque,
+    interpolate_material,
+    plaque_scene,
+)
+from torchpcct.scene.plaque.variants import plaque_variant
+
+__all__ = ["PAPER_POSITION", "PATIENT_DIAMETER", "Plaque", "interpolate_material", "plaque_scene", "plaque_variant"]

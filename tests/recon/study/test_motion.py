@@ -13,7 +13,7 @@ from recon.study.motion.measure import Settings, measure_all
 from recon.study.motion.observed import Reference, observe
 from recon.study.motion.report import build_report
 from recon.study.paper.plaque_scan import inset_grid
-from torchpcct.scene.plaque.plaque import plaque_scene
+from torchpcct.scene.plaque import plaque_scene
 
 TISSUES = {"patient": -100.0, "wall": 60.0, "fibrous": 100.0, "lumen": 470.0, "core": 40.0}
 

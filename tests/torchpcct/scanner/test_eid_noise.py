@@ -15,7 +15,7 @@ from torchpcct.metrics.roi import RoiMean, axial_grid
 from torchpcct.scanner import Scintillator, presets
 from torchpcct.scene.materials import material
 from torchpcct.scene.phantoms.quality import water_cylinder
-from torchpcct.scene.plaque.plaque import plaque_scene
+from torchpcct.scene.plaque import plaque_scene
 
 ENERGIES = np.array([30.0, 60.0, 95.0])
 QUANTA = np.array([3.0, 5.0, 2.0])

@@ -10,7 +10,7 @@ import pytest
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scene import Scene
 from torchpcct.scene.phantoms.thorax import RIB_ANGLES_DEG, thorax
-from torchpcct.scene.plaque.plaque import Plaque
+from torchpcct.scene.plaque import Plaque
 
 IN_THE_WALL = Plaque(position=(47.0, -4.0, 0.0))
 

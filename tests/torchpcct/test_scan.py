@@ -11,7 +11,7 @@ from recon import reconstruct
 from recon.fbp.inset import InsetFbp
 from torchpcct import Scan, VolumeGrid, acquire, full_turn
 from torchpcct.scanner import presets
-from torchpcct.scene.plaque.plaque import plaque_scene
+from torchpcct.scene.plaque import plaque_scene
 
 INSET = VolumeGrid((6, 36, 36), 0.25, (0.0, -30.38, -29.63))
 

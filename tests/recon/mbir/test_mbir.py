@@ -6,8 +6,8 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from test_roi_pwls import CENTER, GRID, clean, problem, scanner  # noqa: F401
-from test_unrolled import certificate
+from certificate import certificate
+from small_scan import CENTER, GRID
 
 from recon import reconstruct
 from recon.fbp.inset import to_hu
@@ -27,7 +27,7 @@ def prior():
     return Mbir(model)
 
 
-def test_values_and_report(clean, problem, prior):  # noqa: F811
+def test_values_and_report(clean, problem, prior):
     noisy = clean.with_noise(4.0, 3)
     volume = reconstruct(noisy, GRID, "mbir", prior=prior, problem=problem, noise_map=True)
     report = volume.report
@@ -43,7 +43,7 @@ def test_values_and_report(clean, problem, prior):  # noqa: F811
     assert 1 < float(report["noise_sd_hu"].mean()) < 200
 
 
-def test_noise_map_is_the_noise(clean, problem, prior):  # noqa: F811
+def test_noise_map_is_the_noise(clean, problem, prior):
     """Against the standard deviation over realisations."""
     scans = [clean.with_noise(2.0, s) for s in range(24)]
     volumes = reconstruct(scans, GRID, "mbir", prior=prior, problem=problem)
@@ -52,7 +52,7 @@ def test_noise_map_is_the_noise(clean, problem, prior):  # noqa: F811
     assert float(estimated / measured) == pytest.approx(1.0, abs=0.15)
 
 
-def test_converged_energy_has_a_certificate(clean, problem, prior):  # noqa: F811
+def test_converged_energy_has_a_certificate(clean, problem, prior):
     scan = clean.with_noise(1.0, 0)
     one = reconstruct(scan, GRID, "mbir", prior=prior, problem=problem)
     more = reconstruct(scan, GRID, "mbir", prior=prior, problem=problem, converge=True)
@@ -68,7 +68,7 @@ def twice(prior):
     return Mbir(model)
 
 
-def test_residual_is_that_of_the_last_pass(clean, problem, twice):  # noqa: F811
+def test_residual_is_that_of_the_last_pass(clean, problem, twice):
     """Of the volume that is returned, by its definition, with the first pass that it was made with."""
     scan = clean.with_noise(1.0, 0)
     normal = twice.problem(problem, problem.statistic(scan).b[None], 1.0)
@@ -84,7 +84,7 @@ def test_residual_is_that_of_the_last_pass(clean, problem, twice):  # noqa: F811
         assert volume.report.get("converged", False) == converge
 
 
-def test_a_run_that_stops_early_says_so(clean, problem, twice, monkeypatch, caplog):  # noqa: F811
+def test_a_run_that_stops_early_says_so(clean, problem, twice, monkeypatch, caplog):
     monkeypatch.setattr("recon.mbir.mbir.minimise_passes", partial(minimise_passes, most=2))
     scan = clean.with_noise(1.0, 0)
     report = reconstruct(scan, GRID, "mbir", prior=twice, problem=problem, converge=True).report
@@ -95,13 +95,13 @@ def test_a_run_that_stops_early_says_so(clean, problem, twice, monkeypatch, capl
 
 
 @pytest.fixture(scope="module")
-def fine(clean):  # noqa: F811
+def fine(clean):
     """The problem on the voxels of the shipped weights."""
     return InsetProblem(clean, VolumeGrid((16, 36, 36), 0.2, CENTER))
 
 
 @pytest.mark.parametrize(("exposure", "distance"), [(0.35, 12.0), (2.0, 6.5)])
-def test_shipped_steps_against_their_own_limit(clean, fine, exposure, distance):  # noqa: F811
+def test_shipped_steps_against_their_own_limit(clean, fine, exposure, distance):
     """The limit does not depend on the start; the unrolled steps end 9.5 HU from it at 0.35 s, 5.0 HU at 2 s.
 
     Other noise ends up to 10.2 and 5.3 HU away, one pass alone 44 and 25 HU.
@@ -122,7 +122,7 @@ def test_shipped_steps_against_their_own_limit(clean, fine, exposure, distance):
     assert 1.0 < rms(unrolled.data - limit.data) < distance
 
 
-def test_wrong_exposure_is_noticed(clean, problem, prior, caplog):  # noqa: F811
+def test_wrong_exposure_is_noticed(clean, problem, prior, caplog):
     from dataclasses import replace
 
     scan = clean.with_noise(1.0, 0)
@@ -133,14 +133,14 @@ def test_wrong_exposure_is_noticed(clean, problem, prior, caplog):  # noqa: F811
     assert "noise variance" in caplog.text
 
 
-def test_unseen_dose_is_noticed(clean, problem, prior):  # noqa: F811
+def test_unseen_dose_is_noticed(clean, problem, prior):
     model = Unrolled(prior.model.prior.config, 6)
     model.seen_scale_hu = torch.tensor([50.0, 60.0])
     volume = reconstruct(clean.with_noise(0.01, 0), GRID, "mbir", prior=Mbir(model), problem=problem)
     assert any("outside of the 50…60 HU" in text for text in volume.report["warnings"])
 
 
-def test_other_voxels_are_averages_of_the_working_grid(clean, prior):  # noqa: F811
+def test_other_voxels_are_averages_of_the_working_grid(clean, prior):
     coarse = VolumeGrid((4, 9, 9), 0.8, CENTER)
     fine = working_grid(coarse, 0.4)
     assert fine.shape == (8, 18, 18)
@@ -162,7 +162,7 @@ def test_averages_keep_a_ramp(voxel):
     np.testing.assert_allclose(average_onto(ramp, source, target).numpy()[inner], expected[inner], atol=0.35 * 0.2)
 
 
-def test_refusals(clean, problem, prior, tmp_path):  # noqa: F811
+def test_refusals(clean, problem, prior, tmp_path):
     with pytest.raises(ValueError, match="another grid"):
         reconstruct(clean, VolumeGrid((4, 9, 9), 0.4, CENTER), "mbir", prior=prior, problem=problem)
     with pytest.raises(ValueError, match="one exposure"):
@@ -178,7 +178,7 @@ def test_refusals(clean, problem, prior, tmp_path):  # noqa: F811
         Mbir.load(bad)
 
 
-def test_shadow_of_dead_readings(clean, problem, prior):  # noqa: F811
+def test_shadow_of_dead_readings(clean, problem, prior):
     """Readings without a count give a finite volume: the logarithm is bounded, the weight is the expected one."""
     scan = clean.with_noise(0.5, 1)
     scan.counts[::10] = 0

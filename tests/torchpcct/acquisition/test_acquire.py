@@ -12,7 +12,7 @@ from torchpcct.geometry import ConeBeam, VolumeGrid, full_turn
 from torchpcct.scanner import presets
 from torchpcct.scene import Body, Ellipsoid, EllipticCylinder, Scene, SinusoidalMotion, chord_lengths
 from torchpcct.scene.phantoms.quality import water_cylinder
-from torchpcct.scene.plaque.plaque import plaque_scene
+from torchpcct.scene.plaque import plaque_scene
 from torchpcct.scene.plaque.variants import plaque_variant
 
 INSET = VolumeGrid((57, 45, 45), 0.2, (0.0, -30.38, -29.63))

@@ -12,10 +12,9 @@ from hypothesis import strategies as st
 from torchpcct import ConeBeam, full_turn
 from torchpcct.acquisition.path_lengths import tissue_path_lengths
 from torchpcct.detector_window import DetectorWindow
-from torchpcct.metrics import data_limit as ceiling
-from torchpcct.metrics import information_matrix, paper_cnr_ceiling
+from torchpcct.metrics import ceiling, information_matrix, paper_cnr_ceiling
 from torchpcct.scene import Body, Ellipsoid, EllipticCylinder, Scene, SinusoidalMotion
-from torchpcct.scene.plaque.plaque import plaque_scene
+from torchpcct.scene.plaque import plaque_scene
 
 
 def system(seed, tissues=4, shape=(3, 5, 7)):

@@ -176,7 +176,7 @@ def test_bad_settings(change, error, match):
 
 
 def test_registered():
-    settings = registry.build_settings("dose", quick=True, seed=3, changes=["histories=0"])
+    settings = registry.build_settings("bowtie", quick=True, seed=3, changes=["histories=0"])
     assert (settings.seed, settings.histories) == (3, 0)
     assert settings.views < Settings().views
 

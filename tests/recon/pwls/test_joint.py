@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from test_gram import matrix, problem
+from inset_operators import matrix, problem
 
 from recon.fbp.channels import ChannelFbp, static_fbp
 from recon.fbp.fbp import fbp

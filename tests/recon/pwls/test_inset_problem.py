@@ -4,38 +4,12 @@ from dataclasses import replace
 
 import pytest
 import torch
+from small_scan import GRID
 
 from recon import reconstruct
 from recon.pwls.inset_problem import InsetProblem
 from recon.pwls.qggmrf import QGGMRF
-from torchpcct import VolumeGrid, acquire
-from torchpcct.scanner import presets
-from torchpcct.scene import Body, Ellipsoid, EllipticCylinder, Scene
-
-CENTER = (0.0, -30.38, -29.63)
-GRID = VolumeGrid((8, 18, 18), 0.4, CENTER)
-
-
-def scanner(views=120):
-    s = presets.pcct(views=views)
-    return s.replace(geometry=replace(s.geometry, rows=12))
-
-
-BALL = Ellipsoid((1.6, 1.6, 1.2), position=CENTER[::-1])
-SCENE = Scene(
-    [Body("patient", EllipticCylinder(120.0), "pericoronary_fat"), Body("ball", BALL, "fibrous_tissue", "patient")]
-)
-
-
-@pytest.fixture(scope="module")
-def clean():
-    return acquire(SCENE, scanner(), region=GRID, duty=0.06, sub_rays=16)
-
-
-@pytest.fixture(scope="module")
-def problem(clean):
-    return InsetProblem(clean, GRID)
-
+from torchpcct import VolumeGrid
 
 WEAK = QGGMRF(strength=1e-3, threshold=300.0)
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from test_gram import HU, problem
+from inset_operators import HU, problem
 
 from recon.gram.gram import Gram
 from recon.limits import contrast_limit, deformation_limit, known_inside, outline_maps

@@ -266,7 +266,7 @@ def test_missing_weights_leave_mbir_out(monkeypatch, caplog):
     def missing(**options):
         raise FileNotFoundError("no weights at nowhere")
 
-    monkeypatch.setattr(recon.mbir.Mbir, "load", missing)
+    monkeypatch.setattr(recon.mbir.mbir.Mbir, "load", missing)
     assert [m.name for m in load_methods(METHODS)] == [m for m in METHODS if "mbir" not in m and m != "fbp_cnn"]
     assert "mbir is left out" in caplog.text
     with pytest.raises(ValueError, match="no method to run"):

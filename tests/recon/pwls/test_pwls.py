@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from test_gram import HU, matrix, problem, tissue
+from inset_operators import HU, matrix, problem, tissue
 
 from recon.gram.gram import Gram
 from recon.pwls.pwls import pwls, solve_normal

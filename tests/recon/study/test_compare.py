@@ -13,7 +13,7 @@ from recon.study.report import markdown_table
 from torchpcct import Volume
 from torchpcct.metrics.placement import RoiRule, place_rois
 from torchpcct.metrics.roi import axial_grid
-from torchpcct.scene.plaque.plaque import plaque_scene
+from torchpcct.scene.plaque import plaque_scene
 
 TINY = Settings(
     realizations=3, views=48, kernels=("soft",), voxels_mm=(0.4,), doses={"1x": 0.35, "5.7x": 2.0}, pwls=False

@@ -12,7 +12,7 @@ from recon.study.spectral.measure import Settings, run
 from recon.study.spectral.report import checks_of
 from recon.study.spectral.tissues import BODIES, truth_labels
 from torchpcct.geometry import VolumeGrid
-from torchpcct.scene.plaque.plaque import plaque_scene
+from torchpcct.scene.plaque import plaque_scene
 from torchpcct.spectral import MMD_TISSUES, dice, pe_pvc, vmi
 
 SMALL = Settings(views=60, voxel_mm=0.4, realizations=2, mbir_realizations=1, noise_levels=(0.0, 1.0), starved_rays=300)

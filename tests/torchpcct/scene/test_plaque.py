@@ -7,7 +7,7 @@ import pytest
 
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scene.materials import MATERIALS
-from torchpcct.scene.plaque.plaque import Plaque, interpolate_material, plaque_scene
+from torchpcct.scene.plaque import Plaque, interpolate_material, plaque_scene
 from torchpcct.scene.plaque.variants import VARIANTS, plaque_variant, stent_bodies, textured
 
 PIXEL = 0.021

@@ -128,7 +128,7 @@ def test_scans_with_pile_up_lose_counts_and_stay_linear_in_water():
 
 def test_a_window_sees_the_pile_up_of_the_whole():
     from torchpcct import VolumeGrid
-    from torchpcct.scene.plaque.plaque import plaque_scene
+    from torchpcct.scene.plaque import plaque_scene
 
     scene, _ = plaque_scene(vessel_length=4.0)
     system = presets.pcct(views=6, mode="spectral", detector=SiliconDetector("spectral", dead_time_ns=50.0))

@@ -24,7 +24,7 @@ from recon.study.resolution.report import build_report, limits
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.resolution import ellipsoid_distance
 from torchpcct.metrics.roi import axial_grid
-from torchpcct.scene.plaque.plaque import plaque_scene
+from torchpcct.scene.plaque import plaque_scene
 
 
 @pytest.fixture(scope="module")

@@ -354,7 +354,7 @@ def test_bad_input_is_named():
 
 _PEAK = """
 import numpy as np, torch
-from recon.fbp import fbp, memory_estimate
+from recon.fbp.fbp import fbp, memory_estimate
 from torchpcct.geometry import ConeBeam, FanBeam, VolumeGrid, full_turn
 torch.set_num_threads(1)
 def peak():

@@ -27,7 +27,7 @@ from train.config import TrainConfig, differences, load_config, packaged_config
 from train.logs import Table, save_picture
 from train.loop import Adam, DivergedError, Group, gradient, learning_rate, train
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 
 
 @dataclass(frozen=True)

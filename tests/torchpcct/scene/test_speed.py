@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from torchpcct.scene.chords import chord_lengths
-from torchpcct.scene.plaque.plaque import plaque_scene
+from torchpcct.scene.plaque import plaque_scene
 
 pytestmark = pytest.mark.bench
 
