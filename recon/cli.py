@@ -251,9 +251,9 @@ def _study(arguments: argparse.Namespace, progress: _Progress) -> None:
 def _simulate(arguments: argparse.Namespace, progress: _Progress) -> None:
     from recon.study.compare.measure import inset_grid
     from torchpcct.acquisition.acquire import acquire
+    from torchpcct.files import require_folder
     from torchpcct.scanner import presets
     from torchpcct.scene.plaque import plaque_scene
-    from torchpcct.volume import require_folder
 
     require_folder(arguments.out)
     scene, plaque = plaque_scene()
@@ -285,10 +285,11 @@ def _reconstruct(arguments: argparse.Namespace, progress: _Progress) -> None:
 
     from recon import reconstruct
     from recon.study.compare.measure import INSET_MM
+    from torchpcct.files import require_folder
     from torchpcct.geometry import VolumeGrid
     from torchpcct.scan import Scan
     from torchpcct.scene.plaque import PAPER_POSITION
-    from torchpcct.volume import check_volume_name, require_folder
+    from torchpcct.volume import check_volume_name
 
     require_folder(arguments.out)
     check_volume_name(arguments.out)
@@ -317,7 +318,7 @@ def _reconstruct(arguments: argparse.Namespace, progress: _Progress) -> None:
 
 
 def _write_json(beside: Path, summary: dict[str, Any]) -> None:
-    from torchpcct.volume import written_whole
+    from torchpcct.files import written_whole
 
     with written_whole(beside.with_name(beside.name + ".json")) as part:
         part.write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")

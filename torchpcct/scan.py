@@ -14,9 +14,9 @@ from torch import Tensor
 
 from torchpcct import counting_noise as noise
 from torchpcct.detector_window import DetectorWindow
+from torchpcct.files import written_whole
 from torchpcct.geometry import ConeBeam
 from torchpcct.scanner.linearisation import WaterLinearisation
-from torchpcct.volume import written_whole
 
 __all__ = ["NOISE_FREE_EXPOSURE_S", "Scan"]
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,42 +13,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchpcct.files import written_whole
 from torchpcct.geometry import VolumeGrid
 
-__all__ = ["Volume", "check_volume_name", "require_folder", "written_whole"]
+__all__ = ["Volume", "check_volume_name"]
 
 _NIFTI, _HDF5 = (".nii", ".nii.gz"), (".h5", ".hdf5")
-
-
-def require_folder(path: str | os.PathLike[str]) -> None:
-    """Raise ``FileNotFoundError`` unless the folder that ``path`` would be written to exists."""
-    parent = Path(path).parent
-    if not parent.is_dir():
-        raise FileNotFoundError(f"cannot write {path}: the folder {parent} does not exist, create it first")
 
 
 def check_volume_name(path: str | os.PathLike[str]) -> None:
     """Raise ``ValueError`` unless the ending of ``path`` names a volume format."""
     if not str(path).endswith((*_NIFTI, *_HDF5)):
         raise ValueError(f"unknown volume format {Path(path).name!r}: use .nii, .nii.gz or .h5")
-
-
-@contextmanager
-def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a temporary name beside ``path``; rename it to ``path`` on success, remove it on any failure.
-
-    Raises:
-        FileNotFoundError: the folder of ``path`` does not exist.
-    """
-    target = Path(path)
-    require_folder(target)
-    # Keep the ending: some writers choose the format by it.
-    part = target.with_name(f".{os.getpid()}.part.{target.name}")
-    try:
-        yield part
-        os.replace(part, target)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 @dataclass(frozen=True)

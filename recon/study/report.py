@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import platform
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,29 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from torchpcct.volume import written_whole
+from torchpcct.files import written_whole
 
-__all__ = ["Report", "environment", "markdown_table"]
-
-
-def environment() -> dict[str, Any]:
-    """Versions and machine that made a result."""
-    import numba
-    import scipy
-    import torch
-
-    import torchpcct
-
-    return {
-        "torchpcct": torchpcct.__version__,
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-        "numpy": np.__version__,
-        "scipy": scipy.__version__,
-        "numba": numba.__version__,
-        "machine": platform.machine(),
-        "cores": os.cpu_count(),
-    }
+__all__ = ["Report", "markdown_table"]
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -13,7 +13,8 @@ from recon.study.bowtie.figures import draw
 from recon.study.bowtie.slice_scan import BOWTIES
 from recon.study.checks import Check, around, checks_section, effects_section
 from recon.study.paper import facts as paper
-from recon.study.report import Report, environment, markdown_table
+from recon.study.report import Report, markdown_table
+from recon.study.study import environment
 from torchpcct.acquisition.plan import Effect
 
 if TYPE_CHECKING:

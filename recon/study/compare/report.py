@@ -11,7 +11,8 @@ from recon.study.compare.measure import Compared
 from recon.study.paper import facts as paper
 from recon.study.paper.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM
 from recon.study.paper.tables import published, table_checks
-from recon.study.report import Report, environment, markdown_table
+from recon.study.report import Report, markdown_table
+from recon.study.study import environment
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.roi import sample_axial
 from torchpcct.viz import Panel, panels

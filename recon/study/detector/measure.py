@@ -19,7 +19,8 @@ from recon.study.detector.rate import (
     pile_up,
     pile_up_section,
 )
-from recon.study.report import Report, environment, markdown_table
+from recon.study.report import Report, markdown_table
+from recon.study.study import environment
 from torchpcct.acquisition.plan import Effect
 from torchpcct.scanner import SiliconDetector, presets
 from torchpcct.scanner.silicon_transport import Stack, efficiency, follow

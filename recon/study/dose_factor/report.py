@@ -13,7 +13,8 @@ from recon.study.dose_factor.measures import LUMEN_HALF_HU, OBSERVERS
 from recon.study.dose_factor.methods import METHOD_NAMES
 from recon.study.dose_factor.settings import FBP_BASE, MAIN_SCENES
 from recon.study.dose_factor.shape_limit import CORRELATION_MM
-from recon.study.report import Report, environment, markdown_table
+from recon.study.report import Report, markdown_table
+from recon.study.study import environment
 
 __all__ = ["build_report", "headline_method"]
 

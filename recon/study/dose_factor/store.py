@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from torchpcct.volume import written_whole
+from torchpcct.files import written_whole
 
 __all__ = ["Store"]
 

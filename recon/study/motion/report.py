@@ -14,7 +14,8 @@ from recon.study.motion.figures import curves_figure, images_figure
 from recon.study.motion.measure import METHODS, Measured
 from recon.study.motion.observed import Observed
 from recon.study.paper import facts as paper
-from recon.study.report import Report, environment, markdown_table
+from recon.study.report import Report, markdown_table
+from recon.study.study import environment
 from torchpcct.acquisition.plan import Effect
 
 __all__ = ["build_report"]

@@ -15,7 +15,8 @@ from recon.study.noise.measure import Measured, as_dict
 from recon.study.noise.ranking import claims_data, claims_section, pairs_data, pairs_section
 from recon.study.paper import facts as paper
 from recon.study.paper.tables import published, table_checks
-from recon.study.report import Report, environment, markdown_table
+from recon.study.report import Report, markdown_table
+from recon.study.study import environment
 from torchpcct.acquisition.plan import Effect
 from torchpcct.metrics.cnr import cnr_interval, cnr_range, sd_interval
 

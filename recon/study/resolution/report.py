@@ -10,9 +10,10 @@ import numpy as np
 
 from recon.study.checks import Check, around, checks_section, effects_section
 from recon.study.paper import facts as paper
-from recon.study.report import Report, environment, markdown_table
+from recon.study.report import Report, markdown_table
 from recon.study.resolution.blur import FWHM_PER_SIGMA, Blurred, crossing
 from recon.study.resolution.measure import Imaged, Measured
+from recon.study.study import environment
 from torchpcct.acquisition.plan import Effect
 from torchpcct.metrics.roi import PROTOCOL_PIXEL_MM
 from torchpcct.viz import Panel, panels

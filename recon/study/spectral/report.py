@@ -9,10 +9,11 @@ from torch import Tensor
 
 from recon.study.checks import Check, around, checks_section, effects_section
 from recon.study.paper import facts as paper
-from recon.study.report import Report, environment, markdown_table
+from recon.study.report import Report, markdown_table
 from recon.study.spectral.figures import curves_figure, tissue_figure
 from recon.study.spectral.scan import PlaqueScan
 from recon.study.spectral.tissues import Tissues
+from recon.study.study import environment
 from torchpcct.acquisition.plan import Effect
 from torchpcct.spectral import MMD_TISSUES
 

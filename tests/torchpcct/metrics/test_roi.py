@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import torch
 
+from torchpcct.files import written_whole
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.roi import RoiMean, axial_grid, sample_axial
-from torchpcct.volume import Volume, written_whole
+from torchpcct.volume import Volume
 
 GRID = VolumeGrid((8, 45, 46), 0.2, (0.1, -30.38, -29.63))
 

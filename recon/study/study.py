@@ -1,0 +1,97 @@
+"""The skeleton of every study: its settings, its clock, and what it says to whoever waits.
+
+A study is a folder of this package, listed in :mod:`recon.study.registry`, with
+
+* ``settings.py``: ``Settings(StudySettings)``, a frozen dataclass that validates itself;
+* ``measure.py``: ``measure(settings, progress, folder) -> Measured``, which simulates, reconstructs and measures, and
+  writes nothing but finished pieces into ``folder`` (where one is given, and the study keeps pieces);
+* ``report.py``: ``build_report(measured) -> Report``: JSON values, Markdown and the figures of ``figures.py``.
+
+So data walks one way, settings → measure → report, and no module looks back.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+__all__ = ["Clock", "Progress", "StudySettings", "environment", "silent", "time_line"]
+
+Progress = Callable[[str, float], None]
+"""Called with the name of a step and its finished fraction, 0…1."""
+
+
+def silent(step: str, fraction: float) -> None:
+    """The progress of whom nobody watches."""
+
+
+class StudySettings:
+    """What the settings of all studies share; each derives a frozen dataclass from it.
+
+    Attributes:
+        QUICK: the values of a first look, by field; the study's docstring or its README row says what they cost.
+    """
+
+    QUICK: ClassVar[Mapping[str, Any]] = {}
+
+    @classmethod
+    def quick(cls, **changes: Any) -> Self:
+        """Settings of a first look in under a minute, with ``changes`` on top."""
+        return cls(**{**cls.QUICK, **changes})
+
+
+class Clock:
+    """Seconds of every step, by the wall.
+
+    Attributes:
+        seconds: step → seconds, in the order in which the steps came first.
+    """
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, step: str) -> None:
+        """Count the time since the last lap (or the start) to ``step``."""
+        now = time.perf_counter()
+        self.seconds[step] = self.seconds.get(step, 0.0) + now - self._last
+        self._last = now
+
+    @contextmanager
+    def step(self, step: str) -> Iterator[None]:
+        """Count the time of a block, and only that, to ``step``."""
+        self._last = time.perf_counter()
+        yield
+        self.lap(step)
+
+
+def environment() -> dict[str, Any]:
+    """Versions and machine that made a result."""
+    import numba
+    import scipy
+    import torch
+
+    import torchpcct
+
+    return {
+        "torchpcct": torchpcct.__version__,
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "numpy": np.__version__,
+        "scipy": scipy.__version__,
+        "numba": numba.__version__,
+        "machine": platform.machine(),
+        "cores": os.cpu_count(),
+    }
+
+
+def time_line(seconds: Mapping[str, float], note: str = "") -> str:
+    """The last line of a report: what took how long."""
+    parts = ", ".join(f"{step} {value:.0f} s" for step, value in seconds.items())
+    return f"Time: {parts}{'; ' if note else ''}{note}."
