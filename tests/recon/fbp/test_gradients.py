@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from recon.fbp import filter_plan
 from recon.fbp.angular_weights import angular_weights
 from recon.fbp.backproject import BackprojectionPlan, backproject
 from recon.fbp.fbp import fbp, filter_sinogram, filter_windowed
@@ -227,7 +228,7 @@ def test_chunks_change_nothing(monkeypatch):
     geometry, _ = CASES["cone-curved"]
     data = torch.randn((2, *geometry.shape), dtype=torch.float64)
     whole = filter_sinogram(data, geometry)
-    monkeypatch.setattr("recon.fbp.filter_plan.CHUNK_BYTES", 1)
+    monkeypatch.setattr(filter_plan, "CHUNK_BYTES", 1)
     torch.testing.assert_close(filter_sinogram(data, geometry), whole, rtol=0, atol=1e-12)
     gradient = torch.randn_like(whole)
     window = full_window(geometry)
