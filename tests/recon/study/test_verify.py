@@ -1,0 +1,60 @@
+"""Figures of the README against committed results."""
+
+import json
+
+import pytest
+
+from recon.study.verify import Claim, load_claims, lookup, rewrite, uncovered, verify
+
+DATA = {"rows": [{"m": "a", "s": 2.0, "v": 1.234}, {"m": "b", "s": 2.0, "v": [5.0, 6.6]}], "n": {"k": 200}}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "r.json").write_text(json.dumps(DATA), encoding="utf-8")
+    return tmp_path
+
+
+CLAIM = Claim(
+    "saves {v:.1f}× (up to {w:.0f}) in {n}",
+    {"v": "r.json: rows[m=a]/v", "w": "r.json: rows[m=b,s=2]/v/1", "n": "r.json: n/k"},
+)
+README = "# T\n\n## Results\n\nIt saves 1.2× (up to\n7) in 200 draws.\nAnd 3 more.\n\n## Other\n\n9 lives.\n"
+
+
+def test_lookup_by_key_row_and_index():
+    assert lookup(DATA, "rows[m=b]/v/0") == 5.0
+    assert lookup(DATA, "n/k") == 200
+    for path, message in (("n/x", "no /n/x"), ("rows[s=2]/v", "2 rows fit"), ("rows[m=c]/v", "0 rows fit")):
+        with pytest.raises(ValueError, match=message):
+            lookup(DATA, path)
+
+
+def test_a_true_and_a_stale_sentence(folder):
+    assert verify(README, [CLAIM], folder)[0].ok
+    stale = verify(README.replace("1.2×", "1.3×"), [CLAIM], folder)[0]
+    assert not stale.ok
+    assert stale.found is not None
+    assert verify(README.replace("saves", "gives"), [CLAIM], folder)[0].found is None
+
+
+def test_rewrite_puts_the_committed_figures_in_and_keeps_the_lines(folder):
+    old = README.replace("1.2×", "9.99×").replace("200", "12")
+    assert rewrite(old, [CLAIM], folder) == README
+
+
+def test_figures_without_a_claim_are_found():
+    assert list(uncovered(README, [CLAIM], ("Results",))) == ["And 3 more."]
+    assert list(uncovered(README, [], ("Other",))) == ["9 lives."]
+
+
+def test_bad_claims_are_refused(folder):
+    with pytest.raises(ValueError, match="no value for"):
+        Claim("{x}", {}).said(folder)
+    with pytest.raises(ValueError, match="cannot read"):
+        Claim("{x}", {"x": "none.json: a"}).said(folder)
+    with pytest.raises(ValueError, match="cannot show"):
+        Claim("{x:.1f}", {"x": "r.json: rows[m=a]/m"}).said(folder)
+    (folder / "c.yaml").write_text("- text: a\n", encoding="utf-8")
+    with pytest.raises(ValueError, match="must hold text and values"):
+        load_claims(folder / "c.yaml")
