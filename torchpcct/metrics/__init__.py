@@ -27,16 +27,14 @@ from torchpcct.metrics.observer import (
     observe,
     template_channel,
 )
+from torchpcct.metrics.plaque_measures import cap_thickness, lumen_area, threshold_contour
 from torchpcct.metrics.resolution import (
     TransferFunction,
-    cap_thickness,
     edge_profile,
     edge_width,
     ellipsoid_distance,
-    lumen_area,
     match_edge_width,
     task_transfer,
-    threshold_contour,
 )
 
 __all__ = [
