@@ -2,17 +2,10 @@
 
 from torchpcct.metrics.bootstrap import Estimate
 from torchpcct.metrics.cnr import Interval, cnr, cnr_from_moments, cnr_interval, cnr_range, mean_interval, sd_interval
+from torchpcct.metrics.contrast_slope import ContrastSlope, contrast_slope, roi_bias
 from torchpcct.metrics.data_limit import Ceiling, ceiling, information_matrix, paper_cnr_ceiling
-from torchpcct.metrics.dose_factor import (
-    ContrastSlope,
-    DoseCurve,
-    DoseFactor,
-    MeasuredDoseCurve,
-    contrast_slope,
-    dose_factor,
-    efficiency,
-    roi_bias,
-)
+from torchpcct.metrics.dose_curve import DoseCurve, MeasuredDoseCurve
+from torchpcct.metrics.dose_factor import DoseFactor, dose_factor, efficiency
 from torchpcct.metrics.noise_power import NoisePower, noise_power_spectrum
 from torchpcct.metrics.observer import (
     ObserverResult,

@@ -247,7 +247,7 @@ def cap_on_line(
     if not step_mm > 0 or not length > step_mm:
         raise ValueError(f"step_mm must be positive and less than the line's {length:g} mm, got {step_mm}")
     steps = math.ceil(length / step_mm)
-    along = np.linspace(0.0, length, steps + 1) if interpolate else step_mm * np.arange(steps)
+    along: Any = np.linspace(0.0, length, steps + 1) if interpolate else step_mm * np.arange(steps)
     points = a[:, None] + (b - a)[:, None] * along / length
     index = (points - np.array([v[0] for v in plane.axes])[:, None]) / np.array(plane.spacing)[:, None]
     if index.min() < 0 or (index.max(axis=1) > np.array(plane.shape) - 1).any():
