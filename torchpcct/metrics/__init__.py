@@ -1,4 +1,11 @@
-"""Figures of merit: CNR, the limit of the data, dose factor, observer, resolution, noise."""
+"""Figures of merit: CNR, the limit of the data, dose factor, observer, resolution, noise.
+
+Reading order: ``placement`` and ``roi`` say where is measured, ``cnr`` is the paper's figure over realisations,
+``data_limit`` the best that any unbiased method can reach. ``bootstrap`` gives every figure its interval. With it
+``dose_curve`` → ``contrast_slope`` → ``dose_factor`` answer what dose FBP needs for what a method shows. ``observer``
+asks whether the core is seen, ``resolution`` and ``noise_power`` how sharp and how noisy an image is, and
+``plaque_measures`` what a reader takes from it: lumen, core and cap.
+"""
 
 from torchpcct.metrics.bootstrap import Estimate
 from torchpcct.metrics.cnr import Interval, cnr, cnr_from_moments, cnr_interval, cnr_range, mean_interval, sd_interval

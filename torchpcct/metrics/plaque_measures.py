@@ -22,7 +22,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, map_coordinates
 from scipy.spatial import cKDTree
@@ -30,6 +29,7 @@ from skimage.measure import find_contours, label
 from skimage.morphology import reconstruction
 
 from torchpcct.geometry import VolumeGrid
+from torchpcct.metrics.roi import as_array
 
 __all__ = [
     "CORE_HU",
@@ -294,7 +294,7 @@ def dice(a: Any, b: Any) -> float:
 
 def _slice(image: Any, grid: VolumeGrid) -> tuple[Floats, VolumeGrid]:
     """The image as ``(y, x)`` float64, and its 2-D grid."""
-    x = image.detach().cpu().numpy() if isinstance(image, torch.Tensor) else np.asarray(image)
+    x = as_array(image)
     if grid.ndim == 3 and grid.shape[0] != 1:
         raise ValueError(f"grid must be one slice, got {grid.shape}: sample the axial image first")
     if x.shape not in (grid.shape, grid.shape[-2:]):

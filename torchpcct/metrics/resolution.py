@@ -15,10 +15,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
 
 from torchpcct.geometry import VolumeGrid
+from torchpcct.metrics.roi import as_array
+from torchpcct.validate import number
 
 __all__ = [
     "TransferFunction",
@@ -77,10 +78,6 @@ def ellipsoid_distance(
     return np.where(inside, -distance, distance).reshape(grid.shape)
 
 
-def _image(value: Any) -> Any:
-    return value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
-
-
 def edge_profile(
     image: Any, distance: Any, reach: tuple[float, float], bin_mm: float, mask: Any = None
 ) -> tuple[Floats, Floats]:
@@ -100,7 +97,7 @@ def edge_profile(
     Raises:
         ValueError: shapes that differ, a bin or reach that is not positive, more empty than filled bins, NaN or Inf.
     """
-    x, r = _image(image), _image(distance)
+    x, r = as_array(image), as_array(distance)
     if x.shape != r.shape or (mask is not None and np.shape(mask) != x.shape):
         raise ValueError(f"image, distance and mask must have the same shape, got {x.shape} and {r.shape}")
     if not (bin_mm > 0 and reach[0] > 0 and reach[1] > 0):
@@ -244,8 +241,7 @@ def match_edge_width(
         ValueError: the target lies outside the widths at ``low`` and ``high``.
     """
     ends = width_of(low) - target_mm, width_of(high) - target_mm
-    if not tolerance > 0:
-        raise ValueError(f"tolerance must be greater than 0, got {tolerance}")
+    number("tolerance", tolerance, positive=True)
     if ends[0] * ends[1] > 0:
         raise ValueError(
             f"the edge width {target_mm:g} mm lies outside {ends[0] + target_mm:g}…{ends[1] + target_mm:g} mm, "
