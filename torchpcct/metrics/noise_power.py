@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchpcct.metrics.resolution import first_below
 from torchpcct.metrics.roi import as_array
 from torchpcct.validate import number, per_axis
 
@@ -82,12 +83,7 @@ class NoisePower:
         lags = [np.fft.fftfreq(n, 1.0 / (n * s)) for n, s in zip(self.power.shape, self.spacing, strict=True)]
         r = np.sqrt(sum(np.square(a) for a in np.meshgrid(*lags, indexing="ij"))).ravel()
         radius, rho = _shells(r, self.autocorrelation.ravel(), 0.5 * min(self.spacing))
-        below = np.flatnonzero(rho <= level)
-        if not below.size:
-            return float("inf")
-        k = int(below[0])
-        part = (rho[k - 1] - level) / (rho[k - 1] - rho[k])
-        return float(radius[k - 1] + part * (radius[k] - radius[k - 1]))
+        return first_below(radius, rho, level, float("inf"))
 
 
 def _shells(radius: Floats, values: Floats, width: float) -> tuple[Floats, Floats]:

@@ -29,6 +29,7 @@ from skimage.measure import find_contours, label
 from skimage.morphology import reconstruction
 
 from torchpcct.geometry import VolumeGrid
+from torchpcct.metrics.resolution import first_below
 from torchpcct.metrics.roi import as_array
 
 __all__ = [
@@ -253,8 +254,12 @@ def cap_on_line(
     if index.min() < 0 or (index.max(axis=1) > np.array(plane.shape) - 1).any():
         raise ValueError(f"the line from {tuple(start)} to {tuple(end)} mm leaves the image: give points inside it")
     profile = map_coordinates(x, index, order=1)
-    lumen_end, core_start = (_first_below(along, profile, level, interpolate) for level in (lumen_hu, core_hu))
-    return core_start - lumen_end if profile[0] >= lumen_hu else math.nan
+    edges = []
+    for level in (lumen_hu, core_hu):
+        beyond = along[profile <= level]
+        exact = interpolate or not beyond.size
+        edges.append(first_below(along, profile, level, math.nan) if exact else float(beyond[0]))
+    return edges[1] - edges[0] if profile[0] >= lumen_hu else math.nan
 
 
 def basin_depth(image: Any, grid: VolumeGrid, within: Any) -> float:
@@ -333,17 +338,6 @@ def _largest(labels: Any) -> Mask:
     if sizes.size < 2:
         return np.zeros(labels.shape, bool)
     return np.asarray(labels == 1 + int(np.argmax(sizes[1:])))
-
-
-def _first_below(along: Floats, profile: Floats, level: float, interpolate: bool) -> float:
-    """Where a profile first falls to ``level``; NaN where it never does."""
-    under = np.flatnonzero(profile <= level)
-    if not under.size:
-        return math.nan
-    k = int(under[0])
-    if k == 0 or not interpolate:
-        return float(along[k])
-    return float(along[k - 1] + (profile[k - 1] - level) / (profile[k - 1] - profile[k]) * (along[k] - along[k - 1]))
 
 
 def _between(points: Floats, others: Floats) -> float:

@@ -26,6 +26,7 @@ __all__ = [
     "edge_profile",
     "edge_width",
     "ellipsoid_distance",
+    "first_below",
     "match_edge_width",
     "task_transfer",
 ]
@@ -122,6 +123,17 @@ def edge_profile(
     return positions, np.interp(positions, mean_r, mean_x)
 
 
+def first_below(x: Floats, values: Floats, level: float, never: float) -> float:
+    """First x at which a sampled curve falls to ``level``, by linear interpolation; ``never`` where it does not."""
+    below = np.flatnonzero(values <= level)
+    if not below.size:
+        return never
+    k = int(below[0])
+    if k == 0:
+        return float(x[0])
+    return float(x[k - 1] + (values[k - 1] - level) / (values[k - 1] - values[k]) * (x[k] - x[k - 1]))
+
+
 def edge_width(positions: Any, profile: Any, low: float = 0.1, high: float = 0.9, plateau: int = 3) -> float:
     """Distance in mm over which an edge goes from ``low`` to ``high`` of its step.
 
@@ -172,12 +184,7 @@ class TransferFunction:
         """Lowest frequency (cycles per mm) at which the TTF falls to ``level``; Inf where it never does."""
         if not 0 < level < 1:
             raise ValueError(f"level must lie in (0, 1), got {level}")
-        below = np.flatnonzero(self.values <= level)
-        if not below.size:
-            return math.inf
-        k = int(below[0])
-        f, v = self.frequencies, self.values
-        return float(f[k - 1] + (v[k - 1] - level) / (v[k - 1] - v[k]) * (f[k] - f[k - 1]))
+        return first_below(self.frequencies, self.values, level, math.inf)
 
     @property
     def f50(self) -> float:
