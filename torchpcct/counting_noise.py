@@ -6,6 +6,7 @@ The stream is SplitMix64 (Steele, Lea, Flood 2014); Poisson numbers come from H�
 (1993) for means of 10 and more, and from inversion below; normal numbers from Box and Muller (1958).
 
 An energy-integrating detector adds up the energies of a Poisson number of quanta: :func:`compound_poisson`.
+Other kernels that need random numbers take them from here too: :func:`seed_key`, :func:`stream` and :func:`draw`.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
-__all__ = ["compound_poisson", "normal", "poisson"]
+__all__ = ["compound_poisson", "draw", "normal", "poisson", "seed_key", "stream"]
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _MIX1 = np.uint64(0xBF58476D1CE4E5B9)
@@ -35,21 +36,22 @@ def _mix(z: Any) -> Any:
 
 
 @njit(inline="always", cache=True)
-def _unit(state: Any) -> Any:
-    """Uniform in the open interval (0, 1)."""
-    return (np.float64(_mix(state) >> _S11) + 0.5) * _TO_UNIT
+def stream(key: Any, index: Any) -> Any:
+    """State at which the random stream of an index begins, for a key of :func:`seed_key`."""
+    return _mix(key ^ _mix(np.uint64(index) * _GOLDEN + _MIX2))
 
 
 @njit(inline="always", cache=True)
-def _stream(key: Any, index: Any) -> Any:
-    return _mix(key ^ _mix(np.uint64(index) * _GOLDEN + _MIX2))
+def draw(state: Any) -> Any:
+    """Next state of a stream and a uniform number in the open interval (0, 1)."""
+    state = state + _GOLDEN
+    return state, (np.float64(_mix(state) >> _S11) + 0.5) * _TO_UNIT
 
 
 @njit(cache=True)
 def _poisson_one(mean: float, state: Any) -> float:
     if mean < 10.0:
-        state = state + _GOLDEN
-        u = _unit(state)
+        state, u = draw(state)
         p = math.exp(-mean)
         k = 0.0
         while u > p and k < 200.0:  # P(k ≥ 200 | mean < 10) < 1e-180: a guard against round-off only
@@ -63,10 +65,9 @@ def _poisson_one(mean: float, state: Any) -> float:
     inv_alpha = 1.1239 + 1.1328 / (b - 3.4)
     v_r = 0.9277 - 3.6224 / (b - 2.0)
     while True:
-        state = state + _GOLDEN
-        u = _unit(state) - 0.5
-        state = state + _GOLDEN
-        v = _unit(state)
+        state, u = draw(state)
+        u -= 0.5
+        state, v = draw(state)
         us = 0.5 - abs(u)
         k = math.floor((2.0 * a / us + b) * u + mean + 0.43)
         if us >= 0.07 and v <= v_r:
@@ -85,7 +86,7 @@ def _poisson_rows(mean: Any, first: Any, scale: float, key: Any, out: Any) -> No
         for j in range(mean.shape[1]):
             lam = np.float64(mean[i, j]) * scale
             if lam > 0.0:
-                out[i, j] = _poisson_one(lam, _stream(key, first[i] + j))
+                out[i, j] = _poisson_one(lam, stream(key, first[i] + j))
             elif lam == 0.0:
                 out[i, j] = 0.0
             else:
@@ -96,9 +97,9 @@ def _poisson_rows(mean: Any, first: Any, scale: float, key: Any, out: Any) -> No
 def _normal_rows(first: Any, key: Any, out: Any) -> None:
     for i in prange(out.shape[0]):
         for j in range(out.shape[1]):
-            state = _stream(key, first[i] + j)
-            radius = math.sqrt(-2.0 * math.log(_unit(state + _GOLDEN)))
-            out[i, j] = radius * math.cos(2.0 * math.pi * _unit(state + _GOLDEN + _GOLDEN))
+            state, u = draw(stream(key, first[i] + j))
+            state, v = draw(state)
+            out[i, j] = math.sqrt(-2.0 * math.log(u)) * math.cos(2.0 * math.pi * v)
 
 
 @njit(parallel=True, cache=True)
@@ -108,7 +109,7 @@ def _compound_rows(mean: Any, quantum: Any, first: Any, scale: float, key: Any, 
             q = np.float64(quantum[i, j])
             lam = np.float64(mean[i, j]) * scale / q
             if lam > 0.0 and q > 0.0:
-                out[i, j] = q * _poisson_one(lam, _stream(key, first[i] + j))
+                out[i, j] = q * _poisson_one(lam, stream(key, first[i] + j))
             elif lam == 0.0 and q > 0.0:
                 out[i, j] = 0.0
             else:
@@ -119,7 +120,8 @@ _QUANTA, _ELECTRONICS = 0, 1
 """Purposes of a reading's random numbers: each has a stream of its own."""
 
 
-def _key(seed: int, purpose: int = _QUANTA) -> Any:
+def seed_key(seed: int, purpose: int = _QUANTA) -> Any:
+    """Key of a seed's streams; ``TypeError`` or ``ValueError`` unless the seed is a whole number in 0 … 2**63 − 1."""
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer):
         raise TypeError(f"seed must be a whole number, got {seed!r}")
     if not 0 <= seed < 2**63:
@@ -152,7 +154,7 @@ def poisson(mean: Tensor, first_index: Any, seed: int, scale: float = 1.0) -> Te
     """
     flat = mean.detach().cpu().contiguous().reshape(-1, mean.shape[-1])
     out = torch.empty_like(flat)
-    _poisson_rows(flat.numpy(), _first(first_index, flat.shape[0]), float(scale), _key(seed), out.numpy())
+    _poisson_rows(flat.numpy(), _first(first_index, flat.shape[0]), float(scale), seed_key(seed), out.numpy())
     return out.reshape(mean.shape)
 
 
@@ -188,10 +190,10 @@ def compound_poisson(
     weight = quantum.detach().cpu().contiguous().reshape(flat.shape)
     first = _first(first_index, flat.shape[0])
     out = torch.empty_like(flat)
-    _compound_rows(flat.numpy(), weight.numpy(), first, float(scale), _key(seed), out.numpy())
+    _compound_rows(flat.numpy(), weight.numpy(), first, float(scale), seed_key(seed), out.numpy())
     if electronic:
         added = torch.empty_like(flat)
-        _normal_rows(first, _key(seed, _ELECTRONICS), added.numpy())
+        _normal_rows(first, seed_key(seed, _ELECTRONICS), added.numpy())
         out.add_(added, alpha=float(electronic))
     return out.reshape(mean.shape)
 
@@ -199,5 +201,5 @@ def compound_poisson(
 def normal(shape: tuple[int, ...], first_index: Any, seed: int, dtype: torch.dtype = torch.float32) -> Tensor:
     """Standard normal numbers keyed like :func:`poisson`; ``shape`` is ``(..., n)``."""
     out = torch.empty((math.prod(shape[:-1]), shape[-1]), dtype=dtype)
-    _normal_rows(_first(first_index, out.shape[0]), _key(seed), out.numpy())
+    _normal_rows(_first(first_index, out.shape[0]), seed_key(seed), out.numpy())
     return out.reshape(shape)

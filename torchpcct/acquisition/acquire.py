@@ -202,7 +202,7 @@ def acquire(
         dense = beam._replace(points=sub_rays_of(SUB_RAY_COUNTS[-1]))
         surround = expected_readings(one, whole, symmetric, dense, step[:1]).numpy()[:, 0]
     counts = _readings(plan_, g, build, energies, beam, step, surround, progress)
-    pile_up = PileUpMap.of(scanner)
+    pile_up = scanner.pile_up()
     if pile_up is not None:
         counts, air, surround = _recorded(pile_up, counts, air, surround, plan_.kept)
     quantum = None

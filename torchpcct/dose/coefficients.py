@@ -13,14 +13,15 @@ their K edges, where fluorescence carries energy away.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-if TYPE_CHECKING:
-    from torchpcct.scanner import Scanner
-    from torchpcct.scene.materials import Material
+from torchpcct.scanner import Scanner
+from torchpcct.scanner.compton import mean_recoil_fraction
+from torchpcct.scanner.filters import behind_filters
+from torchpcct.scene.materials import Material
+from torchpcct.validate import number
 
 __all__ = ["MGY_PER_KEV_PER_G", "air_fluence", "fan_half_angle", "mass_energy_absorption", "mass_interaction"]
 
@@ -40,8 +41,6 @@ def mass_energy_absorption(material: Material, energies_kev: ArrayLike) -> Float
     Raises:
         ValueError: energies outside the cross-section table.
     """
-    from torchpcct.scanner.compton import mean_recoil_fraction
-
     energies = np.atleast_1d(np.asarray(energies_kev, dtype=np.float64))
     absorbed = material.attenuation(energies, "photo")
     absorbed = absorbed + material.attenuation(energies, "incoh") * mean_recoil_fraction(energies)
@@ -78,22 +77,18 @@ def air_fluence(scanner: Scanner, fan_angles_rad: ArrayLike, *, group_kev: float
     Raises:
         ValueError: a negative or non-finite ``group_kev``.
     """
-    if not 0.0 <= group_kev < math.inf:
-        raise ValueError(f"group_kev must be a width ≥ 0 keV, got {group_kev!r}")
+    number("group_kev", group_kev, low=0.0, unit="keV")
     gamma = np.atleast_1d(np.asarray(fan_angles_rad, dtype=np.float64))
     spectrum = scanner.source.spectrum(scanner.energy_bin_kev)
     energies = spectrum.energies
-    slab: Any = sum((m.attenuation(energies) * t for m, t in scanner.filters), np.zeros(energies.size))
-    photons = spectrum.fluence * np.exp(-np.multiply.outer(1.0 / np.cos(gamma), slab))
-    for bowtie in scanner.bowties:
-        photons = photons * bowtie.transmission(gamma, energies)
+    photons = behind_filters(spectrum.fluence, gamma, energies, scanner.filters, scanner.bowties)
     photons[np.abs(gamma) > fan_half_angle(scanner) * (1.0 + 1e-12)] = 0.0
     if group_kev > 0.0:
         energies, photons = _grouped(energies, photons, group_kev)
     return energies, np.asarray(photons)
 
 
-def _grouped(energies: Any, photons: Any, width: float) -> tuple[Floats, Floats]:
+def _grouped(energies: Floats, photons: Floats, width: float) -> tuple[Floats, Floats]:
     index = np.floor((energies - energies[0]) / width + 1e-9).astype(np.int64)
     groups = np.arange(index[-1] + 1)[:, None] == index
     filled = groups.any(1)

@@ -10,18 +10,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchpcct.dose.primary import primary_dose
+from torchpcct.dose.scatter import monte_carlo_dose
 from torchpcct.geometry import VolumeGrid
+from torchpcct.scanner import Scanner
+from torchpcct.scene import Scene
 from torchpcct.scene.phantoms.quality import CTDI_HOLES, ctdi
-
-if TYPE_CHECKING:
-    from torchpcct.scanner import Scanner
-    from torchpcct.scene import Scene
 
 __all__ = ["CtdiDose", "ctdi_dose", "disc_samples"]
 
@@ -111,8 +110,6 @@ def ctdi_dose(
         return CtdiDose(central, peripheral)
     if (axial, quantity) != ("contiguous", "absorbed"):
         raise ValueError("scattered dose exists for axial='contiguous' and quantity='absorbed' only")
-    from torchpcct.dose.scatter import monte_carlo_dose
-
     half = float(scene.bounding_box()[1, :2].max())
     pixels = 2 * math.ceil(half / _PIXEL_MM) + 4
     grid = VolumeGrid((pixels, pixels), _PIXEL_MM)

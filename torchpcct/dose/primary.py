@@ -11,12 +11,13 @@ point. Scattered photons are added by :mod:`torchpcct.dose.scatter`.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from torchpcct.acquisition.transmission import compress
 from torchpcct.dose.coefficients import (
     MGY_PER_KEV_PER_G,
     air_fluence,
@@ -25,12 +26,11 @@ from torchpcct.dose.coefficients import (
     mass_interaction,
 )
 from torchpcct.geometry import VolumeGrid
+from torchpcct.scanner import Scanner
+from torchpcct.scene import Scene
 from torchpcct.scene.chords import interval
 from torchpcct.scene.scene import resolve_material
-
-if TYPE_CHECKING:
-    from torchpcct.scanner import Scanner
-    from torchpcct.scene import Scene
+from torchpcct.validate import choice, number, whole
 
 __all__ = ["QUANTITIES", "plane_points", "primary_dose"]
 
@@ -149,13 +149,10 @@ def primary_dose(
     Raises:
         ValueError: an unknown option or material, a moving scene, ``exposure_s`` ≤ 0, a point outside the orbit.
     """
-    for name, value, known in (("quantity", quantity, QUANTITIES), ("axial", axial, _AXIAL)):
-        if value not in known:
-            raise ValueError(f"{name} must be one of {known}, got {value!r}")
-    if isinstance(views, bool) or not isinstance(views, int | np.integer) or views < 1:
-        raise ValueError(f"views must be a whole number ≥ 1, got {views!r}")
-    if not (math.isfinite(exposure_s) and exposure_s > 0):
-        raise ValueError(f"exposure_s must be greater than 0 s, got {exposure_s}")
+    choice("quantity", quantity, QUANTITIES)
+    choice("axial", axial, _AXIAL)
+    whole("views", views)
+    number("exposure_s", exposure_s, positive=True, unit="s")
     check_static(scene)
     points = plane_points(where)
     g = scanner.geometry
@@ -171,8 +168,6 @@ def primary_dose(
         media = [resolve_material(medium)]
     per_gram = mass_energy_absorption if quantity == "absorbed" else mass_interaction
     deposit = np.stack([per_gram(m, energies) * energies for m in media]) * MGY_PER_KEV_PER_G
-
-    from torchpcct.acquisition.transmission import compress
 
     kinds, params = scene.pack()
     coefficients, basis = compress(scene.contrast(energies), tolerance=1e-6)

@@ -15,19 +15,20 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from torchpcct.counting_noise import seed_key
 from torchpcct.dose.coefficients import MGY_PER_KEV_PER_G, air_fluence, fan_half_angle, mass_energy_absorption
 from torchpcct.dose.primary import check_static, plane_points
+from torchpcct.dose.transport_kernels import BATCHES, transport
 from torchpcct.geometry import VolumeGrid
-
-if TYPE_CHECKING:
-    from torchpcct.scanner import Scanner
-    from torchpcct.scene import Scene
-    from torchpcct.scene.materials import Material
+from torchpcct.scanner import Scanner
+from torchpcct.scene import Scene
+from torchpcct.scene.materials import Material
+from torchpcct.validate import number, whole
 
 __all__ = ["MonteCarloDose", "monte_carlo_dose"]
 
@@ -82,7 +83,7 @@ class MonteCarloDose:
 @functools.lru_cache(maxsize=64)
 def _form_factor(material: Material) -> tuple[Floats, Floats]:
     """Nodes x² and the cumulative integral of F² dx² per atom mixture, from 0."""
-    import xraydb
+    import xraydb  # loads slowly; primary dose does without it
 
     x = np.linspace(0.0, 1.0, _FORM_NODES) ** 2 * _FORM_END
     square = np.zeros_like(x)
@@ -128,28 +129,24 @@ def monte_carlo_dose(
         exposure_s: duration of a rotation in s.
         z_mm: height of the slice.
         histories: photons to follow, rounded down to a multiple of 16.
-        seed: of the random numbers, ≥ 0.
+        seed: of the random numbers, a whole number ≥ 0.
         scan_length_mm: length of the contiguous scan, the width of a rotation being its table feed.
         phantom_length_mm: length of the object along z; photons leave at its ends.
 
     Raises:
+        TypeError: a number of histories or a seed that is no whole number.
         ValueError: a moving scene, voxels that are not square, a body outside of the grid, a bad length or count.
     """
-    from torchpcct.counting_noise import _key
-    from torchpcct.dose.transport_kernels import BATCHES, transport
-
     check_static(scene)
     points = plane_points(grid)
     if abs(grid.spacing[0] / grid.spacing[1] - 1.0) > 1e-9:
         raise ValueError(f"the voxels must be square, got {grid.spacing} mm")
-    if isinstance(histories, bool) or not isinstance(histories, int | np.integer) or histories < BATCHES:
-        raise ValueError(f"histories must be a whole number of at least {BATCHES}, got {histories!r}")
+    whole("histories", histories, low=BATCHES)
     if not (0 < scan_length_mm <= phantom_length_mm < math.inf):
         raise ValueError(
             f"lengths must be 0 < scan_length_mm ≤ phantom_length_mm, got {scan_length_mm} and {phantom_length_mm} mm"
         )
-    if not (math.isfinite(exposure_s) and exposure_s > 0):
-        raise ValueError(f"exposure_s must be greater than 0 s, got {exposure_s}")
+    number("exposure_s", exposure_s, positive=True, unit="s")
     labels = scene.labels(np.concatenate([points, np.full((*grid.shape, 1), float(z_mm))], axis=-1))
     if (labels[[0, -1]] >= 0).any() or (labels[:, [0, -1]] >= 0).any():
         raise ValueError("bodies reach the edge of the grid: give a larger grid, so that no scatter is lost")
@@ -176,7 +173,7 @@ def monte_carlo_dose(
     tally = np.zeros((BATCHES, 2, *grid.shape))
     axes = grid.axes
     transport(
-        n, _key(int(seed)), medium, float(axes[1][0] - grid.spacing[1] / 2), float(axes[0][0] - grid.spacing[0] / 2),
+        n, seed_key(seed), medium, float(axes[1][0] - grid.spacing[1] / 2), float(axes[0][0] - grid.spacing[0] / 2),
         float(grid.spacing[0]), radius, phantom_length_mm / 2.0, scan_length_mm / 2.0, sod, half, fan_cdf,
         np.ascontiguousarray(energy_cdf), energies, _CUTOFF_KEV, _TABLE_STEP_KEV, total, photo, compton, absorption,
         largest, squares, form, _CUTOFF_KEV, tally,

@@ -10,32 +10,15 @@ import math
 from typing import Any
 
 import numba
-import numpy as np
+
+from torchpcct.counting_noise import draw, stream
+from torchpcct.scanner.compton import ELECTRON_REST_KEV
 
 __all__ = ["BATCHES", "transport"]
 
 BATCHES = 16
 
-_GOLDEN = np.uint64(0x9E3779B97F4A7C15)
-_MIX1 = np.uint64(0xBF58476D1CE4E5B9)
-_MIX2 = np.uint64(0x94D049BB133111EB)
-_S30, _S27, _S31, _S11 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(11)
-_REST_KEV = 510.99895
 _KEV_ANGSTROM = 12.398419843
-
-
-@numba.njit(inline="always", cache=True)
-def _mix(z: Any) -> Any:
-    z = (z ^ (z >> _S30)) * _MIX1
-    z = (z ^ (z >> _S27)) * _MIX2
-    return z ^ (z >> _S31)
-
-
-@numba.njit(inline="always", cache=True)
-def _draw(state: Any) -> Any:
-    """Next state of SplitMix64 and a uniform number in (0, 1)."""
-    state = state + _GOLDEN
-    return state, (np.float64(_mix(state) >> _S11) + 0.5) * (1.0 / 9007199254740992.0)
 
 
 @numba.njit(inline="always", cache=True)
@@ -54,13 +37,13 @@ def _find(cumulative: Any, value: float) -> int:
 @numba.njit(inline="always", cache=True)
 def _compton(energy: float, state: Any) -> Any:
     """Scattered energy and cosine after Klein and Nishina (Kahn's rejection, as in Butcher and Messel)."""
-    k = energy / _REST_KEV
+    k = energy / ELECTRON_REST_KEV
     low = 1.0 / (1.0 + 2.0 * k)
     a1, a2 = -math.log(low), 0.5 * (1.0 - low * low)
     while True:
-        state, u1 = _draw(state)
-        state, u2 = _draw(state)
-        state, u3 = _draw(state)
+        state, u1 = draw(state)
+        state, u2 = draw(state)
+        state, u3 = draw(state)
         ratio = math.exp(-a1 * u2) if u1 * (a1 + a2) < a1 else math.sqrt(low * low + (1.0 - low * low) * u2)
         t = (1.0 - ratio) / (k * ratio)
         sine2 = t * (2.0 - t)
@@ -76,8 +59,8 @@ def _rayleigh(energy: float, squares: Any, cumulative: Any, state: Any) -> Any:
     part = (end - squares[k - 1]) / (squares[k] - squares[k - 1])
     top = cumulative[k - 1] + min(part, 1.0) * (cumulative[k] - cumulative[k - 1])
     while True:
-        state, u1 = _draw(state)
-        state, u2 = _draw(state)
+        state, u1 = draw(state)
+        state, u2 = draw(state)
         value = u1 * top
         k = max(_find(cumulative, value), 1)
         width = cumulative[k] - cumulative[k - 1]
@@ -121,14 +104,14 @@ def transport(
     last = largest.size - 2
     for batch in numba.prange(batches):
         for history in range(batch * share, (batch + 1) * share):
-            state = _mix(key ^ _mix(np.uint64(history) * _GOLDEN + _MIX2))
-            state, u = _draw(state)
+            state = stream(key, history)
+            state, u = draw(state)
             # Views are stratified: history k of n lies in the k-th part of the turn, shuffled by the golden ratio.
             beta = 2.0 * math.pi * ((history * 0.6180339887498949) % 1.0)
             k = _find(fan_cdf, u)
-            state, u = _draw(state)
+            state, u = draw(state)
             gamma = half_fan * (2.0 * (k + u) / nodes - 1.0)
-            state, u = _draw(state)
+            state, u = draw(state)
             energy = energies[_find(energy_cdf[k], u)]
             cb, sb = math.cos(beta), math.sin(beta)
             lx, ly = -math.cos(gamma), math.sin(gamma)
@@ -148,7 +131,7 @@ def transport(
                 i = min(max(int(place), 0), last)
                 f = place - i
                 biggest = max(largest[i], largest[i + 1])
-                state, u = _draw(state)
+                state, u = draw(state)
                 flight = -math.log(u) / biggest
                 x += flight * dx
                 y += flight * dy
@@ -164,7 +147,7 @@ def transport(
                 if abs(z) <= score_z:
                     absorbed = (1.0 - f) * absorption[m, i] + f * absorption[m, i + 1]
                     tally[batch, scattered, row, column] += energy * absorbed / biggest
-                state, u = _draw(state)
+                state, u = draw(state)
                 u *= biggest
                 if u > (1.0 - f) * attenuation[m, i] + f * attenuation[m, i + 1]:
                     continue
@@ -178,6 +161,6 @@ def transport(
                 scattered = 1
                 if energy < cutoff:
                     break
-                state, u = _draw(state)
+                state, u = draw(state)
                 phi = 2.0 * math.pi * u
                 dx, dy, dz = _turned(dx, dy, dz, cosine, phi)

@@ -12,13 +12,15 @@ import functools
 import itertools
 import math
 from dataclasses import dataclass, field
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import ndtr
 
 from torchpcct.scanner.compton import recoil
 from torchpcct.scene.materials import MATERIALS, Material
+from torchpcct.validate import choice, number, numbers, whole
 
 __all__ = ["SILICON_THRESHOLDS_KEV", "Detector", "Scintillator", "SiliconDetector"]
 
@@ -75,13 +77,6 @@ class Detector(Protocol):
         """Detectors are values: equal ones share cached spectra."""
 
 
-def _check(name: str, value: Any, low: float, high: float, unit: str) -> float:
-    number = float(value)
-    if not (low <= number <= high and math.isfinite(number)):
-        raise ValueError(f"{name} must lie in {low:g}…{high:g} {unit}, got {value!r}")
-    return number
-
-
 @dataclass(frozen=True)
 class SiliconDetector:
     """Edge-on ("deep") silicon strips that count photons in energy bins.
@@ -110,6 +105,7 @@ class SiliconDetector:
             to higher bins.
 
     Raises:
+        TypeError: a value that is no number.
         ValueError: a value outside its range, thresholds that do not increase, an unknown mode.
     """
 
@@ -125,24 +121,22 @@ class SiliconDetector:
     merge_ns: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.mode not in _MODES:
-            raise ValueError(f"mode must be one of {_MODES}, got {self.mode!r}")
-        thresholds = tuple(float(t) for t in self.thresholds_kev)
-        if not thresholds or any(not b > a for a, b in itertools.pairwise(thresholds)):
-            raise ValueError(f"thresholds_kev must be a non-empty increasing sequence, got {self.thresholds_kev!r}")
-        if not (thresholds[0] >= 0 and math.isfinite(thresholds[-1])):
-            raise ValueError(f"thresholds_kev must be ≥ 0 keV and finite, got {self.thresholds_kev!r}")
-        if isinstance(self.segments, bool) or not isinstance(self.segments, int) or self.segments < 1:
-            raise ValueError(f"segments must be a whole number ≥ 1, got {self.segments!r}")
-        set_ = object.__setattr__
-        set_(self, "thresholds_kev", thresholds)
-        set_(self, "length_mm", _check("length_mm", self.length_mm, 1e-3, 1e3, "mm"))
-        set_(self, "sigma_kev", _check("sigma_kev", self.sigma_kev, 1e-3, 50.0, "keV"))
-        set_(self, "fill_factor", _check("fill_factor", self.fill_factor, 1e-6, 1.0, "(a share of the cell)"))
-        set_(self, "dead_layer_mm", _check("dead_layer_mm", self.dead_layer_mm, 0.0, 1e3, "mm"))
-        set_(self, "charge_sharing", _check("charge_sharing", self.charge_sharing, 0.0, 1.0, "(a share of events)"))
-        set_(self, "dead_time_ns", _check("dead_time_ns", self.dead_time_ns, 0.0, 1e6, "ns"))
-        set_(self, "merge_ns", _check("merge_ns", self.merge_ns, 0.0, self.dead_time_ns, "ns (the dead time)"))
+        choice("mode", self.mode, _MODES)
+        whole("segments", self.segments)
+        thresholds = numbers("thresholds_kev", self.thresholds_kev, low=0.0, unit="keV")
+        if any(not b > a for a, b in itertools.pairwise(thresholds)):
+            raise ValueError(f"thresholds_kev must be increasing, got {self.thresholds_kev!r}")
+        object.__setattr__(self, "thresholds_kev", thresholds)
+        for name, low, high, unit in (
+            ("length_mm", 1e-3, 1e3, "mm"),
+            ("sigma_kev", 1e-3, 50.0, "keV"),
+            ("fill_factor", 1e-6, 1.0, "(a share of the cell)"),
+            ("dead_layer_mm", 0.0, 1e3, "mm"),
+            ("charge_sharing", 0.0, 1.0, "(a share of events)"),
+            ("dead_time_ns", 0.0, 1e6, "ns"),
+            ("merge_ns", 0.0, self.dead_time_ns, "ns (the dead time)"),
+        ):
+            object.__setattr__(self, name, number(name, getattr(self, name), low=low, high=high, unit=unit))
 
     @property
     def bins(self) -> int:
@@ -160,8 +154,7 @@ class SiliconDetector:
 
     def interaction(self, energies_kev: ArrayLike) -> tuple[Floats, Floats]:
         """Probability of a (photoelectric, Compton) interaction in the sensitive silicon per incident photon."""
-        silicon = MATERIALS["silicon"]
-        photo, compton = silicon.attenuation(energies_kev, "photo"), silicon.attenuation(energies_kev, "incoh")
+        photo, compton = (MATERIALS["silicon"].attenuation(energies_kev, kind) for kind in ("photo", "incoh"))
         both = photo + compton
         reached = self.fill_factor * np.exp(-both * self.dead_layer_mm)
         stopped = reached * -np.expm1(-both * self.length_mm) / both
@@ -174,8 +167,6 @@ class SiliconDetector:
             energies_kev: ``(E,)`` photon energies in keV.
             thresholds_kev: ``(T,)`` any thresholds in keV (−inf: all interactions).
         """
-        from scipy.special import ndtr
-
         energies = np.atleast_1d(np.asarray(energies_kev, dtype=np.float64))
         thresholds = np.atleast_1d(np.asarray(thresholds_kev, dtype=np.float64))
         photo, compton = self.interaction(energies)
@@ -211,37 +202,17 @@ class SiliconDetector:
     @functools.cached_property
     def segment_mm(self) -> tuple[float, ...]:
         """Length of each depth segment in mm, entrance first: equal numbers of interactions at 60 keV."""
-        silicon = MATERIALS["silicon"]
-        mu = float(sum(silicon.attenuation(SEGMENT_DESIGN_KEV, kind) for kind in ("photo", "incoh")))
+        mu = float(sum(MATERIALS["silicon"].attenuation(SEGMENT_DESIGN_KEV, kind) for kind in ("photo", "incoh")))
         stopped = -math.expm1(-mu * self.length_mm)
         ends = [-math.log1p(-stopped * k / self.segments) / mu for k in range(self.segments + 1)]
         return tuple(b - a for a, b in itertools.pairwise(ends))
 
     def segment_shares(self, energies_kev: ArrayLike) -> Floats:
         """Share of the interactions that falls into each depth segment, ``(segments, E)``, summing to 1."""
-        silicon = MATERIALS["silicon"]
-        mu = silicon.attenuation(energies_kev, "photo") + silicon.attenuation(energies_kev, "incoh")
+        mu = sum(MATERIALS["silicon"].attenuation(energies_kev, kind) for kind in ("photo", "incoh"))
         ends = np.concatenate([[0.0], np.cumsum(self.segment_mm)])
         left = np.exp(-np.multiply.outer(ends, mu))
         return np.asarray((left[:-1] - left[1:]) / (1.0 - left[-1]))
-
-    def live_fraction(self, count_rate: ArrayLike, energies_kev: ArrayLike, weights: ArrayLike) -> Floats:
-        """Recorded over true counts at a count rate: non-paralysable dead time in every depth segment.
-
-        A factor on the summed counts; :func:`torchpcct.scanner.pileup.recorded_rates` has the bins.
-
-        Args:
-            count_rate: true counts per second and cell (all segments), any shape.
-            energies_kev, weights: spectrum ``(E,)`` that makes these counts; it sets the load of each segment.
-
-        Returns:
-            0…1, the shape of ``count_rate``; all 1 when ``dead_time_ns`` is 0.
-        """
-        w = np.asarray(weights, dtype=np.float64)
-        shares = (self.segment_shares(energies_kev) * w).sum(-1) / w.sum()
-        rate = np.asarray(count_rate, dtype=np.float64)
-        load = np.multiply.outer(rate, shares) * (self.dead_time_ns * 1e-9)
-        return np.asarray((shares / (1.0 + load)).sum(-1))
 
 
 @dataclass(frozen=True)
@@ -269,11 +240,12 @@ class Scintillator:
     def __post_init__(self) -> None:
         if not isinstance(self.material, Material):
             raise TypeError(f"material must be a Material, got {self.material!r}: use material('lumex')")
-        set_ = object.__setattr__
-        set_(self, "depth_mm", _check("depth_mm", self.depth_mm, 1e-3, 1e3, "mm"))
-        set_(self, "fill_factor", _check("fill_factor", self.fill_factor, 1e-6, 1.0, "(a share of the cell)"))
-        noise = _check("electronic_noise_kev", self.electronic_noise_kev, 0.0, 1e9, "keV")
-        set_(self, "electronic_noise_kev", noise)
+        for name, low, high, unit in (
+            ("depth_mm", 1e-3, 1e3, "mm"),
+            ("fill_factor", 1e-6, 1.0, "(a share of the cell)"),
+            ("electronic_noise_kev", 0.0, 1e9, "keV"),
+        ):
+            object.__setattr__(self, name, number(name, getattr(self, name), low=low, high=high, unit=unit))
 
     @property
     def bins(self) -> int:

@@ -9,10 +9,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import PchipInterpolator
 
+from torchpcct.scanner.source import Slabs
 from torchpcct.scene.materials import MATERIALS, Material
+from torchpcct.validate import number, numbers
 
-__all__ = ["Bowtie", "large_bowtie", "roi_bowtie"]
+__all__ = ["Bowtie", "behind_filters", "large_bowtie", "roi_bowtie"]
 
 Floats = NDArray[np.float64]
 
@@ -59,21 +62,17 @@ class Bowtie:
     def __post_init__(self) -> None:
         if not isinstance(self.material, Material):
             raise TypeError(f"material must be a Material, got {self.material!r}: use material('aluminium')")
-        angles = tuple(float(v) for v in self.fan_angles_rad)
-        thickness = tuple(float(v) for v in self.thickness_mm)
+        angles = numbers("fan_angles_rad", self.fan_angles_rad, high=math.pi / 2, unit="rad")
+        thickness = numbers("thickness_mm", self.thickness_mm, low=0.0, unit="mm")
         if len(angles) != len(thickness) or len(angles) < 2:
             raise ValueError(f"{self.name}: give at least 2 nodes, as many thicknesses as fan angles")
         if angles[0] != 0 or any(not b > a for a, b in itertools.pairwise(angles)):
             raise ValueError(f"{self.name}: fan angles must increase strictly from 0 rad, got {angles}")
-        if not all(0 <= t < math.inf for t in thickness) or not angles[-1] < math.pi / 2:
-            raise ValueError(f"{self.name}: thickness must be ≥ 0 mm and finite, fan angles below π/2, got {thickness}")
         object.__setattr__(self, "fan_angles_rad", angles)
         object.__setattr__(self, "thickness_mm", thickness)
 
     def thickness(self, fan_angles_rad: ArrayLike) -> Floats:
         """Path length in mm at fan angles in rad (either sign), same shape, float64."""
-        from scipy.interpolate import PchipInterpolator
-
         # Rounded to the picometre: slopes near the smallest float overflow inside the interpolator.
         nodes, values = np.array(self.fan_angles_rad), np.round(self.thickness_mm, 9)
         curve = PchipInterpolator(np.r_[-nodes[:0:-1], nodes], np.r_[values[:0:-1], values])
@@ -113,11 +112,9 @@ def roi_bowtie(
     Raises:
         ValueError: a length ≤ 0, a region or filter that does not fit between source and isocentre.
     """
-    for name, value in (("sod", sod), ("diameter_mm", diameter_mm), ("thickness_mm", thickness_mm)):
-        if not (math.isfinite(value) and value > 0):
-            raise ValueError(f"{name} must be greater than 0 mm, got {value}")
-    if not 0 < ramp_mm < math.inf:
-        raise ValueError(f"ramp_mm must be greater than 0 mm, got {ramp_mm}")
+    lengths = {"sod": sod, "diameter_mm": diameter_mm, "thickness_mm": thickness_mm, "ramp_mm": ramp_mm}
+    for name, value in lengths.items():
+        number(name, value, positive=True, unit="mm")
     if not (diameter_mm / 2 < sod and 0 <= distance_mm < sod):
         raise ValueError(
             f"region ({diameter_mm} mm) and filter ({distance_mm} mm from the isocentre) must lie nearer to the "
@@ -129,3 +126,14 @@ def roi_bowtie(
     metal: Any = MATERIALS["aluminium"] if material is None else material
     angles = (0.0, inner, outer, min(outer + 0.1, 1.5))
     return Bowtie(metal, angles, (0.0, 0.0, thickness_mm, thickness_mm), "roi")
+
+
+def behind_filters(
+    photons: Floats, fan_angles_rad: Floats, energies_kev: Floats, flat: Slabs, bowties: tuple[Bowtie, ...]
+) -> Floats:
+    """Photons ``(angles, E)`` that pass flat slabs, obliquely, and bowties; ``photons`` broadcasts to that shape."""
+    slab: Any = sum((m.attenuation(energies_kev) * t for m, t in flat), np.zeros(energies_kev.size))
+    photons = photons * np.exp(-np.multiply.outer(1.0 / np.cos(fan_angles_rad), slab))
+    for bowtie in bowties:
+        photons = photons * bowtie.transmission(fan_angles_rad, energies_kev)
+    return photons

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from torchpcct.detector_window import DetectorWindow
+from torchpcct.validate import number, whole
 
 __all__ = ["WaterLinearisation"]
 
@@ -62,8 +63,8 @@ class WaterLinearisation:
         Raises:
             ValueError: a thickness ≤ 0 or an order < 1.
         """
-        if max_mm <= 0 or order < 1:
-            raise ValueError(f"calibration needs max_mm > 0 and order ≥ 1, got {max_mm} and {order}")
+        number("max_mm", max_mm, positive=True, unit="mm")
+        whole("order", order)
         w, mu = np.asarray(weights, np.float64), np.asarray(mu_water, np.float64)
         # Chebyshev nodes: no ringing at the ends.
         t = max_mm * (0.5 - 0.5 * np.cos(np.pi * (np.arange(_SAMPLES) + 0.5) / _SAMPLES))
@@ -81,7 +82,7 @@ class WaterLinearisation:
         return cls(coefficients, scale, mu_ref)
 
     def _evaluate(self, p: Tensor, window: DetectorWindow | None, *, slope: bool) -> Tensor:
-        from torchpcct.scanner.linearisation_kernel import evaluate
+        from torchpcct.scanner.linearisation_kernel import evaluate  # numba: presets load without it
 
         columns = self.scale.size if window is None else window.columns
         if p.shape[-1] != columns:

@@ -13,20 +13,17 @@ recorded mean, which overstates the noise of rays in air and is right within 2 a
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicSpline
 from torch import Tensor
 
+from torchpcct.scanner.detector import SiliconDetector
 from torchpcct.scene.materials import MATERIALS
-
-if TYPE_CHECKING:
-    from torchpcct.scanner.detector import SiliconDetector
-    from torchpcct.scanner.scanner import Scanner
 
 __all__ = ["PileUpMap", "pulse_heights", "recorded_rates"]
 
@@ -125,15 +122,30 @@ class PileUpMap:
     node: Floats
 
     @classmethod
-    def of(cls, scanner: Scanner) -> PileUpMap | None:
-        """The map of a scanner at its tube current, or None if its detector has no dead time. Cached.
+    def calibrate(cls, detector: SiliconDetector, energies_kev: Floats, quanta_per_s: Floats) -> PileUpMap:
+        """Fit behind water.
 
-        Only what stands before the patient, the detector and the current matter, not the number of views.
+        Args:
+            detector: with its dead time.
+            energies_kev: ``(E,)`` keV.
+            quanta_per_s: ``(columns, E)`` photons per second that reach the cells in air, by energy.
         """
-        detector: Any = scanner.detector
-        if detector.energy_integrating or not getattr(detector, "dead_time_ns", 0.0):
-            return None
-        return _map(scanner.with_views(1))
+        columns = quanta_per_s.shape[0]
+        nodes = np.unique(np.linspace(0, columns - 1, _COLUMN_NODES).astype(int))
+        # Dense where the rate is high.
+        thickness = _THICKNESS_MM * np.linspace(0.0, 1.0, _THICKNESS_NODES) ** 1.5
+        transmitted = np.exp(-np.outer(thickness, MATERIALS["water"].attenuation(energies_kev)))
+        rates = quanta_per_s[nodes, None, :] * transmitted
+        free = np.einsum("be,nte->bnt", detector.response(energies_kev), rates)
+        recorded = recorded_rates(detector, energies_kev, rates)
+        ratio = np.log(np.concatenate([recorded / free, recorded.sum(0, keepdims=True) / free.sum(0, keepdims=True)]))
+        p = np.log(free.sum(0)[:, :1] / free.sum(0))  # (nodes, thickness)
+        scale = float(p[:, -1].min())
+        grid = np.linspace(0.0, scale, _SAMPLES)
+        # Cubic: a piecewise linear map would put steps into the slope of the water correction.
+        resampled = np.stack([[CubicSpline(p[i], r[i])(grid) for i in range(nodes.size)] for r in ratio])
+        resampled.setflags(write=False)
+        return cls(resampled, scale, np.interp(np.arange(columns), nodes, np.arange(nodes.size)))
 
     def at(self, line_integrals: Any, columns: Any) -> Floats:
         """ln(recorded / true) of every bin, ``(bins, ...)``, for true line integrals and detector columns."""
@@ -169,27 +181,3 @@ class PileUpMap:
         """What pile-up adds to the line integrals of the summed counts in a calibration, ``(columns, samples)``."""
         columns, total = np.arange(self.node.size)[:, None], self.log_ratio[-1:]
         return np.asarray(self._look_up(total, 0.0, columns)[0] - self._look_up(total, line_integrals, columns)[0])
-
-
-@functools.lru_cache(maxsize=4)
-def _map(scanner: Scanner) -> PileUpMap:
-    from scipy.interpolate import CubicSpline
-
-    detector: Any = scanner.detector
-    energies, quanta = scanner.quanta()
-    nodes = np.unique(np.linspace(0, quanta.shape[0] - 1, _COLUMN_NODES).astype(int))
-    # Dense where the rate is high.
-    thickness = _THICKNESS_MM * np.linspace(0.0, 1.0, _THICKNESS_NODES) ** 1.5
-    transmitted = np.exp(-np.outer(thickness, MATERIALS["water"].attenuation(energies)))
-    rates = quanta[nodes, None, :] * scanner.source.current_ma * transmitted  # quanta per mA·s times mA
-    free = np.einsum("be,nte->bnt", detector.response(energies), rates)
-    recorded = recorded_rates(detector, energies, rates)
-    ratio = np.log(np.concatenate([recorded / free, recorded.sum(0, keepdims=True) / free.sum(0, keepdims=True)]))
-    p = np.log(free.sum(0)[:, :1] / free.sum(0))  # (nodes, thickness)
-    scale = float(p[:, -1].min())
-    grid = np.linspace(0.0, scale, _SAMPLES)
-    # Cubic: a piecewise linear map would put steps into the slope of the water correction.
-    resampled = np.stack([[CubicSpline(p[i], r[i])(grid) for i in range(nodes.size)] for r in ratio])
-    resampled.setflags(write=False)
-    node = np.interp(np.arange(quanta.shape[0]), nodes, np.arange(nodes.size))
-    return PileUpMap(resampled, scale, node)

@@ -14,6 +14,7 @@ from torchpcct.scanner.filters import Bowtie, large_bowtie, roi_bowtie
 from torchpcct.scanner.scanner import Scanner
 from torchpcct.scanner.source import Source
 from torchpcct.scene.materials import MATERIALS
+from torchpcct.validate import choice
 
 __all__ = ["EID_OFFSET_COLUMNS", "EID_PITCH_MM", "FLAT_FILTER_MM", "PCCT_PITCH_MM", "eid", "pcct"]
 
@@ -40,8 +41,7 @@ def _bowties(name: Any, sod: float) -> tuple[Bowtie, ...]:
         return (name,)
     if not isinstance(name, str):
         return tuple(name or ())
-    if name not in _BOWTIES:
-        raise ValueError(f"bowtie must be one of {_BOWTIES} or Bowtie objects, got {name!r}")
+    choice("bowtie", name, _BOWTIES)
     large = (large_bowtie(),) if "large" in name else ()
     return (*large, roi_bowtie(sod)) if "roi" in name else large
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -12,12 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpcct.geometry import ConeBeam, full_turn
-from torchpcct.scanner.detector import Detector
-from torchpcct.scanner.filters import Bowtie
+from torchpcct.scanner.detector import Detector, SiliconDetector
+from torchpcct.scanner.filters import Bowtie, behind_filters
 from torchpcct.scanner.linearisation import WaterLinearisation
 from torchpcct.scanner.pileup import PileUpMap
 from torchpcct.scanner.source import Slabs, Source, slabs
 from torchpcct.scene.materials import MATERIALS, Material
+from torchpcct.validate import number
 
 __all__ = ["Scanner"]
 
@@ -59,9 +59,7 @@ class Scanner:
         bowties = (bowties,) if isinstance(bowties, Bowtie) else tuple(bowties or ())
         if not all(isinstance(b, Bowtie) for b in bowties):
             raise TypeError(f"bowties must be Bowtie objects, got {self.bowties!r}")
-        width = float(self.energy_bin_kev)
-        if not 0.1 <= width <= 5.0:
-            raise ValueError(f"energy_bin_kev must lie in 0.1…5 keV, got {self.energy_bin_kev!r}")
+        width = number("energy_bin_kev", self.energy_bin_kev, low=0.1, high=5.0, unit="keV")
         object.__setattr__(self, "filters", slabs("filters", self.filters))
         object.__setattr__(self, "bowties", bowties)
         object.__setattr__(self, "energy_bin_kev", width)
@@ -117,14 +115,16 @@ class Scanner:
         Raises:
             ValueError: ``exposure_s`` ≤ 0 or not finite.
         """
-        if not (math.isfinite(exposure_s) and exposure_s > 0):
-            raise ValueError(f"exposure_s must be greater than 0 s, got {exposure_s}")
-        return self.source.current_ma * exposure_s / self.geometry.views
+        return self.source.current_ma * number("exposure_s", exposure_s, positive=True, unit="s") / self.geometry.views
 
-    def air_readings(self, exposure_s: float) -> Floats:
-        """Expected reading of every cell in air, ``(bins, rows, columns)`` counts or keV."""
-        signal = self.weights()[1].sum(-1) * self.mas_per_view(exposure_s)
-        return np.asarray(signal[:, None, :] * self.row_factor[:, None])
+    def pile_up(self) -> PileUpMap | None:
+        """What pile-up makes of the expected readings at the tube's current, cached; None without a dead time.
+
+        Only what stands before the patient, the detector and the current matter, not the number of views.
+        """
+        if isinstance(self.detector, SiliconDetector) and self.detector.dead_time_ns:
+            return _pile_up(_Optics.of(self), self.detector)
+        return None
 
     def behind(self, paths: Mapping[Material, float]) -> Floats:
         """:meth:`weights` behind homogeneous slabs, material → path in mm: ``(bins, columns, E)``."""
@@ -151,7 +151,7 @@ class Scanner:
         """
         if bin is not None and not 0 <= bin < self.detector.bins:
             raise ValueError(f"bin must lie in 0…{self.detector.bins - 1}, got {bin}")
-        pile_up = PileUpMap.of(self)
+        pile_up = self.pile_up()
         if pile_up is not None and bin is not None:
             raise ValueError("single energy bins have no water correction with pile-up: calibrate the sum, bin=None")
         return _linearisation(_Optics.of(self), self.detector, float(max_mm), bin, order, pile_up)
@@ -195,12 +195,6 @@ class _Optics:
         return cls(geometry, scanner.source, scanner.filters, scanner.bowties, scanner.energy_bin_kev)
 
 
-def _read_only(*arrays: Floats) -> tuple[Floats, ...]:
-    for array in arrays:
-        array.setflags(write=False)
-    return arrays
-
-
 @functools.lru_cache(maxsize=8)
 def _quanta(optics: _Optics) -> tuple[Floats, Floats]:
     g = optics.geometry
@@ -209,12 +203,9 @@ def _quanta(optics: _Optics) -> tuple[Floats, Floats]:
     # The arc stands square to the beam; a flat detector is hit obliquely, at a greater distance.
     obliquity = np.ones_like(gamma) if g.detector == "curved" else np.cos(gamma)
     per_mm2 = (1000.0 * obliquity / g.sdd) ** 2 * obliquity
-    slab = sum((m.attenuation(spectrum.energies) * t for m, t in optics.filters), np.zeros(spectrum.energies.size))
     photons = np.multiply.outer(per_mm2 * g.pitch[0] * g.pitch[1], spectrum.fluence)
-    photons *= np.exp(-np.multiply.outer(1.0 / np.cos(gamma), slab))
-    for bowtie in optics.bowties:
-        photons *= bowtie.transmission(gamma, spectrum.energies)
-    _read_only(photons)
+    photons = behind_filters(photons, gamma, spectrum.energies, optics.filters, optics.bowties)
+    photons.setflags(write=False)
     return spectrum.energies, photons
 
 
@@ -223,8 +214,14 @@ def _weights(optics: _Optics, detector: Detector, squared: bool) -> tuple[Floats
     energies, photons = _quanta(optics)
     response = detector.variance(energies) if squared else detector.response(energies)
     weights = photons * response[:, None, :]
-    _read_only(weights)
+    weights.setflags(write=False)
     return energies, weights
+
+
+@functools.lru_cache(maxsize=4)
+def _pile_up(optics: _Optics, detector: SiliconDetector) -> PileUpMap:
+    energies, quanta = _quanta(optics)
+    return PileUpMap.calibrate(detector, energies, quanta * optics.source.current_ma)  # per mA·s times mA
 
 
 @functools.lru_cache(maxsize=16)

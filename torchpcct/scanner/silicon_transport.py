@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from torchpcct.scanner.compton import ELECTRON_REST_KEV
-from torchpcct.scanner.detector import SiliconDetector, _check
+from torchpcct.scanner.detector import SiliconDetector
 from torchpcct.scene.materials import MATERIALS
+from torchpcct.validate import choice, number, whole
 
 __all__ = ["Deposits", "Stack", "efficiency", "follow"]
 
@@ -43,9 +44,9 @@ class Stack:
     strip_pitch_mm: float = 0.35
 
     def __post_init__(self) -> None:
-        _check("sheet_pitch_mm", self.sheet_pitch_mm, 1e-3, 1e3, "mm")
-        _check("strip_pitch_mm", self.strip_pitch_mm, 1e-3, 1e3, "mm")
-        _check("foil_mm", self.foil_mm, 0.0, 0.99 * self.sheet_pitch_mm, "mm (less than the sheets' pitch)")
+        number("sheet_pitch_mm", self.sheet_pitch_mm, low=1e-3, high=1e3, unit="mm")
+        number("strip_pitch_mm", self.strip_pitch_mm, low=1e-3, high=1e3, unit="mm")
+        number("foil_mm", self.foil_mm, low=0.0, high=0.99 * self.sheet_pitch_mm, unit="mm (less than the pitch)")
 
 
 @dataclass(frozen=True)
@@ -95,9 +96,7 @@ class Deposits:
             ValueError: an unknown ``pulses``.
         """
         places = {"segment": (self.sheet, self.strip, self.segment), "strip": (self.sheet, self.strip), "photon": ()}
-        if pulses not in places:
-            raise ValueError(f"pulses must be one of {', '.join(places)}, got {pulses!r}")
-        keys = np.stack([self.photon, *places[pulses]], axis=1)
+        keys = np.stack([self.photon, *places[choice("pulses", pulses, places)]], axis=1)
         _, index = np.unique(keys, axis=0, return_inverse=True)
         index = index.reshape(-1)
         heights: Floats = np.bincount(index, self.energy_kev).astype(np.float64)
@@ -139,8 +138,7 @@ def follow(
         ValueError: no photons, a spectrum without any.
     """
     stack = stack or Stack()
-    if photons < 1:
-        raise ValueError(f"photons must be at least 1, got {photons}")
+    whole("photons", photons)
     chance = np.asarray(weights, dtype=np.float64)
     if not (np.isfinite(chance).all() and (chance >= 0).all() and chance.sum() > 0):
         raise ValueError("weights must be finite, ≥ 0 and not all 0")

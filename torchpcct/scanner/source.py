@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpcct.scene.materials import MATERIALS, Material
+from torchpcct.validate import number, numbers
 
 __all__ = ["ANODE_ANGLE_DEG", "INHERENT_ALUMINIUM_MM", "TUBE_OUTPUT", "Slabs", "Source", "Spectrum", "slabs"]
 
@@ -46,8 +46,7 @@ def slabs(name: str, value: Any) -> Slabs:
     for m, t in pairs:
         if not isinstance(m, Material):
             raise TypeError(f"{name} must hold (Material, mm) pairs, got {m!r}: use material('aluminium')")
-        if not (math.isfinite(t) and t >= 0):
-            raise ValueError(f"{name}: thickness of {m.name} must be ≥ 0 mm, got {t}")
+        number(f"{name}: thickness of {m.name}", t, low=0.0, unit="mm")
     return pairs
 
 
@@ -93,9 +92,9 @@ class Source:
             already behind ``filtration``; see :meth:`tabulated`.
 
     Raises:
-        ValueError: a value outside its range; no filtration at all (unfiltered spectra are dominated by photons below
-            10 keV, which no patient beam contains).
-        TypeError: filtration or focal spot of the wrong form.
+        ValueError: a value outside its range, a focal spot that is not two numbers; no filtration at all (unfiltered
+            spectra are dominated by photons below 10 keV, which no patient beam contains).
+        TypeError: filtration of the wrong form, a value that is no number.
     """
 
     kvp: float = 100.0
@@ -108,23 +107,11 @@ class Source:
 
     def __post_init__(self) -> None:
         set_ = object.__setattr__
-        for name, low, high, unit in (
-            ("kvp", 20.0, 150.0, "kV"),
-            ("anode_angle_deg", 3.0, 45.0, "degrees"),
-            ("current_ma", 0.0, math.inf, "mA"),
-            ("output", 0.0, math.inf, "times spekpy's output"),
-        ):
-            value = float(getattr(self, name))
-            if not (low <= value <= high and 0 < value < math.inf):
-                raise ValueError(f"{name} must be a finite number > 0 in {low:g}…{high:g} {unit}, got {value}")
-            set_(self, name, value)
-        try:
-            width, length = (float(v) for v in self.focal_spot)
-        except (TypeError, ValueError):
-            raise TypeError(f"focal_spot must be (width, length) in mm, got {self.focal_spot!r}") from None
-        if not (0 <= width < math.inf and 0 <= length < math.inf):
-            raise ValueError(f"focal_spot must be ≥ 0 mm and finite, got {self.focal_spot!r}")
-        set_(self, "focal_spot", (width, length))
+        set_(self, "kvp", number("kvp", self.kvp, low=20.0, high=150.0, unit="kV"))
+        set_(self, "anode_angle_deg", number("anode_angle_deg", self.anode_angle_deg, low=3.0, high=45.0, unit="°"))
+        set_(self, "current_ma", number("current_ma", self.current_ma, positive=True, unit="mA"))
+        set_(self, "output", number("output", self.output, positive=True, unit="times spekpy's output"))
+        set_(self, "focal_spot", numbers("focal_spot", self.focal_spot, 2, low=0.0, unit="mm"))
         set_(self, "filtration", slabs("filtration", self.filtration))
         if self.table is not None:
             set_(self, "table", _table(self.table))
@@ -159,11 +146,10 @@ class Source:
         Raises:
             ValueError: ``bin_kev`` out of range.
         """
-        if not 0.1 <= bin_kev <= 5.0:
-            raise ValueError(f"bin_kev must lie in 0.1…5 keV, got {bin_kev}")
+        width = number("bin_kev", bin_kev, low=0.1, high=5.0, unit="keV")
         if self.table is not None:
-            return _rebinned(self.table, self.output, float(bin_kev))
-        return _spectrum(self.kvp, self.anode_angle_deg, self.filtration, self.output, float(bin_kev))
+            return _rebinned(self.table, self.output, width)
+        return _spectrum(self.kvp, self.anode_angle_deg, self.filtration, self.output, width)
 
 
 def _table(value: Any) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -191,7 +177,7 @@ def _rebinned(table: tuple[tuple[float, ...], tuple[float, ...]], output: float,
 
 @functools.lru_cache(maxsize=32)
 def _bare_tube(kvp: float, anode_angle_deg: float, bin_kev: float) -> tuple[Floats, Floats]:
-    import spekpy
+    import spekpy  # loads slowly; tabulated spectra do without it
 
     # z = 100 cm and 1 mAs; spekpy counts photons per cm² and bin.
     tube = spekpy.Spek(kvp=kvp, th=anode_angle_deg, dk=bin_kev, z=100.0, mas=1.0, physics="casim")

@@ -9,16 +9,15 @@ also keep rays without any count finite; see :mod:`torchpcct.spectral.decompose_
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from torchpcct.scan import Scan
+from torchpcct.spectral.decompose_kernels import sensitivity, solve
 from torchpcct.spectral.model import SpectralModel, evaluate
-
-if TYPE_CHECKING:
-    from torchpcct.scan import Scan
 
 __all__ = ["Decomposition", "cramer_rao", "decompose", "decompose_scan", "decompose_surround", "inverse"]
 
@@ -125,8 +124,6 @@ class _Decompose(torch.autograd.Function):
         ctx: Any, counts: Tensor, model: SpectralModel, column: Any, intensity: Any, reduce_bias: bool,
         tolerance: float, box: Any,
     ) -> Any:  # fmt: skip
-        from torchpcct.spectral.decompose_kernels import solve
-
         n = counts.detach().contiguous().reshape(model.bins, -1)
         rays = column.size
         out = torch.empty((2, rays), dtype=counts.dtype)
@@ -152,8 +149,6 @@ class _Decompose(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad: Tensor, *_: Any) -> Any:
-        from torchpcct.spectral.decompose_kernels import sensitivity
-
         counts, out = ctx.saved_tensors
         model, column, intensity, reduce_bias, box = ctx.rest
         jacobian = torch.empty((2, model.bins, column.size), dtype=torch.float64)

@@ -180,7 +180,7 @@ def solve(
     energies, groups = mu.shape[1], coarse_mu.shape[1]
     for block in prange((rays + _BLOCK - 1) // _BLOCK):
         v = np.empty((6, energies))
-        coarse_v = np.empty((6, groups))
+        group_v = np.empty((6, groups))
         m = np.empty((bins, 6))
         n = np.empty(bins)
         for i in range(block * _BLOCK, min((block + 1) * _BLOCK, rays)):
@@ -198,19 +198,7 @@ def solve(
             a2 = min(max(t * direction[1], bounds[1, 0]), bounds[1, 1])
             # A few energies bring the estimate near, at a fraction of the cost; the full spectra then decide.
             a1, a2, _, _, _, _ = _iterate(
-                n,
-                s,
-                coarse_mu,
-                coarse_spectra[c],
-                coarse_v,
-                m,
-                a1,
-                a2,
-                bounds,
-                reach,
-                reduce_bias,
-                coarse_tolerance,
-                12,
+                n, s, coarse_mu, coarse_spectra[c], group_v, m, a1, a2, bounds, reach, reduce_bias, coarse_tolerance, 12
             )
             a1, a2, f11, f12, f22, count = _iterate(
                 n, s, mu, spectra[c], v, m, a1, a2, bounds, reach, reduce_bias, tolerance, limit

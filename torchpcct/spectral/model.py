@@ -11,19 +11,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchpcct.scan import Scan
+from torchpcct.scanner import Scanner
 from torchpcct.scene.materials import material
 from torchpcct.spectral.basis import Basis, pe_pvc
-
-if TYPE_CHECKING:
-    from torchpcct.scan import Scan
-    from torchpcct.scanner import Scanner
+from torchpcct.spectral.decompose_kernels import expected
 
 __all__ = ["SpectralModel"]
 
@@ -244,8 +243,6 @@ def evaluate(model: SpectralModel, line_integrals: Tensor, column: Any, intensit
 
     The derivatives λ₁, λ₂ (per mm), λ₁₁, λ₁₂, λ₂₂ (per mm²) stand in ``(5, bins, rays)``.
     """
-    from torchpcct.spectral.decompose_kernels import expected
-
     a = line_integrals.detach().to(torch.float64).reshape(2, -1).numpy()
     counts = np.empty((model.bins, column.size))
     slopes = np.empty((5, model.bins, column.size))

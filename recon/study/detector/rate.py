@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from recon.study.report import markdown_table
 from torchpcct.scanner import Scanner, SiliconDetector, presets
-from torchpcct.scanner.pileup import PileUpMap, recorded_rates
+from torchpcct.scanner.pileup import recorded_rates
 from torchpcct.scanner.silicon_transport import efficiency, follow
 from torchpcct.scene.materials import PLAQUE_MATERIALS, material
 
@@ -98,8 +98,6 @@ def pile_up(dead_ns: float) -> dict[str, Any]:
     # Line integrals of the central ray: air and body as recorded, with the correction of the ideal detector and with
     # one that was calibrated in water with pile-up on.
     body, inset = _lines(free, free), {}
-    pile = PileUpMap.of(scanner)
-    assert pile is not None
     for name, corrected in (("uncorrected", free), ("calibrated", scanner)):
         lines = _lines(scanner, corrected)
         mu, reference = corrected.water_linearisation().mu_ref, free.water_linearisation().mu_ref

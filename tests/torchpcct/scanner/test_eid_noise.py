@@ -226,8 +226,7 @@ def test_the_logarithm_is_finite_and_nearly_unbiased(clean):
     assert torch.isfinite(starved.line_integrals()).all()
 
 
-def test_exact_roi_covariance_matches_monte_carlo():
-    clean = acquire(SCENE, scanner(), region=REGION, duty=0.06, sub_rays=16)
+def test_exact_roi_covariance_matches_monte_carlo(clean):
     fbp = InsetFbp(clean, [INSET], ["standard"])
     image = axial_grid(INSET.center)
     y, x = np.meshgrid(image.axes[1] - INSET.center[1], image.axes[2] - INSET.center[2], indexing="ij")

@@ -81,13 +81,13 @@ def test_bad_tables_are_refused(energies, fluence, message):
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
-        ({"kvp": 300.0}, ValueError, "kvp must be"),
+        ({"kvp": 300.0}, ValueError, "kvp must lie"),
         ({"kvp": float("nan")}, ValueError, "kvp must be"),
         ({"current_ma": 0.0}, ValueError, "current_ma must be"),
-        ({"anode_angle_deg": 1.0}, ValueError, "anode_angle_deg must be"),
+        ({"anode_angle_deg": 1.0}, ValueError, "anode_angle_deg must lie"),
         ({"output": -1.0}, ValueError, "output must be"),
-        ({"focal_spot": (-1.0, 0.5)}, ValueError, "focal_spot must be"),
-        ({"focal_spot": 0.5}, TypeError, "width, length"),
+        ({"focal_spot": (-1.0, 0.5)}, ValueError, r"focal_spot\[0\] must be at least 0 mm"),
+        ({"focal_spot": 0.5}, ValueError, "focal_spot must be 2 numbers"),
         ({"filtration": ()}, ValueError, "filtration must not be empty"),
         ({"filtration": 2.0}, TypeError, "pairs"),
     ],
@@ -153,7 +153,7 @@ def test_bowtie_transmission_is_beer_lambert():
     [
         (lambda: Bowtie(material("aluminium"), (0.1, 0.2), (1.0, 2.0)), "increase strictly from 0"),
         (lambda: Bowtie(material("aluminium"), (0.0, 0.2, 0.1), (1.0, 2.0, 3.0)), "increase strictly"),
-        (lambda: Bowtie(material("aluminium"), (0.0, 0.2), (1.0, -2.0)), "thickness must be"),
+        (lambda: Bowtie(material("aluminium"), (0.0, 0.2), (1.0, -2.0)), "thickness_mm.* must be at least 0 mm"),
         (lambda: Bowtie(material("aluminium"), (0.0,), (1.0,)), "at least 2 nodes"),
         (lambda: roi_bowtie(626.0, diameter_mm=2000.0), "nearer to the"),
         (lambda: roi_bowtie(626.0, ramp_mm=0.0), "ramp_mm"),
@@ -314,35 +314,27 @@ def test_depth_segments_share_the_load():
     assert detector.segment_shares([30.0])[0, 0] > 1 / 3
 
 
-def test_pile_up_is_off_by_default_and_lighter_with_more_segments():
-    rates = np.array([0.0, 1e5, 1e7])
-    np.testing.assert_allclose(SiliconDetector().live_fraction(rates, [60.0], [1.0]), 1.0, rtol=1e-12)
-    one = SiliconDetector(segments=1, dead_time_ns=50.0).live_fraction(rates, [60.0], [1.0])
-    three = SiliconDetector(segments=3, dead_time_ns=50.0).live_fraction(rates, [60.0], [1.0])
-    np.testing.assert_allclose(one, 1 / (1 + rates * 50e-9), rtol=1e-12)
-    np.testing.assert_allclose(three, 1 / (1 + rates / 3 * 50e-9), rtol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"mode": "both"}, "mode must be one of"),
-        ({"thresholds_kev": ()}, "non-empty increasing"),
+        ({"mode": "both"}, "unknown mode 'both'"),
+        ({"thresholds_kev": ()}, "one number or more"),
         ({"thresholds_kev": (20.0, 10.0)}, "increasing"),
-        ({"thresholds_kev": (-5.0, 10.0)}, "≥ 0 keV"),
+        ({"thresholds_kev": (-5.0, 10.0)}, "at least 0 keV"),
         ({"length_mm": 0.0}, "length_mm must lie"),
         ({"segments": 0}, "segments must be"),
-        ({"segments": 1.5}, "segments must be"),
         ({"sigma_kev": 0.0}, "sigma_kev must lie"),
         ({"fill_factor": 1.2}, "fill_factor must lie"),
         ({"dead_layer_mm": -1.0}, "dead_layer_mm must lie"),
         ({"charge_sharing": 2.0}, "charge_sharing must lie"),
-        ({"dead_time_ns": float("nan")}, "dead_time_ns must lie"),
+        ({"dead_time_ns": float("nan")}, "dead_time_ns must be finite"),
     ],
 )
 def test_bad_silicon_is_refused(change, message):
     with pytest.raises(ValueError, match=message):
         SiliconDetector(**change)
+    with pytest.raises(TypeError, match="segments must be a whole number"):
+        SiliconDetector(segments=1.5)
 
 
 # --- scintillator -------------------------------------------------------------------------------------------------
