@@ -164,7 +164,7 @@ def test_plan_models_only_what_the_scene_needs(plaque):
 
 def test_the_plan_says_what_the_detector_does():
     """Pile-up and charge sharing are modelled exactly if the detector has them, and then the readings show it."""
-    system = scanner(2, 1)
+    system = presets.pcct(views=2, rows=1, columns=100, energy_bin_kev=5.0)
 
     def scan(**changes):
         detector = replace(system.detector, **changes)
