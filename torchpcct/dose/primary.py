@@ -29,7 +29,7 @@ from torchpcct.geometry import VolumeGrid
 from torchpcct.scanner import Scanner
 from torchpcct.scene import Scene
 from torchpcct.scene.chords import interval
-from torchpcct.scene.scene import resolve_material
+from torchpcct.scene.materials import material
 from torchpcct.validate import choice, number, whole
 
 __all__ = ["QUANTITIES", "plane_points", "primary_dose"]
@@ -165,7 +165,7 @@ def primary_dose(
         media = list(scene.materials)
     else:
         labels = np.zeros(points.shape[:-1], dtype=np.int64)
-        media = [resolve_material(medium)]
+        media = [material(medium)]
     per_gram = mass_energy_absorption if quantity == "absorbed" else mass_interaction
     deposit = np.stack([per_gram(m, energies) * energies for m in media]) * MGY_PER_KEV_PER_G
 

@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from torchpcct import ConeBeam, full_turn
+from torchpcct.acquisition.bodies import BodySet
 from torchpcct.acquisition.path_lengths import tissue_path_lengths
-from torchpcct.acquisition.transmission import Beam, BodySet, expected_readings, sub_rays
+from torchpcct.acquisition.transmission import Beam, expected_readings, sub_rays
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.scene import Body, Ellipsoid, EllipticCylinder, Scene, SinusoidalMotion
 from torchpcct.scene.chords import pack
