@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from recon.study.paper.measures import PlaqueImage
@@ -10,7 +11,7 @@ from torchpcct.metrics.placement import RoiPair
 from torchpcct.metrics.roi import PROTOCOL_PIXEL_MM
 from torchpcct.viz import Panel
 
-__all__ = ["extent", "middle_panel", "plaque_panel", "roi_outlines"]
+__all__ = ["curve_axes", "extent", "middle_panel", "plaque_panel", "roi_outlines"]
 
 _SHOWN_PX = 160
 """Edge of the middle of an image of the protocol's pixels that shows the vessel and its surroundings."""
@@ -33,7 +34,7 @@ def _middle(image: Any) -> Any:
 
 
 def middle_panel(image: Any, title: str = "", **more: Any) -> Panel:
-    """The vessel and its surroundings in an image of the protocol's pixels; ``more``: of :class:`torchpcct.viz.Panel`."""
+    """The vessel and its surroundings in an image of the protocol's pixels; ``more``: other fields of the panel."""
     half = 0.5 * PROTOCOL_PIXEL_MM * _SHOWN_PX
     return Panel(_middle(image), (-half, half, -half, half), title, **more)
 
@@ -43,3 +44,16 @@ def plaque_panel(found: PlaqueImage, title: str = "", caption: str = "") -> Pane
     s = found.segmentation
     outlines = [(_middle(s.lumen), "tomato"), *([(_middle(s.core), "gold")] if s.core_found else [])]
     return middle_panel(found.image, title, outlines=outlines, caption=caption)
+
+
+def curve_axes(x_label: str, y_labels: Sequence[str]) -> tuple[Any, Any]:
+    """A matplotlib figure of curves over one x, side by side, and its axes: one for every label."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(4.0 * len(y_labels), 3.8), dpi=130, layout="constrained")
+    axes = figure.subplots(1, len(y_labels))
+    for ax, label in zip(axes, y_labels, strict=True):
+        ax.set_xlabel(x_label)
+        ax.set_ylabel(label)
+        ax.grid(alpha=0.3)
+    return figure, axes

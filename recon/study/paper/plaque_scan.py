@@ -40,7 +40,7 @@ REFERENCE_VOXEL_MM = 0.10
 REFERENCE_KERNEL = "standard"
 """Of the noise-free image that the ROIs are checked on."""
 
-SCANNERS = {"PCCT": presets.pcct, "EID-CT": presets.eid}
+SCANNERS: dict[str, Callable[..., Scanner]] = {"PCCT": presets.pcct, "EID-CT": presets.eid}
 """The paper's two scanners: name → preset, called with the number of views."""
 
 
