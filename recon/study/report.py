@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -13,7 +14,12 @@ import numpy as np
 
 from torchpcct.files import written_whole
 
-__all__ = ["Report", "markdown_table"]
+__all__ = ["Report", "markdown_table", "or_dash"]
+
+
+def or_dash(value: float, digits: int) -> str:
+    """A table's cell: the value, or a dash for NaN."""
+    return "–" if math.isnan(value) else f"{value:.{digits}f}"
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
