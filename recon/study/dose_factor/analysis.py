@@ -50,7 +50,7 @@ from torchpcct.metrics import (
     sd_interval,
     task_transfer,
 )
-from torchpcct.metrics.dose_factor import DOSES
+from torchpcct.metrics.dose_curve import DOSES
 
 __all__ = ["ASSUMED_FACTOR", "Analysis", "analyse"]
 

@@ -13,7 +13,7 @@ from recon.study.dose_factor.methods import METHOD_NAMES
 from recon.study.dose_factor.scene import StudyScene
 from recon.study.dose_factor.settings import FBP_BASE
 from recon.study.paper.plaque_scan import inset_grid
-from torchpcct.metrics.dose_factor import DOSES
+from torchpcct.metrics.dose_curve import DOSES
 from torchpcct.metrics.roi import sample_axial
 from torchpcct.viz import Panel, panels
 
