@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any
 
 from recon.study.dose_factor.measures import LUMEN_HALF_HU, OBSERVERS
@@ -60,7 +60,7 @@ def at_dose(data: dict[str, Any], dose: float) -> list[dict[str, Any]]:
     return [e for e in data["methods"] if e["exposure_s"] == dose]
 
 
-def text(e: Any, digits: int = 2, unit: str = "") -> str:
+def text(e: Any, digits: int = 2) -> str:
     """Value and interval; a figure that is out of range or missing says so."""
     if e is None:
         return "–"
@@ -68,7 +68,7 @@ def text(e: Any, digits: int = 2, unit: str = "") -> str:
         return str(e["text"])
     if e.get("value") is None:
         return "–"
-    value = f"{e['value']:.{digits}f}{unit}"
+    value = f"{e['value']:.{digits}f}"
     if e.get("low") is None and e.get("high") is None:
         return value
     low, high = (("−∞", "∞")[k] if e[n] is None else f"{e[n]:.{digits}f}" for k, n in enumerate(("low", "high")))
@@ -78,10 +78,6 @@ def text(e: Any, digits: int = 2, unit: str = "") -> str:
 def _percent(e: dict[str, Any]) -> str:
     """A share with its interval."""
     return text({k: None if v is None else 100 * v for k, v in e.items() if k != "why"}, 0)
-
-
-def _section(title: str, about: str, header: Sequence[str], rows: list[list[str]]) -> str:
-    return f"## {title}\n\n{about}\n\n{markdown_table(header, rows)}"
 
 
 def _name(e: dict[str, Any]) -> str:
@@ -174,13 +170,11 @@ def _shape_limit_table(data: dict[str, Any]) -> str:
         return ""
     rows = [
         [
-            f"{e['exposure_s']:g} s, {e['displacement_mm']:g} mm",
-            f"{e['contrast_sd_hu']:.1f}",
-            f"{100 * e['share']:.0f}",
-            f"{e['factor']:.1f}",
+            f"{e['exposure_s']:g} s, {e['displacement_mm']:g} mm", f"{e['contrast_sd_hu']:.1f}",
+            f"{100 * e['share']:.0f}", f"{e['factor']:.1f}",
         ]
         for e in data["shape_limits"]
-    ]
+    ]  # fmt: skip
     return (
         "## What not knowing the shapes costs\n\nThe limit takes every outline as known. Here all outlines are "
         "displaced along their normals by a smooth random field of the given standard deviation (correlation "
@@ -204,7 +198,7 @@ def _wide_table(entry: dict[str, Any]) -> str:
         if e["exact"]:
             c = e["limit_factors"]
             name = f"{e['method']}, exact"
-            cells = [f"≤ {c[k]:.1f}{'' if c[k] >= ASSUMED_FACTOR else ' (below 5.7)'}" for k in c]
+            cells = [f"≤ {c[k]:.1f}{'' if c[k] >= ASSUMED_FACTOR else f' (below {ASSUMED_FACTOR})'}" for k in c]
         else:
             name, f = METHOD_NAMES[e["method"]], e["factors"]
             cells = [text(f[k]) for k in ("paper_cnr", "contrast_variance")]
@@ -228,8 +222,7 @@ def _voxel_table(data: dict[str, Any]) -> str:
     rows = [
         [
             f"{e['exposure_s']:g} s, {e['voxel_mm']:.2f} mm", text(e["paper_cnr"]), text(e["slope"], 3),
-            *(text(b, 1) for b in e["bias_hu"]), text(e["contrast_sd_hu"], 1),
-            _percent(e["efficiency"]),
+            *(text(b, 1) for b in e["bias_hu"]), text(e["contrast_sd_hu"], 1), _percent(e["efficiency"]),
         ]
         for e in sorted(data["other_voxels"], key=lambda e: e["exposure_s"])
     ]  # fmt: skip
@@ -241,16 +234,10 @@ def _voxel_table(data: dict[str, Any]) -> str:
 
 
 def _resolution_table(data: dict[str, Any]) -> str:
-    rows = []
-
-    def row(name: str, r: dict[str, Any]) -> list[str]:
-        cells = [r.get(k) for k in ("edge_width_mm", "f50_lp_mm", "f10_lp_mm")]
-        return [name, *("–" if v is None else f"{v:.2f}" for v in cells)]
-
-    for f in data["fbp"]:
-        rows.append(row(f"FBP {f['label']}", f["resolution"]))
-    for e in data["methods"]:
-        rows.append(row(_name(e), e["resolution"]))
+    entries = [(f"FBP {f['label']}", f["resolution"]) for f in data["fbp"]]
+    entries += [(_name(e), e["resolution"]) for e in data["methods"]]
+    keys = ("edge_width_mm", "f50_lp_mm", "f10_lp_mm")
+    rows = [[name, *("–" if r.get(k) is None else f"{r[k]:.2f}" for k in keys)] for name, r in entries]
     return (
         "## Resolution at the core's own contrast\n\nEdge of the core in the ensemble mean, present minus absent.\n\n"
         + markdown_table(["", "10–90 % width, mm", "f50, lp/mm", "f10, lp/mm"], rows)
@@ -303,10 +290,9 @@ def _shape_table(data: dict[str, Any]) -> str:
         ]  # fmt: skip
 
     for e in data["methods"]:
-        name = _name(e)
         if "fbp_shape" in e and e is at_dose(data, e["exposure_s"])[0]:
             rows.append([f"FBP {BASE}, {e['exposure_s']:g} s", *cells(e["fbp_shape"])])
-        rows.append([name, *cells(e["shape"])])
+        rows.append([_name(e), *cells(e["shape"])])
     header = ["", "lumen at 250 HU, |error|, mm²", "at half maximum", "lost, %", "cap |error|, mm", "lost, %"]
     return (
         "## Lumen area and cap thickness in single realisations\n\n"

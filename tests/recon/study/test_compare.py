@@ -1,17 +1,13 @@
-"""The compare study and the command line, end to end at small scale."""
-
-import json
+"""The comparison at small scale, and the ROIs that it measures in."""
 
 import numpy as np
 import pytest
 from tiny_studies import TINY, assert_report_is_whole
 
-from recon.cli import main
 from recon.study.compare.measure import measure
 from recon.study.compare.settings import Settings
 from recon.study.paper.plaque_scan import inset_grid
 from recon.study.report import markdown_table
-from torchpcct import Volume
 from torchpcct.metrics.placement import RoiRule, place_rois
 from torchpcct.metrics.roi import axial_grid
 from torchpcct.scene.plaque import plaque_scene
@@ -54,44 +50,3 @@ def test_rois_lie_inside_their_tissues():
     assert rois.background.sum() < rois.foreground.sum()
     with pytest.raises(ValueError, match="foreground ROI is empty"):
         place_rois(scene, image, rule=RoiRule(core_margin=3.0))
-
-
-def test_command_line_simulate_and_reconstruct(tmp_path, capsys):
-    scan, volume = tmp_path / "scan.h5", tmp_path / "plaque.nii.gz"
-    assert main(["simulate", "--views", "48", "--exposure", "2", "--seed", "3", "--out", str(scan)]) == 0
-    assert json.loads(capsys.readouterr().out)["seed"] == 3
-    assert main(["reconstruct", str(scan), "--kernel", "soft", "--voxel", "0.4", "--out", str(volume)]) == 0
-    summary = json.loads(capsys.readouterr().out)
-    assert summary["method"] == "fbp"
-    assert json.loads((tmp_path / "plaque.nii.gz.json").read_text()) == summary
-    assert volume.exists()
-    h5 = tmp_path / "plaque.h5"
-    assert main(["reconstruct", str(scan), "--voxel", "0.4", "--out", str(h5)]) == 0
-    assert Volume.load(h5).grid.spacing == (0.4, 0.4, 0.4)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["simulate", "--exposure", "0", "--out", "{tmp}/a.h5"], "exposure_s"),
-        (["simulate", "--seed", "-1", "--exposure", "1", "--out", "{tmp}/a.h5"], "seed"),
-        (["simulate", "--out", "{tmp}/none/a.h5"], "does not exist"),
-        (["reconstruct", "{tmp}/none.h5", "--out", "{tmp}/a.h5"], "none.h5"),
-        (["reconstruct", "{tmp}/none.h5", "--out", "{tmp}/a.png"], "unknown volume format"),
-        (["compare", "--realizations", "2", "--out", "{tmp}/o"], "realizations"),
-    ],
-)
-def test_command_line_refuses_bad_input_and_writes_nothing(tmp_path, capsys, arguments, message):
-    assert main([a.format(tmp=tmp_path) for a in arguments]) == 2
-    assert message in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("command", ["compare", "simulate", "reconstruct"])
-def test_help(command, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main([command, "--help"])
-    assert stop.value.code == 0
-    text = capsys.readouterr().out
-    for flag in ("--seed", "--device", "--out"):
-        assert flag in text
