@@ -25,6 +25,7 @@ from recon.study.paper.plaque_scan import (
     Functional,
     PlaqueScan,
     duty,
+    equal_dose,
     prepare,
 )
 from recon.study.resolution.blur import FWHM_PER_SIGMA, Blurred, blur_series
@@ -142,8 +143,7 @@ def _image(
     scene, plaque = bodies
     scanner = SCANNERS[name](FULL_VIEWS[name] // settings.thinning)
     on = duty(scanner, FULL_VIEWS[name])
-    # The spectrum is the same: equal fluence at the isocentre asks for an exposure by the square of the distance.
-    exposure_s = settings.exposure_s * (scanner.geometry.sod / SCANNERS["PCCT"](8).geometry.sod) ** 2
+    exposure_s = settings.exposure_s * equal_dose(scanner)
     scanned = prepare([REFERENCE_KERNEL], [REFERENCE_VOXEL_MM], bodies, scanner, FULL_VIEWS[name], progress)
     volume = scanned.fbp(scanned.clean)[0][0]
     core, fibrous = (float(r(volume)) for r in scanned.pairs[0])
