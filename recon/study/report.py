@@ -61,6 +61,11 @@ class Report:
     text: str
     figures: dict[str, Any] = field(default_factory=dict)
 
+    def made_by(self, command: str) -> None:
+        """Add the command that repeats the study to values and text."""
+        self.data["command"] = command
+        self.text += f" Command: `{command}`."
+
     def save(self, folder: str | os.PathLike[str]) -> list[Path]:
         """Write ``report.json``, ``report.md`` and the figures into ``folder`` (made if need be).
 

@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from torchpcct.scanner import presets
+
 __all__ = [
     "BACKGROUND",
     "BOWTIE",
@@ -22,18 +24,21 @@ __all__ = [
     "KERNELS",
     "NOISE_FREE_ROI_HU",
     "REALIZATIONS",
+    "ROTATION_S",
     "SPECTRAL",
     "TABLE_EXPOSURE_S",
     "VOXELS_MM",
     "table_exposure",
 ]
 
-FULL_VIEWS = {"PCCT": 1968, "EID-CT": 984}
+FULL_VIEWS = {"PCCT": presets.PCCT_VIEWS, "EID-CT": presets.EID_VIEWS}
 """Views per rotation, by the scanner's name. A study with fewer views stands for the same scan, thinned out."""
+
+ROTATION_S = 0.35
 
 KERNELS = ("soft", "standard", "detail", "bone")
 VOXELS_MM = (0.20, 0.25, 0.30, 0.35, 0.40)
-DOSES = {"1x": 0.35, "2x": 0.70, "5.7x": 2.00, "8x": 2.80}
+DOSES = {"1x": ROTATION_S, "2x": 0.70, "5.7x": 2.00, "8x": 2.80}
 """Exposure (one rotation) in s of each dose level, at 1000 mA."""
 
 TABLE_EXPOSURE_S = 2.00

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.fbp.channels import ChannelFbp, static_fbp
-from recon.study.compare.measure import inset_grid
+from recon.study.paper.plaque_scan import inset_grid
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.acquisition.plan import Effect
 from torchpcct.detector_window import DetectorWindow, shadow
