@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from recon.study.compare.measure import PWLS, Measured
+from recon.study.figures import extent, roi_outlines
 from recon.study.paper import facts as paper
 from recon.study.paper.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM
 from torchpcct.geometry import VolumeGrid
@@ -21,7 +22,6 @@ def sections_figure(m: Measured) -> Any:
     columns = [("noise free\nstandard 0.10 mm", ("noise free", REFERENCE_KERNEL, REFERENCE_VOXEL_MM))]
     columns += [(f"FBP {kernel}\n{voxel:.2f} mm", ("fbp", kernel, voxel)) for kernel in s.kernels]
     columns.append((f"PWLS {PWLS[1]}\n{voxel:.2f} mm", (*PWLS, voxel)))
-    outlines = ((m.rois.foreground[0], "deepskyblue"), (m.rois.background[0], "tomato"))
     z, y, x = image.center
     pixel = image.spacing[1]
     section = VolumeGrid((int(8.75 / pixel), 1, image.shape[2]), pixel, (z, y, x))
@@ -31,17 +31,11 @@ def sections_figure(m: Measured) -> Any:
             continue
         volume, grid = m.images[key], m.grids[key[2]]
         axial = sample_axial(volume, grid, image)[0]
-        rows[0].append(Panel(axial, _extent(image, 1, 2), title, () if rows[0] else outlines))
-        rows[1].append(Panel(sample_axial(volume, grid, section)[:, 0], _extent(section, 0, 2)))
+        rows[0].append(Panel(axial, extent(image), title, () if rows[0] else roi_outlines(m.rois)))
+        rows[1].append(Panel(sample_axial(volume, grid, section)[:, 0], extent(section, 0, 2)))
     return panels(
         rows,
         ("axial", "sagittal (x–z)"),
         f"Plaque, deep-silicon PCCT, {paper.table_exposure(s.doses):g} s, one realisation",
         "C150 / W600 HU. ROI outlines: necrotic core (blue), fibrous tissue (red).",
     )
-
-
-def _extent(grid: VolumeGrid, vertical: int, horizontal: int) -> tuple[float, float, float, float]:
-    """Edges of an image in mm about the plaque's centre, as matplotlib wants them."""
-    h, v = grid.extent[horizontal] / 2, grid.extent[vertical] / 2
-    return (-h, h, -v, v)

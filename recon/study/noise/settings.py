@@ -7,7 +7,6 @@ from typing import Any, ClassVar
 
 from recon.study.paper import facts as paper
 from recon.study.study import StudySettings
-from torchpcct.validate import whole
 
 __all__ = ["Settings"]
 
@@ -53,9 +52,7 @@ class Settings(StudySettings):
     }
 
     def __post_init__(self) -> None:
-        least = {"realizations": 10, "seed": 0, "views": 8, "reconstructed": 1, "experiments": 100}
-        for name, low in least.items():
-            whole(name, getattr(self, name), low)
+        self.check_whole(realizations=10, seed=0, views=8, reconstructed=1, experiments=100)
         if len(self.kernels) * len(self.voxels_mm) < 2:
             raise ValueError("a ranking needs at least two settings: give more kernels or voxels_mm")
         if len(self.doses) < 2:
