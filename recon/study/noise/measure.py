@@ -96,7 +96,7 @@ class Measured:
         return np.polyfit(x, 0.5 * np.log(np.array(list(self.variances.values()))), 1)[0]
 
 
-def measure(settings: Settings, progress: Progress = silent, folder: Path | None = None) -> Measured:
+def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
     """Simulate, take exact moments, draw realisations, reconstruct a few in full; keeps no pieces."""
     clock = Clock()
     scene = plaque_scene()

@@ -134,7 +134,7 @@ class Measured:
         return {name: float(self.plaque.area(name, 0.0)) for name in ("lumen", "core")}
 
 
-def measure(settings: Settings, progress: Progress = silent, folder: Path | None = None) -> Measured:
+def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
     """Simulate, blur, segment, measure; keeps no pieces."""
     clock = Clock()
     scene, plaque = plaque_scene()

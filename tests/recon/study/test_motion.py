@@ -69,7 +69,7 @@ def test_eid_is_less_sensitive(tiny):
 
 def test_report(tiny, tmp_path):
     study = tiny("motion")
-    sections = ("one view in 12", "wrong by 20 %", "## Agreement with the paper", "## What was modelled")
+    sections = ("one view in 24", "wrong by 20 %", "## Agreement with the paper", "## What was modelled")
     data = assert_report_is_whole(study, tmp_path, {"motion.png", "motion_images.png"}, sections)
     assert {"range [0, A]", "EID-CT less sensitive"} <= {c["paper"] for c in data["checks"]}
     assert len(data["residual"]) == 3
