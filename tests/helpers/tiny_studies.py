@@ -24,14 +24,14 @@ TINY: dict[str, dict[str, Any]] = {
         "plaque_realizations": 4,
     },
     "motion": {
-        "thinning": 12, "fractions": (0.2, 1.0), "eid_fractions": (0.2,), "errors": (0.2,), "voxel_mm": 0.4,
+        "thinning": 24, "fractions": (0.2, 1.0), "eid_fractions": (0.2,), "errors": (0.2,), "voxel_mm": 0.4,
         "realizations": 1, "exposure_s": 20.0, "methods": ("fbp", "pwls"),
     },
     "noise": {
         "realizations": 24, "views": 48, "kernels": ("soft", "bone"), "voxels_mm": (0.25, 0.40),
         "doses": {"1x": 0.35, "5.7x": 2.0}, "reconstructed": 2, "experiments": 500,
     },
-    "resolution": {"thinning": 16, "sigmas_px": (0.0, 3.75, 10.0)},
+    "resolution": {"thinning": 32, "sigmas_px": (0.0, 3.75, 10.0), "bulges_mm": ()},
     "spectral": {
         "views": 60, "voxel_mm": 0.4, "realizations": 2, "mbir_realizations": 1, "noise_levels": (0.0, 1.0),
         "starved_rays": 300,

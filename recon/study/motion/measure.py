@@ -52,7 +52,7 @@ class Measured:
         return {fraction: pair for (name, fraction), pair in self.residual.items() if name == scanner}
 
 
-def measure(settings: Settings, progress: Progress = silent, folder: Path | None = None) -> Measured:
+def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
     """Simulate and reconstruct residual motion in both scanners, and compensate the PCCT's; keeps no pieces."""
     clock = Clock()
     m = Measured(settings, seconds=clock.seconds)

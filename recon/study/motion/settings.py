@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 from recon.study.paper import facts as paper
 from recon.study.study import StudySettings
 from torchpcct.scene.motion import SinusoidalMotion
-from torchpcct.validate import number, whole
+from torchpcct.validate import number
 
 __all__ = ["METHODS", "Settings"]
 
@@ -41,7 +41,7 @@ class Settings(StudySettings):
     thinning: int = 1
     amplitude_mm: float = 2.0
     rate_bpm: float = 60.0
-    rotation_s: float = 0.35
+    rotation_s: float = paper.ROTATION_S
     direction: float = 0.0
     fractions: tuple[float, ...] = paper.MOTION["fractions"]
     eid_fractions: tuple[float, ...] = paper.MOTION["eid_fractions"]
@@ -62,8 +62,7 @@ class Settings(StudySettings):
     }
 
     def __post_init__(self) -> None:
-        for name, least in (("thinning", 1), ("realizations", 1), ("seed", 0)):
-            whole(name, getattr(self, name), least)
+        self.check_whole(thinning=1, realizations=1, seed=0)
         for name in ("amplitude_mm", "rate_bpm", "rotation_s", "voxel_mm", "exposure_s"):
             number(name, getattr(self, name), positive=True)
         for name in ("fractions", "eid_fractions", "errors"):

@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.fbp.inset import InsetFbp
@@ -28,6 +30,7 @@ __all__ = [
     "PlaqueScan",
     "duty",
     "enclosing",
+    "equal_dose",
     "inset_grid",
     "prepare",
     "roi_entry",
@@ -56,6 +59,13 @@ def inset_grid(plaque: Plaque, voxel_mm: float) -> VolumeGrid:
 def duty(scanner: Scanner, full_views: int) -> float:
     """Share of a view's time with the beam on: fewer views than ``full_views`` stand for the same scan, thinned out."""
     return min(1.0, scanner.geometry.views / full_views)
+
+
+def equal_dose(scanner: Scanner) -> float:
+    """Exposure of a scanner over that of the PCCT at equal dose: equal fluence at the isocentre.
+
+    The spectrum in front of the patient is the same, so it falls with the square of the tube's distance."""
+    return float((scanner.geometry.sod / presets.pcct(8).geometry.sod) ** 2)
 
 
 @dataclass(frozen=True)
@@ -90,6 +100,16 @@ class PlaqueScan:
     pairs: list[Any]
     rois: RoiPair
     fbp: InsetFbp
+
+    def roi_means(self, volumes: Sequence[Tensor]) -> NDArray[np.float64]:
+        """``(S, 2)`` HU, the two ROI means of what ``fbp`` gives: all grids and kernels, the grid varying slowest."""
+        return np.array(
+            [
+                [float(roi(volume)) for roi in pair]
+                for pair, grid in zip(self.pairs, volumes, strict=True)
+                for volume in grid
+            ]
+        )
 
 
 def prepare(

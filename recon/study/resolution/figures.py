@@ -2,27 +2,38 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
+from torch import Tensor
 
 from recon.study.figures import curve_axes, middle_panel, plaque_panel
 from recon.study.paper import facts as paper
 from recon.study.resolution.blur import blur
-from recon.study.resolution.measure import Measured
+from recon.study.resolution.measure import Imaged, Measured
+from torchpcct.geometry import VolumeGrid
+from torchpcct.metrics.roi import PROTOCOL_PIXEL_MM, sample_axial
 from torchpcct.viz import panels
 
 __all__ = ["curves_figure", "images_figure"]
 
 
+def _sagittal(s: Imaged) -> Tensor:
+    """``(z, x)`` HU through core and lumen, in the protocol's pixels."""
+    image, high = s.scanned.rois.image, math.floor(s.scanned.fine.extent[0] / PROTOCOL_PIXEL_MM)
+    cut = VolumeGrid((high, 1, image.shape[2]), PROTOCOL_PIXEL_MM, image.center)
+    return sample_axial(s.volume.double(), s.scanned.fine, cut)[:, 0]
+
+
 def images_figure(m: Measured) -> Any:
     """First row: both scanners; second: PCCT under blur with its segmentation; third: the same, along the vessel."""
-    p = m.scanners["PCCT"]
+    series = m.scanners["PCCT"].blurred
     top = []
     for name, s in m.scanners.items():
-        top += [middle_panel(s.axial, f"{name}, axial"), middle_panel(s.sagittal, "along the vessel")]
-    middle = [plaque_panel(b, f"σ = {b.sigma_px:g}", f"{b.fwhm_mm:.2f} mm") for b in p.blurred]
-    bottom = [middle_panel(blur(p.sagittal, b.sigma_px)) for b in p.blurred]
+        top += [middle_panel(s.blurred[0].image, f"{name}, axial"), middle_panel(_sagittal(s), "along the vessel")]
+    middle = [plaque_panel(b, f"σ = {b.sigma_px:g}", f"{b.fwhm_mm:.2f} mm") for b in series]
+    bottom = [middle_panel(blur(_sagittal(m.scanners["PCCT"]), b.sigma_px)) for b in series]
     return panels(
         [top, middle, bottom], ("no blur", "PCCT axial", "PCCT along"),
         "Noise-free plaque in different resolutions",

@@ -13,7 +13,7 @@ from recon.study.paper import facts as paper
 from recon.study.report import Report, markdown_table, or_dash
 from recon.study.resolution.blur import FWHM_PER_SIGMA, limits
 from recon.study.resolution.figures import curves_figure, images_figure
-from recon.study.resolution.measure import Imaged, Measured
+from recon.study.resolution.measure import Measured, RoiFigures
 from recon.study.study import environment, time_line
 from torchpcct.acquisition.plan import Effect
 from torchpcct.metrics.roi import PROTOCOL_PIXEL_MM
@@ -35,7 +35,7 @@ def build_report(m: Measured) -> Report:
         "study": "resolution",
         "settings": asdict(m.settings),
         "truth": {**{f"{k}_mm2": v for k, v in m.true_mm2.items()}, "cap_mm": m.plaque.cap_thickness},
-        "scanners": {name: _entry(s) for name, s in m.scanners.items()},
+        "scanners": {name: _entry(m, name) for name in m.scanners},
         "limits_px": found,
         "margin_fwhm_mm": margin,
         "final_fwhm_mm": final,
@@ -68,15 +68,22 @@ def build_report(m: Measured) -> Report:
     return Report("resolution", data, "\n\n".join(sections), figures)
 
 
-def _entry(s: Imaged) -> dict[str, Any]:
+def _entry(m: Measured, name: str) -> dict[str, Any]:
+    s, f = m.scanners[name], m.smoothed
+    smoothed = {
+        "sigma_mm": m.smoothed_sigma_mm,
+        "contrast_hu": f.contrast_hu,
+        "own_contrast_hu": f.own_contrast_hu,
+        "sd_hu": f.sd_hu,
+    }
     return {
-        "roi_hu": s.roi_hu,
-        "empty_hu": s.empty_hu,
-        "own_contrast_hu": s.own_contrast_hu,
-        "contrast_sd_hu": s.sd_hu,
-        "cnr": s.contrast_hu / s.sd_hu,
-        "own_cnr": s.own_contrast_hu / s.sd_hu,
-        "smoothed": None if s.smoothed is None else asdict(s.smoothed),
+        "roi_hu": s.rois.roi_hu,
+        "empty_hu": s.rois.empty_hu,
+        "own_contrast_hu": s.rois.own_contrast_hu,
+        "contrast_sd_hu": s.rois.sd_hu,
+        "cnr": s.rois.cnr,
+        "own_cnr": s.rois.own_cnr,
+        "smoothed": smoothed if name == "PCCT" else None,
         "exposure_s": s.exposure_s,
         "fwhm_mm": asdict(s.width),
         "blurred": [b.as_dict() for b in s.blurred],
@@ -85,8 +92,7 @@ def _entry(s: Imaged) -> dict[str, Any]:
 
 
 def _checks(m: Measured, found: dict[str, Any], final: float) -> list[Check]:
-    p, published = m.scanners["PCCT"], paper.RESOLUTION
-    e = m.scanners["EID-CT"]
+    p, e, published = m.scanners["PCCT"], m.scanners["EID-CT"], paper.RESOLUTION
     (last, lost), cap = published["last_kernels_px"], published["cap_limit_px"]
     areas = np.array([b.segmentation.lumen_area for b in p.blurred])
     core, fibrous = paper.NOISE_FREE_ROI_HU["foreground"], paper.NOISE_FREE_ROI_HU["background"]
@@ -95,15 +101,17 @@ def _checks(m: Measured, found: dict[str, Any], final: float) -> list[Check]:
     thin_side = "; ".join(
         f"{shell:.2f} mm of fibrous tissue between core and wall: {_lost_at(x, 'σ = ')}" for shell, x in shells.items()
     )
-    own = e.own_contrast_hu / p.own_contrast_hu
+    own, roi_hu = e.rois.own_contrast_hu / p.rois.own_contrast_hu, p.rois.roi_hu
     coarse = (
         f"the contrast falls to {100 * own:.0f} %, the noise of the ROI means "
-        f"to {100 * e.sd_hu / p.sd_hu:.0f} %: the coarse cells pass little of the noise either{_same_blur(p)}"
+        f"to {100 * e.rois.sd_hu / p.rois.sd_hu:.0f} %: the coarse cells pass little of the noise either. The PCCT "
+        f"blurred to the EID-CT's resolution: contrast of the core {m.smoothed.own_contrast_hu:.1f} HU, CNR "
+        f"{m.smoothed.own_cnr:.2f}"
     )
     return [
-        around("PCCT core ROI, HU", p.roi_hu[0], core, 8.0),
-        around("PCCT fibrous ROI, HU", p.roi_hu[1], fibrous, 8.0),
-        Check("PCCT fibrous ROI below 100 HU through the blur of edges", p.roi_hu[1], fibrous, high=100.0),
+        around("PCCT core ROI, HU", roi_hu[0], core, 8.0),
+        around("PCCT fibrous ROI, HU", roi_hu[1], fibrous, 8.0),
+        Check("PCCT fibrous ROI below 100 HU through the blur of edges", roi_hu[1], fibrous, high=100.0),
         Check("core's boundary visible (half of its basin's depth), up to σ, px", found["basin"],
               f"{last:g} … {lost:g}", last - _STEP_PX, lost + _STEP_PX),
         around("first blur at which the band 20–60 HU joins the rim, σ, px", joined, lost, _STEP_PX).explained(
@@ -119,24 +127,13 @@ def _checks(m: Measured, found: dict[str, Any], final: float) -> list[Check]:
         Check("EID-CT: depth of the core's basin, HU", e.blurred[0].depth, "boundary not resolved", high=1.0),
         Check("EID-CT: contrast that the core makes, over the PCCT's", own, "hardly discernible", high=0.5),
         Check("EID-CT: CNR that the core makes, over the PCCT's at equal fluence",
-              e.own_contrast_hu / e.sd_hu / (p.own_contrast_hu / p.sd_hu), "hardly discernible",
-              high=0.5).explained(coarse),
+              e.rois.own_cnr / p.rois.own_cnr, "hardly discernible", high=0.5).explained(coarse),
     ]  # fmt: skip
 
 
 def _lost_at(found: dict[str, Any], prefix: str = "") -> str:
     """The first blur at which the core is not segmented."""
     return "never" if found["core_lost"] is None else f"{prefix}{found['core_lost']:g}"
-
-
-def _same_blur(p: Imaged) -> str:
-    if p.smoothed is None:
-        return ""
-    s = p.smoothed
-    return (
-        f". The PCCT blurred to the EID-CT's resolution: contrast of the core {s.own_contrast_hu:.1f} HU, CNR "
-        f"{s.own_contrast_hu / s.sd_hu:.2f}"
-    )
 
 
 def _intro(m: Measured, found: dict[str, Any], margin: float, final: float) -> str:
@@ -159,25 +156,13 @@ def _intro(m: Measured, found: dict[str, Any], margin: float, final: float) -> s
 def _scanners_section(m: Measured) -> str:
     rows = []
     for name, s in m.scanners.items():
-        b = s.blurred[0]
-        rows.append(
-            [
-                name,
-                f"{s.width.area:.3f} ({s.width.radial:.3f} / {s.width.tangential:.3f})",
-                f"{s.roi_hu[0]:.1f} / {s.roi_hu[1]:.1f}",
-                f"{s.contrast_hu:.1f} ({s.own_contrast_hu:.1f})",
-                f"{s.contrast_hu / s.sd_hu:.2f} ({s.own_contrast_hu / s.sd_hu:.2f})",
-                f"{b.segmentation.lumen_area:.2f}",
-                or_dash(b.segmentation.core_area, 2),
-                or_dash(b.cap_line, 3),
-                f"{b.depth:.1f}",
-            ]
-        )
-    if (f := m.scanners["PCCT"].smoothed) is not None:
-        contrast = f"{f.contrast_hu:.1f} ({f.own_contrast_hu:.1f})"
-        cnr = f"{f.contrast_hu / f.sd_hu:.2f} ({f.own_contrast_hu / f.sd_hu:.2f})"
-        width = f"{m.scanners['EID-CT'].width.area:.3f}"
-        rows.append(["PCCT blurred to the EID-CT's width", width, "–", contrast, cnr, *["–"] * 4])
+        b, (core, fibrous) = s.blurred[0], s.rois.roi_hu
+        width = f"{s.width.area:.3f} ({s.width.radial:.3f} / {s.width.tangential:.3f})"
+        read = [or_dash(b.segmentation.core_area, 2), or_dash(b.cap_line, 3), f"{b.depth:.1f}"]
+        area = f"{b.segmentation.lumen_area:.2f}"
+        rows.append([name, width, f"{core:.1f} / {fibrous:.1f}", *_contrast_cells(s.rois), area, *read])
+    width = f"{m.scanners['EID-CT'].width.area:.3f}"
+    rows.append(["PCCT blurred to the EID-CT's width", width, "–", *_contrast_cells(m.smoothed), *["–"] * 4])
     head = [
         "scanner", "FWHM (radial / tangential), mm", "core / fibrous, HU", "contrast (own), HU", "CNR (own)",
         "lumen, mm²", "core, mm²", "cap, mm", "basin, HU",
@@ -197,6 +182,10 @@ def _scanners_section(m: Measured) -> str:
         "holds half of the blurred edge on either side of a cap thinner than that edge: 20 % are meant, here as in the "
         "paper, against this figure; the true 0.17 mm are not measurable by thresholds at any of these blurs."
     )
+
+
+def _contrast_cells(f: RoiFigures) -> list[str]:
+    return [f"{f.contrast_hu:.1f} ({f.own_contrast_hu:.1f})", f"{f.cnr:.2f} ({f.own_cnr:.2f})"]
 
 
 def _blur_section(m: Measured) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 
 from recon.study.paper import facts as paper
 from recon.study.study import StudySettings
-from torchpcct.validate import number, whole
+from torchpcct.validate import number
 
 __all__ = ["Settings"]
 
@@ -41,7 +41,7 @@ class Settings(StudySettings):
     QUICK: ClassVar[dict[str, Any]] = {"thinning": 8, "bulges_mm": (0.5,)}
 
     def __post_init__(self) -> None:
-        whole("thinning", self.thinning)
+        self.check_whole(thinning=1)
         s = np.array(self.sigmas_px, dtype=np.float64)
         if s.size < 3 or s[0] != 0 or not (np.diff(s) > 0).all():
             raise ValueError(f"sigmas_px must rise from 0 in at least 3 values, got {self.sigmas_px}")
