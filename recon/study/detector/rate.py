@@ -1,4 +1,4 @@
-"""Counts of the detector at its rates, and what pile-up and charge sharing cost in counts, energy, CT numbers, noise."""
+"""Counts of the detector at its rates; what pile-up and charge sharing cost in counts, energy, CT numbers, noise."""
 
 from __future__ import annotations
 
