@@ -126,9 +126,9 @@ def compress(contrast: Floats, longest_mm: float = 1000.0, tolerance: float = 1e
     The rank is the smallest for which a chord of ``longest_mm`` changes the line integral by less than ``tolerance``.
     """
     u, s, vt = np.linalg.svd(contrast, full_matrices=False)
-    for rank in range(1, s.size + 1):
+    for rank in range(min(s.size, 1), s.size + 1):  # 0 where there is no body at all
         coefficients, basis = u[:, :rank] * s[:rank], vt[:rank]
-        if np.abs(contrast - coefficients @ basis).max() * longest_mm <= tolerance:
+        if np.abs(contrast - coefficients @ basis).max(initial=0.0) * longest_mm <= tolerance:
             break
     return np.ascontiguousarray(coefficients), np.ascontiguousarray(basis)
 
