@@ -1,13 +1,18 @@
 """The skeleton of every study: its settings, its clock, and what it says to whoever waits.
 
-A study is a folder of this package, listed in :mod:`recon.study.registry`, with
+A study is a folder of this package with four modules, listed in :mod:`recon.study.registry`, which runs it by its name:
 
 * ``settings.py``: ``Settings(StudySettings)``, a frozen dataclass that validates itself;
-* ``measure.py``: ``measure(settings, progress, folder) -> Measured``, which simulates, reconstructs and measures, and
-  writes nothing but finished pieces into ``folder`` (where one is given, and the study keeps pieces);
-* ``report.py``: ``build_report(measured) -> Report``: JSON values, Markdown and the figures of ``figures.py``.
+* ``measure.py``: ``measure(settings, progress=silent, folder=None) -> Measured``, which simulates, reconstructs and
+  measures. It prints nothing and writes nothing, but finished pieces into ``folder`` where the study keeps pieces;
+* ``report.py``: ``build_report(measured) -> Report``: JSON values, Markdown and the figures; it measures nothing;
+* ``figures.py``: the pictures of the report.
 
-So data walks one way, settings → measure → report, and no module looks back.
+``Measured`` is the study's own: a dataclass with ``settings``, ``seconds`` (of a :class:`Clock`) and what was found. So
+data walks one way, settings → measure → report, and no module looks back.
+
+Noise has one rule in all studies: realisation i draws with the seed ``settings.seed + i``, the same at every dose, in
+every scene and for every method, so that their results can be paired.
 """
 
 from __future__ import annotations
@@ -20,6 +25,8 @@ from contextlib import contextmanager
 from typing import Any, ClassVar, Self
 
 import numpy as np
+
+from torchpcct.validate import whole
 
 __all__ = ["Clock", "Progress", "StudySettings", "environment", "silent", "time_line"]
 
@@ -35,7 +42,7 @@ class StudySettings:
     """What the settings of all studies share; each derives a frozen dataclass from it.
 
     Attributes:
-        QUICK: the values of a first look, by field; the study's docstring or its README row says what they cost.
+        QUICK: the values of a first look, by field; a comment beside says what is left out.
     """
 
     QUICK: ClassVar[Mapping[str, Any]] = {}
@@ -44,6 +51,16 @@ class StudySettings:
     def quick(cls, **changes: Any) -> Self:
         """Settings of a first look in under a minute, with ``changes`` on top."""
         return cls(**{**cls.QUICK, **changes})
+
+    def check_whole(self, **least: int) -> None:
+        """Check fields that count something: field → the least value.
+
+        Raises:
+            TypeError: no whole number.
+            ValueError: a value below the least.
+        """
+        for name, low in least.items():
+            whole(name, getattr(self, name), low)
 
 
 class Clock:

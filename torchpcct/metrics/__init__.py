@@ -1,18 +1,18 @@
-"""Figures of merit: CNR, the limit of the data, dose factor, observer, resolution, noise."""
+"""Figures of merit: CNR, the limit of the data, dose factor, observer, resolution, noise.
+
+Reading order: ``placement`` and ``roi`` say where is measured, ``cnr`` is the paper's figure over realisations,
+``data_limit`` the best that any unbiased method can reach. ``bootstrap`` gives every figure its interval. With it
+``dose_curve`` → ``contrast_slope`` → ``dose_factor`` answer what dose FBP needs for what a method shows. ``observer``
+asks whether the core is seen, ``resolution`` and ``noise_power`` how sharp and how noisy an image is, and
+``plaque_measures`` what a reader takes from it: lumen, core and cap.
+"""
 
 from torchpcct.metrics.bootstrap import Estimate
 from torchpcct.metrics.cnr import Interval, cnr, cnr_from_moments, cnr_interval, cnr_range, mean_interval, sd_interval
+from torchpcct.metrics.contrast_slope import ContrastSlope, contrast_slope, roi_bias
 from torchpcct.metrics.data_limit import Ceiling, ceiling, information_matrix, paper_cnr_ceiling
-from torchpcct.metrics.dose_factor import (
-    ContrastSlope,
-    DoseCurve,
-    DoseFactor,
-    MeasuredDoseCurve,
-    contrast_slope,
-    dose_factor,
-    efficiency,
-    roi_bias,
-)
+from torchpcct.metrics.dose_curve import DoseCurve, MeasuredDoseCurve
+from torchpcct.metrics.dose_factor import DoseFactor, dose_factor, efficiency
 from torchpcct.metrics.noise_power import NoisePower, noise_power_spectrum
 from torchpcct.metrics.observer import (
     ObserverResult,
@@ -27,16 +27,14 @@ from torchpcct.metrics.observer import (
     observe,
     template_channel,
 )
+from torchpcct.metrics.plaque_measures import cap_thickness, lumen_area, threshold_contour
 from torchpcct.metrics.resolution import (
     TransferFunction,
-    cap_thickness,
     edge_profile,
     edge_width,
     ellipsoid_distance,
-    lumen_area,
     match_edge_width,
     task_transfer,
-    threshold_contour,
 )
 
 __all__ = [

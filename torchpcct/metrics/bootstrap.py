@@ -7,8 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr, ndtri
 
-__all__ = ["Estimate", "bca_interval", "leave_one_out", "resampling"]
+from torchpcct.validate import whole
+
+__all__ = ["Estimate", "bca_interval", "evaluate", "generator", "leave_one_out", "resampling"]
 
 Floats = NDArray[np.float64]
 _ELEMENTS = 1 << 21
@@ -22,9 +25,14 @@ class Estimate(NamedTuple):
     high: float
 
 
+def generator(seed: int) -> np.random.Generator:
+    """Random numbers of a seed, a whole number ≥ 0: the one rule of this package."""
+    return np.random.default_rng(whole("seed", seed, low=0))
+
+
 def resampling(realizations: int, draws: int, seed: int) -> NDArray[np.int64]:
     """``(draws, realizations)`` indices with replacement. The same arguments give the same indices: paired."""
-    return np.random.default_rng(seed).integers(0, realizations, (draws, realizations))
+    return generator(seed).integers(0, realizations, (draws, realizations))
 
 
 def leave_one_out(realizations: int) -> NDArray[np.int64]:
@@ -52,8 +60,6 @@ def bca_interval(value: float, draws: Any, jackknife: Any, level: float = 0.95) 
         jackknife: ``(realizations,)`` with one left out; not finite: no acceleration.
         level: coverage, in (0, 1).
     """
-    from scipy.special import ndtr, ndtri
-
     if not 0 < level < 1:
         raise ValueError(f"level must lie in (0, 1), got {level}")
     d = np.sort(np.asarray(draws, dtype=np.float64))

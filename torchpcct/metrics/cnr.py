@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from torchpcct.metrics.bootstrap import generator
+
 __all__ = ["Interval", "cnr", "cnr_from_moments", "cnr_interval", "cnr_range", "mean_interval", "sd_interval"]
 
 Floats = NDArray[np.float64]
@@ -112,7 +114,7 @@ def cnr_interval(
     if np.trace(scatter) == 0:
         raise ValueError("the ROI means do not vary: CNR needs noisy realisations (exposure_s is not None)")
     lower = np.linalg.cholesky(scatter + 1e-12 * np.trace(scatter) * np.eye(2))
-    rng = np.random.default_rng(seed)
+    rng = generator(seed)
     # S = L Lᵀ ~ Wishart(Σ, n-1) and B Bᵀ ~ Wishart(I, n-1) (Bartlett, B lower): the pivot for Σ is (L B⁻¹)(L B⁻¹)ᵀ.
     root = lower @ np.linalg.inv(_bartlett(rng, draws, n - 1))
     mean = data.mean(1) - np.einsum("dij,dj->di", root, rng.standard_normal((draws, 2))) / np.sqrt(n)
@@ -141,7 +143,7 @@ def cnr_range(
         root = np.linalg.cholesky(np.asarray(covariance, dtype=np.float64))
     except np.linalg.LinAlgError:
         raise ValueError("covariance must be positive definite: the ROI means must vary independently") from None
-    rng = np.random.default_rng(seed)
+    rng = generator(seed)
     mean = np.asarray(means, dtype=np.float64) + rng.standard_normal((draws, 2)) @ root.T / np.sqrt(realizations)
     scatter = root @ _bartlett(rng, draws, realizations - 1) / np.sqrt(realizations - 1)
     estimates = (mean[:, 1] - mean[:, 0]) / np.sqrt(np.einsum("dij,dij->d", scatter, scatter))

@@ -19,7 +19,9 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+
+from torchpcct.metrics.roi import as_array
+from torchpcct.validate import number
 
 __all__ = ["Ceiling", "ceiling", "information_matrix", "paper_cnr_ceiling"]
 
@@ -46,8 +48,7 @@ def information_matrix(maps: Sequence[Any] | Any, inverse_variance: Any, *, scal
     Raises:
         ValueError: no maps, shapes that differ, a negative weight, NaN or Inf, a scale that is not positive.
     """
-    if not (np.isfinite(scale) and scale > 0):
-        raise ValueError(f"scale must be a positive number, got {scale}")
+    number("scale", scale, positive=True)
     if len(maps) == 0:
         raise ValueError("maps is empty: give the path lengths of at least one tissue")
     weight = torch.as_tensor(inverse_variance)
@@ -128,8 +129,7 @@ def ceiling(information: Any, functionals: Any, dose: float = 1.0) -> Ceiling:
         raise ValueError(f"information must be a square matrix, got the shape {f.shape}")
     if not np.isfinite(f).all() or not np.allclose(f, f.T, rtol=1e-9, atol=1e-12 * np.abs(f).max()):
         raise ValueError("information must be finite and symmetric: compute it with information_matrix")
-    if not (np.isfinite(dose) and dose > 0):
-        raise ValueError(f"dose must be a positive number, got {dose}")
+    number("dose", dose, positive=True)
     h = np.atleast_2d(np.array(functionals, dtype=np.float64))
     if h.ndim != 2 or h.shape[1] != f.shape[0] or not np.isfinite(h).all():
         raise ValueError(f"functionals must be finite and ({f.shape[0]},) or (m, {f.shape[0]}), got {h.shape}")
@@ -175,7 +175,7 @@ def paper_cnr_ceiling(information: Any, amplitudes: Any, foreground: Any, backgr
 
 
 def _functional(name: str, value: Any, tissues: int) -> Floats:
-    h = np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value)
+    h = as_array(value)
     if h.ndim:
         if h.shape != (tissues,):
             raise ValueError(f"{name} must be a tissue's index or ({tissues},) area fractions, got shape {h.shape}")

@@ -12,8 +12,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
+
+from torchpcct.metrics.roi import as_array
+from torchpcct.validate import number, per_axis
 
 __all__ = ["NoisePower", "noise_power_spectrum"]
 
@@ -57,8 +59,7 @@ class NoisePower:
         """
         f = np.sqrt(sum(np.square(a) for a in np.meshgrid(*self.frequencies, indexing="ij"))).ravel()
         step = max(1 / (n * s) for n, s in zip(self.power.shape, self.spacing, strict=True)) if width is None else width
-        if not step > 0:
-            raise ValueError(f"width must be greater than 0 cycles per mm, got {width}")
+        number("width", step, positive=True, unit="cycles per mm")
         inside = f <= 0.5 / max(self.spacing) + 1e-12
         return _shells(f[inside], self.power.ravel()[inside], step)
 
@@ -107,13 +108,10 @@ def noise_power_spectrum(realizations: Any, spacing: float | tuple[float, ...]) 
     Raises:
         ValueError: fewer than 2 realisations, a wrong number of axes, a spacing that is not positive, NaN or Inf.
     """
-    x = realizations.detach().cpu().numpy() if isinstance(realizations, torch.Tensor) else np.asarray(realizations)
+    x = as_array(realizations)
     if x.ndim not in (3, 4) or x.shape[0] < 2:
         raise ValueError(f"realizations must be (n ≥ 2, y, x) or (n ≥ 2, z, y, x), got the shape {x.shape}")
-    axes = x.ndim - 1
-    per = (float(spacing),) * axes if np.ndim(spacing) == 0 else tuple(float(s) for s in spacing)  # type: ignore
-    if len(per) != axes or not all(s > 0 for s in per):
-        raise ValueError(f"spacing must be one positive number in mm or {axes}, got {spacing!r}")
+    per = per_axis("spacing", spacing, x.ndim - 1, positive=True, unit="mm")
     n = x.shape[0]
     mean = x.mean(0, dtype=np.float64)
     if not np.isfinite(mean).all():

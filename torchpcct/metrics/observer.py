@@ -15,11 +15,12 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
+from scipy.special import expit, logit, ndtr, ndtri
 
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.bootstrap import Estimate, bca_interval, evaluate, leave_one_out, resampling
+from torchpcct.metrics.roi import as_array
 
 __all__ = [
     "ObserverResult",
@@ -88,7 +89,7 @@ def template_channel(expected_difference: Any) -> Floats:
     Raises:
         ValueError: an image that is 0 everywhere, or NaN or Inf.
     """
-    t = _array(expected_difference).astype(np.float64)
+    t = as_array(expected_difference).astype(np.float64)
     norm = float(np.sqrt(np.square(t).sum()))
     if not (math.isfinite(norm) and norm > 0):
         raise ValueError("expected_difference must be finite and differ from 0 somewhere")
@@ -101,7 +102,7 @@ def channel_responses(images: Any, channels: Any) -> Floats:
     Raises:
         ValueError: images and channels of different shapes, NaN or Inf.
     """
-    x, c = _array(images), _array(channels)
+    x, c = as_array(images), as_array(channels)
     if x.ndim < 2 or x.shape[1:] != c.shape[1:]:
         raise ValueError(f"images (n, ...) and channels (c, ...) must match, got {x.shape} and {c.shape}")
     flat = c.reshape(c.shape[0], -1).astype(np.float64)
@@ -109,10 +110,6 @@ def channel_responses(images: Any, channels: Any) -> Floats:
     if not np.isfinite(responses).all():
         raise ValueError("images hold NaN or Inf: check the reconstruction before measuring it")
     return responses
-
-
-def _array(value: Any) -> Any:
-    return value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
 
 
 def hotelling_scores(
@@ -146,10 +143,23 @@ def hotelling_scores(
         means = [np.asarray(m, dtype=np.float64) for m in known_means]
         if len(means) != 2 or any(m.shape != (c,) for m in means):
             raise ValueError(f"known_means must be two arrays ({c},), got {[m.shape for m in means]}")
-        scores = _scores_known(a, b, means[0], means[1], used, train)
     else:
-        scores = _scores_estimated(a, b, used, train)
-    return scores
+        means = [x[:train].mean(0) for x in (a, b)]
+    da, db = (x[:train] - m for x, m in zip((a, b), means, strict=True))
+    scatter = da.T @ da + db.T @ db
+    if train is None:
+        own = [d[:, :, None] * d[:, None] for d in (da, db)]
+        # About the mean of the others the scatter is S − n / (n − 1) d dᵀ.
+        scatter = scatter - (own[0] + own[1]) * n / used if known_means is None else scatter - own[0] - own[1]
+        if known_means is None:
+            means = [(x.sum(0) - x) / used for x in (a, b)]
+    difference = np.broadcast_to(means[0] - means[1], scatter.shape[:-1])
+    w = _templates(scatter / (2 * used - (0 if known_means is not None else 2)), difference)
+    # Scores from the middle of the two classes: the threshold 0 is that of the trained observer.
+    middle: Any = 0.0 if known_means is not None else (means[0] + means[1]) / 2
+    if train is None:
+        return ((a - middle) * w).sum(1), ((b - middle) * w).sum(1)
+    return (a[used:] - middle) @ w, (b[used:] - middle) @ w
 
 
 def _templates(scatter: Any, difference: Any) -> Floats:
@@ -161,35 +171,6 @@ def _templates(scatter: Any, difference: Any) -> Floats:
     if np.linalg.cond(scaled).max() > 1e12:
         raise ValueError("the channels are linearly dependent on these images: use fewer")
     return np.linalg.solve(scaled, (difference / sd)[..., None])[..., 0] / sd
-
-
-def _scores_known(a: Floats, b: Floats, mean_a: Floats, mean_b: Floats, used: int, train: int | None) -> Any:
-    da, db = a - mean_a, b - mean_b
-    if train is not None:
-        scatter = (da[:used].T @ da[:used] + db[:used].T @ db[:used]) / (2 * used)
-        w = _templates(scatter, mean_a - mean_b)
-        return a[used:] @ w, b[used:] @ w
-    scatter = (da.T @ da + db.T @ db - da[:, :, None] * da[:, None] - db[:, :, None] * db[:, None]) / (2 * used)
-    w = _templates(scatter, np.broadcast_to(mean_a - mean_b, a.shape))
-    return (a * w).sum(1), (b * w).sum(1)
-
-
-def _scores_estimated(a: Floats, b: Floats, used: int, train: int | None) -> Any:
-    if train is not None:
-        ma, mb = a[:used].mean(0), b[:used].mean(0)
-        da, db = a[:used] - ma, b[:used] - mb
-        w = _templates((da.T @ da + db.T @ db) / (2 * used - 2), ma - mb)
-        # Scores from the middle of the two classes: the threshold 0 is that of the trained observer.
-        return (a[used:] - (ma + mb) / 2) @ w, (b[used:] - (ma + mb) / 2) @ w
-    n = a.shape[0]
-    da, db = a - a.mean(0), b - b.mean(0)
-    # Scatter about the mean of the others: S − n / (n − 1) d dᵀ.
-    total = da.T @ da + db.T @ db
-    scatter = total - (da[:, :, None] * da[:, None] + db[:, :, None] * db[:, None]) * n / (n - 1)
-    ma, mb = (a.sum(0) - a) / used, (b.sum(0) - b) / used
-    w = _templates(scatter / (2 * used - 2), ma - mb)
-    middle = (ma + mb) / 2
-    return ((a - middle) * w).sum(1), ((b - middle) * w).sum(1)
 
 
 def _pair(present: Any, absent: Any) -> tuple[Floats, Floats]:
@@ -216,8 +197,6 @@ def auc(present: Any, absent: Any, *, paired: bool = True, level: float = 0.95) 
     Raises:
         ValueError: fewer than 2 scores, NaN or Inf, unequal numbers when paired, a level outside (0, 1).
     """
-    from scipy.special import expit, logit, ndtri
-
     a, b = _pair(present, absent)
     if paired and a.size != b.size:
         raise ValueError(f"paired scores must be equally many, got {a.size} and {b.size}: set paired=False")
@@ -269,8 +248,6 @@ def d_prime(present: Any, absent: Any, level: float = 0.95, draws: int = 2000, s
 
 def auc_from_d_prime(value: Any) -> Any:
     """Area of normal scores of equal variance, ``Φ(d′ / √2)``."""
-    from scipy.special import ndtr
-
     area = ndtr(np.asarray(value, dtype=np.float64) / math.sqrt(2.0))
     return float(area) if np.ndim(area) == 0 else area
 
@@ -305,7 +282,7 @@ def observe(
     responses = [channel_responses(x, channels) for x in (present, absent)]
     means = None
     if known_means is not None:
-        means = tuple(channel_responses(_array(m)[None], channels)[0] for m in known_means)
+        means = tuple(channel_responses(as_array(m)[None], channels)[0] for m in known_means)
     s1, s0 = hotelling_scores(*responses, known_means=means, train=train)
     return ObserverResult(auc(s1, s0, level=level), d_prime(s1, s0, level=level, seed=seed), s1, s0)
 

@@ -9,16 +9,14 @@ connected region: in the paper's table its SD is 1.7 to 2.3 times that of the co
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
 
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.roi import RoiMean
-
-if TYPE_CHECKING:
-    from torchpcct.scene import Scene
+from torchpcct.scene import Scene
 
 __all__ = ["RoiPair", "RoiRule", "place_rois", "whole_rois"]
 
@@ -86,26 +84,16 @@ def place_rois(
     """
     rule = rule or RoiRule()
     labels = scene.labels(image)
-    pixel = image.spacing[1:]
     in_core, in_tissue = labels == scene.index(core), labels == scene.index(tissue)
     if not in_core.any():
         raise ValueError(f"the body {core!r} does not cross the axial image: move the image")
-
-    def depth(mask: Any) -> Any:
-        return ndimage.distance_transform_edt(mask[0], sampling=pixel)[None]
-
-    foreground = depth(in_core) > rule.core_margin
+    foreground = _depth(in_core, image) > rule.core_margin
     background = (
-        (depth(in_tissue) > rule.background_margin)
-        & (depth(~in_core) < rule.background_reach)
-        & (depth(labels != scene.index(lumen)) > rule.lumen_margin)
+        (_depth(in_tissue, image) > rule.background_margin)
+        & (_depth(~in_core, image) < rule.background_reach)
+        & (_depth(labels != scene.index(lumen), image) > rule.lumen_margin)
     )
-    for name, mask, margin in (
-        ("foreground", foreground, rule.core_margin),
-        ("background", background, rule.background_margin),
-    ):
-        if not np.any(mask):
-            raise ValueError(f"the {name} ROI is empty: its margin of {margin} mm is wider than the tissue; reduce it")
+    _not_empty(foreground, background, rule)
     regions, count = ndimage.label(background[0])
     sizes = ndimage.sum_labels(background[0], regions, np.arange(1, count + 1))
     background = (regions == 1 + int(np.argmax(sizes)))[None]
@@ -134,16 +122,26 @@ def whole_rois(
     Raises:
         ValueError: an unknown body, or a ROI that comes out empty.
     """
-    labels = scene.labels(image)
+    labels, rule = scene.labels(image), RoiRule(margin, margin, float("inf"), lumen_margin)
+    foreground = _depth(labels == scene.index(core), image) > margin
+    background = (_depth(labels == scene.index(tissue), image) > margin) & (
+        _depth(labels != scene.index(lumen), image) > lumen_margin
+    )
+    _not_empty(foreground, background, rule)
+    return RoiPair(foreground, background, image, rule)
 
-    def depth(mask: Any) -> Any:
-        if image.shape[0] == 1:
-            return ndimage.distance_transform_edt(mask[0], sampling=image.spacing[1:])[None]
-        return ndimage.distance_transform_edt(mask, sampling=image.spacing)
 
-    foreground = depth(labels == scene.index(core)) > margin
-    background = (depth(labels == scene.index(tissue)) > margin) & (depth(labels != scene.index(lumen)) > lumen_margin)
-    for name, mask in (("foreground", foreground), ("background", background)):
+def _depth(mask: Any, image: VolumeGrid) -> Any:
+    """Distance in mm to the mask's edge; in the plane where the image has one slice."""
+    if image.shape[0] == 1:
+        return ndimage.distance_transform_edt(mask[0], sampling=image.spacing[1:])[None]
+    return ndimage.distance_transform_edt(mask, sampling=image.spacing)
+
+
+def _not_empty(foreground: Any, background: Any, rule: RoiRule) -> None:
+    for name, mask, margin in (
+        ("foreground", foreground, rule.core_margin),
+        ("background", background, rule.background_margin),
+    ):
         if not np.any(mask):
             raise ValueError(f"the {name} ROI is empty: its margin of {margin} mm is wider than the tissue; reduce it")
-    return RoiPair(foreground, background, image, RoiRule(margin, margin, float("inf"), lumen_margin))

@@ -1,13 +1,18 @@
-"""Threshold segmentation of a plaque's axial image, and what is measured on it.
+"""What is measured on a plaque's axial image: by contours at a threshold, by segmentation, on a line.
 
-The protocol of Li et al. (section "Image Resolution"): on the axial image of 0.035 mm pixels the lumen is what reads at
-least 250 HU (half of the contrast-enhanced blood), the necrotic core what reads 20 to 60 HU (half to one and a half
-times its value); the lumen's area is its number of pixels, the cap's thickness the smallest distance between the two.
+By contours, :func:`lumen_area` and :func:`cap_thickness` find the closed contour around a point that is known to lie in
+the region, to a fraction of a voxel; they need no protocol and no fat around the vessel.
+
+By segmentation, :func:`segment_plaque` follows the protocol of Li et al. (section "Image Resolution"): on the axial
+image of 0.035 mm pixels the lumen is what reads at least 250 HU (half of the contrast-enhanced blood), the necrotic
+core what reads 20 to 60 HU (half to one and a half times its value); the lumen's area is its number of pixels, the
+cap's thickness the smallest distance between the two.
 
 A band of CT numbers selects more than the core: every edge between bright tissue and fat passes through it, and so
 does the vessel's wall. All of that is connected to the fat around the vessel. The core is therefore the part of the
 band that tissue brighter than the band ENCLOSES in the image ("well identified and separated from the vessel media",
 as the paper puts it); once blur or noise opens a way out, there is no core to measure, and its measures are NaN.
+On the line from the lumen to the core, :func:`cap_on_line` still reads what is left of the cap.
 """
 
 from __future__ import annotations
@@ -17,12 +22,27 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation, map_coordinates
+from scipy.spatial import cKDTree
+from skimage.measure import find_contours, label
+from skimage.morphology import reconstruction
 
 from torchpcct.geometry import VolumeGrid
+from torchpcct.metrics.roi import as_array
 
-__all__ = ["CORE_HU", "LUMEN_HU", "PlaqueSegmentation", "basin_depth", "cap_on_line", "dice", "segment_plaque"]
+__all__ = [
+    "CORE_HU",
+    "LUMEN_HU",
+    "PlaqueSegmentation",
+    "basin_depth",
+    "cap_on_line",
+    "cap_thickness",
+    "dice",
+    "lumen_area",
+    "segment_plaque",
+    "threshold_contour",
+]
 
 LUMEN_HU = 250.0
 """Threshold of the lumen in HU (Li et al.)."""
@@ -35,6 +55,67 @@ Floats = NDArray[np.float64]
 
 # Dark regions join at edges only, bright ones at corners too: a closed diagonal line of cap separates.
 _CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], dtype=bool)
+
+
+def threshold_contour(image: Any, grid: VolumeGrid, threshold: float, seed: tuple[float, float]) -> Floats | None:
+    """Closed contour at a threshold around a point, by marching squares with linear interpolation.
+
+    Args:
+        image: ``(y, x)`` or ``(1, y, x)`` HU, tensor or array.
+        grid: of the image.
+        threshold: HU.
+        seed: ``(y, x)`` mm, a point of the region: the smallest closed contour around it is taken.
+
+    Returns:
+        ``(points, 2)`` y, x in mm, first point repeated at the end; None where no closed contour surrounds the seed
+        (the region is lost, or merged with the image's border).
+
+    Raises:
+        ValueError: an image that is not one slice of the grid's shape, NaN or Inf.
+    """
+    x, plane = _slice(image, grid)
+    origin = np.array([a[0] for a in plane.axes])
+    best, area = None, math.inf
+    for contour in find_contours(x, threshold):
+        if not np.array_equal(contour[0], contour[-1]):
+            continue
+        points = origin + contour * plane.spacing
+        if _surrounds(points, seed) and _area(points) < area:
+            best, area = points, _area(points)
+    return best
+
+
+def lumen_area(image: Any, grid: VolumeGrid, seed: tuple[float, float], threshold: float = LUMEN_HU) -> float:
+    """Area in mm² inside the threshold contour around ``seed`` (sub-voxel); NaN where there is no closed contour.
+
+    Args:
+        image, grid, threshold, seed: as in :func:`threshold_contour`.
+    """
+    contour = threshold_contour(image, grid, threshold, seed)
+    return math.nan if contour is None else _area(contour)
+
+
+def cap_thickness(
+    image: Any,
+    grid: VolumeGrid,
+    lumen_seed: tuple[float, float],
+    core_seed: tuple[float, float],
+    lumen_threshold: float = LUMEN_HU,
+    core_threshold: float = 70.0,
+) -> float:
+    """Smallest distance in mm between the lumen's and the core's contour; NaN where either is lost.
+
+    Args:
+        image, grid: as in :func:`threshold_contour`.
+        lumen_seed, core_seed: ``(y, x)`` mm, points of the two regions.
+        lumen_threshold: the lumen is brighter than this, HU.
+        core_threshold: the core is darker than this, HU: halfway between core (40) and fibrous tissue (100).
+    """
+    lumen = threshold_contour(image, grid, lumen_threshold, lumen_seed)
+    core = threshold_contour(image, grid, core_threshold, core_seed)
+    if lumen is None or core is None:
+        return math.nan
+    return min(_to_line(lumen, core), _to_line(core, lumen))
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,13 +169,10 @@ class PlaqueSegmentation:
             return math.nan
         lumen = self._contours(self.lumen, self.lumen_hu)
         core = self._contours(self.core, self.core_hu[1])
-        return min(_smallest(a, b) for a in lumen for b in core)
+        return min(_between(a, b) for a in lumen for b in core)
 
     def _contours(self, region: Mask, level: float) -> list[Floats]:
         """Contours of the image at ``level`` that bound ``region``, each ``(points, 2)`` mm."""
-        from scipy.ndimage import binary_dilation
-        from skimage.measure import find_contours
-
         near = binary_dilation(region, np.ones((3, 3), bool))
         found = []
         for line in find_contours(self.image, level):
@@ -120,20 +198,16 @@ def segment_plaque(
         ValueError: an image that is not one slice of the grid's shape, NaN or Inf, thresholds that do not rise from
             the core's band to the lumen.
     """
-    from skimage.measure import label
-
     low, high = (float(v) for v in core_hu)
     if not low < high < lumen_hu:
         raise ValueError(f"thresholds must rise from the core's band to the lumen, got {core_hu} and {lumen_hu} HU")
-    x = _slice(image, grid)
+    x, plane = _slice(image, grid)
     lumen = _largest(label(x >= lumen_hu, connectivity=2))
     band = (x >= low) & (x <= high)
     dark = label(x <= high, connectivity=1)
     border = np.unique(np.concatenate([dark[0], dark[-1], dark[:, 0], dark[:, -1]]))
     core = _largest(np.where(np.isin(dark, border) | ~band, 0, dark))
-    return PlaqueSegmentation(
-        x, grid.slice if grid.ndim == 3 else grid, lumen, band, core, float(lumen_hu), (low, high)
-    )
+    return PlaqueSegmentation(x, plane, lumen, band, core, float(lumen_hu), (low, high))
 
 
 def cap_on_line(
@@ -145,6 +219,7 @@ def cap_on_line(
     lumen_hu: float = LUMEN_HU,
     core_hu: float = CORE_HU[1],
     step_mm: float = 0.005,
+    interpolate: bool = True,
 ) -> float:
     """Cap thickness in mm on the line from the lumen to the core: where the image falls below both thresholds.
 
@@ -157,6 +232,8 @@ def cap_on_line(
         lumen_hu, core_hu: the lumen ends where the image first falls below the one, the core begins where it first
             falls to the other.
         step_mm: sampling of the line.
+        interpolate: read the crossings between samples; False: at the first sample beyond them, in steps of
+            ``step_mm`` from ``start``.
 
     Returns:
         NaN where the line starts below ``lumen_hu`` or does not reach ``core_hu``.
@@ -164,22 +241,20 @@ def cap_on_line(
     Raises:
         ValueError: as :func:`segment_plaque`; a line that leaves the image, a step that is not positive.
     """
-    from scipy.ndimage import map_coordinates
-
-    x = _slice(image, grid)
-    plane = grid.slice if grid.ndim == 3 else grid
+    x, plane = _slice(image, grid)
     a, b = np.array(start, dtype=np.float64), np.array(end, dtype=np.float64)
     length = float(np.hypot(*(b - a)))
     if not step_mm > 0 or not length > step_mm:
         raise ValueError(f"step_mm must be positive and less than the line's {length:g} mm, got {step_mm}")
-    along = np.linspace(0.0, length, math.ceil(length / step_mm) + 1)
+    steps = math.ceil(length / step_mm)
+    along: Any = np.linspace(0.0, length, steps + 1) if interpolate else step_mm * np.arange(steps)
     points = a[:, None] + (b - a)[:, None] * along / length
     index = (points - np.array([v[0] for v in plane.axes])[:, None]) / np.array(plane.spacing)[:, None]
     if index.min() < 0 or (index.max(axis=1) > np.array(plane.shape) - 1).any():
         raise ValueError(f"the line from {tuple(start)} to {tuple(end)} mm leaves the image: give points inside it")
     profile = map_coordinates(x, index, order=1)
-    edges = [_first_below(along, profile, level) for level in (lumen_hu, core_hu)]
-    return edges[1] - edges[0] if profile[0] >= lumen_hu else math.nan
+    lumen_end, core_start = (_first_below(along, profile, level, interpolate) for level in (lumen_hu, core_hu))
+    return core_start - lumen_end if profile[0] >= lumen_hu else math.nan
 
 
 def basin_depth(image: Any, grid: VolumeGrid, within: Any) -> float:
@@ -195,9 +270,7 @@ def basin_depth(image: Any, grid: VolumeGrid, within: Any) -> float:
     Raises:
         ValueError: as :func:`segment_plaque`; a region of another shape or without pixels.
     """
-    from skimage.morphology import reconstruction
-
-    x = _slice(image, grid)
+    x, _ = _slice(image, grid)
     region = np.asarray(within, dtype=bool)
     if region.shape != x.shape or not region.any():
         raise ValueError(f"within must mark pixels of an image of shape {x.shape}, got {region.shape}, {region.sum()}")
@@ -219,8 +292,9 @@ def dice(a: Any, b: Any) -> float:
     return 2.0 * int((first & second).sum()) / total if total else math.nan
 
 
-def _slice(image: Any, grid: VolumeGrid) -> Floats:
-    x = image.detach().cpu().numpy() if isinstance(image, torch.Tensor) else np.asarray(image)
+def _slice(image: Any, grid: VolumeGrid) -> tuple[Floats, VolumeGrid]:
+    """The image as ``(y, x)`` float64, and its 2-D grid."""
+    x = as_array(image)
     if grid.ndim == 3 and grid.shape[0] != 1:
         raise ValueError(f"grid must be one slice, got {grid.shape}: sample the axial image first")
     if x.shape not in (grid.shape, grid.shape[-2:]):
@@ -228,7 +302,29 @@ def _slice(image: Any, grid: VolumeGrid) -> Floats:
     x = x.reshape(grid.shape[-2:]).astype(np.float64)
     if not np.isfinite(x).all():
         raise ValueError("image holds NaN or Inf: check the reconstruction before measuring it")
-    return x
+    return x, grid.slice if grid.ndim == 3 else grid
+
+
+def _area(points: Floats) -> float:
+    p = points - points[0]
+    return abs(float((p[:-1, 0] * p[1:, 1] - p[1:, 0] * p[:-1, 1]).sum())) / 2
+
+
+def _surrounds(points: Floats, seed: tuple[float, float]) -> bool:
+    """Even-odd rule for a ray along +x."""
+    y, x = points[:, 0] - seed[0], points[:, 1] - seed[1]
+    cross = (y[:-1] > 0) != (y[1:] > 0)
+    x0, x1, y0, y1 = x[:-1][cross], x[1:][cross], y[:-1][cross], y[1:][cross]
+    return bool(((x0 - y0 * (x1 - x0) / (y1 - y0)) > 0).sum() % 2)
+
+
+def _to_line(points: Floats, line: Floats) -> float:
+    """Smallest distance from points to the segments of a polyline."""
+    start, along = line[:-1], np.diff(line, axis=0)
+    length = np.maximum(np.square(along).sum(-1), 1e-300)
+    offset = points[:, None] - start
+    part = np.clip((offset * along).sum(-1) / length, 0.0, 1.0)
+    return float(np.sqrt(np.square(offset - part[..., None] * along).sum(-1).min()))
 
 
 def _largest(labels: Any) -> Mask:
@@ -239,19 +335,17 @@ def _largest(labels: Any) -> Mask:
     return np.asarray(labels == 1 + int(np.argmax(sizes[1:])))
 
 
-def _first_below(along: Floats, profile: Floats, level: float) -> float:
-    """Where a profile first falls to ``level``, by linear interpolation; NaN where it never does."""
+def _first_below(along: Floats, profile: Floats, level: float, interpolate: bool) -> float:
+    """Where a profile first falls to ``level``; NaN where it never does."""
     under = np.flatnonzero(profile <= level)
     if not under.size:
         return math.nan
     k = int(under[0])
-    if k == 0:
-        return float(along[0])
+    if k == 0 or not interpolate:
+        return float(along[k])
     return float(along[k - 1] + (profile[k - 1] - level) / (profile[k - 1] - profile[k]) * (along[k] - along[k - 1]))
 
 
-def _smallest(points: Floats, others: Floats) -> float:
+def _between(points: Floats, others: Floats) -> float:
     """Smallest distance between the points of two contours (a pixel holds several of each)."""
-    from scipy.spatial import cKDTree
-
     return float(cKDTree(others).query(points)[0].min())

@@ -1,4 +1,4 @@
-"""Resolution at a task's own contrast, and what segmentation makes of it.
+"""Resolution at a task's own contrast.
 
 The edge-spread function (ESF) is the mean of a (noise-free or ensemble-mean) image over voxels of equal distance from a
 known surface; its derivative is the line-spread function, whose spectrum is the task transfer function (TTF). For a
@@ -15,21 +15,19 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
 
 from torchpcct.geometry import VolumeGrid
+from torchpcct.metrics.roi import as_array
+from torchpcct.validate import number
 
 __all__ = [
     "TransferFunction",
-    "cap_thickness",
     "edge_profile",
     "edge_width",
     "ellipsoid_distance",
-    "lumen_area",
     "match_edge_width",
     "task_transfer",
-    "threshold_contour",
 ]
 
 Floats = NDArray[np.float64]
@@ -80,10 +78,6 @@ def ellipsoid_distance(
     return np.where(inside, -distance, distance).reshape(grid.shape)
 
 
-def _image(value: Any) -> Any:
-    return value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
-
-
 def edge_profile(
     image: Any, distance: Any, reach: tuple[float, float], bin_mm: float, mask: Any = None
 ) -> tuple[Floats, Floats]:
@@ -103,7 +97,7 @@ def edge_profile(
     Raises:
         ValueError: shapes that differ, a bin or reach that is not positive, more empty than filled bins, NaN or Inf.
     """
-    x, r = _image(image), _image(distance)
+    x, r = as_array(image), as_array(distance)
     if x.shape != r.shape or (mask is not None and np.shape(mask) != x.shape):
         raise ValueError(f"image, distance and mask must have the same shape, got {x.shape} and {r.shape}")
     if not (bin_mm > 0 and reach[0] > 0 and reach[1] > 0):
@@ -247,8 +241,7 @@ def match_edge_width(
         ValueError: the target lies outside the widths at ``low`` and ``high``.
     """
     ends = width_of(low) - target_mm, width_of(high) - target_mm
-    if not tolerance > 0:
-        raise ValueError(f"tolerance must be greater than 0, got {tolerance}")
+    number("tolerance", tolerance, positive=True)
     if ends[0] * ends[1] > 0:
         raise ValueError(
             f"the edge width {target_mm:g} mm lies outside {ends[0] + target_mm:g}…{ends[1] + target_mm:g} mm, "
@@ -268,94 +261,3 @@ def match_edge_width(
         else:
             b = middle
     return float(middle)
-
-
-def threshold_contour(image: Any, grid: VolumeGrid, threshold: float, seed: tuple[float, float]) -> Floats | None:
-    """Closed contour at a threshold around a point, by marching squares with linear interpolation.
-
-    Args:
-        image: ``(y, x)`` or ``(1, y, x)`` HU.
-        grid: of the image.
-        threshold: HU.
-        seed: ``(y, x)`` mm, a point of the region: the smallest closed contour around it is taken.
-
-    Returns:
-        ``(points, 2)`` y, x in mm, first point repeated at the end; None where no closed contour surrounds the seed
-        (the region is lost, or merged with the image's border).
-
-    Raises:
-        ValueError: an image that is not one slice or not the grid's shape, NaN or Inf.
-    """
-    from skimage.measure import find_contours
-
-    x = _image(image)
-    plane = grid.slice if grid.ndim == 3 else grid
-    if x.shape != grid.shape or (grid.ndim == 3 and grid.shape[0] != 1):
-        raise ValueError(f"image must be one slice of the grid's shape {grid.shape}, got {x.shape}")
-    x = x.reshape(plane.shape).astype(np.float64)
-    if not np.isfinite(x).all():
-        raise ValueError("image holds NaN or Inf: check the reconstruction before measuring it")
-    origin = np.array([a[0] for a in plane.axes])
-    best, area = None, math.inf
-    for contour in find_contours(x, threshold):
-        if not np.array_equal(contour[0], contour[-1]):
-            continue
-        points = origin + contour * plane.spacing
-        if _surrounds(points, seed) and _area(points) < area:
-            best, area = points, _area(points)
-    return best
-
-
-def _area(points: Floats) -> float:
-    p = points - points[0]
-    return abs(float((p[:-1, 0] * p[1:, 1] - p[1:, 0] * p[:-1, 1]).sum())) / 2
-
-
-def _surrounds(points: Floats, seed: tuple[float, float]) -> bool:
-    """Even-odd rule for a ray along +x."""
-    y, x = points[:, 0] - seed[0], points[:, 1] - seed[1]
-    cross = (y[:-1] > 0) != (y[1:] > 0)
-    x0, x1, y0, y1 = x[:-1][cross], x[1:][cross], y[:-1][cross], y[1:][cross]
-    return bool(((x0 - y0 * (x1 - x0) / (y1 - y0)) > 0).sum() % 2)
-
-
-def lumen_area(image: Any, grid: VolumeGrid, seed: tuple[float, float], threshold: float = 250.0) -> float:
-    """Area in mm² inside the threshold contour around ``seed`` (sub-voxel); NaN where there is no closed contour.
-
-    Args:
-        image, grid, threshold, seed: as in :func:`threshold_contour`; 250 HU is the paper's threshold of the lumen.
-    """
-    contour = threshold_contour(image, grid, threshold, seed)
-    return math.nan if contour is None else _area(contour)
-
-
-def cap_thickness(
-    image: Any,
-    grid: VolumeGrid,
-    lumen_seed: tuple[float, float],
-    core_seed: tuple[float, float],
-    lumen_threshold: float = 250.0,
-    core_threshold: float = 70.0,
-) -> float:
-    """Smallest distance in mm between the lumen's and the core's contour; NaN where either is lost.
-
-    Args:
-        image, grid: as in :func:`threshold_contour`.
-        lumen_seed, core_seed: ``(y, x)`` mm, points of the two regions.
-        lumen_threshold: the lumen is brighter than this, HU.
-        core_threshold: the core is darker than this, HU: halfway between core (40) and fibrous tissue (100).
-    """
-    lumen = threshold_contour(image, grid, lumen_threshold, lumen_seed)
-    core = threshold_contour(image, grid, core_threshold, core_seed)
-    if lumen is None or core is None:
-        return math.nan
-    return min(_distance(lumen, core), _distance(core, lumen))
-
-
-def _distance(points: Floats, line: Floats) -> float:
-    """Smallest distance from points to the segments of a polyline."""
-    start, along = line[:-1], np.diff(line, axis=0)
-    length = np.maximum(np.square(along).sum(-1), 1e-300)
-    offset = points[:, None] - start
-    part = np.clip((offset * along).sum(-1) / length, 0.0, 1.0)
-    return float(np.sqrt(np.square(offset - part[..., None] * along).sum(-1).min()))

@@ -18,10 +18,15 @@ from torch import Tensor
 
 from torchpcct.geometry import VolumeGrid
 
-__all__ = ["PROTOCOL_PIXELS", "PROTOCOL_PIXEL_MM", "RoiMean", "axial_grid", "sample_axial"]
+__all__ = ["PROTOCOL_PIXELS", "PROTOCOL_PIXEL_MM", "RoiMean", "as_array", "axial_grid", "sample_axial"]
 
 PROTOCOL_PIXEL_MM = 0.035
 PROTOCOL_PIXELS = 256
+
+
+def as_array(image: Any) -> Any:
+    """An image, tensor on any device or array, as a NumPy array of its own dtype."""
+    return image.detach().cpu().numpy() if isinstance(image, Tensor) else np.asarray(image)
 
 
 def axial_grid(center: tuple[float, float, float]) -> VolumeGrid:

@@ -23,6 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchpcct.metrics import plaque_measures
 from torchpcct.scene.materials import Material
 from torchpcct.spectral.basis import FIT_ENERGIES_KEV, Basis
 
@@ -223,13 +224,8 @@ def dice(labels: Any, truth: Any, names: Sequence[str] = MMD_TISSUES) -> Mapping
     Raises:
         ValueError: shapes that differ.
     """
-    a, b = torch.as_tensor(labels), torch.as_tensor(truth)
+    a, b = torch.as_tensor(labels).cpu(), torch.as_tensor(truth).cpu()
     if a.shape != b.shape:
         raise ValueError(f"labels {tuple(a.shape)} and truth {tuple(b.shape)} must have the same shape")
-    known = b >= 0
-    a, b = a[known], b[known]
-    out = {}
-    for k, name in enumerate(names):
-        both, total = int(((a == k) & (b == k)).sum()), int((a == k).sum() + (b == k).sum())
-        out[name] = 2 * both / total if total else float("nan")
-    return out
+    a, b = a[b >= 0], b[b >= 0]
+    return {name: plaque_measures.dice(a == k, b == k) for k, name in enumerate(names)}

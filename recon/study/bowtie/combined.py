@@ -64,7 +64,7 @@ def combine(
         scanner = presets.pcct(views=views, bowtie=bowtie)
         # The ROIs are those of the plaque with its core, whatever fills it.
         scene = plaque_scene(core_contrast=1.0 if core else 0.0)
-        scans[bowtie, core] = prepare((KERNEL,), (VOXEL_MM,), scene, scanner, 1968)
+        scans[bowtie, core] = prepare((KERNEL,), (VOXEL_MM,), scene, scanner, paper.FULL_VIEWS["PCCT"])
         progress(0.12 * (k + 1))
     reference = scans["large", True]
     grid = working_grid(inset_grid(plaque_scene()[1], 0.2), prior.voxel_mm)

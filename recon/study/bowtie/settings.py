@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from recon.study.study import StudySettings
-from torchpcct.validate import choice, number, numbers, whole
+from torchpcct.validate import choice, number, numbers
 
 __all__ = ["DETECTORS", "Settings"]
 
@@ -52,9 +52,7 @@ class Settings(StudySettings):
     }  # fmt: skip
 
     def __post_init__(self) -> None:
-        least = {"views": 8, "realizations": 2, "histories": 0, "plaque_views": 8, "plaque_realizations": 4, "seed": 0}
-        for name, low in least.items():
-            whole(name, getattr(self, name), low)
+        self.check_whole(views=8, realizations=2, histories=0, plaque_views=8, plaque_realizations=4, seed=0)
         if 0 < self.histories < 10_000:
             raise ValueError(f"histories must be 0 (no scatter) or at least 10000, got {self.histories}")
         number("exposure_s", self.exposure_s, positive=True, unit="s")

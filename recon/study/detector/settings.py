@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from recon.study.study import StudySettings
-from torchpcct.validate import numbers, whole
+from torchpcct.validate import numbers
 
 __all__ = ["Settings"]
 
@@ -33,7 +33,6 @@ class Settings(StudySettings):
     QUICK: ClassVar = {"photons": 40_000}
 
     def __post_init__(self) -> None:
-        whole("photons", self.photons, 1000)
-        whole("seed", self.seed, 0)
+        self.check_whole(photons=1000, seed=0)
         numbers("dead_times_ns", self.dead_times_ns, positive=True, unit="ns")
         numbers("charge_sharing", self.charge_sharing, positive=True, high=1.0)

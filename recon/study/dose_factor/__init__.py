@@ -5,8 +5,3 @@ draws its realisations, ``methods`` reconstruct them, ``study`` runs all of that
 ``analysis``, ``further``, ``rois`` and ``stability`` turn samples into figures, ``report`` and ``figures`` into text
 and pictures.
 """
-
-from recon.study.dose_factor.measure import Measured, run
-from recon.study.dose_factor.settings import Settings, estimate_seconds
-
-__all__ = ["Measured", "Settings", "estimate_seconds", "run"]

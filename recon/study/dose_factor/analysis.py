@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.study.compare.measure import inset_grid
 from recon.study.dose_factor.estimates import (
     DRAWS,
     attempt,
@@ -29,6 +28,7 @@ from recon.study.dose_factor.measure import Measured
 from recon.study.dose_factor.measures import DOG_CHANNELS, OBSERVERS, crop_window, observer_channels
 from recon.study.dose_factor.scene import StudyScene
 from recon.study.dose_factor.settings import FBP_BASE, MAIN_SCENES
+from recon.study.paper.plaque_scan import inset_grid
 from torchpcct.metrics import (
     ContrastSlope,
     DoseCurve,
@@ -50,7 +50,7 @@ from torchpcct.metrics import (
     sd_interval,
     task_transfer,
 )
-from torchpcct.metrics.dose_factor import DOSES
+from torchpcct.metrics.dose_curve import DOSES
 
 __all__ = ["ASSUMED_FACTOR", "Analysis", "analyse"]
 

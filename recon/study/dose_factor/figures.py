@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from recon.study.compare.measure import inset_grid
 from recon.study.dose_factor.facts import fbp_label
 from recon.study.dose_factor.measure import Measured
 from recon.study.dose_factor.methods import METHOD_NAMES
 from recon.study.dose_factor.scene import StudyScene
 from recon.study.dose_factor.settings import FBP_BASE
-from torchpcct.metrics.dose_factor import DOSES
+from recon.study.paper.plaque_scan import inset_grid
+from torchpcct.metrics.dose_curve import DOSES
 from torchpcct.metrics.roi import sample_axial
 from torchpcct.viz import Panel, panels
 

@@ -18,6 +18,7 @@ import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -34,13 +35,13 @@ from recon.study.dose_factor.settings import MAIN_SCENES, NOISY_SCENES, Settings
 from recon.study.dose_factor.shape_limit import shape_limits
 from recon.study.dose_factor.stability import worst_case_gains
 from recon.study.dose_factor.store import Store
+from recon.study.study import Clock, Progress, silent
 
-__all__ = ["Measured", "run"]
+__all__ = ["Measured", "measure"]
 
 log = logging.getLogger(__name__)
 
 Floats = NDArray[np.float64]
-Progress = Callable[[str, float], None]
 
 
 @dataclass
@@ -59,7 +60,7 @@ class Measured:
         wide: FBP variant → covariance of the means in the wider ROIs at 1 s.
         gains: dose → method or FBP variant → worst-case response, HU mm^1.5.
         shape_limits: dose → displacement of the outlines in mm → smallest contrast SD, HU.
-        seconds: (method) → s per volume.
+        seconds: (method) → s per volume; total_seconds: of this run, with the pieces that it found finished.
     """
 
     settings: Settings
@@ -75,20 +76,29 @@ class Measured:
     gains: dict[float, dict[str, float]]
     shape_limits: dict[float, dict[float, float]]
     seconds: dict[str, float]
+    total_seconds: float = 0.0
 
 
-def run(settings: Settings, folder: str | Path, progress: Progress | None = None) -> Measured:
+def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
     """Measure, or finish a measurement that was interrupted.
 
     Args:
         settings: what to measure.
-        folder: of the pieces, made if need be; finished pieces of the same settings are kept and reused.
         progress: called with the name of the step and its finished fraction.
+        folder: of the pieces, made if need be; finished pieces of the same settings are kept and reused. None: they
+            are kept until the measurement is complete.
 
     Raises:
-        ValueError: settings out of range, no method to run.
+        ValueError: no method to run.
     """
-    return _Study(settings, Store(Path(folder)), progress or (lambda step, fraction: None)).run()
+    if folder is None:
+        with TemporaryDirectory() as kept:
+            return measure(settings, progress, kept)
+    clock = Clock()
+    measured = _Study(settings, Store(Path(folder)), progress).run()
+    clock.lap("all")
+    measured.total_seconds = clock.seconds["all"]
+    return measured
 
 
 class _Study:

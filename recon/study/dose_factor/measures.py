@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.observer import dog_channels
-from torchpcct.metrics.resolution import lumen_area
+from torchpcct.metrics.plaque_measures import lumen_area
 from torchpcct.metrics.roi import sample_axial
 
 if TYPE_CHECKING:

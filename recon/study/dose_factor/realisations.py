@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from recon.fbp.inset import InsetFbp
-from recon.study.compare.measure import inset_grid
 from recon.study.dose_factor.measures import crop_window, segmentation
 from recon.study.dose_factor.scene import StudyScene
 from recon.study.dose_factor.settings import FBP_BASE, NOISY_SCENES, Settings
+from recon.study.paper.plaque_scan import inset_grid
 
 if TYPE_CHECKING:
     from recon.study.dose_factor.measure import Settings

@@ -34,16 +34,10 @@ def headline_method(methods: Any) -> str:
     return "mbir" if "mbir" in names else names[-1]
 
 
-def build_report(measured: Measured, seconds: float | None = None, command: str = "") -> Report:
-    """``report.json``, ``report.md``, ``dose_factor.png`` and ``dose_factor_images.png``.
-
-    Args:
-        measured: of :func:`recon.study.dose_factor.run`.
-        seconds: time of this run; it is no part of the tables.
-        command: that repeats the study.
-    """
+def build_report(measured: Measured) -> Report:
+    """``report.json``, ``report.md``, ``dose_factor.png`` and ``dose_factor_images.png``."""
     data = {"study": "dose-factor", **analyse(measured), "environment": environment()}
-    data["command"], data["seconds"] = command, seconds
+    data["command"], data["seconds"] = "", measured.total_seconds
     sections = [
         headline(data),
         "# Measured dose factors",
@@ -419,10 +413,8 @@ def _scene_table(data: dict[str, Any]) -> str:
 
 
 def _footer(data: dict[str, Any]) -> str:
-    s, e = data["seconds"], data["environment"]
-    parts = [f"torchpcct {e['torchpcct']}, PyTorch {e['torch']}, {e['cores']} cores."]
-    if data["command"]:
-        parts.append(f"Command: `{data['command']}`.")
-    if s is not None:
-        parts.append(f"Time of the last run, with the pieces it found finished: {s:.0f} s.")
-    return " ".join(parts)
+    e = data["environment"]
+    return (
+        f"torchpcct {e['torchpcct']}, PyTorch {e['torch']}, {e['cores']} cores. "
+        f"Time of the last run, with the pieces it found finished: {data['seconds']:.0f} s."
+    )

@@ -15,12 +15,12 @@ import torch
 from numpy.typing import NDArray
 
 from recon.mbir.mbir import average_onto
-from recon.study.compare.measure import inset_grid
 from recon.study.dose_factor.facts import fbp_label
 from recon.study.dose_factor.measure import Measured
 from recon.study.dose_factor.measures import crop_window
 from recon.study.dose_factor.scene import StudyScene
 from recon.study.dose_factor.settings import FBP_BASE, MAIN_SCENES
+from recon.study.paper.plaque_scan import inset_grid
 from torchpcct.metrics import ContrastSlope, DoseCurve, contrast_slope
 
 __all__ = ["OTHER_VOXELS_MM", "OtherVoxels", "Wide", "sd_at"]

@@ -24,6 +24,7 @@ from recon.study.dose_factor.facts import SceneFacts, fbp_label
 from recon.study.dose_factor.measures import OBSERVERS, crop_window, observer_channels
 from recon.study.dose_factor.settings import FBP_BASE, MAIN_SCENES, WIDE_ROIS, Settings
 from recon.study.dose_factor.store import Store
+from recon.study.paper.facts import FULL_VIEWS
 from recon.study.paper.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM, enclosing, inset_grid
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import VolumeGrid
@@ -196,7 +197,7 @@ class StudyScene:
         views = self.settings.views
         grids = [inset_grid(self.plaque, v) for v in {*self.settings.voxels_mm, self.settings.voxel_mm, 0.1}]
         # Fewer views stand for the same scan, thinned out: the beam is on for as long as one of its views.
-        whole = acquire(self.scene, self.scanner, region=enclosing(grids), duty=min(1.0, views / 1968))
+        whole = acquire(self.scene, self.scanner, region=enclosing(grids), duty=min(1.0, views / FULL_VIEWS["PCCT"]))
         assert whole.window is not None
         windows = [shadow(whole.geometry, g, margin=1) for g in grids]
         near = DetectorWindow.union(windows, whole.geometry.columns).widened(FILTER_MARGIN_COLUMNS, whole.window)

@@ -13,11 +13,11 @@ from recon.fbp.fbp import filter_windowed
 from recon.fbp.inset import InsetFbp
 from recon.mbir.mbir import Mbir
 from recon.sensitivity import worst_case_gain
-from recon.study.compare.measure import inset_grid
 from recon.study.dose_factor.facts import fbp_label
 from recon.study.dose_factor.methods import IMAGE_METHODS, Method, fingerprint
 from recon.study.dose_factor.realisations import Realisations
 from recon.study.dose_factor.settings import FBP_BASE
+from recon.study.paper.plaque_scan import inset_grid
 
 __all__ = ["FBP_KERNELS", "worst_case_gains"]
 

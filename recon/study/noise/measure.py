@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from recon.study.compare.measure import FULL_VIEWS
 from recon.study.noise.few_runs import Table, exact_table
 from recon.study.paper import facts as paper
 from recon.study.paper.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM, PlaqueScan, prepare, roi_entry
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Measured", "Settings", "measure", "run"]
 
-EID_VIEWS = 984
+EID_VIEWS = paper.FULL_VIEWS["EID-CT"]
 EID_KERNELS = ("soft", "standard")
 EID_VOXELS_MM = (0.25, 0.40)
 AVERAGED_FROM_MM = 0.30
@@ -61,7 +60,7 @@ class Settings:
 
     realizations: int = 200
     seed: int = 0
-    views: int = FULL_VIEWS
+    views: int = paper.FULL_VIEWS["PCCT"]
     kernels: tuple[str, ...] = paper.KERNELS
     voxels_mm: tuple[float, ...] = paper.VOXELS_MM
     doses: dict[str, float] = field(default_factory=lambda: dict(paper.DOSES))
@@ -177,7 +176,7 @@ def measure(settings: Settings, progress: Progress | None = None) -> Measured:
     scene = plaque_scene()
     scanner = presets.pcct(views=settings.views)
     kernels, voxels = settings.kernels, settings.voxels_mm
-    scanned = prepare(kernels, voxels, scene, scanner, FULL_VIEWS, lambda f: report("simulate", f))
+    scanned = prepare(kernels, voxels, scene, scanner, paper.FULL_VIEWS["PCCT"], lambda f: report("simulate", f))
     clean = scanned.clean
     lap("simulate")
     fine = InsetFbp(clean, [scanned.fine], [REFERENCE_KERNEL])(clean)[0][0]
@@ -299,7 +298,7 @@ def _eid_rows(
     voxels = [v for v in EID_VOXELS_MM if v in settings.voxels_mm]
     if not kernels or not voxels:
         return []
-    scanner = presets.eid(views=max(8, EID_VIEWS * settings.views // FULL_VIEWS))
+    scanner = presets.eid(views=max(8, EID_VIEWS * settings.views // paper.FULL_VIEWS["PCCT"]))
     scanned = prepare(kernels, voxels, scene, scanner, EID_VIEWS, lambda f: report("EID-CT", 0.8 * f))
     means = _roi_means(scanned, scanned.fbp(scanned.clean)).reshape(len(voxels), len(kernels), 2)
     adjoints = roi_adjoints(scanned.clean, scanned.fbp, scanned.pairs)

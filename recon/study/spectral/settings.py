@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from recon.study.study import StudySettings
-from torchpcct.validate import number, whole
+from torchpcct.validate import number
 
 __all__ = ["Settings"]
 
@@ -46,9 +46,7 @@ class Settings(StudySettings):
     def __post_init__(self) -> None:
         number("exposure_s", self.exposure_s, positive=True, unit="s")
         number("voxel_mm", self.voxel_mm, positive=True, unit="mm")
-        for name, low in (("realizations", 1), ("mbir_realizations", 0), ("views", 60), ("starved_rays", 100)):
-            whole(name, getattr(self, name), low)
-        whole("seed", self.seed, 0)
+        self.check_whole(realizations=1, mbir_realizations=0, views=60, starved_rays=100, seed=0)
         if self.mbir_realizations > self.realizations:
             raise ValueError(
                 f"mbir_realizations must lie in 0…{self.realizations} (realizations), got {self.mbir_realizations}"

@@ -8,18 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from tiny_studies import TINY as SMALLEST
+from tiny_studies import assert_report_is_whole
 
 from recon.cli import main
 from recon.mbir.mbir import average_onto
 from recon.pwls.qggmrf import quadratic
-from recon.study.compare.measure import inset_grid
-from recon.study.dose_factor import Settings, estimate_seconds, figures, run
 from recon.study.dose_factor import measure as study
 from recon.study.dose_factor.analysis import analyse
 from recon.study.dose_factor.estimates import controlled
+from recon.study.dose_factor.measure import measure
 from recon.study.dose_factor.measures import crop_window
 from recon.study.dose_factor.methods import (
-    METHOD_NAMES,
     METHODS,
     LinearFilter,
     Misstated,
@@ -28,27 +28,25 @@ from recon.study.dose_factor.methods import (
     load_methods,
 )
 from recon.study.dose_factor.realisations import Realisations
-from recon.study.dose_factor.report import build_report, headline
+from recon.study.dose_factor.report import headline
 from recon.study.dose_factor.rois import OtherVoxels, Wide
 from recon.study.dose_factor.scene import StudyScene, _tissue_groups
-from recon.study.dose_factor.settings import MAIN_SCENES
+from recon.study.dose_factor.settings import MAIN_SCENES, Settings
 from recon.study.dose_factor.store import Store
+from recon.study.paper.plaque_scan import inset_grid
 from torchpcct import VolumeGrid
 
-TINY = Settings(
-    n=6, slow_n=3, scene_n=3, doses=(2.0,), scene_doses=(2.0,), methods=("linear",), scenes=("half_size_core",),
-    scene_methods=("linear",), views=48, voxel_mm=0.4, kernels=("soft",), voxels_mm=(0.25,), blurs_mm=(0.4,), block=3,
-)  # fmt: skip
+TINY = Settings(**SMALLEST["dose-factor"])
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    return tmp_path_factory.mktemp("study")
+def folder(tiny):
+    return tiny("dose-factor").folder
 
 
 @pytest.fixture(scope="module")
-def measured(folder):
-    return run(TINY, folder)
+def measured(tiny):
+    return tiny("dose-factor").measured
 
 
 @pytest.fixture(scope="module")
@@ -95,18 +93,14 @@ def test_nothing_linear_exceeds_the_limit(analysed):
     assert limit["contrast_sd_fat_unknown_hu"] >= limit["contrast_sd_hu"]
 
 
-def test_report_files(measured, tmp_path):
-    report = build_report(measured, 1.0, "torchpcct dose-factor")
-    report.save(tmp_path / "out")
-    data = json.loads((tmp_path / "out" / "report.json").read_text())
+def test_report(tiny, tmp_path):
+    study = tiny("dose-factor")
+    sections = ("physics allows at most", "# Measured dose factors", "half_size_core")
+    data = assert_report_is_whole(study, tmp_path, {"dose_factor.png", "dose_factor_images.png"}, sections)
     assert data["study"] == "dose-factor"
     assert {e["method"] for e in data["methods"]} == {"linear"}
-    text = (tmp_path / "out" / "report.md").read_text()
-    assert text.startswith("The paper assumes 5.7×; measured")
-    assert "physics allows at most" in text.splitlines()[0]
-    assert "half_size_core" in text
-    for name in ("dose_factor.png", "dose_factor_images.png"):
-        assert (tmp_path / "out" / name).read_bytes().startswith(b"\x89PNG")
+    assert study.report.text.startswith("The paper assumes 5.7×; measured")
+    assert sections[0] in study.report.text.splitlines()[0]
 
 
 class _Stop(Exception):
@@ -122,11 +116,11 @@ def test_an_interrupted_study_goes_on_to_the_same_report(measured, analysed, fol
             raise _Stop
 
     with pytest.raises(_Stop):
-        run(TINY, tmp_path, stop)
+        measure(TINY, stop, tmp_path)
     done = {p: p.stat().st_mtime_ns for p in (tmp_path / "methods").rglob("*.npz")}
     assert done
     assert not list(tmp_path.rglob("*.part.*"))
-    again = run(TINY, tmp_path)
+    again = measure(TINY, folder=tmp_path)
     assert plain(analyse(again)) == plain(analysed)
     assert all(p.stat().st_mtime_ns == t for p, t in done.items())
 
@@ -134,7 +128,7 @@ def test_an_interrupted_study_goes_on_to_the_same_report(measured, analysed, fol
 def test_a_finished_study_computes_nothing(measured, folder, monkeypatch):
     calls = []
     monkeypatch.setattr(Store, "piece", _counting(Store.piece, calls))
-    run(TINY, folder)
+    measure(TINY, folder=folder)
     assert not calls
 
 
@@ -253,11 +247,6 @@ def test_control_variates():
     # Noise that has nothing to do with the control stays.
     free = rng.standard_normal((200, 2))
     np.testing.assert_allclose(controlled(free, noise, [0.0, 0.0]).mean(0), free.mean(0), atol=0.03)
-
-
-def test_every_method_has_a_name_and_a_colour():
-    assert set(METHOD_NAMES) == set(METHODS)
-    assert set(METHODS) - set(figures._COLORS) == {"mbir_noise_half", "mbir_noise_double"}
 
 
 def test_missing_weights_leave_mbir_out(monkeypatch, caplog):
@@ -415,11 +404,6 @@ def test_bad_settings(changes, message):
         Settings(**changes)
     with pytest.raises(TypeError, match="n must be a whole number"):
         Settings(n=7.5)
-
-
-def test_estimate_grows_with_the_work():
-    small, large = (sum(estimate_seconds(s).values()) for s in (Settings.quick(), Settings()))
-    assert 0 < small < 600 < large
 
 
 def test_command_line(measured, folder, monkeypatch, capsys):

@@ -16,7 +16,7 @@ from torchpcct.metrics import (
     roi_bias,
 )
 from torchpcct.metrics.bootstrap import bca_interval, leave_one_out, resampling
-from torchpcct.metrics.dose_factor import DOSES, FIGURES
+from torchpcct.metrics.dose_curve import DOSES, FIGURES
 
 MEANS, COVARIANCE = (40.0, 100.0), np.array([[100.0, 40.0], [40.0, 300.0]])
 FULL_RANGE = st.floats(0.125, 16)
@@ -250,7 +250,7 @@ MEASURED = MeasuredDoseCurve([1.0, 2.0], np.stack([samples(10), samples(10, 2.0)
         (lambda: DoseCurve.paper_cnr((100, 40), COVARIANCE), "must exceed"),
         (lambda: DoseCurve.paper_cnr(MEANS, np.zeros((2, 2))), "covariance"),
         (lambda: DoseCurve.contrast_variance(COVARIANCE, slope=0), "slope"),
-        (lambda: dose_factor(samples(10), CURVE, "rmse"), "figure must be one of"),
+        (lambda: dose_factor(samples(10), CURVE, "rmse"), "unknown figure 'rmse'"),
         (lambda: dose_factor(samples(10), CURVE, "contrast_variance"), "rises with dose"),
         (lambda: dose_factor(samples(10), CURVE, slope=0.9), "contrast_variance only"),
         (lambda: dose_factor(samples(2), CURVE), "≥ 3"),

@@ -1,4 +1,4 @@
-"""Lumen, core and cap by thresholds, against drawn shapes whose measures are known."""
+"""Lumen, core and cap by contours and by thresholds, against drawn shapes whose measures are known."""
 
 from __future__ import annotations
 
@@ -9,9 +9,18 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.special import ndtr
 
 from torchpcct.geometry import VolumeGrid
-from torchpcct.metrics.plaque_measures import basin_depth, cap_on_line, dice, segment_plaque
+from torchpcct.metrics.plaque_measures import (
+    basin_depth,
+    cap_on_line,
+    cap_thickness,
+    dice,
+    lumen_area,
+    segment_plaque,
+    threshold_contour,
+)
 from torchpcct.metrics.resolution import ellipsoid_distance
 
 GRID = VolumeGrid((160, 180), (0.03, 0.025), (-30.0, -29.0))
@@ -47,6 +56,39 @@ def test_discs(lumen, core, cap, angle):
     assert found.core_area == pytest.approx(math.pi * core**2, abs=0.2 * 2 * math.pi * core * 0.03)
     assert found.cap_thickness == pytest.approx(cap, abs=0.004)
     assert cap_on_line(image, GRID, a, b, lumen_hu=300.0, core_hu=70.0) == pytest.approx(cap, abs=0.003)
+    samples = cap_on_line(image, GRID, a, b, lumen_hu=300.0, core_hu=70.0, step_mm=0.01, interpolate=False)
+    assert samples == pytest.approx(cap, abs=0.0131)
+    assert samples / 0.01 == pytest.approx(round(samples / 0.01), abs=1e-6)
+    # Contours lie between the pixels.
+    assert math.sqrt(lumen_area(image, GRID, a, 300.0) / math.pi) == pytest.approx(lumen, abs=1e-3)
+    assert cap_thickness(image, GRID, a, b, 300.0, 70.0) == pytest.approx(cap, abs=0.004)
+    contour = threshold_contour(image, GRID, 70.0, b)
+    np.testing.assert_array_equal(contour[0], contour[-1])
+    np.testing.assert_allclose(np.hypot(*(contour - b).T), core, atol=0.005)
+
+
+@pytest.mark.parametrize("radius", [0.4, 1.1])
+def test_contours_at_another_threshold_of_a_blurred_edge(radius):
+    grid, sigma = VolumeGrid((1, 200, 200), 0.035, (0.0, -30.0, -29.0)), 0.1
+    image = 100.0 + 400.0 * ndtr(-ellipsoid_distance(grid.slice, (-30.0, -29.5), (radius, radius)) / sigma)
+    higher = lumen_area(torch.from_numpy(image)[None], grid, (-30.0, -29.5), threshold=400.0)
+    # A thirtieth of a pixel: what linear interpolation of a bent profile costs.
+    assert math.sqrt(higher / math.pi) == pytest.approx(radius - sigma * 0.6745, abs=1.2e-3)
+
+
+def test_area_is_in_square_millimetres_of_any_pixel():
+    grid = VolumeGrid((80, 150), (0.06, 0.03), (1.0, 2.0))
+    distance = ellipsoid_distance(grid, (1.01, 2.02), (0.9, 1.3))
+    area = lumen_area(500 - 500 * np.clip(0.5 + distance / 0.2, 0, 1), grid, (1.0, 2.0))
+    assert area == pytest.approx(math.pi * 0.9 * 1.3, rel=3e-3)
+
+
+def test_contours_that_are_lost_are_nan():
+    image, a, b = vessel()
+    assert math.isnan(lumen_area(image, GRID, a, threshold=600.0))
+    assert math.isnan(cap_thickness(np.maximum(image, 90), GRID, a, b))
+    assert threshold_contour(image, GRID, 250.0, (-33.0, -32.0)) is None
+    assert math.isfinite(cap_thickness(image, GRID, a, b))
 
 
 def test_rims_belong_to_the_band_but_not_to_the_core():
@@ -131,7 +173,6 @@ def test_dice():
     assert math.isnan(dice(a, b))
     a[0], b[0, 2:] = True, True
     assert dice(a, b) == pytest.approx(2 * 2 / 6)
-    assert dice(a, a) == 1.0
     assert dice(a, ~a) == 0.0
 
 
@@ -147,6 +188,8 @@ def test_dice():
         (lambda: cap_on_line(np.zeros(GRID.shape), GRID, (-30, -29), (-30, -29)), "step_mm"),
         (lambda: basin_depth(np.zeros(GRID.shape), GRID, np.zeros(GRID.shape)), "must mark pixels"),
         (lambda: dice(np.zeros(3), np.zeros(4)), "same shape"),
+        (lambda: lumen_area(np.zeros((3, 3)), GRID, (0, 0)), "shape"),
+        (lambda: lumen_area(np.full(GRID.shape, np.nan), GRID, (0, 0)), "NaN"),
     ],
 )
 def test_refusals(call, match):

@@ -1,4 +1,4 @@
-"""Edges, transfer functions and segmentation against closed forms."""
+"""Edges and transfer functions against closed forms."""
 
 import math
 
@@ -11,14 +11,11 @@ from scipy.special import erf
 
 from torchpcct import VolumeGrid
 from torchpcct.metrics import (
-    cap_thickness,
     edge_profile,
     edge_width,
     ellipsoid_distance,
-    lumen_area,
     match_edge_width,
     task_transfer,
-    threshold_contour,
 )
 
 GRID = VolumeGrid((120, 120), 0.1, (3.0, -2.0))
@@ -125,63 +122,6 @@ def test_distance_at_the_centre_and_on_symmetry_planes():
     np.testing.assert_allclose(flat[0], -np.hypot(x - x0, 0.3 * np.sqrt(1 - x**2)), atol=1e-9)
 
 
-# Segmentation.
-
-
-PIXELS = VolumeGrid((1, 200, 200), 0.035, (0.0, -30.0, -29.0))
-
-
-def vessel(lumen=1.0, core=0.5, cap=0.17, sigma=0.02):
-    """Blood disk about (-30, -29.5), a core disk ``cap`` to its right, in fibrous tissue."""
-    a = ellipsoid_distance(PIXELS.slice, (-30.0, -29.5), (lumen, lumen))
-    b = ellipsoid_distance(PIXELS.slice, (-30.0, -29.5 + lumen + cap + core), (core, core))
-    image = 100 + 400 * (1 - blurred(a, sigma, 0, 1)) - 60 * (1 - blurred(b, sigma, 0, 1))
-    return image[None]
-
-
-SEEDS = (-30.0, -29.5), (-30.0, -29.5 + 1.0 + 0.17 + 0.5)
-
-
-@pytest.mark.parametrize("radius", [0.4, 0.7, 1.1])
-def test_lumen_area(radius):
-    # The threshold halfway between blood and tissue lies on the surface of a straight edge.
-    area = lumen_area(torch.from_numpy(vessel(radius)), PIXELS, SEEDS[0], threshold=300.0)
-    assert math.sqrt(area / math.pi) == pytest.approx(radius, abs=1e-3)
-    higher = lumen_area(vessel(radius, sigma=0.1), PIXELS, SEEDS[0], threshold=400.0)
-    # A thirtieth of a pixel: what linear interpolation of a bent profile costs.
-    assert math.sqrt(higher / math.pi) == pytest.approx(radius - 0.1 * 0.6745, abs=1.2e-3)
-
-
-def test_area_is_in_square_millimetres_of_any_pixel():
-    grid = VolumeGrid((80, 150), (0.06, 0.03), (1.0, 2.0))
-    distance = ellipsoid_distance(grid, (1.01, 2.02), (0.9, 1.3))
-    assert lumen_area(500 - 500 * np.clip(0.5 + distance / 0.2, 0, 1), grid, (1.0, 2.0)) == pytest.approx(
-        math.pi * 0.9 * 1.3, rel=3e-3
-    )
-
-
-@pytest.mark.parametrize("cap", [0.1, 0.17, 0.4])
-def test_cap_thickness(cap):
-    seed = (-30.0, -29.5 + 1.0 + cap + 0.5)
-    thickness = cap_thickness(vessel(cap=cap), PIXELS, SEEDS[0], seed, 300.0, 70.0)
-    assert thickness == pytest.approx(cap, abs=0.004)
-
-
-def test_what_is_lost_is_nan():
-    image = vessel()
-    assert math.isnan(lumen_area(image, PIXELS, SEEDS[0], threshold=600.0))
-    assert math.isnan(cap_thickness(np.maximum(image, 90), PIXELS, *SEEDS))
-    assert threshold_contour(image, PIXELS, 250.0, (-33.0, -32.0)) is None
-    assert math.isfinite(cap_thickness(image, PIXELS, *SEEDS))
-
-
-def test_contour_is_closed_and_around_the_seed():
-    contour = threshold_contour(vessel(), PIXELS, 70.0, SEEDS[1])
-    np.testing.assert_array_equal(contour[0], contour[-1])
-    radius = np.hypot(contour[:, 0] - SEEDS[1][0], contour[:, 1] - SEEDS[1][1])
-    np.testing.assert_allclose(radius, 0.5, atol=0.005)
-
-
 @pytest.mark.parametrize(
     ("call", "match"),
     [
@@ -197,8 +137,6 @@ def test_contour_is_closed_and_around_the_seed():
         (lambda: task_transfer(DISK, DISK, (1, 1), 0.1).frequency(1.0), "level"),
         (lambda: ellipsoid_distance(GRID, (0.0, 0.0, 0.0), (1.0, 1.0)), "one per axis"),
         (lambda: ellipsoid_distance(GRID, (0.0, 0.0), (1.0, 0.0)), "positive"),
-        (lambda: lumen_area(np.zeros((3, 3)), PIXELS, (0, 0)), "shape"),
-        (lambda: lumen_area(vessel() * np.nan, PIXELS, (0, 0)), "NaN"),
     ],
 )
 def test_refusals(call, match):
