@@ -45,7 +45,7 @@ class Measured:
     seconds: dict[str, float]
 
 
-def measure(settings: Settings, progress: Progress = silent, folder: Path | None = None) -> Measured:
+def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
     """Dose, noise, beam hardening, and the plaque by FBP and MBIR; nothing is kept in ``folder``."""
     s, clock = settings, Clock()
     parts: dict[str, Any] = {}

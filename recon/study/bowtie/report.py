@@ -35,6 +35,7 @@ def build_report(measured: Measured) -> Report:
     m, p = measured, measured.parts
     checks = _checks(p)
     data = {
+        "study": "bowtie",
         "settings": asdict(m.settings),
         "checks": [c.as_dict() for c in checks],
         **p,

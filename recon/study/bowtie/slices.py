@@ -193,7 +193,8 @@ def noise(
     regions = {"heart": r < HEART_DISC_MM}
     if name == "ctdi":
         regions = {region: (r >= low) & (r < high) for region, (low, high) in CTDI_REGIONS_MM.items()}
-    first, squares, rings = clean, [], []
+    first, rings = clean, []
+    squares: list[list[list[float]]] = []
     for seed in seeds:
         noisy = np.stack([slice_image(s.with_noise(exposure_s, seed), grid, kernel) for s in scans.values()])
         first, error = (first if squares else noisy), noisy - clean

@@ -32,7 +32,7 @@ class Measured:
     seconds: dict[str, float]
 
 
-def measure(settings: Settings, progress: Progress = silent, folder: Path | None = None) -> Measured:
+def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
     """Follow photons and compute rates; nothing is kept in ``folder``."""
     s, clock, rng = settings, Clock(), np.random.default_rng(settings.seed)
     efficiency, spectrum, looked_at = [], [], cases()

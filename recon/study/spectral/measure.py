@@ -72,7 +72,7 @@ class Measured:
     processor_seconds: float
 
 
-def measure(settings: Settings, progress: Progress = silent, folder: Path | None = None) -> Measured:
+def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
     """Scan, decompose, reconstruct, label; nothing is kept in ``folder``."""
     s, clock, spent = settings, Clock(), time.process_time()
 
@@ -86,7 +86,7 @@ def measure(settings: Settings, progress: Progress = silent, folder: Path | None
     clean = scan.fbp(scan.exact.line_integrals)
     data["second_order_bound"] = second_order_bound(scan, LOW_EXPOSURE_S)
     data["starved"] = starved_rays(scan, s.starved_rays, s.seed)
-    data["water"] = {k: v.tolist() for k, v in water_hu(VMI_ENERGIES_KEV).items()}
+    data["water"] = {k: v.tolist() for k, v in water_hu(VMI_ENERGIES_KEV, s.views).items()}
     done("water and starved rays")
     lines, volumes, data["rays"] = [], [], []
     for k in range(s.realizations):

@@ -27,6 +27,7 @@ def build_report(measured: Measured) -> Report:
     s, m = measured.settings, measured.data
     checks = checks_of(m)
     data = {
+        "study": "spectral",
         "settings": asdict(s),
         **m,
         "seconds": measured.seconds,

@@ -47,6 +47,7 @@ _ROD_MM = 8.0
 """Radius of the water rod at the plaque's place."""
 
 _WATER_ROWS, _WATER_VIEWS = 8, 246
+"""Of the scans of water; never more views than the study's own scan."""
 
 
 def _acquired(
@@ -190,14 +191,14 @@ def starved_rays(scan: SpectralScan, rays: int, seed: int) -> dict[str, float]:
     }
 
 
-def water_hu(energies: Any) -> dict[str, NDArray[np.float64]]:
+def water_hu(energies: Any, views: int) -> dict[str, NDArray[np.float64]]:
     """HU of water in virtual monochromatic images at every energy, through the whole chain, noise free.
 
     Returns:
         place → ``(E,)`` HU: a water cylinder of the patient's size at its centre and at the plaque's place, and a rod
         of water at the plaque's place in the patient's fat.
     """
-    scanner = presets.pcct(views=_WATER_VIEWS, mode="spectral", rows=_WATER_ROWS)
+    scanner = presets.pcct(views=min(views, _WATER_VIEWS), mode="spectral", rows=_WATER_ROWS)
     x, y, z = PAPER_POSITION
     spacing, patient = (0.25, 0.5, 0.5), EllipticCylinder(PATIENT_DIAMETER / 2)
     there, middle = VolumeGrid((2, 16, 16), spacing, (z, y, x)), VolumeGrid((2, 16, 16), spacing, 0.0)
