@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -100,23 +99,23 @@ def patient_ratio(scanners: dict[str, Scanner], exposure_s: float, histories: in
 
 
 def ctdi_figures(
-    scanners: dict[str, Scanner], exposure_s: float, histories: int, seed: int, progress: Callable[[float], None]
-) -> dict[str, Any]:
-    """Doses in the bores of the 32 cm phantom for both bowties, by three readings of "dose".
+    scanners: dict[str, Scanner], exposure_s: float, histories: int, seed: int
+) -> dict[str, dict[str, CtdiDose]]:
+    """Doses in the bores of the 32 cm phantom for both bowties, by four readings of "dose".
 
     Returns:
         ``"plane"``: unscattered, in the plane; ``"contiguous"``: unscattered part of CTDI100; ``"interacted"``: all
-        energy of the first interaction; ``"total"``: with scatter (only with histories); each bowtie → CtdiDose.
+        energy of the first interaction; ``"total"``: with scatter (only with histories); each bowtie → dose.
     """
-    doses: dict[str, dict[str, CtdiDose]] = {"plane": {}, "contiguous": {}, "interacted": {}}
-    for k, (name, scanner) in enumerate(scanners.items()):
-        doses["plane"][name] = ctdi_dose(scanner, exposure_s, axial="plane")
-        doses["contiguous"][name] = ctdi_dose(scanner, exposure_s)
-        doses["interacted"][name] = ctdi_dose(scanner, exposure_s, quantity="interacted")
-        if histories:
-            doses.setdefault("total", {})[name] = ctdi_dose(scanner, exposure_s, histories=histories, seed=seed)
-        progress((k + 1) / len(scanners))
-    return doses
+    asked: dict[str, dict[str, Any]] = {
+        "plane": {"axial": "plane"}, "contiguous": {}, "interacted": {"quantity": "interacted"},
+    }  # fmt: skip
+    if histories:
+        asked["total"] = {"histories": histories, "seed": seed}
+    return {
+        kind: {b: ctdi_dose(scanner, exposure_s, **how) for b, scanner in scanners.items()}
+        for kind, how in asked.items()
+    }
 
 
 def ratios(doses: dict[str, CtdiDose]) -> dict[str, float]:
@@ -144,8 +143,8 @@ def ramp_figures(scanners: dict[str, Scanner], exposure_s: float) -> list[dict[s
 def transmission(scanners: dict[str, Scanner]) -> dict[str, Any]:
     """Share of the energy that each bowtie lets through, relative to no bowtie, and thickness, over the fan."""
     gamma = np.linspace(0.0, 0.32, 161)
-    result: dict[str, Any] = {"fan_angle_deg": np.degrees(gamma)}
-    result["offset_at_isocentre_mm"] = scanners["large"].geometry.sod * np.sin(gamma)
+    sod = scanners["large"].geometry.sod
+    result: dict[str, Any] = {"fan_angle_deg": np.degrees(gamma), "offset_at_isocentre_mm": sod * np.sin(gamma)}
     for name, scanner in scanners.items():
         spectrum = scanner.source.spectrum(scanner.energy_bin_kev)
         slab: Any = sum((m.attenuation(spectrum.energies) * t for m, t in scanner.filters), np.zeros(1))
@@ -155,6 +154,5 @@ def transmission(scanners: dict[str, Scanner]) -> dict[str, Any]:
             passed *= bowtie.transmission(gamma, spectrum.energies)
         result[name] = passed.sum(-1) / energy.sum(-1)
         result[f"{name} mm"] = np.sum([b.thickness(gamma) for b in scanner.bowties], axis=0)
-    result["roi_edge_mm"] = 50.0
-    result["roi_edge_deg"] = math.degrees(math.asin(50.0 / scanners["large"].geometry.sod))
-    return result
+    edge = 50.0
+    return {**result, "roi_edge_mm": edge, "roi_edge_deg": math.degrees(math.asin(edge / sod))}

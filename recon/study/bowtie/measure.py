@@ -54,7 +54,8 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     scanners = wide_scanners(8)
     parts["transmission"] = transmission(scanners)
     parts["ramps"] = ramp_figures(scanners, s.exposure_s)
-    ctdi = ctdi_figures(scanners, s.exposure_s, s.histories, s.seed, lambda f: progress("dose", 0.3 * f))
+    ctdi = ctdi_figures(scanners, s.exposure_s, s.histories, s.seed)
+    progress("dose", 0.3)
     parts["ctdi_ratios"] = {k: ratios(v) for k, v in ctdi.items()}
     # The CTDI phantom's map is drawn only, its doses are those in the bores: no scatter.
     asked = {"ctdi": (max(s.map_mm / 2, 1.0), 0), "thorax": (s.map_mm, s.histories)}

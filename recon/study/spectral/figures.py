@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from recon.study.figures import extent
 from recon.study.paper import facts as paper
 from recon.study.spectral.measure import Measured
 from torchpcct.spectral import MMD_TISSUES, vmi
@@ -19,12 +20,11 @@ _SHOWN_KEV = (40.0, 52.0, 70.0)
 
 
 def _show(ax: Any, image: Any, measured: Measured, title: str, **options: Any) -> Any:
-    y, x = measured.scan.grid.extent[1:]
     ax.set_xticks([])
     ax.set_yticks([])
     ax.set_title(title, fontsize=8)
-    extent = (-x / 2, x / 2, -y / 2, y / 2)
-    return ax.imshow(np.asarray(image), origin="lower", extent=extent, interpolation="nearest", **options)
+    edges = extent(measured.scan.grid)
+    return ax.imshow(np.asarray(image), origin="lower", extent=edges, interpolation="nearest", **options)
 
 
 def curves_figure(measured: Measured) -> Any:
