@@ -9,12 +9,12 @@ import numba
 import numpy as np
 import pytest
 import torch
+from analytic import Gaussian, line_integrals, rasterize
 from geometries import REGISTRY
 
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
 from torchpcct.projector import Projector
-from torchpcct.projector.analytic import Gaussian, line_integrals, rasterize
 from torchpcct.projector.cpu import plane_passes as plane
 
 NAMES = sorted(REGISTRY)
