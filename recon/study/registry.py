@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import ast
 import importlib
-import importlib.util
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -42,8 +41,6 @@ def part(name: str, module: str) -> Any:
         ValueError: an unknown study.
     """
     folder = choice("study", _FORMER.get(name, name), STUDIES).replace("-", "_")
-    if importlib.util.find_spec(f"recon.study.{folder}.settings") is None:  # bridge
-        module = "measure"  # bridge
     return importlib.import_module(f"recon.study.{folder}.{module}")
 
 
@@ -92,9 +89,6 @@ def run(name: str, settings: Any, progress: Progress | None = None, folder: str 
     kind = part(name, "settings").Settings
     if not isinstance(settings, kind):
         raise TypeError(f"settings must be {kind.__module__}.Settings, got {type(settings).__name__}")
-    measure, report = part(name, "measure"), part(name, "report")
-    if measure is report:  # bridge
-        bridged: Report = measure.run(settings, progress)  # bridge
-        return bridged  # bridge
-    built: Report = report.build_report(measure.measure(settings, progress or silent, folder))
-    return built
+    measured = part(name, "measure").measure(settings, progress or silent, folder)
+    report: Report = part(name, "report").build_report(measured)
+    return report

@@ -1,1 +1,1 @@
-"""What the paper says (``facts``, ``tables``) and how its plaque is scanned and read (``plaque_scan``, ``measures``)."""
+"""What the paper says (``facts``, ``tables``); how its plaque is scanned (``plaque_scan``) and read (``measures``)."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
 from dataclasses import FrozenInstanceError, fields
 
@@ -50,8 +49,6 @@ COUNTS = {
 @pytest.mark.parametrize("name", registry.STUDIES)
 def test_settings_of_every_study(name):
     """Valid as they are, as a first look and at the smallest scale; nonsense is refused by its name."""
-    if importlib.util.find_spec(f"recon.study.{name.replace('-', '_')}.settings") is None:
-        pytest.skip("bridge")
     full, quick = (registry.build_settings(name, quick=q, seed=3) for q in (False, True))
     assert full != quick
     kind = type(full)
