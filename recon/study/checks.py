@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from recon.study.report import markdown_table
@@ -36,6 +36,10 @@ class Check:
     def ok(self) -> bool:
         """Whether the figure lies in the accepted range."""
         return bool(self.low <= self.ours <= self.high)
+
+    def explained(self, cause: str) -> Check:
+        """The check with ``cause`` as its note, where it is outside."""
+        return self if self.ok or not cause else replace(self, note=cause)
 
     def as_dict(self) -> dict[str, Any]:
         """JSON values, ``ok`` among them; open ends are None."""

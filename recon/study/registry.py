@@ -1,25 +1,26 @@
-"""The studies that ``torchpcct study NAME`` runs.
+"""The studies by name: what ``torchpcct study NAME`` runs, loaded when they are asked for.
 
-Each study is a module of this package with
-
-* ``Settings``: a frozen dataclass that validates itself, with ``Settings.quick(**changes)`` for a first look (≤ 60 s);
-* ``run(settings, progress=None) -> Report``: computes everything and returns the report, writing nothing;
-  ``progress(step, fraction)`` is called with the name of the step and its finished fraction.
+What a study must be is said in :mod:`recon.study.study`.
 """
 
 from __future__ import annotations
 
 import ast
 import importlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import fields
+from pathlib import Path
 from typing import Any
 
 from recon.study.report import Report
+from recon.study.study import Progress, silent
+from torchpcct.validate import choice
 
-__all__ = ["STUDIES", "build_settings", "run"]
+__all__ = ["STUDIES", "build_settings", "part", "run"]
 
 STUDIES: dict[str, str] = {
+    "compare": "the paper's CNR tables by FBP and PWLS, with intervals",
+    "dose-factor": "the dose that each method saves against FBP, measured, beside what the data allow",
     "detector": "the silicon detector: counts, DQE beside the published one, pile-up, charge sharing",
     "bowtie": "ROI bowtie: CTDI and thorax dose, noise inside and outside, and its product with MBIR",
     "motion": "residual motion in PCCT and EID-CT, and reconstruction with the motion known, exactly or not",
@@ -27,13 +28,20 @@ STUDIES: dict[str, str] = {
     "resolution": "PCCT and EID-CT without noise, blurred step by step: lumen, cap and core by thresholds",
     "spectral": "energy bins into PE and PVC: monochromatic images, best energy, tissue maps, by FBP and joint MBIR",
 }
-"""Name → one line of help. The module is ``recon.study.<name>.measure``."""
+"""Name → one line of help. The study ``some-name`` is the package ``recon.study.some_name``."""
+
+_FORMER = {"dose": "bowtie"}
+"""The study "bowtie" was first published as "dose"; whoever calls it so still gets it."""
 
 
-def _module(name: str) -> Any:
-    if name not in STUDIES:
-        raise ValueError(f"unknown study {name!r}: use one of {', '.join(STUDIES)}")
-    return importlib.import_module(f"recon.study.{name}.measure")
+def part(name: str, module: str) -> Any:
+    """One of the modules ``settings``, ``measure`` and ``report`` of a study.
+
+    Raises:
+        ValueError: an unknown study.
+    """
+    folder = choice("study", _FORMER.get(name, name), STUDIES).replace("-", "_")
+    return importlib.import_module(f"recon.study.{folder}.{module}")
 
 
 def build_settings(name: str, *, quick: bool = False, seed: int | None = None, changes: Sequence[str] = ()) -> Any:
@@ -47,8 +55,9 @@ def build_settings(name: str, *, quick: bool = False, seed: int | None = None, c
 
     Raises:
         ValueError: an unknown study or field, a change without ``=``, a value that the settings refuse.
+        TypeError: a value of a wrong type.
     """
-    kind = _module(name).Settings
+    kind = part(name, "settings").Settings
     known = {f.name for f in fields(kind) if f.init}
     values: dict[str, Any] = {} if seed is None or "seed" not in known else {"seed": seed}
     for change in changes:
@@ -64,16 +73,22 @@ def build_settings(name: str, *, quick: bool = False, seed: int | None = None, c
     return kind.quick(**values) if quick else kind(**values)
 
 
-def run(name: str, settings: Any, progress: Callable[[str, float], None] | None = None) -> Report:
-    """Run a study; see the module's docstring.
+def run(name: str, settings: Any, progress: Progress | None = None, folder: str | Path | None = None) -> Report:
+    """Measure a study and build its report, which is not saved.
+
+    Args:
+        name: of the study.
+        settings: of that study.
+        progress: called with the name of the step and its finished fraction.
+        folder: for finished pieces, which the next run of the same settings reuses; None: nothing is kept.
 
     Raises:
-        ValueError: an unknown study.
+        ValueError: an unknown study; what the study itself refuses.
         TypeError: settings of another study.
     """
-    module = _module(name)
-    if not isinstance(settings, module.Settings):
-        raise TypeError(f"settings must be {module.__name__}.Settings, got {type(settings).__name__}")
-    report = module.run(settings, progress)
-    assert isinstance(report, Report)
+    kind = part(name, "settings").Settings
+    if not isinstance(settings, kind):
+        raise TypeError(f"settings must be {kind.__module__}.Settings, got {type(settings).__name__}")
+    measured = part(name, "measure").measure(settings, progress or silent, folder)
+    report: Report = part(name, "report").build_report(measured)
     return report

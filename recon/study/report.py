@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,12 @@ import numpy as np
 
 from torchpcct.files import written_whole
 
-__all__ = ["Report", "markdown_table"]
+__all__ = ["Report", "markdown_table", "or_dash", "records_table"]
+
+
+def or_dash(value: float, digits: int) -> str:
+    """A table's cell: the value, or a dash for NaN."""
+    return "–" if math.isnan(value) else f"{value:.{digits}f}"
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -27,6 +33,11 @@ def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
     rule = "|" + "|".join((":" if i == 0 else "") + "-" * (w + 1) + (":" if i else "") for i, w in enumerate(widths))
     return "\n".join([line(cells[0]), rule + "|", *map(line, cells[1:])])
+
+
+def records_table(records: Iterable[Mapping[str, Any]], columns: Mapping[str, str]) -> str:
+    """A table of records; ``columns``: heading → format of the cell, e.g. ``"{dqe:.3f} ± {dqe_error:.3f}"``."""
+    return markdown_table(list(columns), [[cell.format(**record) for cell in columns.values()] for record in records])
 
 
 def _plain(value: Any) -> Any:
@@ -54,6 +65,11 @@ class Report:
     data: dict[str, Any]
     text: str
     figures: dict[str, Any] = field(default_factory=dict)
+
+    def made_by(self, command: str) -> None:
+        """Add the command that repeats the study to values and text."""
+        self.data["command"] = command
+        self.text += f" Command: `{command}`."
 
     def save(self, folder: str | os.PathLike[str]) -> list[Path]:
         """Write ``report.json``, ``report.md`` and the figures into ``folder`` (made if need be).

@@ -1,13 +1,18 @@
 """The skeleton of every study: its settings, its clock, and what it says to whoever waits.
 
-A study is a folder of this package, listed in :mod:`recon.study.registry`, with
+A study is a folder of this package with four modules, listed in :mod:`recon.study.registry`, which runs it by its name:
 
 * ``settings.py``: ``Settings(StudySettings)``, a frozen dataclass that validates itself;
-* ``measure.py``: ``measure(settings, progress, folder) -> Measured``, which simulates, reconstructs and measures, and
-  writes nothing but finished pieces into ``folder`` (where one is given, and the study keeps pieces);
-* ``report.py``: ``build_report(measured) -> Report``: JSON values, Markdown and the figures of ``figures.py``.
+* ``measure.py``: ``measure(settings, progress=silent, folder=None) -> Measured``, which simulates, reconstructs and
+  measures. It prints nothing and writes nothing, but finished pieces into ``folder`` where the study keeps pieces;
+* ``report.py``: ``build_report(measured) -> Report``: JSON values, Markdown and the figures; it measures nothing;
+* ``figures.py``: the pictures of the report.
 
-So data walks one way, settings → measure → report, and no module looks back.
+``Measured`` is the study's own: a dataclass with ``settings``, ``seconds`` (of a :class:`Clock`) and what was found. So
+data walks one way, settings → measure → report, and no module looks back.
+
+Noise has one rule in all studies: realisation i draws with the seed ``settings.seed + i``, the same at every dose, in
+every scene and for every method, so that their results can be paired.
 """
 
 from __future__ import annotations
@@ -19,9 +24,16 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, ClassVar, Self
 
+import numba
 import numpy as np
+import scipy
+import torch
+from tqdm import tqdm
 
-__all__ = ["Clock", "Progress", "StudySettings", "environment", "silent", "time_line"]
+import torchpcct
+from torchpcct.validate import whole
+
+__all__ = ["Clock", "Progress", "ProgressBars", "StudySettings", "environment", "silent", "time_line"]
 
 Progress = Callable[[str, float], None]
 """Called with the name of a step and its finished fraction, 0…1."""
@@ -31,11 +43,44 @@ def silent(step: str, fraction: float) -> None:
     """The progress of whom nobody watches."""
 
 
+class ProgressBars:
+    """Progress on the terminal's error stream, a bar per step.
+
+    Args:
+        enabled: False: nothing is shown.
+    """
+
+    def __init__(self, enabled: bool) -> None:
+        self.enabled = enabled
+        self._step: str | None = None
+        self._bar: Any = None
+
+    def __call__(self, step: str, fraction: float) -> None:
+        if not self.enabled:
+            return
+        if step != self._step:
+            self.close()
+            self._step = step
+            form = "{desc:<28} {bar:30} {percentage:3.0f}% {elapsed}<{remaining}"
+            self._bar = tqdm(total=100, desc=step, unit="%", leave=True, bar_format=form)
+        self._bar.update(100 * fraction - self._bar.n)
+
+    def of(self, step: str) -> Callable[[float], None]:
+        """The progress of one step."""
+        return lambda fraction: self(step, fraction)
+
+    def close(self) -> None:
+        """End the bar of the last step."""
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None
+
+
 class StudySettings:
     """What the settings of all studies share; each derives a frozen dataclass from it.
 
     Attributes:
-        QUICK: the values of a first look, by field; the study's docstring or its README row says what they cost.
+        QUICK: the values of a first look, by field; a comment beside says what is left out.
     """
 
     QUICK: ClassVar[Mapping[str, Any]] = {}
@@ -44,6 +89,20 @@ class StudySettings:
     def quick(cls, **changes: Any) -> Self:
         """Settings of a first look in under a minute, with ``changes`` on top."""
         return cls(**{**cls.QUICK, **changes})
+
+    def estimated_seconds(self) -> dict[str, float]:
+        """Rough time of each part in s on two idle cores, nothing finished yet; empty: not known."""
+        return {}
+
+    def check_whole(self, **least: int) -> None:
+        """Check fields that count something: field → the least value.
+
+        Raises:
+            TypeError: no whole number.
+            ValueError: a value below the least.
+        """
+        for name, low in least.items():
+            whole(name, getattr(self, name), low)
 
 
 class Clock:
@@ -73,12 +132,6 @@ class Clock:
 
 def environment() -> dict[str, Any]:
     """Versions and machine that made a result."""
-    import numba
-    import scipy
-    import torch
-
-    import torchpcct
-
     return {
         "torchpcct": torchpcct.__version__,
         "python": platform.python_version(),

@@ -24,7 +24,7 @@ from torch import Tensor
 from recon.gram.gram import Gram
 from recon.pwls.inset_problem import DEFAULT_PRIOR, InsetProblem
 from recon.pwls.pwls import pwls
-from recon.study.compare.measure import inset_grid
+from recon.study.paper.plaque_scan import inset_grid
 from torchpcct import Projector, acquire
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.scanner import presets

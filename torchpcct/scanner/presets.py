@@ -16,7 +16,19 @@ from torchpcct.scanner.source import Source
 from torchpcct.scene.materials import MATERIALS
 from torchpcct.validate import choice
 
-__all__ = ["EID_OFFSET_COLUMNS", "EID_PITCH_MM", "FLAT_FILTER_MM", "PCCT_PITCH_MM", "eid", "pcct"]
+__all__ = [
+    "EID_OFFSET_COLUMNS",
+    "EID_PITCH_MM",
+    "EID_VIEWS",
+    "FLAT_FILTER_MM",
+    "PCCT_PITCH_MM",
+    "PCCT_VIEWS",
+    "eid",
+    "pcct",
+]
+
+PCCT_VIEWS, EID_VIEWS = 1968, 984
+"""Published views per turn."""
 
 PCCT_PITCH_MM = (0.50, 0.35)
 """Inferred (row, column) pitch at the detector: 40 rows of 0.5 mm cover the 11.3 mm that the published volumes hold at
@@ -47,7 +59,7 @@ def _bowties(name: Any, sod: float) -> tuple[Bowtie, ...]:
 
 
 def pcct(
-    views: int = 1968,
+    views: int = PCCT_VIEWS,
     mode: str = "counting",
     *,
     bowtie: Any = "large",
@@ -90,7 +102,7 @@ def pcct(
 
 
 def eid(
-    views: int = 984,
+    views: int = EID_VIEWS,
     *,
     bowtie: Any = "large",
     kvp: float = 100.0,

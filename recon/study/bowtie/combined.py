@@ -9,57 +9,39 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.stats import t as student
 
-from recon.study.bowtie.slice_scan import BOWTIES
+from recon.fbp.exact_noise import roi_covariance
+from recon.mbir.mbir import Mbir, working_grid
+from recon.pwls.inset_problem import InsetProblem
+from recon.study.bowtie.slices import BOWTIES
+from recon.study.paper import facts as paper
 from recon.study.paper.plaque_scan import PlaqueScan, inset_grid, prepare
-from torchpcct.metrics import ContrastSlope, DoseCurve, DoseFactor, contrast_slope, dose_factor
+from torchpcct.metrics import DoseCurve, contrast_slope, dose_factor
 from torchpcct.scanner import presets
+from torchpcct.scene.materials import MATERIALS
 from torchpcct.scene.plaque import plaque_scene
 
-__all__ = ["Combined", "combine"]
+__all__ = ["FIGURES", "combine", "variance_ratio"]
 
 Floats = NDArray[np.float64]
 
 KERNEL, VOXEL_MM = "soft", 0.25
 """FBP that factors are quoted against: the paper's best."""
 
-FULL_VIEWS = 1968
-
-
-@dataclass(frozen=True)
-class Combined:
-    """Figures of one exposure.
-
-    Attributes:
-        exposure_s: of the scan.
-        fbp_sd: bowtie → SD of the two ROI means (core, fibrous) of FBP and of their difference, HU, exact.
-        mbir_sd: bowtie → the same of MBIR over the realisations.
-        means: (method, bowtie) → mean of the two ROI means, HU: noise free for FBP, over the realisations for MBIR.
-        variance_ratio: MBIR's contrast variance with over without the ROI bowtie, (value, low, high), paired.
-        slope: MBIR's contrast slope with the large bowtie.
-        factors: figure → dose factor of MBIR with the ROI bowtie against FBP with the large one, equal exposure = 1.
-        factors_large: the same of MBIR with the large bowtie.
-    """
-
-    exposure_s: float
-    fbp_sd: dict[str, list[float]]
-    mbir_sd: dict[str, list[float]]
-    means: dict[str, list[float]]
-    variance_ratio: tuple[float, float, float]
-    slope: ContrastSlope
-    factors: dict[str, DoseFactor]
-    factors_large: dict[str, DoseFactor]
+FIGURES = {"contrast_variance": "contrast variance", "paper_cnr": "paper's CNR"}
+"""What factors are measured by → its name in tables."""
 
 
 def combine(
-    doses: tuple[float, ...], n: int, views: int, seed: int, progress: Callable[[float], None]
-) -> tuple[list[Combined], dict[str, Any]]:
+    doses: tuple[float, ...], n: int, views: int, seed: int, saved: dict[str, float],
+    progress: Callable[[float], None],
+) -> tuple[list[dict[str, Any]], dict[str, Any]]:  # fmt: skip
     """Scan, reconstruct, measure.
 
     Args:
@@ -67,26 +49,25 @@ def combine(
         n: paired realisations.
         views: per rotation; fewer keep the tube load of the whole scan.
         seed: realisation k uses the seed ``seed + k``.
+        saved: kind of dose → factor that the ROI bowtie saves at equal exposure.
         progress: called with the finished fraction.
 
     Returns:
-        Figures of each exposure, and the plan of the simulation.
+        JSON values of each exposure, and the plan of the simulation. SDs are those of the two ROI means (core, fibrous)
+        and of their difference, exact for FBP, over the realisations for MBIR; means likewise, noise free for FBP.
+        Factors have their interval: of MBIR with either bowtie against FBP with the large one at equal exposure, and
+        the first times the dose that the bowtie saves (``product_…``).
     """
-    from recon.fbp.exact_noise import roi_covariance
-    from recon.mbir.mbir import Mbir, working_grid
-    from recon.pwls.inset_problem import InsetProblem
-
     prior = Mbir.load()
     scans: dict[tuple[str, bool], PlaqueScan] = {}
     for k, (bowtie, core) in enumerate((("large", True), ("large", False), ("large+roi", True))):
         scanner = presets.pcct(views=views, bowtie=bowtie)
-        scene = plaque_scene(core_contrast=1.0 if core else 0.0)
         # The ROIs are those of the plaque with its core, whatever fills it.
-        scans[bowtie, core] = prepare((KERNEL,), (VOXEL_MM,), scene, scanner, FULL_VIEWS)
+        scene = plaque_scene(core_contrast=1.0 if core else 0.0)
+        scans[bowtie, core] = prepare((KERNEL,), (VOXEL_MM,), scene, scanner, paper.FULL_VIEWS["PCCT"])
         progress(0.12 * (k + 1))
     reference = scans["large", True]
-    plaque = plaque_scene()[1]
-    grid = working_grid(inset_grid(plaque, 0.2), prior.voxel_mm)
+    grid = working_grid(inset_grid(plaque_scene()[1], 0.2), prior.voxel_mm)
     rois = reference.rois.on(grid)
     covariance, problems, statistics, fbp_means = {}, {}, {}, {}
     for (bowtie, core), scan in scans.items():
@@ -96,16 +77,14 @@ def combine(
         statistics[bowtie, core] = problems[bowtie].statistic(scan.clean).b
         volume = scan.fbp(scan.clean)[0][0]
         fbp_means[bowtie, core] = [float(r(volume)) for r in reference.pairs[0]]
-    contrasts = np.array([np.diff(fbp_means["large", core])[0] for core in (True, False)])
-    true = np.array([_true_contrast(reference), 0.0])
-    fbp_slope = float((contrasts[0] - contrasts[1]) / true[0])
+    true = np.array([_true_contrast(), 0.0])
+    with_core, without = (np.diff(fbp_means["large", core])[0] for core in (True, False))
+    fbp_slope = float((with_core - without) / true[0])
     results = []
     for j, dose in enumerate(doses):
-        samples: dict[Any, Any] = {}
+        samples: dict[tuple[str, bool], Floats] = {}
         for i, key in enumerate(scans):
-            bowtie = key[0]
-            problem = problems[bowtie]
-            rows = []
+            problem, rows = problems[key[0]], []
             for k in range(n):
                 generator = torch.Generator().manual_seed(seed + k)
                 b = statistics[key] * dose + problem.gram.scaled(dose).noise(generator=generator).to(torch.float32)
@@ -113,23 +92,22 @@ def combine(
                 rows.append([float(r(volume)) for r in rois])
             samples[key] = np.array(rows)
             progress(0.4 + 0.6 * (j + (i + 1) / len(scans)) / len(doses))
-        results.append(_figures(dose, samples, covariance, fbp_means, fbp_slope, true))
+        results.append(_figures(dose, samples, covariance, fbp_means, fbp_slope, true, saved))
     return results, dict(reference.clean.info["plan"])
 
 
-def _true_contrast(scan: PlaqueScan) -> float:
+def _true_contrast() -> float:
     """Fibrous tissue minus core as the scanner sees them behind the patient, HU."""
-    from torchpcct.scene.materials import MATERIALS
-
     scanner = presets.pcct()
     energies = scanner.weights()[0]
-    column = scanner.geometry.columns // 2
-    weights = scanner.behind({MATERIALS["pericoronary_fat"]: 240.0})[0, column]
-    hu = [MATERIALS[m].hu(energies, weights) for m in ("fibrous_tissue", "necrotic_core")]
-    return hu[0] - hu[1]
+    weights = scanner.behind({MATERIALS["pericoronary_fat"]: 240.0})[0, scanner.geometry.columns // 2]
+    fibrous, core = (MATERIALS[m].hu(energies, weights) for m in ("fibrous_tissue", "necrotic_core"))
+    return fibrous - core
 
 
-def _figures(dose: float, samples: Any, covariance: Any, fbp_means: Any, fbp_slope: float, true: Floats) -> Combined:
+def _figures(
+    dose: float, samples: Any, covariance: Any, fbp_means: Any, fbp_slope: float, true: Floats, saved: dict[str, float]
+) -> dict[str, Any]:
     difference = {key: s[:, 1] - s[:, 0] for key, s in samples.items()}
     slope = contrast_slope(true, np.stack([difference["large", True], difference["large", False]]))
     c = covariance["large"] / dose
@@ -137,37 +115,36 @@ def _figures(dose: float, samples: Any, covariance: Any, fbp_means: Any, fbp_slo
         "contrast_variance": DoseCurve.contrast_variance(c, fbp_slope),
         "paper_cnr": DoseCurve.paper_cnr(fbp_means["large", True], c),
     }
-    factors = {
-        bowtie: {
-            "contrast_variance": dose_factor(
-                samples[bowtie, True], curves["contrast_variance"], "contrast_variance", slope=slope
-            ),
-            "paper_cnr": dose_factor(samples[bowtie, True], curves["paper_cnr"], "paper_cnr"),
-        }
-        for bowtie in BOWTIES
-    }
+    fbp_sd = {b: _sd(covariance[b] / dose) for b in BOWTIES}
     means = {f"mbir {b}": samples[b, True].mean(0).tolist() for b in BOWTIES}
-    means |= {f"fbp {b}": fbp_means[b, True] for b in BOWTIES}
-    return Combined(
-        dose,
-        {b: _sd(covariance[b] / dose) for b in BOWTIES},
-        {b: _sd(np.cov(samples[b, True].T)) for b in BOWTIES},
-        means,
-        _variance_ratio(difference["large+roi", True], difference["large", True]),
-        slope,
-        factors["large+roi"],
-        factors["large"],
-    )
+    result: dict[str, Any] = {
+        "exposure_s": dose,
+        "fbp_sd_hu": fbp_sd,
+        "mbir_sd_hu": {b: _sd(np.cov(samples[b, True].T)) for b in BOWTIES},
+        "means_hu": means | {f"fbp {b}": fbp_means[b, True] for b in BOWTIES},
+        "mbir_contrast_slope": [slope.value, slope.low, slope.high],
+        "mbir_variance_ratio_roi_to_large": variance_ratio(difference["large+roi", True], difference["large", True]),
+        "fbp_variance_ratio_roi_to_large": [
+            (roi / large) ** 2 for large, roi in zip(*(fbp_sd[b] for b in BOWTIES), strict=True)
+        ],
+    }
+    for figure in FIGURES:
+        options: dict[str, Any] = {"slope": slope} if figure == "contrast_variance" else {}
+        large, roi = (list(dose_factor(samples[b, True], curves[figure], figure, **options)[:3]) for b in BOWTIES)
+        result[figure] = {
+            "mbir_factor_roi_bowtie": roi,
+            "mbir_factor_large_bowtie": large,
+            **{f"product_{kind}": [factor * v for v in roi] for kind, factor in saved.items()},
+        }
+    return result
 
 
 def _sd(c: Any) -> list[float]:
     return [math.sqrt(c[0, 0]), math.sqrt(c[1, 1]), math.sqrt(c[0, 0] + c[1, 1] - 2 * c[0, 1])]
 
 
-def _variance_ratio(a: Floats, b: Floats) -> tuple[float, float, float]:
+def variance_ratio(a: Floats, b: Floats) -> tuple[float, float, float]:
     """Ratio of the variances of paired samples with a 95 % interval (Pitman and Morgan's exact one for normal data)."""
-    from scipy.stats import t as student
-
     n = a.size
     ratio = float(a.var(ddof=1) / b.var(ddof=1))
     r = float(np.corrcoef(a, b)[0, 1])

@@ -1,24 +1,23 @@
-"""Report of the dose study."""
+"""Report of the bowtie study: doses, noise, MBIR and ROI bowtie together."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from recon.study.bowtie.dose_maps import ratios
+from recon.study.bowtie.combined import FIGURES
 from recon.study.bowtie.figures import draw
-from recon.study.bowtie.slice_scan import BOWTIES
+from recon.study.bowtie.measure import Measured
+from recon.study.bowtie.slices import BOWTIES
 from recon.study.checks import Check, around, checks_section, effects_section
 from recon.study.paper import facts as paper
-from recon.study.report import Report, markdown_table
-from recon.study.study import environment
+from recon.study.report import Report, markdown_table, records_table
+from recon.study.study import environment, time_line
 from torchpcct.acquisition.plan import Effect
-
-if TYPE_CHECKING:
-    from recon.study.bowtie.measure import Measured
 
 __all__ = ["build_report"]
 
@@ -28,83 +27,51 @@ _KINDS = {
     "interacted": "all energy of the first interaction",
     "total": "with scatter, CTDI100",
 }
+_RATIOS = ("peripheral", "central", "weighted")
 
 
-def build_report(m: Measured) -> Report:
+def build_report(measured: Measured) -> Report:
     """Checks, tables, figure."""
-    checks = _checks(m)
+    m, p = measured, measured.parts
+    checks = _checks(p)
     data = {
+        "study": "bowtie",
         "settings": asdict(m.settings),
         "checks": [c.as_dict() for c in checks],
-        "transmission": m.transmission,
+        **p,
         "ctdi_mgy": {k: {b: {**asdict(d), "weighted": d.weighted} for b, d in v.items()} for k, v in m.ctdi.items()},
-        "ctdi_ratios": {k: ratios(v) for k, v in m.ctdi.items()},
-        "ramps": m.ramps,
-        "thorax_dose_ratio": m.thorax,
-        "patient_dose_ratio": m.patient_ratio,
-        "noise": m.noise,
-        "cupping_hu": m.cupping_hu,
-        "combined": [_combined(m, c) for c in m.combined],
-        "plaque_plan": m.plan,
         "seconds": m.seconds,
         "environment": environment(),
     }
-    text = "\n\n".join(
-        [
-            "# Dose: the ROI bowtie, alone and together with MBIR",
-            _summary(m),
-            checks_section(checks),
-            _ctdi(m),
-            _thorax(m),
-            _noise(m),
-            _combination(m),
-            effects_section(_effects(m)),
-            _footer(m),
-        ]
-    )
-    return Report("dose", data, text, {"dose.png": draw(m)})
+    sections = [
+        "# Dose: the ROI bowtie, alone and together with MBIR",
+        _summary(p),
+        checks_section(checks),
+        _ctdi(m),
+        _thorax(p["thorax_dose_ratio"]),
+        _noise(m),
+        *([_combination(m)] if p["combined"] else []),
+        effects_section(_effects(m)),
+        time_line(m.seconds, f"seed {m.settings.seed}"),
+    ]
+    return Report("bowtie", data, "\n\n".join(sections), {"bowtie.png": draw(measured)})
 
 
-def _saved(m: Measured, kind: str) -> float:
-    """Dose without over with the ROI bowtie, weighted CTDI."""
-    return 1.0 / ratios(m.ctdi[kind])["weighted"]
+def _saved(parts: dict[str, Any], kind: str) -> float:
+    """Weighted CTDI without over with the ROI bowtie."""
+    return float(1.0 / parts["ctdi_ratios"][kind]["weighted"])
 
 
-def _saved_with_error(m: Measured, kind: str) -> tuple[float, float]:
-    large, roi = (m.ctdi[kind][b] for b in BOWTIES)
-    value = large.weighted / roi.weighted
-    return value, value * math.hypot(large.weighted_error / large.weighted, roi.weighted_error / roi.weighted)
+def _interval(values: Sequence[float]) -> str:
+    value, low, high = values
+    return f"{value:.2f} [{low:.2f}, {high:.2f}]"
 
 
-def _product(factor: Any, saved: float) -> list[float]:
-    return [saved * factor.value, saved * factor.low, saved * factor.high]
-
-
-def _combined(m: Measured, c: Any) -> dict[str, Any]:
-    entry: dict[str, Any] = {
-        "exposure_s": c.exposure_s,
-        "fbp_sd_hu": c.fbp_sd,
-        "mbir_sd_hu": c.mbir_sd,
-        "means_hu": c.means,
-        "mbir_contrast_slope": [c.slope.value, c.slope.low, c.slope.high],
-        "mbir_variance_ratio_roi_to_large": c.variance_ratio,
-        "fbp_variance_ratio_roi_to_large": [(c.fbp_sd["large+roi"][k] / c.fbp_sd["large"][k]) ** 2 for k in range(3)],
-    }
-    for figure, factor in c.factors.items():
-        large = c.factors_large[figure]
-        entry[figure] = {
-            "mbir_factor_roi_bowtie": list(factor[:3]),
-            "mbir_factor_large_bowtie": list(large[:3]),
-            **{f"product_{k}": _product(factor, _saved(m, k)) for k in ("plane", "total") if k in m.ctdi},
-        }
-    return entry
-
-
-def _checks(m: Measured) -> list[Check]:
-    p, r = paper.BOWTIE, ratios(m.ctdi["plane"])
+def _checks(parts: dict[str, Any]) -> list[Check]:
+    p, r, noise = paper.BOWTIE, parts["ctdi_ratios"]["plane"], parts["noise"]
     inferred = "the ramp's width, not published, was inferred from this ratio"
-    ribs, skin = (100.0 * (1.0 - m.thorax[n]["unscattered"]) for n in ("side ribs", "skin"))
-    inside, outside, heart = m.noise["ctdi"]["inside"], m.noise["ctdi"]["outside"], m.noise["thorax"]["heart"]
+    ribs, skin = (100.0 * (1.0 - parts["thorax_dose_ratio"][n]["unscattered"]) for n in ("side ribs", "skin"))
+    inside, outside, heart = noise["ctdi"]["inside"], noise["ctdi"]["outside"], noise["thorax"]["heart"]
     checks = [
         around("CTDI phantom: peripheral dose, with / without", r["peripheral"], 0.48, 0.06, inferred),
         around("CTDI phantom: central dose, with / without", r["central"], 0.96, 0.06),
@@ -115,37 +82,31 @@ def _checks(m: Measured) -> list[Check]:
         around("CTDI phantom: noise outside the ROI, with / without", outside["ratio"], 2.59, 0.4),
         around("thorax: noise in the heart, with / without", heart["ratio"], 1.02, 0.05),
     ]
-    checks += [Check(f"residual cupping of 32 cm water, {b}, HU", v, "–", 0.0, 10.0) for b, v in m.cupping_hu.items()]
-    for c in m.combined:
-        factor = c.factors["contrast_variance"].value
-        value = factor * _saved(m, "plane")
-        note = f"bowtie {_saved(m, 'plane'):.2f} × MBIR {factor:.2f}: the paper adds up 2 × 4"
-        name = f"dose saved by MBIR and ROI bowtie at {c.exposure_s:g} s, contrast variance"
-        checks.append(Check(name, value, p["total_dose_factor"], p["total_dose_factor"], note=note))
+    for bowtie, hu in parts["cupping_hu"].items():
+        checks.append(Check(f"residual cupping of 32 cm water, {bowtie}, HU", hu, "–", 0.0, 10.0))
+    for c in parts["combined"]:
+        found = c["contrast_variance"]
+        factor, saved = found["mbir_factor_roi_bowtie"][0], _saved(parts, "plane")
+        note = f"bowtie {saved:.2f} × MBIR {factor:.2f}: the paper adds up 2 × 4"
+        name = f"dose saved by MBIR and ROI bowtie at {c['exposure_s']:g} s, contrast variance"
+        checks.append(Check(name, found["product_plane"][0], p["total_dose_factor"], p["total_dose_factor"], note=note))
     return checks
 
 
-def _interval(values: Any) -> str:
-    value, low, high = values
-    return f"{value:.2f} [{low:.2f}, {high:.2f}]"
-
-
-def _summary(m: Measured) -> str:
-    r = ratios(m.ctdi["plane"])
+def _summary(parts: dict[str, Any]) -> str:
+    r = parts["ctdi_ratios"]["plane"]
     text = (
         f"The ROI bowtie lets CTDIw fall to {r['weighted']:.2f} of its value (unscattered photons, nearly what the "
         f"paper's figures are; see below) and leaves the noise inside the 10 cm region as it is."
     )
-    if "total" in m.ctdi:
-        t = ratios(m.ctdi["total"])
+    if t := parts["ctdi_ratios"].get("total"):
         text += (
             f" With scattered photons the saving is smaller: CTDIw {t['weighted']:.2f}, and the centre falls to "
             f"{t['central']:.2f}, because most of its dose is scatter from outside the region."
         )
-    if m.combined:
+    if parts["combined"]:
         each = ", ".join(
-            f"{_interval(_product(c.factors['contrast_variance'], _saved(m, 'plane')))} at {c.exposure_s:g} s"
-            for c in m.combined
+            f"{_interval(c['contrast_variance']['product_plane'])} at {c['exposure_s']:g} s" for c in parts["combined"]
         )
         text += (
             f" MBIR and ROI bowtie together save a factor of {each} in dose for equal, slope-corrected contrast noise "
@@ -157,16 +118,16 @@ def _summary(m: Measured) -> str:
 def _ctdi(m: Measured) -> str:
     rows = []
     for kind, doses in m.ctdi.items():
-        r = ratios(doses)
+        r = m.parts["ctdi_ratios"][kind]
         for b in BOWTIES:
             d = doses[b]
             error = f" ± {d.weighted_error:.2f}" if d.weighted_error else ""
             figures = (d.total_peripheral, d.total_central, d.weighted)
-            shares = [f"{r[k]:.3f}" if b != "large" else "" for k in ("peripheral", "central", "weighted")]
+            shares = [f"{r[k]:.3f}" if b != "large" else "" for k in _RATIOS]
             rows.append([_KINDS[kind], b, *[f"{v:.2f}" for v in figures[:2]], f"{figures[2]:.2f}{error}", *shares])
     p = paper.BOWTIE
     for k, b in enumerate(BOWTIES):
-        values = [p[n][k] for n in ("peripheral_mgy", "central_mgy", "weighted_mgy")]
+        values = [p[f"{n}_mgy"][k] for n in _RATIOS]
         rows.append(
             ["paper", b, *[f"{v:.2f}" for v in values], *(["", "", ""] if k == 0 else ["0.48", "0.96", "0.50"])]
         )
@@ -189,18 +150,18 @@ def _ctdi(m: Measured) -> str:
             f"{100 * total.peripheral_scattered / total.total_peripheral:.0f} % of the peripheral and "
             f"{100 * total.central_scattered / total.total_central:.0f} % of the central dose."
         )
-    ramp = [[f"{x['ramp_mm']:g}", *[f"{x[k]:.3f}" for k in ("peripheral", "central", "weighted")]] for x in m.ramps]
-    ramps = markdown_table(["ramp, mm", "peripheral", "central", "CTDIw"], ramp)
+    columns = {"ramp, mm": "{ramp_mm:g}"}
+    columns |= {"peripheral": "{peripheral:.3f}", "central": "{central:.3f}", "CTDIw": "{weighted:.3f}"}
     return (
         f"## CTDI phantom\n\n{table}\n\n{why}\n\nThe paper states thickness, distance and region of the ROI bowtie, "
         "not its material nor the width of its ramp (aluminium and 15 mm here). Unscattered dose in the plane, with "
-        f"over without, against that width:\n\n{ramps}"
+        f"over without, against that width:\n\n{records_table(m.parts['ramps'], columns)}"
     )
 
 
-def _thorax(m: Measured) -> str:
-    kinds = list(next(iter(m.thorax.values())))
-    rows = [[n, *[f"{100 * (1 - v[k]):.1f}" for k in kinds]] for n, v in m.thorax.items()]
+def _thorax(tissues: dict[str, dict[str, float]]) -> str:
+    kinds = list(tissues["skin"])
+    rows = [[n, *[f"{100 * (1 - v[k]):.1f}" for k in kinds]] for n, v in tissues.items()]
     return (
         "## Thorax\n\nAnalytic thorax with the heart at the isocentre; % less dose with the ROI bowtie. Paper: over 45 "
         "(side ribs), 55 (skin and large muscles), heart unchanged.\n\n" + markdown_table(["tissue", *kinds], rows)
@@ -208,17 +169,16 @@ def _thorax(m: Measured) -> str:
 
 
 def _noise(m: Measured) -> str:
-    p = paper.BOWTIE
-    rows = []
+    p, rows = paper.BOWTIE, []
     for name, region in (("ctdi", "inside"), ("ctdi", "outside"), ("thorax", "heart")):
-        e = m.noise[name][region]
+        e = m.parts["noise"][name][region]
         cells = [f"{e['mean_hu'][k]:.1f} / {e['sd_hu'][k]:.1f}" for k in range(2)]
         theirs = [f"{p[f'{region}_mean_hu'][k]:.1f} / {p[f'{region}_sd_hu'][k]:.1f}" for k in range(2)]
         published = p[f"{region}_sd_hu"]
         ratio = f"{e['ratio']:.3f} ± {e['ratio_error']:.3f}"
         rows.append([f"{name}, {region}", cells[0], cells[1], ratio, *theirs, f"{published[1] / published[0]:.3f}"])
     header = ["region", "large", "large+roi", "SD ratio", "paper: large", "large+roi", "SD ratio"]
-    quanta = m.noise["ctdi"]["quanta_per_reading"]
+    quanta = m.parts["noise"]["ctdi"]["quanta_per_reading"]
     return (
         "## Noise\n\nMean / SD in HU; one detector row, kernel "
         f"{m.settings.kernel}, 0.78 mm voxels, {m.settings.exposure_s:g} s, {m.settings.realizations} realisations "
@@ -232,28 +192,23 @@ def _noise(m: Measured) -> str:
 
 
 def _combination(m: Measured) -> str:
-    if not m.combined:
-        return ""
+    results, kinds = m.parts["combined"], [k for k in ("plane", "total") if k in m.ctdi]
     rows = []
-    for c in m.combined:
-        fbp = (c.fbp_sd["large+roi"][2] / c.fbp_sd["large"][2]) ** 2
-        for figure, label in (("contrast_variance", "contrast variance"), ("paper_cnr", "paper's CNR")):
-            factor = c.factors[figure]
-            cells = [f"{c.exposure_s:g} s, {label}", _interval(c.factors_large[figure][:3]), _interval(factor[:3])]
-            cells += [_interval(_product(factor, _saved(m, k))) if k in m.ctdi else "" for k in ("plane", "total")]
-            rows.append(cells)
-        _, low, high = c.variance_ratio
-        rows[-1].append("")
-        rows[-2].append(f"FBP {fbp:.5f}, MBIR [{low:.4f}, {high:.4f}]")
+    for c in results:
+        _, low, high = c["mbir_variance_ratio_roi_to_large"]
+        last = f"FBP {c['fbp_variance_ratio_roi_to_large'][2]:.5f}, MBIR [{low:.4f}, {high:.4f}]"
+        for figure, label in FIGURES.items():
+            found = c[figure]
+            factors = (found["mbir_factor_large_bowtie"], found["mbir_factor_roi_bowtie"])
+            products = [_interval(found[f"product_{k}"]) if k in kinds else "" for k in ("plane", "total")]
+            rows.append([f"{c['exposure_s']:g} s, {label}", *map(_interval, factors), *products, last])
+            last = ""
     header = ["", "MBIR, large", "MBIR, large+roi", "× bowtie, unscattered", "× bowtie, with scatter", "variance ratio"]
-    first = m.combined[0]
-    shift = {k: first.means[f"{k} large+roi"][0] - first.means[f"{k} large"][0] for k in ("fbp", "mbir")}
-    slopes = ", ".join(f"{c.slope.value:.2f} at {c.exposure_s:g} s" for c in m.combined)
-    saved = ", ".join(
-        f"{v:.2f} ± {e:.2f} ({_KINDS[k]})"
-        for k in ("plane", "total") if k in m.ctdi for v, e in (_saved_with_error(m, k),)
-    )  # fmt: skip
-    patient = ", ".join(f"{1 / v:.2f} ({k})" for k, v in m.patient_ratio.items())
+    means = results[0]["means_hu"]
+    shift = {k: means[f"{k} large+roi"][0] - means[f"{k} large"][0] for k in ("fbp", "mbir")}
+    slopes = ", ".join(f"{c['mbir_contrast_slope'][0]:.2f} at {c['exposure_s']:g} s" for c in results)
+    saved = ", ".join(f"{_saved(m.parts, k):.2f} ± {_saved_error(m, k):.2f} ({_KINDS[k]})" for k in kinds)
+    patient = ", ".join(f"{1 / v:.2f} ({k})" for k, v in m.parts["patient_dose_ratio"].items())
     return (
         "## MBIR and ROI bowtie in one simulation\n\nThe plaque 42.4 mm off the isocentre in 24 cm of fat, scanned "
         f"with both bowties; {m.settings.plaque_realizations} realisations, the same white noise for both. Factors: "
@@ -269,10 +224,15 @@ def _combination(m: Measured) -> str:
     )
 
 
+def _saved_error(m: Measured, kind: str) -> float:
+    large, roi = (m.ctdi[kind][b] for b in BOWTIES)
+    return _saved(m.parts, kind) * math.hypot(large.weighted_error / large.weighted, roi.weighted_error / roi.weighted)
+
+
 def _effects(m: Measured) -> list[Effect]:
-    plan = [Effect(**e) for e in m.plan.get("effects", [])]
+    plan = [Effect(**e) for e in m.parts["plaque_plan"]["effects"]]
     scatter = m.settings.histories > 0
-    images = np.abs(np.diff(m.noise["ctdi"]["inside"]["mean_hu"]))[0]
+    images = np.abs(np.diff(m.parts["noise"]["ctdi"]["inside"]["mean_hu"]))[0]
     return [
         *plan,
         Effect("scatter in the dose", scatter, None, "Monte Carlo: Klein–Nishina, form factors; table above"),
@@ -283,13 +243,3 @@ def _effects(m: Measured) -> list[Effect]:
         Effect("overbeaming", False, None, "dose of contiguous slices; a penumbra adds to both bowties alike"),
         Effect("electron ranges, fluorescence", False, None, "dose is collision kerma"),
     ]
-
-
-def _footer(m: Measured) -> str:
-    e = environment()
-    seconds = ", ".join(f"{k} {v:.0f} s" for k, v in m.seconds.items())
-    return (
-        f"Command `torchpcct study dose`, seed {m.settings.seed}. Time: {seconds}. "
-        f"torchpcct {e['torchpcct']}, torch {e['torch']}, numpy {e['numpy']}, "
-        f"numba {e['numba']}, {e['cores']} cores ({e['machine']}). All settings are in report.json."
-    )

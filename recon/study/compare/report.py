@@ -1,54 +1,133 @@
-"""The comparison's tables, text and figure."""
+"""The comparison's tables and text."""
 
 from __future__ import annotations
 
+import resource
+import sys
+from collections.abc import Callable
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
-from recon.study.checks import Check, checks_section
-from recon.study.compare.measure import Compared
+from recon.study.checks import Check, around, checks_section
+from recon.study.compare.figures import sections_figure
+from recon.study.compare.measure import PWLS, Key, Measured
 from recon.study.paper import facts as paper
 from recon.study.paper.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM
 from recon.study.paper.tables import published, table_checks
 from recon.study.report import Report, markdown_table
-from recon.study.study import environment
-from torchpcct.geometry import VolumeGrid
-from torchpcct.metrics.roi import sample_axial
-from torchpcct.viz import Panel, panels
+from recon.study.study import environment, time_line
+from torchpcct.metrics.cnr import cnr, cnr_interval, mean_interval, sd_interval
 
 __all__ = ["build_report"]
 
 
-def build_report(result: Compared) -> Report:
-    """Report of :func:`recon.study.compare.measure.run`: ``report.json``, ``report.md``, ``compare.png``."""
-    checks = _checks(result)
-    data = {
+def build_report(m: Measured) -> Report:
+    """Report of :func:`recon.study.compare.measure.measure`: ``report.json``, ``report.md``, ``compare.png``."""
+    data: dict[str, Any] = {
         "study": "compare",
-        **result.as_dict(),
-        "checks": [c.as_dict() for c in checks],
-        "environment": environment(),
+        "settings": asdict(m.settings),
+        "plan": m.plan,
+        "rois": m.rois.as_dict(),
+        "noise_free": m.noise_free,
+        "statistics": [_statistics(key, means) for key, means in m.means.items()],
+        "noise_against_dose": _noise_against_dose(m),
+        "pwls": m.pwls,
+        "seconds": {k: round(v, 2) for k, v in m.seconds.items()},
     }
+    checks = _checks(data)
+    data["checks"] = [c.as_dict() for c in checks]
+    data["environment"] = environment()
     sections = [
         "# Plaque CNR by FBP and PWLS, beside the paper",
-        _intro(result),
-        _noise_free_table(result),
-        *(_tables(result, name, exposure) for name, exposure in result.settings.doses.items()),
-        _noise_table(result),
-        _pwls_table(result),
+        _intro(data),
+        _noise_free_table(data),
+        *(_tables(data, name, exposure) for name, exposure in m.settings.doses.items()),
+        _noise_table(data),
+        _pwls_table(data),
         checks_section(checks, every=False),
-        _footer(result),
+        time_line(m.seconds, f"peak memory {_peak_memory_gib():.1f} GiB"),
     ]
-    figure = _figure(result)
-    return Report("compare", data, "\n\n".join(s for s in sections if s), {"compare.png": figure})
+    return Report("compare", data, "\n\n".join(s for s in sections if s), {"compare.png": sections_figure(m)})
 
 
-def _intro(result: Compared) -> str:
-    s, r = result.settings, result.rois.as_dict()
+# --- figures ------------------------------------------------------------------------------------------------------
+
+
+def _statistics(key: Key, means: Any) -> dict[str, Any]:
+    """Means, standard deviations and CNR with their 95 % intervals."""
+    result: dict[str, Any] = dict(zip(("method", "kernel", "voxel_mm", "exposure_s"), key, strict=True))
+    result["realizations"] = len(means)
+    foreground, background = means.T
+    for name, values in (("foreground", foreground), ("background", background)):
+        sd = float(np.std(values, ddof=1))
+        result[name] = {
+            "means_hu": values.tolist(),
+            "mean_hu": float(np.mean(values)),
+            "mean_interval": list(mean_interval(values)),
+            "sd_hu": sd,
+            "sd_interval": list(sd_interval(sd, len(values))),
+        }
+    result["cnr"] = float(cnr(foreground, background))
+    result["cnr_interval"] = list(cnr_interval(foreground, background))
+    return result
+
+
+def _noise_against_dose(m: Measured) -> list[dict[str, Any]]:
+    """Slope of log σ against log dose per method, kernel, voxel size and ROI: −½ for pure counting noise.
+
+    The noise of the voxels (entry ``pixel``, SD across realisations, rms over the inset) pins the slope down; that of
+    two ROI means over few realisations does not.
+    """
+    groups: dict[tuple[str, str, float], list[Key]] = {}
+    for key in m.means:
+        groups.setdefault(key[:3], []).append(key)
+    slopes = []
+    for (method, kernel, voxel), keys in groups.items():
+        if len(keys) < 2:
+            continue
+        x = np.log([exposure for *_, exposure in keys])
+        entry: dict[str, Any] = {"method": method, "kernel": kernel, "voxel_mm": voxel}
+        for i, roi in enumerate(("foreground", "background")):
+            sds = [np.std(m.means[key][:, i], ddof=1) for key in keys]
+            entry[roi] = float(np.polyfit(x, np.log(sds), 1)[0])
+        if all(key in m.voxel_noise for key in keys):
+            entry["pixel"] = float(np.polyfit(x, np.log([m.voxel_noise[key] for key in keys]), 1)[0])
+        slopes.append(entry)
+    return slopes
+
+
+def _is_reference(entry: dict[str, Any]) -> bool:
+    return (entry["kernel"], entry["voxel_mm"]) == (REFERENCE_KERNEL, REFERENCE_VOXEL_MM)
+
+
+def _checks(data: dict[str, Any]) -> list[Check]:
+    """Every row of the paper that this study covers, with its tolerance."""
+    checks: list[Check] = []
+    for e in data["noise_free"]:
+        if _is_reference(e):
+            for roi, published_hu in paper.NOISE_FREE_ROI_HU.items():
+                checks.append(around(f"noise-free {roi} mean, standard 0.10 mm, HU", e[f"{roi}_hu"], published_hu, 8))
+        if "covariance_hu2_s" in e:
+            covariance = np.array(e["covariance_hu2_s"]) / paper.TABLE_EXPOSURE_S
+            checks += table_checks(e["kernel"], e["voxel_mm"], (e["foreground_hu"], e["background_hu"]), covariance)
+    for e in data["noise_against_dose"]:
+        if e["method"] == "fbp" and "pixel" in e:
+            name = f"slope of voxel noise against dose, {e['kernel']} {e['voxel_mm']:.2f} mm"
+            checks.append(Check(name, e["pixel"], -0.5, -0.515, -0.485))
+    return checks
+
+
+# --- text ---------------------------------------------------------------------------------------------------------
+
+
+def _intro(data: dict[str, Any]) -> str:
+    s, r = data["settings"], data["rois"]
     return (
-        f"{s.realizations} noise realisations per dose (seeds {s.seed}…{s.seed + s.realizations - 1}, the same for "
-        f"every method), {s.views} views. Foreground ROI (necrotic core): {r['foreground_pixels']} pixels of "
-        f"{r['pixel_mm']} mm, {r['foreground_mm2']:.2f} mm²; background ROI (fibrous tissue): "
+        f"{s['realizations']} noise realisations per dose (seeds {s['seed']}…{s['seed'] + s['realizations'] - 1}, the "
+        f"same for every method), {s['views']} views. Foreground ROI (necrotic core): {r['foreground_pixels']} pixels "
+        f"of {r['pixel_mm']} mm, {r['foreground_mm2']:.2f} mm²; background ROI (fibrous tissue): "
         f"{r['background_pixels']} pixels, {r['background_mm2']:.2f} mm². "
         "CNR = (mean_bg − mean_fg) / sqrt(var_bg + var_fg) of the ROI means across "
         "realisations. Square brackets: 95 % interval. “exact”: expectation and SD of FBP without sampling error (one "
@@ -57,96 +136,88 @@ def _intro(result: Compared) -> str:
     )
 
 
-def _rows(result: Compared) -> list[tuple[str, str]]:
-    rows = [("fbp", kernel) for kernel in result.settings.kernels]
-    if result.settings.pwls:
-        rows.append(("pwls", "q-GGMRF"))
-    return rows
-
-
 def _label(method: str, kernel: str) -> str:
-    return f"FBP {kernel}" if method == "fbp" else f"PWLS {kernel}"
+    return f"{method.upper()} {kernel}"
 
 
-def _paper(table: Any, method: str, kernel: str, voxel: float, exposure: float) -> Any:
-    """The paper's entry for this setting, or None."""
-    return published(table, kernel, voxel, exposure) if method == "fbp" else None
-
-
-def _noise_free_table(result: Compared) -> str:
-    voxels = [REFERENCE_VOXEL_MM, *result.settings.voxels_mm]
-    entries = {(e["kernel"], e["voxel_mm"]): e for e in result.noise_free}
+def _noise_free_table(data: dict[str, Any]) -> str:
+    s = data["settings"]
+    voxels = [REFERENCE_VOXEL_MM, *s["voxels_mm"]]
+    entries = {(e["kernel"], e["voxel_mm"]): e for e in data["noise_free"]}
 
     def cell(kernel: str, voxel: float) -> str:
         e = entries.get((kernel, voxel))
         if e is None:
             return "–"
         text = f"{e['foreground_hu']:.1f} / {e['background_hu']:.1f}"
-        if (kernel, voxel) == (REFERENCE_KERNEL, REFERENCE_VOXEL_MM):
+        if _is_reference(e):
             p = paper.NOISE_FREE_ROI_HU
             text += f" (paper {p['foreground']:.1f} / {p['background']:.1f})"
         return text
 
-    kernels = list(dict.fromkeys([*result.settings.kernels, REFERENCE_KERNEL]))
+    kernels = list(dict.fromkeys([*s["kernels"], REFERENCE_KERNEL]))
     rows = [[f"FBP {k}", *(cell(k, v) for v in voxels)] for k in kernels]
     table = markdown_table(["core / fibrous, HU", *(f"{v:.2f} mm" for v in voxels)], rows)
     return f"## Noise-free ROI means\n\n{table}"
 
 
-def _tables(result: Compared, name: str, exposure: float) -> str:
-    s = result.settings
-    header = [*(f"{v:.2f} mm" for v in s.voxels_mm)]
-    parts = [f"## {name} dose: {exposure:.2f} s"]
-    for roi, title, table in (
-        ("foreground", "Core ROI mean (SD), HU", paper.FOREGROUND),
-        ("background", "Fibrous ROI mean (SD), HU", paper.BACKGROUND),
+def _tables(data: dict[str, Any], dose: str, exposure: float) -> str:
+    """Measured and exact moments of both ROIs and the CNR at an exposure."""
+    s = data["settings"]
+    measured = {(e["method"], e["kernel"], e["voxel_mm"]): e for e in data["statistics"] if e["exposure_s"] == exposure}
+    exact = {(e["kernel"], e["voxel_mm"]): e for e in data["noise_free"] if "covariance_hu2_s" in e}
+    methods = [("fbp", kernel) for kernel in s["kernels"]] + ([PWLS] if s["pwls"] else [])
+    parts = [f"## {dose} dose: {exposure:.2f} s"]
+
+    def add(
+        title: str, table: Any, found: Callable[[Any], str], of_paper: str, known: Callable[[Any, Any], str]
+    ) -> None:
+        def cell(method: str, kernel: str, voxel: float) -> str:
+            if (method, kernel, voxel) not in measured:
+                return "–"
+            text = found(measured[method, kernel, voxel])
+            entry = published(table, kernel, voxel, exposure) if method == "fbp" else None
+            return text if entry is None else f"{text} paper {of_paper.format(*np.atleast_1d(entry))}"
+
+        def exact_cell(kernel: str, voxel: float) -> str:
+            e = exact.get((kernel, voxel))
+            if e is None:
+                return "–"
+            return known((e["foreground_hu"], e["background_hu"]), np.diag(e["covariance_hu2_s"]) / exposure)
+
+        rows = [[_label(m, k), *(cell(m, k, v) for v in s["voxels_mm"])] for m, k in methods]
+        rows += [[f"FBP {k}, exact", *(exact_cell(k, v) for v in s["voxels_mm"])] for k in s["kernels"]]
+        parts.append(markdown_table([title, *(f"{v:.2f} mm" for v in s["voxels_mm"])], rows))
+
+    for i, (roi, title, table) in enumerate(
+        (
+            ("foreground", "Core ROI mean (SD), HU", paper.FOREGROUND),
+            ("background", "Fibrous ROI mean (SD), HU", paper.BACKGROUND),
+        )
     ):
 
-        def moments(method: str, kernel: str, voxel: float, roi: str = roi, table: Any = table) -> str:
-            stat = result.find(method, kernel, voxel, exposure)
-            if stat is None:
-                return "–"
-            d = stat.as_dict()[roi]
-            low, high = d["mean_interval"]
-            text = f"{d['mean_hu']:.1f} [{low:.0f}, {high:.0f}] ({d['sd_hu']:.1f})"
-            entry = _paper(table, method, kernel, voxel, exposure)
-            return text if entry is None else f"{text} paper {entry[0]:.1f} ({entry[1]:.1f})"
+        def moments(e: Any, roi: str = roi) -> str:
+            low, high = e[roi]["mean_interval"]
+            return f"{e[roi]['mean_hu']:.1f} [{low:.0f}, {high:.0f}] ({e[roi]['sd_hu']:.1f})"
 
-        rows = [[_label(m, k), *(moments(m, k, v) for v in s.voxels_mm)] for m, k in _rows(result)]
-        index = 0 if roi == "foreground" else 1
-        rows += [[f"FBP {k}, exact", *(_exact(result, k, v, exposure, index) for v in s.voxels_mm)] for k in s.kernels]
-        parts.append(markdown_table([title, *header], rows))
+        def exact_moments(means: Any, variances: Any, i: int = i) -> str:
+            return f"{means[i]:.1f} ({np.sqrt(variances[i]):.1f})"
 
-    def ratio(method: str, kernel: str, voxel: float) -> str:
-        stat = result.find(method, kernel, voxel, exposure)
-        if stat is None:
-            return "–"
-        d = stat.as_dict()
-        low, high = d["cnr_interval"]
-        text = f"{d['cnr']:.2f} [{low:.1f}, {high:.1f}]"
-        entry = _paper(paper.CNR, method, kernel, voxel, exposure)
-        return text if entry is None else f"{text} paper {entry:.2f}"
+        add(title, table, moments, "{:.1f} ({:.1f})", exact_moments)
 
-    rows = [[_label(m, k), *(ratio(m, k, v) for v in s.voxels_mm)] for m, k in _rows(result)]
-    rows += [[f"FBP {k}, exact", *(_exact(result, k, v, exposure, None) for v in s.voxels_mm)] for k in s.kernels]
-    parts.append(markdown_table(["CNR", *header], rows))
+    def ratio(e: Any) -> str:
+        low, high = e["cnr_interval"]
+        return f"{e['cnr']:.2f} [{low:.1f}, {high:.1f}]"
+
+    def exact_ratio(means: Any, variances: Any) -> str:
+        return f"{(means[1] - means[0]) / np.sqrt(variances.sum()):.2f}"
+
+    add("CNR", paper.CNR, ratio, "{:.2f}", exact_ratio)
     return "\n\n".join(parts)
 
 
-def _exact(result: Compared, kernel: str, voxel: float, exposure: float, roi: int | None) -> str:
-    """Exact mean (SD) of one ROI, or the exact CNR."""
-    for e in result.noise_free:
-        if (e["kernel"], e["voxel_mm"]) == (kernel, voxel) and "covariance_hu2_s" in e:
-            means = (e["foreground_hu"], e["background_hu"])
-            variance = np.diag(e["covariance_hu2_s"]) / exposure
-            if roi is None:
-                return f"{(means[1] - means[0]) / np.sqrt(variance.sum()):.2f}"
-            return f"{means[roi]:.1f} ({np.sqrt(variance[roi]):.1f})"
-    return "–"
-
-
-def _noise_table(result: Compared) -> str:
-    slopes = result.as_dict()["noise_against_dose"]
+def _noise_table(data: dict[str, Any]) -> str:
+    slopes = data["noise_against_dose"]
     if not slopes:
         return ""
     rows = [
@@ -159,96 +230,21 @@ def _noise_table(result: Compared) -> str:
     return f"{text}\n\n{markdown_table(['method', 'voxel, mm', 'slope'], rows)}"
 
 
-def _pwls_table(result: Compared) -> str:
-    if not result.pwls:
+def _pwls_table(data: dict[str, Any]) -> str:
+    if not data["pwls"]:
         return ""
     rows = [
         [
-            f"{e['exposure_s']:.2f} s, {e['voxel_mm']:.2f} mm",
-            str(e["exact_pairs"]),
-            str(sum(e["inner_iterations"])),
-            f"{e['gradient'][-1]:.1e}",
-            f"{e['largest_rmsd_hu']:.2f}",
-            f"{e['seconds_per_volume']:.1f}",
+            f"{e['exposure_s']:.2f} s, {e['voxel_mm']:.2f} mm", str(e["exact_pairs"]), str(sum(e["inner_iterations"])),
+            f"{e['gradient'][-1]:.1e}", f"{e['largest_rmsd_hu']:.2f}", f"{e['seconds_per_volume']:.1f}",
         ]
-        for e in result.pwls
-    ]
+        for e in data["pwls"]
+    ]  # fmt: skip
     header = ["PWLS", "exact pairs", "inner steps", "gradient left", "HU from minimum", "s / volume"]
     text = "## PWLS, convergence\n\nFirst realisation; “HU from minimum” is the worst of all, rms over the volume."
     return f"{text}\n\n{markdown_table(header, rows)}"
 
 
-def _checks(result: Compared) -> list[Check]:
-    """Every row of the paper that this study covers, with its tolerance."""
-    checks: list[Check] = []
-
-    def add(name: str, ours: float, published: float, low: float, high: float) -> None:
-        checks.append(Check(name, ours, published, low, high))
-
-    for e in result.noise_free:
-        if (e["kernel"], e["voxel_mm"]) == (REFERENCE_KERNEL, REFERENCE_VOXEL_MM):
-            for roi in ("foreground", "background"):
-                p = paper.NOISE_FREE_ROI_HU[roi]
-                add(f"noise-free {roi} mean, standard 0.10 mm, HU", e[f"{roi}_hu"], p, p - 8, p + 8)
-        if "covariance_hu2_s" in e:
-            means = (e["foreground_hu"], e["background_hu"])
-            covariance = np.array(e["covariance_hu2_s"]) / paper.TABLE_EXPOSURE_S
-            checks += table_checks(e["kernel"], e["voxel_mm"], means, covariance)
-    for e in result.as_dict()["noise_against_dose"]:
-        if e["method"] == "fbp" and "pixel" in e:
-            add(
-                f"slope of voxel noise against dose, {e['kernel']} {e['voxel_mm']:.2f} mm",
-                e["pixel"],
-                -0.5,
-                -0.515,
-                -0.485,
-            )
-    return checks
-
-
-def _footer(result: Compared) -> str:
-    seconds = ", ".join(f"{k} {v:.1f} s" for k, v in result.seconds.items())
-    return f"Time: {seconds}. Peak memory: {_peak_memory_gib():.1f} GiB."
-
-
 def _peak_memory_gib() -> float:
-    import resource
-    import sys
-
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / 2**30 if sys.platform == "darwin" else peak / 2**20
-
-
-def _figure(result: Compared) -> Any:
-    """Axial and longitudinal sections of one realisation at the tables' dose, per kernel and method."""
-    s = result.settings
-    voxel = 0.25 if 0.25 in s.voxels_mm else s.voxels_mm[0]
-    columns: list[tuple[str, Any, VolumeGrid]] = []
-    noise_free = result.images["noise free", REFERENCE_KERNEL, REFERENCE_VOXEL_MM]
-    columns.append(("noise free\nstandard 0.10 mm", noise_free, result.grids[REFERENCE_VOXEL_MM]))
-    for method, kernel in _rows(result):
-        image = result.images.get((method, kernel, voxel))
-        if image is not None:
-            columns.append((f"{_label(method, kernel)}\n{voxel:.2f} mm", image, result.grids[voxel]))
-    rows: list[list[Panel]] = [[], []]
-    for i, (title, volume, grid) in enumerate(columns):
-        axial = sample_axial(volume, grid, result.rois.image)[0]
-        outlines = ((result.rois.foreground[0], "deepskyblue"), (result.rois.background[0], "tomato"))
-        rows[0].append(Panel(axial, _extent(result.rois.image, 1, 2), title, outlines if i == 0 else ()))
-        z, y, x = result.rois.image.center
-        pixel = result.rois.image.spacing[1]
-        section = VolumeGrid((int(8.75 / pixel), 1, result.rois.image.shape[2]), pixel, (z, y, x))
-        rows[1].append(Panel(sample_axial(volume, grid, section)[:, 0], _extent(section, 0, 2)))
-    exposure = result.shown_exposure_s
-    return panels(
-        rows,
-        ("axial", "sagittal (x–z)"),
-        f"Plaque, deep-silicon PCCT, {exposure:g} s, one realisation",
-        "C150 / W600 HU. ROI outlines: necrotic core (blue), fibrous tissue (red).",
-    )
-
-
-def _extent(grid: VolumeGrid, vertical: int, horizontal: int) -> tuple[float, float, float, float]:
-    """Edges of an image in mm about the plaque's centre, as matplotlib wants them."""
-    h, v = grid.extent[horizontal] / 2, grid.extent[vertical] / 2
-    return (-h, h, -v, v)

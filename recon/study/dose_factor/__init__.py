@@ -1,12 +1,8 @@
 """The measured dose factor: every method on the same noise realisations of the paper's scan.
 
-``settings`` say what is measured; ``scene`` simulates a scene and keeps its ``facts`` (what holds exactly), ``noise``
-draws its realisations, ``methods`` reconstruct them, ``study`` runs all of that in resumable pieces (``store``).
-``analysis``, ``further``, ``rois`` and ``stability`` turn samples into figures, ``report`` and ``figures`` into text
-and pictures.
+``settings`` say what is measured. A scene is a ``variant`` (where things are), then a ``scene`` (its scan) with facts
+that hold exactly: ``tissue_values``, ``exact_fbp``. ``realisations`` draws its noise, ``methods`` reconstruct it,
+``measures`` reads every volume, ``shape_limit`` and ``stability`` bound what can be had; ``measure`` runs it all in
+resumable pieces (``store``). From samples to figures: ``estimates``, ``exact``, ``main_scenes``, ``other_rois``,
+``further_scenes``, together ``analysis``. ``tables`` and ``figures`` make the ``report`` of them.
 """
-
-from recon.study.dose_factor.measure import Measured, run
-from recon.study.dose_factor.settings import Settings, estimate_seconds
-
-__all__ = ["Measured", "Settings", "estimate_seconds", "run"]

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
-from recon.study.dose_factor.methods import IMAGE_METHODS, METHODS
 from recon.study.paper import facts as paper
+from recon.study.study import StudySettings
 
 __all__ = [
     "EXTRA_SCENES",
     "FBP_BASE",
+    "IMAGE_METHODS",
     "MAIN_SCENES",
+    "METHODS",
+    "METHOD_NAMES",
     "NOISY_SCENES",
     "SLOW_METHODS",
     "WIDE_ROIS",
     "Settings",
-    "estimate_seconds",
+    "fbp_label",
     "with_twin",
 ]
 
@@ -40,17 +44,37 @@ EXTRA_SCENES = (
 )  # fmt: skip
 """Scenes that can expose an invention."""
 
+METHOD_NAMES = {
+    "linear": "linear 3-D filter",
+    "linear_z": "linear filter along z",
+    "quadratic": "quadratic PWLS",
+    "qggmrf": "q-GGMRF PWLS",
+    "tv": "smoothed TV",
+    "fbp_cnn": "FBP + MBIR's prior",
+    "mbir_one_pass": "MBIR, one pass",
+    "mbir": "MBIR, two passes",
+    "mbir_noise_half": "MBIR, noise taken for ½",
+    "mbir_noise_double": "MBIR, noise taken for 2×",
+}
+"""Methods in the order of the tables, as reports call them. ``fbp_cnn`` is MBIR's prior on FBP images, ``mbir_noise_*``
+MBIR that takes the noise for half or twice of what it is."""
+
+METHODS = tuple(METHOD_NAMES)
+
+IMAGE_METHODS = ("fbp_cnn",)
+"""Methods of an image domain: in place of b = AᵀW y they are given G x of an FBP volume x."""
+
 SLOW_METHODS = ("quadratic", "qggmrf", "tv", "fbp_cnn", "mbir_noise_half", "mbir_noise_double")
 """Few realisations place them well enough: iterated to convergence, drawn anew as images, or a test of robustness."""
 
 _SECONDS = {"scene": 45.0, "fbp": 90.0, "data": 3.0, "images": 3.0, "linear": 0.3, "linear_z": 0.3, "quadratic": 1.5,
             "qggmrf": 5.0, "tv": 10.0, "fbp_cnn": 1.0, "mbir_one_pass": 0.5, "mbir": 1.0, "mbir_noise_half": 1.0,
             "mbir_noise_double": 1.0}  # fmt: skip
-"""Rough cost at 1968 views on two cores: one scene, exact FBP noise, one realisation, one volume of each method."""
+"""Rough cost at all views on two cores: one scene, exact FBP noise, one realisation, one volume of each method."""
 
 
 @dataclass(frozen=True)
-class Settings:
+class Settings(StudySettings):
     """Settings of the study.
 
     Args:
@@ -59,11 +83,11 @@ class Settings:
         scene_n: realisations of each further scene and dose.
         doses: exposures in s.
         scene_doses: exposures of the further scenes.
-        seed: realisation k uses the noise seed ``seed + k``.
-        methods: names of :data:`recon.study.dose_factor.methods.METHODS`.
+        seed: first seed.
+        methods: names of :data:`METHODS`.
         scenes: further scenes, of :data:`EXTRA_SCENES`.
         scene_methods: methods that reconstruct the further scenes.
-        views: per rotation (paper: 1968); fewer keep the tube load of the whole scan.
+        views: per rotation; fewer than the paper's keep the tube load of the whole scan.
         voxel_mm: of the methods' grid.
         kernels, voxels_mm: FBP that is analysed exactly.
         blurs_mm: σ of Gaussian filters after soft FBP, for FBP of the same resolution as a method.
@@ -87,7 +111,7 @@ class Settings:
     methods: tuple[str, ...] = METHODS
     scenes: tuple[str, ...] = EXTRA_SCENES
     scene_methods: tuple[str, ...] = ("linear", "mbir")
-    views: int = 1968
+    views: int = paper.FULL_VIEWS["PCCT"]
     voxel_mm: float = 0.2
     kernels: tuple[str, ...] = paper.KERNELS
     voxels_mm: tuple[float, ...] = (0.25, 0.20)
@@ -97,13 +121,15 @@ class Settings:
     fast_noise: bool = False
     block: int = 8
 
+    # About 90 s: an eighth of the views, 8 realisations, fast noise.
+    QUICK: ClassVar[Mapping[str, Any]] = {
+        "n": 8, "scene_n": 4, "doses": (2.0,), "scene_doses": (2.0,), "views": 246, "fast_noise": True,
+        "methods": ("linear", "mbir_one_pass", "mbir"), "scenes": ("half_size_core",),
+        "kernels": ("soft", "standard"), "voxels_mm": (0.25,), "blurs_mm": (0.25,), "bounds": False, "rois": (),
+    }  # fmt: skip
+
     def __post_init__(self) -> None:
-        for name, least in (("n", 3), ("slow_n", 3), ("scene_n", 3), ("seed", 0), ("views", 8), ("block", 1)):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int):
-                raise TypeError(f"{name} must be a whole number, got {value!r}")
-            if value < least:
-                raise ValueError(f"{name} must be at least {least}, got {value}")
+        self.check_whole(n=3, slow_n=3, scene_n=3, seed=0, views=8, block=1)
         for name in ("doses", "scene_doses"):
             values = tuple(float(v) for v in getattr(self, name))
             object.__setattr__(self, name, values)
@@ -128,16 +154,6 @@ class Settings:
         if FBP_BASE[0] not in self.kernels or FBP_BASE[1] not in self.voxels_mm:
             raise ValueError(f"kernels and voxels_mm must hold FBP {FBP_BASE[0]} at {FBP_BASE[1]} mm, the reference")
 
-    @classmethod
-    def quick(cls, **changes: Any) -> Settings:
-        """A first look in about 90 s: an eighth of the views, 8 realisations, fast noise."""
-        values: dict[str, Any] = {
-            "n": 8, "scene_n": 4, "doses": (2.0,), "scene_doses": (2.0,), "views": 246, "fast_noise": True,
-            "methods": ("linear", "mbir_one_pass", "mbir"), "scenes": ("half_size_core",),
-            "kernels": ("soft", "standard"), "voxels_mm": (0.25,), "blurs_mm": (0.25,), "bounds": False, "rois": (),
-        }  # fmt: skip
-        return cls(**{**values, **changes})
-
     def realizations(self, method: str) -> int:
         """Realisations of each main scene and dose for a method."""
         return min(self.n, self.slow_n) if method in SLOW_METHODS else self.n
@@ -146,27 +162,29 @@ class Settings:
         """Realisations of every piece."""
         return [range(k, min(k + self.block, n)) for k in range(0, n, self.block)]
 
+    def estimated_seconds(self) -> dict[str, float]:
+        """Rough time in s of each part on two idle cores, nothing finished yet."""
+        share = self.views / paper.FULL_VIEWS["PCCT"]
+        further = sum(len(with_twin(name)) for name in self.scenes)
+        extra = further * self.scene_n * len(self.scene_doses)
+        drawn = 0 if self.fast_noise else len(NOISY_SCENES) * self.n * len(self.doses)
+        on_images = bool(set(self.methods) & set(IMAGE_METHODS))
+        image_scenes = len(NOISY_SCENES) if on_images else int(not self.fast_noise)
+        images = image_scenes * min(self.n, self.slow_n) * len(self.doses)
+        parts = {
+            "scenes": share * ((len(MAIN_SCENES) + further) * _SECONDS["scene"] + _SECONDS["fbp"]),
+            "data": share * drawn * _SECONDS["data"],
+            "images": share * images * _SECONDS["images"],
+        }
+        for name in self.methods:
+            volumes = len(MAIN_SCENES) * self.realizations(name) * len(self.doses)
+            parts[name] = (volumes + (extra if name in self.scene_methods else 0)) * _SECONDS[name]
+        return parts
 
-def estimate_seconds(settings: Settings) -> dict[str, float]:
-    """Rough time in s of each part on two idle cores, nothing finished yet."""
-    share = settings.views / 1968
-    further = sum(len(with_twin(name)) for name in settings.scenes)
-    extra = further * settings.scene_n * len(settings.scene_doses)
-    drawn = 0 if settings.fast_noise else len(NOISY_SCENES) * settings.n * len(settings.doses)
-    parts = {
-        "scenes": share * ((len(MAIN_SCENES) + further) * _SECONDS["scene"] + _SECONDS["fbp"]),
-        "data": share * drawn * _SECONDS["data"],
-        "images": share * _image_draws(settings) * _SECONDS["images"],
-    }
-    for name in settings.methods:
-        volumes = len(MAIN_SCENES) * settings.realizations(name) * len(settings.doses)
-        parts[name] = (volumes + (extra if name in settings.scene_methods else 0)) * _SECONDS[name]
-    return parts
 
-
-def _image_draws(settings: Settings) -> int:
-    scenes = len(NOISY_SCENES) if set(settings.methods) & set(IMAGE_METHODS) else int(not settings.fast_noise)
-    return scenes * min(settings.n, settings.slow_n) * len(settings.doses)
+def fbp_label(kernel: str, voxel_mm: float, blur_mm: float = 0.0) -> str:
+    """Name of an FBP variant."""
+    return f"{kernel} {voxel_mm:.2f} mm" + (f" + {blur_mm:.2f} mm Gauss" if blur_mm else "")
 
 
 def with_twin(name: str) -> list[str]:

@@ -3,76 +3,80 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from torch import Tensor
 
 from recon.fbp.inset import InsetFbp, view_motion
+from recon.mbir.mbir import Mbir
 from recon.pwls.inset_problem import InsetProblem, reconstruct_pwls
-from recon.study.motion.measure import KERNEL, Measured
 from recon.study.motion.observed import Observed, Reference, observe
+from recon.study.motion.settings import Settings
+from recon.study.paper.plaque_scan import REFERENCE_KERNEL
+from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
 
-if TYPE_CHECKING:
-    from recon.mbir.mbir import Mbir
+__all__ = ["Key", "compensate", "estimate_name", "reconstruct_fbp"]
 
-__all__ = ["compensate"]
+Key = tuple[str, float | None, bool]
+"""Method, error of the estimated motion (0: the true one; None: the still vessel), whether there is noise."""
 
 _PWLS_TOLERANCE_HU = 2.0
 
 
-def compensate(m: Measured, still: Scan, moving: Scan, reference: Reference, progress: Callable[[float], None]) -> None:
-    """Fill ``m.compensated`` from the noise-free scans of the still and of the moving vessel.
+def estimate_name(error: float | None) -> str:
+    """What a report calls an estimate of the motion; see :data:`Key`."""
+    return "at rest" if error is None else f"wrong by {100 * error:.0f} %" if error else "true motion"
+
+
+def reconstruct_fbp(scan: Scan, grid: VolumeGrid, motion: Any = None) -> Tensor:
+    """FBP with the study's kernel, ``(z, y, x)`` HU; ``motion``: of :class:`recon.fbp.inset.InsetFbp`."""
+    return InsetFbp(scan, [grid], [REFERENCE_KERNEL], motion=motion)(scan)[0][0]
+
+
+def compensate(
+    s: Settings, still: Scan, moving: Scan, reference: Reference, progress: Callable[[float], None]
+) -> dict[Key, list[Observed]]:
+    """Reconstruct the noise-free scans of the still and of the moving vessel and their noisy realisations.
 
     PWLS, whose solution is to be certified by exact projections, is run without noise and for the first noise
     realisation, at rest and with the true motion; FBP and MBIR with every estimate of the motion.
+
+    Returns:
+        One entry per realisation.
     """
-    s = m.settings
-    path = view_motion(s.motion.scaled(max(s.fractions)), moving.geometry, s.rotation_s)
-    estimates: list[float | None] = [None, 0.0, *s.errors]
-    noise: list[int | None] = [None, *range(s.seed, s.seed + s.realizations)]
-    makers = {"fbp": _fbp, "pwls": _pwls, "mbir": _mbir}
+    grid = reference.grid
+    path = view_motion(s.motion.scaled(s.worst), moving.geometry, s.rotation_s)
+    estimates: dict[float | None, Any] = {None: None}
+    estimates |= {e: (1.0 - e) * path for e in (0.0, *s.errors)}
     problems: dict[float | None, InsetProblem] = {}
     if set(s.methods) - {"fbp"}:
-        problem = InsetProblem(still, m.grid)
-        problems = {e: problem if e is None else problem.with_motion((1.0 - e) * path) for e in estimates}
+        problem = InsetProblem(still, grid)
+        problems = {e: problem if motion is None else problem.with_motion(motion) for e, motion in estimates.items()}
+    network = Mbir.load() if "mbir" in s.methods else None
+
+    def reconstruct(method: str, scan: Scan, error: float | None) -> Tensor:
+        if method == "fbp":
+            return reconstruct_fbp(scan, grid, estimates[error])
+        if network is None or method == "pwls":
+            return reconstruct_pwls([scan], grid, problem=problems[error], tolerance=_PWLS_TOLERANCE_HU)[0].data
+        # Noise free: as a scan of the study's exposure whose readings happen to be their expectations.
+        b = problems[error].statistic(scan).b * (s.exposure_s / NOISE_FREE_EXPOSURE_S if scan.noise_free else 1.0)
+        return network(problems[error], b[None], s.exposure_s)[0]
+
+    noise: list[int | None] = [None, *range(s.seed, s.seed + s.realizations)]
+    found: dict[Key, list[Observed]] = {}
     rest: dict[str, Tensor] = {}
     for k, seed in enumerate(noise):
         # The same draws at rest and in motion: noise belongs to the reading, not to what is seen.
         scans = [scan if seed is None else scan.with_noise(s.exposure_s, seed) for scan in (still, moving)]
         for method in s.methods:
-            if method == "pwls" and k > 1:
-                continue
             for error in estimates:
-                if method == "pwls" and error:
+                if method == "pwls" and (k > 1 or error):
                     continue
-                motion = None if error is None else (1.0 - error) * path
-                volume = makers[method](scans[error is not None], m, motion, problems.get(error))
+                volume = reconstruct(method, scans[error is not None], error)
                 if seed is None and error is None:
                     rest[method] = volume
-                found: Observed = observe(volume, m.grid, reference, rest[method])
-                m.compensated.setdefault((method, error, seed is not None), []).append(found)
+                found.setdefault((method, error, seed is not None), []).append(observe(volume, reference, rest[method]))
         progress((k + 1) / len(noise))
-
-
-def _fbp(scan: Scan, m: Measured, motion: Any, problem: InsetProblem | None) -> Tensor:
-    return InsetFbp(scan, [m.grid], [KERNEL], motion=motion)(scan)[0][0]
-
-
-def _pwls(scan: Scan, m: Measured, motion: Any, problem: InsetProblem | None) -> Tensor:
-    return reconstruct_pwls([scan], m.grid, problem=problem, tolerance=_PWLS_TOLERANCE_HU)[0].data
-
-
-@lru_cache(maxsize=1)
-def _learned() -> Mbir:
-    from recon.mbir.mbir import Mbir
-
-    return Mbir.load()
-
-
-def _mbir(scan: Scan, m: Measured, motion: Any, problem: InsetProblem | None) -> Tensor:
-    """Noise free: as a scan of the study's exposure whose readings happen to be their expectations."""
-    assert problem is not None
-    b = problem.statistic(scan).b * (m.settings.exposure_s / NOISE_FREE_EXPOSURE_S if scan.noise_free else 1.0)
-    return _learned()(problem, b[None], m.settings.exposure_s)[0]
+    return found

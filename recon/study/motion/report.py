@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from recon.study.checks import Check, checks_section, effects_section
+from recon.study.motion.compensation import estimate_name
 from recon.study.motion.figures import curves_figure, images_figure
-from recon.study.motion.measure import METHODS, Measured
+from recon.study.motion.measure import Measured
 from recon.study.motion.observed import Observed
+from recon.study.motion.settings import METHODS
 from recon.study.paper import facts as paper
-from recon.study.report import Report, markdown_table
-from recon.study.study import environment
+from recon.study.report import Report, markdown_table, or_dash
+from recon.study.study import environment, time_line
 from torchpcct.acquisition.plan import Effect
 
 __all__ = ["build_report"]
@@ -28,7 +30,7 @@ _DICE = 0.5
 
 
 def build_report(m: Measured) -> Report:
-    """Report of :func:`recon.study.motion.measure.measure_all`: ``report.json``, ``report.md`` and two figures."""
+    """Report of :func:`recon.study.motion.measure.measure`: ``report.json``, ``report.md`` and two figures."""
     checks = _checks(m)
     data: dict[str, Any] = {
         "study": "motion",
@@ -56,7 +58,7 @@ def build_report(m: Measured) -> Report:
         _residual_section(m),
         _compensation_section(m),
         effects_section([Effect(**e) for e in m.plan["effects"]], m.plan["tolerance_hu"]),
-        _footer(m, data["environment"]),
+        _footer(m),
     ]
     figures = {"motion_images.png": images_figure(m), "motion.png": curves_figure(m)}
     return Report("motion", data, "\n\n".join(sections), figures)
@@ -81,37 +83,35 @@ def _intro(m: Measured) -> str:
 
 
 def _headline(m: Measured) -> str:
-    rest = m.at_rest["PCCT"]
-    worst = max(m.settings.fractions)
-    plain = m.residual["PCCT", worst][0]
-    fixed = m.compensated["fbp", 0.0, False][0]
+    rest, errors = m.at_rest["PCCT"], (0.0, *m.settings.errors)
+    mm = m.settings.amplitude_mm * m.settings.worst
+    plain = m.residual["PCCT", m.settings.worst][0]
+    estimates = {method: [m.compensated[method, e, False][0] for e in errors]
+                 for method in METHODS if (method, errors[-1], False) in m.compensated}  # fmt: skip
+    fixed = estimates["fbp"][0]
     text = (
-        f"Uncompensated, {worst * m.settings.amplitude_mm:g} mm of motion change the image by "
+        f"Uncompensated, {mm:g} mm of motion change the image by "
         f"{100 * plain.nrmse:.0f} % (normalised rms) and leave {'a' if plain.segmentation.core_found else 'no'} core "
         f"to segment; with the motion known, FBP comes back to {100 * fixed.nrmse:.1f} %, the lumen's area to "
         f"{_relative(fixed, rest):.1f} % of that at rest, the core's contrast to {fixed.contrast_hu:.1f} HU "
         f"(at rest {rest.contrast_hu:.1f})."
     )
-    errors = (0.0, *m.settings.errors)
-    mm = m.settings.amplitude_mm * worst
-    contrasts = [m.compensated["fbp", e, False][0].contrast_hu for e in errors]
-    limit = _up_to(errors, [_change(c, rest.contrast_hu) <= _TOLERANCE for c in contrasts])
+    limit = _up_to(errors, [_contrast_kept(o, rest) for o in estimates["fbp"]])
     if limit is not None:
         text += (
             f" FBP's contrast of the core stays within {_TOLERANCE:.0f} % of that at rest if the assumed amplitude is "
             f"wrong by up to {100 * limit:.0f} %, a residual motion of {limit * mm:.2g} mm"
         )
         text += "." if limit == errors[-1] else "; at the next larger error it does not."
-    for method, title in METHODS.items():
-        if (method, errors[-1], False) in m.compensated:
-            kept = _up_to(errors, [_core_right(m.compensated[method, e, False][0]) for e in errors])
-            name = title.split(" (")[0]
-            if kept is None:
-                text += f" {name} does not segment the core at any."
-            elif kept == 0:
-                text += f" {name} segments the core with the true motion only."
-            else:
-                text += f" {name} segments the core up to an error of {100 * kept:.0f} % ({kept * mm:.2g} mm)."
+    for method, found in estimates.items():
+        kept = _up_to(errors, [_core_right(o) for o in found])
+        text += f" {METHODS[method].split(' (')[0]} "
+        if kept is None:
+            text += "does not segment the core at any."
+        elif kept == 0:
+            text += "segments the core with the true motion only."
+        else:
+            text += f"segments the core up to an error of {100 * kept:.0f} % ({kept * mm:.2g} mm)."
     return text
 
 
@@ -125,8 +125,8 @@ def _up_to(errors: Sequence[float], good: Sequence[bool]) -> float | None:
     return kept
 
 
-def _change(value: float, reference: float) -> float:
-    return 100.0 * abs(value / reference - 1.0)
+def _contrast_kept(found: Observed, rest: Observed) -> bool:
+    return 100.0 * abs(found.contrast_hu / rest.contrast_hu - 1.0) <= _TOLERANCE
 
 
 def _core_right(found: Observed) -> bool:
@@ -136,53 +136,39 @@ def _core_right(found: Observed) -> bool:
 
 def _checks(m: Measured) -> list[Check]:
     s, rest = m.settings, m.at_rest["PCCT"]
-    series = {f: m.residual["PCCT", f][0] for f in s.fractions}
-    stable = paper.MOTION["lumen_stable_below"]
+    series = {f: here for f, (here, _) in m.residuals("PCCT").items()}
+    stable, tolerated = paper.MOTION["lumen_stable_below"], paper.MOTION["tolerated"]
     drift = {f: abs(_relative(o, rest) - 100.0) for f, o in series.items()}
     small = [v for f, v in drift.items() if f < stable]
-    worst = max(s.fractions)
-    errors = [series[f].nrmse for f in s.fractions]
+    last = series[s.worst]
     checks = [
         Check("largest displacement over the amplitude", m.range_mm[1] / s.amplitude_mm, "range [0, A]", 0.99, 1.01),
         Check("smallest displacement over the amplitude", m.range_mm[0] / s.amplitude_mm, "range [0, A]", -0.01, 0.01),
     ]
     if small:
-        checks.append(
-            Check(f"lumen area's change below {100 * stable:.0f} % of the motion, %", max(small), "stable",
-                  high=_TOLERANCE)
-        )  # fmt: skip
-    if stable in drift and worst > stable:
-        checks.append(
-            Check(f"lumen area's change at {100 * worst:.0f} % over that at {100 * stable:.0f} % of the motion",
-                  drift[worst] / max(drift[stable], 1e-9), "suffers beyond", low=1.0)
-        )  # fmt: skip
-    tolerated = paper.MOTION["tolerated"]
+        name = f"lumen area's change below {100 * stable:.0f} % of the motion, %"
+        checks.append(Check(name, max(small), "stable", high=_TOLERANCE))
+    if stable in drift and s.worst > stable:
+        name = f"lumen area's change at {100 * s.worst:.0f} % over that at {100 * stable:.0f} % of the motion"
+        checks.append(Check(name, drift[s.worst] / max(drift[stable], 1e-9), "suffers beyond", low=1.0))
     if tolerated in series and rest.segmentation.core_found:
-        core = _core_change(series[tolerated], rest)
-        checks.append(
-            Check(f"core area's change at {100 * tolerated:.0f} % (100: lost), %", core,
-                  f"more than the lumen's {drift[tolerated]:.1f}", low=max(drift[tolerated], 1.0))
-        )  # fmt: skip
-    contrasts = [_change(o.contrast_hu, rest.contrast_hu) <= _TOLERANCE for o in series.values()]
+        name = f"core area's change at {100 * tolerated:.0f} % (100: lost), %"
+        more = f"more than the lumen's {drift[tolerated]:.1f}"
+        checks.append(Check(name, _core_change(series[tolerated], rest), more, low=max(drift[tolerated], 1.0)))
     if tolerated in series:
-        borne = _up_to(s.fractions, contrasts)
-        checks.append(
-            Check("largest residual motion with the core's contrast within 20 %, % of the motion",
-                  math.nan if borne is None else 100 * borne, f"{100 * tolerated:.0f}", 100 * tolerated / 2,
-                  100 * tolerated)
-        )  # fmt: skip
-    checks.append(
-        Check(f"core segmented at {100 * worst:.0f} % of the motion (1: yes)",
-              float(series[worst].segmentation.core_found), "structures not reconstructed", high=0.0)
-    )  # fmt: skip
-    if len(errors) > 1:
-        checks.append(Check("smallest rise of the NRMSE with the motion", min(np.diff(errors)), "rises", low=0.0))
-    for fraction in s.eid_fractions:
+        borne = _up_to(s.fractions, [_contrast_kept(o, rest) for o in series.values()])
+        name = "largest residual motion with the core's contrast within 20 %, % of the motion"
+        ours, limit = math.nan if borne is None else 100 * borne, 100 * tolerated
+        checks.append(Check(name, ours, f"{limit:.0f}", limit / 2, limit))
+    name = f"core segmented at {100 * s.worst:.0f} % of the motion (1: yes)"
+    checks.append(Check(name, float(last.segmentation.core_found), "structures not reconstructed", high=0.0))
+    if len(series) > 1:
+        rise = min(np.diff([o.nrmse for o in series.values()]))
+        checks.append(Check("smallest rise of the NRMSE with the motion", rise, "rises", low=0.0))
+    for fraction, (eid, _) in m.residuals("EID-CT").items():
         if fraction in series:
-            ratio = m.residual["EID-CT", fraction][0].nrmse / series[fraction].nrmse
-            checks.append(
-                Check(f"NRMSE at {100 * fraction:.0f} %, EID-CT over PCCT", ratio, "EID-CT less sensitive", high=1.0)
-            )
+            name = f"NRMSE at {100 * fraction:.0f} %, EID-CT over PCCT"
+            checks.append(Check(name, eid.nrmse / series[fraction].nrmse, "EID-CT less sensitive", high=1.0))
     return checks
 
 
@@ -196,10 +182,11 @@ def _core_change(found: Observed, rest: Observed) -> float:
 def _residual_section(m: Measured) -> str:
     rows = []
     for name, rest in m.at_rest.items():
-        rows.append(_row(f"{name}, at rest", None, rest, rest))
-        for (scanner, f), (here, back) in m.residual.items():
-            if scanner == name:
-                rows.append(_row(f"{name}, {100 * f:.0f} %", (here, back), here, rest))
+        rows.append([f"{name}, at rest", "–", "–", *_cells(rest, rest)])
+        rows += [
+            [f"{name}, {100 * f:.0f} %", f"{100 * here.nrmse:.1f}", f"{100 * back.nrmse:.1f}", *_cells(here, rest)]
+            for f, (here, back) in m.residuals(name).items()
+        ]
     head = ["residual motion", "NRMSE in place, %", "moved back, %", "lumen, % of rest", "lumen Dice", "core, mm²",
             "basin, HU", "contrast, HU"]  # fmt: skip
     return (
@@ -212,14 +199,11 @@ def _residual_section(m: Measured) -> str:
     )
 
 
-def _row(name: str, pair: tuple[Observed, Observed] | None, found: Observed, rest: Observed) -> list[str]:
+def _cells(found: Observed, rest: Observed) -> list[str]:
     return [
-        name,
-        f"{100 * pair[0].nrmse:.1f}" if pair else "–",
-        f"{100 * pair[1].nrmse:.1f}" if pair else "–",
         f"{_relative(found, rest):.1f}",
         f"{found.lumen_dice:.2f}",
-        _or(found.segmentation.core_area, 2),
+        or_dash(found.segmentation.core_area, 2),
         f"{found.depth:.1f}",
         f"{found.contrast_hu:.1f}",
     ]
@@ -229,17 +213,12 @@ def _compensation_section(m: Measured) -> str:
     s = m.settings
     parts = ["## Compensation\n\n" + _compensation_text(m)]
     for noisy in (False, True):
-        rows = []
-        for method, title in METHODS.items():
-            for error in (None, 0.0, *s.errors):
-                found = m.compensated.get((method, error, noisy))
-                if found is None:
-                    continue
-                rest = m.compensated[method, None, noisy]
-                name = (
-                    "at rest" if error is None else ("true motion" if error == 0 else f"wrong by {100 * error:.0f} %")
-                )
-                rows.append([f"{title}, {name}", *_averages(found, rest, noisy)])
+        rows = [
+            [f"{METHODS[method]}, {estimate_name(e)}", *_averages(found, m.compensated[method, None, noisy], noisy)]
+            for method in METHODS
+            for e in (None, 0.0, *s.errors)
+            if (found := m.compensated.get((method, e, noisy)))
+        ]
         head = ["reconstruction", "residual, NRMSE %", "lumen, % of rest", "lumen Dice", "core found", "core Dice",
                 "basin, HU", "contrast, HU", "cap, mm"]  # fmt: skip
         runs = f"means of {s.realizations} realisations" if s.realizations > 1 else "one realisation"
@@ -249,46 +228,41 @@ def _compensation_section(m: Measured) -> str:
 
 
 def _averages(found: Sequence[Observed], rest: Sequence[Observed], noisy: bool) -> list[str]:
-    def mean(values: list[float], digits: int) -> str:
+    def mean(values: Iterable[float], digits: int) -> str:
         finite = [v for v in values if math.isfinite(v)]
         return f"{np.mean(finite):.{digits}f}" if finite else "–"
 
     return [
-        mean([100 * o.nrmse for o in found], 1),
-        mean([_relative(o, r) for o, r in zip(found, rest, strict=True)], 1),
-        mean([o.lumen_dice for o in found], 2),
+        mean((100 * o.nrmse for o in found), 1),
+        mean((_relative(o, r) for o, r in zip(found, rest, strict=True)), 1),
+        mean((o.lumen_dice for o in found), 2),
         f"{sum(_core_right(o) for o in found)} of {len(found)}",
-        mean([o.core_dice for o in found], 2),
-        "–" if noisy else mean([o.depth for o in found], 1),
-        mean([o.contrast_hu for o in found], 1),
-        mean([o.cap_line for o in found], 3),
+        mean((o.core_dice for o in found), 2),
+        "–" if noisy else mean((o.depth for o in found), 1),
+        mean((o.contrast_hu for o in found), 1),
+        mean((o.cap_line for o in found), 3),
     ]
 
 
 def _compensation_text(m: Measured) -> str:
     s = m.settings
-    worst = max(s.fractions)
+    mm = s.worst * s.amplitude_mm
     return (
-        f"The scan with {100 * worst:.0f} % of the motion ({worst * s.amplitude_mm:g} mm), reconstructed with the "
+        f"The scan with {100 * s.worst:.0f} % of the motion ({mm:g} mm), reconstructed with the "
         "motion given. The fat around the vessel stands still: its known readings are taken off and reconstructed at "
         "rest; what the vessel adds is filtered and backprojected along the rays that met the vessel where it was "
         "(FBP), or projected with the grid displaced in every view (PWLS and MBIR). Wrong by e: the estimate is "
-        f"(1 − e) times the true motion, a residual motion of e · {worst * s.amplitude_mm:g} mm. NRMSE: against the "
+        f"(1 − e) times the true motion, a residual motion of e · {mm:g} mm. NRMSE: against the "
         "same method's noise-free image at rest; with noise it is mostly noise. Core found: a region segmented with a "
         f"Dice of at least {_DICE:g} with the true core. PWLS was run to its certified minimum, at rest and with the "
         "true motion."
     )
 
 
-def _footer(m: Measured, versions: dict[str, Any]) -> str:
+def _footer(m: Measured) -> str:
     s = m.settings
-    seconds = ", ".join(f"{k} {v:.0f} s" for k, v in m.seconds.items())
-    stack = ", ".join(f"{k} {v}" for k, v in versions.items())
-    seeds = f"Seeds of the noise: {s.seed} … {s.seed + s.realizations - 1}."
     thinned = "" if s.thinning == 1 else f" --set thinning={s.thinning}"
-    repeat = f"torchpcct study motion{thinned} --set realizations={s.realizations}"
-    return f"Repeat: `{repeat}`. Time: {seconds}. {seeds} Environment: {stack}."
-
-
-def _or(value: float, digits: int) -> str:
-    return "–" if math.isnan(value) else f"{value:.{digits}f}"
+    seeds = f"seeds of the noise: {s.seed} … {s.seed + s.realizations - 1}; versions: report.json"
+    return (
+        f"Repeat: `torchpcct study motion{thinned} --set realizations={s.realizations}`. {time_line(m.seconds, seeds)}"
+    )

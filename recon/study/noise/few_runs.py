@@ -8,7 +8,7 @@ measured table is (paired bootstrap over its realisations).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 from torchpcct.metrics.bootstrap import bca_interval, leave_one_out, resampling
 
 __all__ = [
-    "CLAIMS",
-    "Claim",
     "Pair",
     "Table",
     "exact_table",
@@ -172,99 +170,3 @@ def kendall(a: Any, b: Any) -> Floats:
     a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
     i, j = np.triu_indices(a.shape[-1], 1)
     return np.asarray(np.sign((a[..., i] - a[..., j]) * (b[..., i] - b[..., j])).mean(-1))
-
-
-# --- what the paper concludes from its tables -----------------------------------------------------------------------
-
-Setting = tuple[str, float]
-Holds = Callable[[Table, Sequence[Setting]], NDArray[np.bool_]]
-
-
-@dataclass(frozen=True)
-class Claim:
-    """A statement of the paper about its tables, as a function of a table.
-
-    Attributes:
-        text: what it says.
-        needs: settings that must be among those studied.
-        holds: ``holds(table, settings)`` → booleans of the table's leading axes.
-    """
-
-    text: str
-    needs: tuple[Setting, ...]
-    holds: Holds
-
-
-def _at(settings: Sequence[Setting], *wanted: Setting) -> list[int]:
-    return [list(settings).index(w) for w in wanted]
-
-
-def _best(settings: Sequence[Setting], table: Table, wanted: Setting) -> NDArray[np.bool_]:
-    return np.asarray(table.cnr.argmax(-1) == _at(settings, wanted)[0])
-
-
-def _top_two(table: Table, settings: Sequence[Setting]) -> NDArray[np.bool_]:
-    order = np.argsort(-table.cnr, axis=-1)[..., :2]
-    return np.asarray(np.isin(order, _at(settings, ("soft", 0.25), ("standard", 0.25))).all(-1))
-
-
-def _groups(settings: Sequence[Setting], axis: int) -> list[list[int]]:
-    """Indices of the settings that share their kernel (axis 0) or their voxel size (axis 1)."""
-    return [
-        [i for i, s in enumerate(settings) if s[axis] == value] for value in dict.fromkeys(s[axis] for s in settings)
-    ]
-
-
-def _smallest_at_quarter(
-    figure: Floats, settings: Sequence[Setting], kernels: Sequence[str] | None = None
-) -> NDArray[np.bool_]:
-    """Whether, for every kernel (or those given), ``figure`` is smallest at 0.25 mm."""
-    result = np.ones(figure.shape[:-1], dtype=bool)
-    for members in _groups(settings, 0):
-        if kernels is not None and settings[members[0]][0] not in kernels:
-            continue
-        sizes = [settings[i][1] for i in members]
-        result &= figure[..., members].argmin(-1) == sizes.index(0.25)
-    return result
-
-
-def _soft_quietest(table: Table, settings: Sequence[Setting]) -> NDArray[np.bool_]:
-    result = np.ones(table.noise.shape[:-1], dtype=bool)
-    for members in _groups(settings, 1):
-        names = [settings[i][0] for i in members]
-        result &= table.noise[..., members].argmin(-1) == names.index("soft")
-    return result
-
-
-def _kernel_order(table: Table, settings: Sequence[Setting]) -> NDArray[np.bool_]:
-    index = _at(settings, *((k, 0.25) for k in ("soft", "standard", "detail", "bone")))
-    return np.asarray((np.diff(table.cnr[..., index], axis=-1) < 0).all(-1))
-
-
-def _closest(table: Table, settings: Sequence[Setting]) -> NDArray[np.bool_]:
-    from recon.study.paper import facts as paper
-
-    reference = np.array([paper.NOISE_FREE_ROI_HU["foreground"], paper.NOISE_FREE_ROI_HU["background"]])
-    return _smallest_at_quarter(np.abs(table.mean - reference).sum(-1), settings, ("soft", "standard"))
-
-
-def _worst(table: Table, settings: Sequence[Setting]) -> NDArray[np.bool_]:
-    return np.asarray(table.cnr.argmin(-1) == _at(settings, ("bone", 0.30))[0])
-
-
-_SOFT, _QUARTER = ("soft", 0.25), tuple((k, 0.25) for k in ("soft", "standard", "detail", "bone"))
-
-CLAIMS = (
-    Claim("soft, 0.25 mm has the highest CNR", (_SOFT,), lambda t, s: _best(s, t, _SOFT)),
-    Claim("soft and standard at 0.25 mm have the two highest CNRs", _QUARTER[:2], _top_two),
-    Claim("at 0.25 mm the CNR falls from soft over standard and detail to bone", _QUARTER, _kernel_order),
-    Claim("the soft kernel has the least noise at every voxel size", _QUARTER[:2], _soft_quietest),
-    Claim(
-        "the SD of the core's mean is smallest at 0.25 mm with every kernel",
-        _QUARTER[:1],
-        lambda t, s: _smallest_at_quarter(t.sd[..., 0], s),
-    ),
-    Claim("the means come closest to 40 and 92 HU at 0.25 mm (soft and standard)", _QUARTER[:2], _closest),
-    Claim("bone, 0.30 mm has the lowest CNR", (("bone", 0.30),), _worst),
-)
-"""What the paper reads from its tables. All but the last are stated in its text; the last one is read off its table."""

@@ -6,11 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from recon.study.noise.few_runs import measured_table
+from recon.study.figures import extent, roi_outlines
 from recon.study.noise.measure import Measured
 from recon.study.paper import facts as paper
 from recon.study.paper.tables import published
-from torchpcct.metrics.cnr import cnr_interval, cnr_range
 from torchpcct.metrics.roi import sample_axial
 from torchpcct.viz import Panel, panels
 
@@ -23,51 +22,49 @@ _IMAGES_SCALE = 0.62
 
 def images_figure(m: Measured) -> Any:
     """One realisation at the tables' dose: kernels down, voxel sizes across."""
-    rois = m.scanned.rois
-    half = [rois.image.extent[axis] / 2 for axis in (1, 2)]
-    extent = (-half[1], half[1], -half[0], half[0])
-    grids = dict(zip(m.settings.voxels_mm, m.scanned.grids, strict=True))
-    rows: list[list[Panel]] = []
-    for kernel in m.settings.kernels:
+    s, rois = m.settings, m.scanned.rois
+    rows = []
+    for kernel in s.kernels:
+        first = kernel == s.kernels[0]
         row = []
-        for voxel in m.settings.voxels_mm:
-            image = sample_axial(m.images[kernel, voxel], grids[voxel], rois.image)[0]
-            outlines = ((rois.foreground[0], "deepskyblue"), (rois.background[0], "tomato")) if not rows else ()
-            row.append(Panel(image, extent, f"{voxel:.2f} mm" if not rows else "", outlines))
+        for voxel, grid in zip(s.voxels_mm, m.scanned.grids, strict=True):
+            image = sample_axial(m.images[kernel, voxel], grid, rois.image)[0]
+            title, outlines = (f"{voxel:.2f} mm", roi_outlines(rois)) if first else ("", ())
+            row.append(Panel(image, extent(rois.image), title, outlines))
         rows.append(row)
     figure = panels(
         rows,
-        m.settings.kernels,
-        f"FBP of one noise realisation, {m.settings.table_exposure_s:g} s, axial",
+        s.kernels,
+        f"FBP of one noise realisation, {s.table_exposure_s:g} s, axial",
         "C150 / W600 HU. ROI outlines (top row): necrotic core (blue), fibrous tissue (red).",
     )
     figure.set_size_inches(_IMAGES_SCALE * figure.get_size_inches())
     return figure
 
 
-def cnr_figure(m: Measured) -> Any:
-    """CNR of every setting: exact, n realisations with interval, range of 10-run experiments, the paper's."""
+def cnr_figure(m: Measured, rows: list[dict[str, Any]]) -> Any:
+    """CNR of every setting: exact, n realisations with interval, range of 10-run experiments, the paper's.
+
+    Args:
+        rows: of the report's table at the tables' dose.
+    """
     from matplotlib.figure import Figure
 
-    exposure = m.settings.table_exposure_s
-    exact, values = m.exact(exposure), m.means[exposure]
-    measured = measured_table(values)
-    figure = Figure(figsize=(2.4 * len(m.settings.kernels) + 1.0, 4.0), dpi=150, layout="constrained")
-    axes = figure.subplots(1, len(m.settings.kernels), squeeze=False, sharey=True)[0]
+    exposure, kernels = m.settings.table_exposure_s, m.settings.kernels
+    figure = Figure(figsize=(2.4 * len(kernels) + 1.0, 4.0), dpi=150, layout="constrained")
+    axes = figure.subplots(1, len(kernels), squeeze=False, sharey=True)[0]
     x = np.array(m.settings.voxels_mm)
     step = 0.05 if x.size < 2 else float(np.diff(x).min())
-    for ax, kernel in zip(axes, m.settings.kernels, strict=True):
-        index = [m.axes.index((kernel, v)) for v in m.settings.voxels_mm]
-        bands = np.array(
-            [cnr_range(exact.mean[i], m.covariance[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] / exposure, 10) for i in index]
-        )
+    for ax, kernel in zip(axes, kernels, strict=True):
+        own = [r for r in rows if r["kernel"] == kernel]
+        bands = np.array([r["ten_runs"]["cnr_range"] for r in own])
         ax.fill_between(x, bands[:, 0], bands[:, 1], color="0.85", label="95 % of 10-run experiments", linewidth=0)
-        ax.plot(x, exact.cnr[index], color="black", linewidth=1.2, label="exact")
-        ends = np.array([cnr_interval(values[:, i, 0], values[:, i, 1]) for i in index])
-        middle = measured.cnr[index]
+        ax.plot(x, [r["exact"]["cnr"] for r in own], color="black", linewidth=1.2, label="exact")
+        middle = np.array([r["measured"]["cnr"] for r in own])
+        ends = np.array([r["measured"]["cnr_interval"] for r in own])
         ax.errorbar(
             x + 0.12 * step, middle, [middle - ends[:, 0], ends[:, 1] - middle], fmt="o", markersize=3, capsize=2,
-            color="tab:blue", linewidth=1, label=f"n = {len(values)}, 95 %",
+            color="tab:blue", linewidth=1, label=f"n = {m.settings.realizations}, 95 %",
         )  # fmt: skip
         entries = [published(paper.CNR, kernel, v, exposure) for v in m.settings.voxels_mm]
         if all(e is not None for e in entries):

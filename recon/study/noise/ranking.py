@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from recon.study.noise.few_runs import CLAIMS, few_run_tables, kendall, pair_differences, resampled_tables
+from recon.study.noise.claims import CLAIMS
+from recon.study.noise.few_runs import Pair, few_run_tables, kendall, pair_differences, resampled_tables
 from recon.study.noise.measure import Measured
 from recon.study.paper import facts as paper
 from recon.study.paper.tables import published
@@ -18,6 +19,18 @@ __all__ = ["claims_data", "claims_section", "pairs_data", "pairs_section"]
 _BOOTSTRAP = 40_000
 _ESTABLISHED = 0.975
 """Share of bootstrap resamples in which a claim must hold to count as established (its complement: refuted)."""
+
+
+def _published_cnr(m: Measured, exposure: float) -> Any:
+    """The paper's CNR of every setting, or None where it does not give all of them."""
+    entries = [published(paper.CNR, k, v, exposure) for k, v in m.axes]
+    return None if any(e is None for e in entries) else np.array(entries, dtype=float)
+
+
+def _range(values: Any) -> list[float]:
+    """Median between the ends of the 95 % range."""
+    quantiles: list[float] = np.quantile(values, [0.025, 0.5, 0.975]).tolist()
+    return quantiles
 
 
 def claims_data(m: Measured, exposure: float) -> tuple[list[dict[str, Any]], dict[str, Any]]:
@@ -45,25 +58,22 @@ def claims_data(m: Measured, exposure: float) -> tuple[list[dict[str, Any]], dic
             }
         )
     winners = np.bincount(shared.cnr.argmax(-1), minlength=len(axes)) / s.experiments
+    half = s.experiments // 2
     shares: dict[str, Any] = {
         "experiments": s.experiments,
         "winners": {f"{k} {v:.2f} mm": float(w) for (k, v), w in zip(axes, winners, strict=True)},
-        "tau_exact_shared": np.quantile(kendall(shared.cnr, exact.cnr), [0.025, 0.5, 0.975]).tolist(),
-        "tau_exact_own": np.quantile(kendall(own.cnr, exact.cnr), [0.025, 0.5, 0.975]).tolist(),
-        "tau_between_experiments": np.quantile(
-            kendall(shared.cnr[: s.experiments // 2], shared.cnr[s.experiments // 2 : 2 * (s.experiments // 2)]),
-            [0.025, 0.5, 0.975],
-        ).tolist(),
+        "tau_exact_shared": _range(kendall(shared.cnr, exact.cnr)),
+        "tau_exact_own": _range(kendall(own.cnr, exact.cnr)),
+        "tau_between_experiments": _range(kendall(shared.cnr[:half], shared.cnr[half : 2 * half])),
     }
-    entries = [published(paper.CNR, k, v, exposure) for k, v in axes]
-    if all(e is not None for e in entries):
-        theirs = np.array(entries, dtype=float)
+    theirs = _published_cnr(m, exposure)
+    if theirs is not None:
+        agreement = kendall(shared.cnr, theirs)
         shares["tau_paper_exact"] = float(kendall(theirs, exact.cnr))
-        shares["tau_paper_shared"] = np.quantile(kendall(shared.cnr, theirs), [0.025, 0.5, 0.975]).tolist()
-        shares["same_order_as_paper_shared"] = float((kendall(shared.cnr, theirs) == 1).mean())
-        pairs = (("soft", 0.25), ("soft", 0.20))
-        if set(pairs) <= set(axes):
-            a, b = (axes.index(p) for p in pairs)
+        shares["tau_paper_shared"] = _range(agreement)
+        shares["same_order_as_paper_shared"] = float((agreement == 1).mean())
+        if {("soft", 0.25), ("soft", 0.20)} <= set(axes):
+            a, b = axes.index(("soft", 0.25)), axes.index(("soft", 0.20))
             limit = theirs[a] / theirs[b]
             shares["soft_quarter_over_fifth"] = {
                 "paper": float(limit),
@@ -139,10 +149,8 @@ def pairs_data(m: Measured, exposure: float) -> dict[str, Any]:
     level = 1 - 0.05 / len(every)
     joint = pair_differences(values, exact, every, level=level, draws=_BOOTSTRAP, seed=m.settings.seed)
     found = [p for p in joint if p.established]
-    entries = [published(paper.CNR, k, v, exposure) for k, v in axes]
-    agree = None
-    if all(e is not None for e in entries):
-        theirs = np.array(entries, dtype=float)
+    theirs, agree = _published_cnr(m, exposure), None
+    if theirs is not None:
         agree = sum(np.sign(p.difference) == np.sign(theirs[p.first] - theirs[p.second]) for p in found)
     return {
         "reference": f"{best[0]} {best[1]:.2f} mm",
@@ -164,7 +172,7 @@ def pairs_data(m: Measured, exposure: float) -> dict[str, Any]:
     }
 
 
-def _runs_needed(p: Any, n: int) -> float:
+def _runs_needed(p: Pair, n: int) -> float:
     """Paired realisations for an 80 % chance that a 95 % interval excludes zero."""
     error = (p.high - p.low) / (2 * 1.96)
     return float(n * ((1.96 + 0.84) * error / p.exact) ** 2) if p.exact else float("inf")

@@ -1,22 +1,23 @@
-"""Tables, text and figures of the noise study."""
+"""Tables and text of the noise study."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Iterable
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 from scipy import stats
 
 from recon.study.checks import Check, around, checks_section, effects_section
-from recon.study.noise.few_runs import Table, measured_table
+from recon.study.noise.few_runs import measured_table
 from recon.study.noise.figures import cnr_figure, images_figure
-from recon.study.noise.measure import Measured, as_dict
+from recon.study.noise.measure import Measured
 from recon.study.noise.ranking import claims_data, claims_section, pairs_data, pairs_section
 from recon.study.paper import facts as paper
 from recon.study.paper.tables import published, table_checks
 from recon.study.report import Report, markdown_table
-from recon.study.study import environment
+from recon.study.study import environment, time_line
 from torchpcct.acquisition.plan import Effect
 from torchpcct.metrics.cnr import cnr_interval, cnr_range, sd_interval
 
@@ -27,27 +28,38 @@ def build_report(m: Measured) -> Report:
     """Report of :func:`recon.study.noise.measure.measure`: ``report.json``, ``report.md`` and two figures."""
     exposure = m.settings.table_exposure_s
     tables = {name: _dose_table(m, dose) for name, dose in m.settings.doses.items()}
+    shown = next(rows for name, rows in tables.items() if m.settings.doses[name] == exposure)
     claims, shares = claims_data(m, exposure)
     pairs = pairs_data(m, exposure)
     checks = _checks(m)
+    plan = m.scanned.clean.info["plan"]
     data = {
         "study": "noise",
-        **as_dict(m),
+        "settings": asdict(m.settings),
+        "plan": dict(plan),
+        "rois": m.scanned.rois.as_dict(),
+        "noise_free_reference": m.reference,
+        "order": "settings: voxel size slowest, then kernel; ROI means: setting, then core / fibrous",
+        "axes": m.axes,
+        "expected_hu": np.round(m.expected, 4),
+        "covariance_hu2_at_1s": np.round(m.covariance, 4),
+        "averaging_voxels_sd_hu_at_1s": [[*k, *np.round(v, 4)] for k, v in m.averaging.items()],
+        "full_reconstructions": m.check,
         "doses": tables,
-        "noise_against_dose": {"slopes": np.round(m.slopes(), 5).tolist()},
+        "noise_against_dose": {"slopes": np.round(m.slopes(), 5)},
         "claims": claims,
         "ten_run_experiments": shares,
         "pairs": pairs,
         "eid": m.eid,
         "checks": [c.as_dict() for c in checks],
+        "seconds": m.seconds,
         "environment": environment(),
     }
-    plan = m.scanned.clean.info["plan"]
     sections = [
         "# Noise of the plaque images: kernels, voxel sizes, doses",
         _intro(m),
-        _dose_section(m, exposure),
-        _other_doses(m),
+        _dose_section(m, shown),
+        _all_doses(m, tables),
         claims_section(m, claims, shares),
         pairs_section(m, pairs),
         _slopes_section(m),
@@ -55,9 +67,9 @@ def build_report(m: Measured) -> Report:
         _eid_section(m),
         checks_section(checks, every=False),
         effects_section([_effect(e) for e in plan["effects"]], plan["tolerance_hu"]),
-        "Time: " + ", ".join(f"{k} {v:.0f} s" for k, v in m.seconds.items()) + ".",
+        time_line(m.seconds),
     ]
-    figures = {"noise_images.png": images_figure(m), "noise_cnr.png": cnr_figure(m)}
+    figures = {"noise_images.png": images_figure(m), "noise_cnr.png": cnr_figure(m, shown)}
     return Report("noise", data, "\n\n".join(s for s in sections if s), figures)
 
 
@@ -91,98 +103,73 @@ def _intro(m: Measured) -> str:
 
 
 def _dose_table(m: Measured, exposure: float) -> list[dict[str, Any]]:
-    exact = m.exact(exposure)
-    values = m.means[exposure]
-    measured, ten = measured_table(values), measured_table(values[:10])
+    """One row per setting: exact, by all realisations, by the first ten."""
+    exact, values = m.exact(exposure), m.means[exposure]
+
+    def sampled(runs: Any, i: int, **more: Any) -> dict[str, Any]:
+        table = measured_table(runs[:, i : i + 1])
+        interval = list(cnr_interval(runs[:, i, 0], runs[:, i, 1]))
+        return {"mean_hu": table.mean[0], "sd_hu": table.sd[0], "cnr": table.cnr[0], "cnr_interval": interval, **more}
+
     rows = []
     for i, (kernel, voxel) in enumerate(m.axes):
-        part = slice(2 * i, 2 * i + 2)
-        matrix = m.covariance[part, part] / exposure
+        measured, ten = sampled(values, i), sampled(values[:10], i)
+        measured["sd_interval"] = [list(sd_interval(float(v), len(values))) for v in measured["sd_hu"]]
+        ten["cnr_range"] = list(cnr_range(exact.mean[i], m.block(i, exposure), 10))
         rows.append(
             {
                 "kernel": kernel,
                 "voxel_mm": voxel,
                 "exposure_s": exposure,
                 "exact": {"mean_hu": exact.mean[i], "sd_hu": exact.sd[i], "cnr": exact.cnr[i]},
-                "measured": {
-                    "mean_hu": measured.mean[i],
-                    "sd_hu": measured.sd[i],
-                    "sd_interval": [list(sd_interval(float(v), len(values))) for v in measured.sd[i]],
-                    "cnr": measured.cnr[i],
-                    "cnr_interval": list(cnr_interval(values[:, i, 0], values[:, i, 1])),
-                },
-                "ten_runs": {
-                    "mean_hu": ten.mean[i],
-                    "sd_hu": ten.sd[i],
-                    "cnr": ten.cnr[i],
-                    "cnr_interval": list(cnr_interval(values[:10, i, 0], values[:10, i, 1])),
-                    "cnr_range": list(cnr_range(exact.mean[i], matrix, 10)),
-                },
+                "measured": measured,
+                "ten_runs": ten,
             }
         )
     return rows
 
 
-def _grid(m: Measured, title: str, cell: Any) -> str:
-    rows = [[f"FBP {k}", *(cell(k, v) for v in m.settings.voxels_mm)] for k in m.settings.kernels]
+def _grid(m: Measured, title: str, cells: Iterable[str]) -> str:
+    """A table of all settings, kernels down, voxel sizes across."""
+    by = dict(zip(m.axes, cells, strict=True))
+    rows = [[f"FBP {k}", *(by[k, v] for v in m.settings.voxels_mm)] for k in m.settings.kernels]
     return markdown_table([title, *(f"{v:.2f} mm" for v in m.settings.voxels_mm)], rows)
 
 
-def _index(m: Measured, kernel: str, voxel: float) -> int:
-    return m.axes.index((kernel, voxel))
-
-
-def _beside(text: str, entry: Any, digits: int) -> str:
+def _paper(table: Any, row: dict[str, Any], digits: int) -> str:
+    """The paper's entry, as the end of a cell."""
+    entry = published(table, row["kernel"], row["voxel_mm"], row["exposure_s"])
     if entry is None:
-        return text
+        return ""
     values = np.atleast_1d(entry)
-    shown = f"{values[0]:.{digits}f}" + (f" ({values[1]:.1f})" if values.size == 2 else "")
-    return f"{text}; paper {shown}"
+    return f"; paper {values[0]:.{digits}f}" + (f" ({values[1]:.1f})" if values.size == 2 else "")
 
 
-def _dose_section(m: Measured, exposure: float) -> str:
-    exact, values = m.exact(exposure), m.means[exposure]
-    measured, ten = measured_table(values), measured_table(values[:10])
-    n = len(values)
-    parts = [f"## ROI means and CNR at {exposure:g} s"]
+def _dose_section(m: Measured, rows: list[dict[str, Any]]) -> str:
+    n = m.settings.realizations
+    parts = [f"## ROI means and CNR at {m.settings.table_exposure_s:g} s"]
     for roi, name, table in ((0, "Core", paper.FOREGROUND), (1, "Fibrous", paper.BACKGROUND)):
-
-        def moments(kernel: str, voxel: float, roi: int = roi, table: Any = table) -> str:
-            i = _index(m, kernel, voxel)
-            text = f"{exact.mean[i, roi]:.1f} ({exact.sd[i, roi]:.1f})"
-            text += f"; n = {n}: {measured.mean[i, roi]:.1f} ({measured.sd[i, roi]:.1f})"
-            return _beside(text, published(table, kernel, voxel, exposure), 1)
-
-        parts.append(_grid(m, f"{name}, exact mean (SD), HU", moments))
-
-    def ratio(kernel: str, voxel: float) -> str:
-        i = _index(m, kernel, voxel)
-        low, high = cnr_interval(values[:, i, 0], values[:, i, 1])
-        text = f"{exact.cnr[i]:.2f}; n = {n}: {measured.cnr[i]:.2f} [{low:.2f}, {high:.2f}]; n = 10: {ten.cnr[i]:.2f}"
-        return _beside(text, published(paper.CNR, kernel, voxel, exposure), 2)
-
-    parts.append(_grid(m, "CNR, exact", ratio))
-
-    def spread(kernel: str, voxel: float) -> str:
-        i = _index(m, kernel, voxel)
-        part = slice(2 * i, 2 * i + 2)
-        low, high = cnr_range(exact.mean[i], m.covariance[part, part] / exposure, 10)
-        return f"{low:.2f} … {high:.2f}"
-
-    parts.append(_grid(m, "95 % of experiments of 10 read a CNR of", spread))
+        both = [[f"{r[t]['mean_hu'][roi]:.1f} ({r[t]['sd_hu'][roi]:.1f})" for t in ("exact", "measured")] for r in rows]
+        cells = [f"{a}; n = {n}: {b}{_paper(table, row, 1)}" for (a, b), row in zip(both, rows, strict=True)]
+        parts.append(_grid(m, f"{name}, exact mean (SD), HU", cells))
+    ratios, spreads = [], []
+    for row in rows:
+        exact, measured, ten = row["exact"], row["measured"], row["ten_runs"]
+        low, high = measured["cnr_interval"]
+        text = f"{exact['cnr']:.2f}; n = {n}: {measured['cnr']:.2f} [{low:.2f}, {high:.2f}]; n = 10: {ten['cnr']:.2f}"
+        ratios.append(text + _paper(paper.CNR, row, 2))
+        low, high = ten["cnr_range"]
+        spreads.append(f"{low:.2f} … {high:.2f}")
+    parts.append(_grid(m, "CNR, exact", ratios))
+    parts.append(_grid(m, "95 % of experiments of 10 read a CNR of", spreads))
     return "\n\n".join(parts)
 
 
-def _other_doses(m: Measured) -> str:
+def _all_doses(m: Measured, tables: dict[str, list[dict[str, Any]]]) -> str:
     parts = ["## CNR at every dose"]
-    for name, exposure in m.settings.doses.items():
-        exact, measured = m.exact(exposure), measured_table(m.means[exposure])
-
-        def cell(kernel: str, voxel: float, exact: Table = exact, measured: Table = measured) -> str:
-            i = _index(m, kernel, voxel)
-            return f"{exact.cnr[i]:.2f} ({measured.cnr[i]:.2f})"
-
-        parts.append(_grid(m, f"{name}, {exposure:g} s: exact (n = {m.settings.realizations})", cell))
+    for name, rows in tables.items():
+        title = f"{name}, {m.settings.doses[name]:g} s: exact (n = {m.settings.realizations})"
+        parts.append(_grid(m, title, (f"{r['exact']['cnr']:.2f} ({r['measured']['cnr']:.2f})" for r in rows)))
     return "\n\n".join(parts)
 
 
@@ -211,7 +198,7 @@ def _averaging_section(m: Measured) -> str:
     exact = m.exact(exposure)
     rows = []
     for (kernel, voxel), sd in m.averaging.items():
-        i = _index(m, kernel, voxel)
+        i = m.axes.index((kernel, voxel))
         cells = [f"{kernel} {voxel:.2f} mm"]
         for roi, table in ((0, paper.FOREGROUND), (1, paper.BACKGROUND)):
             entry = published(table, kernel, voxel, exposure)
@@ -257,24 +244,22 @@ def _eid_section(m: Measured) -> str:
 
 def _checks(m: Measured) -> list[Check]:
     checks = []
-    for roi, value in paper.NOISE_FREE_ROI_HU.items():
-        checks.append(around(f"noise-free {roi} mean, standard 0.10 mm, HU", m.reference[f"{roi}_hu"], value, 8.0))
+    for name, value in paper.NOISE_FREE_ROI_HU.items():
+        checks.append(around(f"noise-free {name} mean, standard 0.10 mm, HU", m.reference[f"{name}_hu"], value, 8.0))
     for i, (kernel, voxel) in enumerate(m.axes):
-        part = slice(2 * i, 2 * i + 2)
-        covariance = m.covariance[part, part] / paper.TABLE_EXPOSURE_S
         means = (float(m.expected[i, 0]), float(m.expected[i, 1]))
-        entry = [published(t, kernel, voxel, paper.TABLE_EXPOSURE_S) for t in (paper.FOREGROUND, paper.BACKGROUND)]
-        for check in table_checks(kernel, voxel, means, covariance):
-            if not check.ok and " mean," in check.name:
-                sd = entry[0 if check.name.startswith("core") else 1][1]
-                check = replace(check, note=f"standard error of the paper's mean: {sd / 10**0.5:.0f} HU")
-            elif not check.ok and " SD," in check.name:
+        for check in table_checks(kernel, voxel, means, m.block(i, paper.TABLE_EXPOSURE_S)):
+            roi = int(check.name.startswith("fibrous"))
+            note = ""
+            if " mean," in check.name:
+                sd = published((paper.FOREGROUND, paper.BACKGROUND)[roi], kernel, voxel, paper.TABLE_EXPOSURE_S)[1]
+                note = f"standard error of the paper's mean: {sd / 10**0.5:.0f} HU"
+            elif " SD," in check.name:
                 note = _sd_note(check)
                 if (kernel, voxel) in m.averaging:
-                    sd = m.averaging[kernel, voxel][0 if check.name.startswith("core") else 1]
-                    note += f"; {sd / paper.TABLE_EXPOSURE_S**0.5:.1f} HU with averaging voxels"
-                check = replace(check, note=note)
-            checks.append(check)
+                    sd = m.averaging[kernel, voxel][roi] / paper.TABLE_EXPOSURE_S**0.5
+                    note += f"; {sd:.1f} HU with averaging voxels"
+            checks.append(check.explained(note))
     soft = {e["scanner"]: e for e in m.eid if (e["kernel"], e["voxel_mm"]) == ("soft", 0.25)}
     if soft:
         share = soft["EID-CT"]["contrast_hu"] / soft["PCCT"]["contrast_hu"]
@@ -282,8 +267,8 @@ def _checks(m: Measured) -> list[Check]:
             Check("contrast of the core in EID-CT over PCCT, soft 0.25 mm", share, "hardly discernible", 0, 0.25)
         )
     slopes = m.slopes()
-    checks.append(Check("slope of σ against dose, lowest of all ROI means", float(slopes.min()), -0.5, -0.515, -0.485))
-    checks.append(Check("slope of σ against dose, highest of all ROI means", float(slopes.max()), -0.5, -0.515, -0.485))
+    for name, slope in (("lowest", slopes.min()), ("highest", slopes.max())):
+        checks.append(around(f"slope of σ against dose, {name} of all ROI means", float(slope), -0.5, 0.015))
     checks.append(
         Check("full reconstructions: difference of ROI means, SDs", m.check["largest_difference_in_sd"], "–", 0.0, 0.05)
     )

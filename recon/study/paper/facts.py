@@ -7,34 +7,56 @@ realizations" and "Necrotic core detectability measured as the CNR".
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
+from torchpcct.scanner import presets
+
 __all__ = [
+    "ASSUMED_FACTOR",
     "BACKGROUND",
     "BOWTIE",
     "CNR",
     "DOSES",
     "FOREGROUND",
+    "FULL_VIEWS",
     "KERNELS",
     "NOISE_FREE_ROI_HU",
     "REALIZATIONS",
+    "ROTATION_S",
     "SPECTRAL",
     "TABLE_EXPOSURE_S",
     "VOXELS_MM",
+    "table_exposure",
 ]
+
+FULL_VIEWS = {"PCCT": presets.PCCT_VIEWS, "EID-CT": presets.EID_VIEWS}
+"""Views per rotation, by the scanner's name. A study with fewer views stands for the same scan, thinned out."""
+
+ROTATION_S = 0.35
 
 KERNELS = ("soft", "standard", "detail", "bone")
 VOXELS_MM = (0.20, 0.25, 0.30, 0.35, 0.40)
-DOSES = {"1x": 0.35, "2x": 0.70, "5.7x": 2.00, "8x": 2.80}
+DOSES = {"1x": ROTATION_S, "2x": 0.70, "5.7x": 2.00, "8x": 2.80}
 """Exposure (one rotation) in s of each dose level, at 1000 mA."""
+
+ASSUMED_FACTOR = 5.7
+"""Dose that the paper assumes denoising to save."""
 
 TABLE_EXPOSURE_S = 2.00
 """Exposure of both tables. The paper does not state it; the text of its noise section and the size of its standard
 deviations point to the assumed 5.7× dose (an inference of ours)."""
 
 REALIZATIONS = 10
+
+
+def table_exposure(doses: Mapping[str, float]) -> float:
+    """The exposure of a study for which its tables are shown: the paper's, or the study's last."""
+    exposures = list(doses.values())
+    return TABLE_EXPOSURE_S if TABLE_EXPOSURE_S in exposures else exposures[-1]
+
 
 NOISE_FREE_ROI_HU = {"foreground": 40.1, "background": 91.8}
 """Noise-free ROI means, standard kernel, 0.1 mm voxels."""

@@ -5,25 +5,32 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from recon.fbp.inset import InsetFbp
+from torchpcct.acquisition.acquire import acquire
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.placement import RoiPair, place_rois
 from torchpcct.metrics.roi import axial_grid
-
-if TYPE_CHECKING:
-    from recon.fbp.inset import InsetFbp
-    from torchpcct.scan import Scan
-    from torchpcct.scanner import Scanner
-    from torchpcct.scene import Scene
-    from torchpcct.scene.plaque import Plaque
+from torchpcct.scan import Scan
+from torchpcct.scanner import Scanner, presets
+from torchpcct.scene import Scene
+from torchpcct.scene.plaque import Plaque
 
 __all__ = [
     "INSET_MM",
     "REFERENCE_KERNEL",
     "REFERENCE_VOXEL_MM",
+    "SCANNERS",
+    "Functional",
     "PlaqueScan",
+    "duty",
     "enclosing",
+    "equal_dose",
     "inset_grid",
     "prepare",
     "roi_entry",
@@ -36,6 +43,9 @@ REFERENCE_VOXEL_MM = 0.10
 REFERENCE_KERNEL = "standard"
 """Of the noise-free image that the ROIs are checked on."""
 
+SCANNERS: dict[str, Callable[..., Scanner]] = {"PCCT": presets.pcct, "EID-CT": presets.eid}
+"""The paper's two scanners: name → preset, called with the number of views."""
+
 
 def inset_grid(plaque: Plaque, voxel_mm: float) -> VolumeGrid:
     """The grid of the inset about a plaque at a voxel size."""
@@ -44,6 +54,32 @@ def inset_grid(plaque: Plaque, voxel_mm: float) -> VolumeGrid:
     shape = tuple(math.ceil(extent / voxel_mm - 1e-6) for extent in (z, y, x))
     px, py, pz = plaque.position
     return VolumeGrid(shape, voxel_mm, (pz, py, px))
+
+
+def duty(scanner: Scanner, full_views: int) -> float:
+    """Share of a view's time with the beam on: fewer views than ``full_views`` stand for the same scan, thinned out."""
+    return min(1.0, scanner.geometry.views / full_views)
+
+
+def equal_dose(scanner: Scanner) -> float:
+    """Exposure of a scanner over that of the PCCT at equal dose: equal fluence at the isocentre.
+
+    The spectrum in front of the patient is the same, so it falls with the square of the tube's distance."""
+    return float((scanner.geometry.sod / presets.pcct(8).geometry.sod) ** 2)
+
+
+@dataclass(frozen=True)
+class Functional:
+    """A linear functional of a volume, as :func:`recon.fbp.exact_noise.roi_covariance` takes ROI means.
+
+    Args:
+        weights: shape of the volume, float64.
+    """
+
+    weights: Tensor
+
+    def __call__(self, volume: Tensor) -> float:
+        return float((self.weights * volume).sum())
 
 
 @dataclass
@@ -65,6 +101,16 @@ class PlaqueScan:
     rois: RoiPair
     fbp: InsetFbp
 
+    def roi_means(self, volumes: Sequence[Tensor]) -> NDArray[np.float64]:
+        """``(S, 2)`` HU, the two ROI means of what ``fbp`` gives: all grids and kernels, the grid varying slowest."""
+        return np.array(
+            [
+                [float(roi(volume)) for roi in pair]
+                for pair, grid in zip(self.pairs, volumes, strict=True)
+                for volume in grid
+            ]
+        )
+
 
 def prepare(
     kernels: Sequence[str],
@@ -80,22 +126,18 @@ def prepare(
         kernels, voxels_mm: of the study.
         scene: a scene and its plaque, as :func:`torchpcct.scene.plaque.plaque.plaque_scene` gives.
         scanner: with the number of views to simulate.
-        full_views: views of the complete scan. Fewer views stand for the same scan, thinned out: the beam is on for as
-            long as in one of its views.
+        full_views: views of the complete scan, see :func:`duty`.
         progress: called with the finished fraction of the simulation.
 
     Raises:
         ValueError: ROIs that come out empty; an inset outside the field of view.
     """
-    from recon.fbp.inset import InsetFbp
-    from torchpcct.acquisition.acquire import acquire
-
     bodies, plaque = scene
     grids = [inset_grid(plaque, v) for v in voxels_mm]
     fine = inset_grid(plaque, REFERENCE_VOXEL_MM)
     rois = place_rois(bodies, axial_grid(fine.center))
-    duty = min(1.0, scanner.geometry.views / full_views)
-    clean = acquire(bodies, scanner, region=enclosing([*grids, fine]), duty=duty, progress=progress)
+    region = enclosing([*grids, fine])
+    clean = acquire(bodies, scanner, region=region, duty=duty(scanner, full_views), progress=progress)
     return PlaqueScan(clean, fine, grids, [rois.on(g) for g in grids], rois, InsetFbp(clean, grids, kernels))
 
 

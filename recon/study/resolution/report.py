@@ -10,46 +10,22 @@ import numpy as np
 
 from recon.study.checks import Check, around, checks_section, effects_section
 from recon.study.paper import facts as paper
-from recon.study.report import Report, markdown_table
-from recon.study.resolution.blur import FWHM_PER_SIGMA, Blurred, crossing
-from recon.study.resolution.measure import Imaged, Measured
-from recon.study.study import environment
+from recon.study.report import Report, markdown_table, or_dash
+from recon.study.resolution.blur import FWHM_PER_SIGMA, limits
+from recon.study.resolution.figures import curves_figure, images_figure
+from recon.study.resolution.measure import Measured, RoiFigures
+from recon.study.study import environment, time_line
 from torchpcct.acquisition.plan import Effect
 from torchpcct.metrics.roi import PROTOCOL_PIXEL_MM
-from torchpcct.viz import Panel, panels
 
-__all__ = ["build_report", "limits"]
+__all__ = ["build_report"]
 
 _STEP_PX = 1.25
 _PX_FWHM = FWHM_PER_SIGMA * PROTOCOL_PIXEL_MM
 
 
-def limits(series: list[Blurred], tolerance: float) -> dict[str, Any]:
-    """Where a blur series loses what: blurs in pixels.
-
-    Returns:
-        ``cap``: blur at which the cap's thickness on the line has changed by ``tolerance``; ``lumen``: the same of the
-        lumen's area; ``core_lost``: first blur of the series at which the core is not segmented (None: at none);
-        ``basin``: blur at which the core's basin has half of its depth.
-    """
-    sigmas = [b.sigma_px for b in series]
-    sharp = series[0]
-    lost = [b.sigma_px for b in series if not b.segmentation.core_found]
-
-    def change(values: list[float], reference: float) -> list[float]:
-        return [abs(v / reference - 1.0) for v in values]
-
-    areas = [b.segmentation.lumen_area for b in series]
-    return {
-        "cap": crossing(sigmas, change([b.cap_line for b in series], sharp.cap_line), tolerance),
-        "lumen": crossing(sigmas, change(areas, areas[0]), tolerance),
-        "core_lost": lost[0] if lost else None,
-        "basin": crossing(sigmas, [sharp.depth - b.depth for b in series], 0.5 * sharp.depth),
-    }
-
-
 def build_report(m: Measured) -> Report:
-    """Report of :func:`recon.study.resolution.measure.measure_all`: ``report.json``, ``report.md`` and two figures."""
+    """Report of :func:`recon.study.resolution.measure.measure`: ``report.json``, ``report.md`` and two figures."""
     pcct = m.scanners["PCCT"]
     found = limits(pcct.blurred, m.settings.tolerance)
     margin = _PX_FWHM * min(found["cap"], found["lumen"])
@@ -59,7 +35,7 @@ def build_report(m: Measured) -> Report:
         "study": "resolution",
         "settings": asdict(m.settings),
         "truth": {**{f"{k}_mm2": v for k, v in m.true_mm2.items()}, "cap_mm": m.plaque.cap_thickness},
-        "scanners": {name: _entry(s) for name, s in m.scanners.items()},
+        "scanners": {name: _entry(m, name) for name in m.scanners},
         "limits_px": found,
         "margin_fwhm_mm": margin,
         "final_fwhm_mm": final,
@@ -86,21 +62,28 @@ def build_report(m: Measured) -> Report:
         _blur_section(m),
         _variants_section(m),
         effects_section(effects, pcct.plan["tolerance_hu"]),
-        _footer(m, data["environment"]),
+        _footer(m),
     ]
-    figures = {"resolution_images.png": _images(m), "resolution.png": _curves(m)}
+    figures = {"resolution_images.png": images_figure(m), "resolution.png": curves_figure(m)}
     return Report("resolution", data, "\n\n".join(sections), figures)
 
 
-def _entry(s: Imaged) -> dict[str, Any]:
+def _entry(m: Measured, name: str) -> dict[str, Any]:
+    s, f = m.scanners[name], m.smoothed
+    smoothed = {
+        "sigma_mm": m.smoothed_sigma_mm,
+        "contrast_hu": f.contrast_hu,
+        "own_contrast_hu": f.own_contrast_hu,
+        "sd_hu": f.sd_hu,
+    }
     return {
-        "roi_hu": s.roi_hu,
-        "empty_hu": s.empty_hu,
-        "own_contrast_hu": s.own_contrast_hu,
-        "contrast_sd_hu": s.sd_hu,
-        "cnr": s.contrast_hu / s.sd_hu,
-        "own_cnr": s.own_contrast_hu / s.sd_hu,
-        "smoothed": None if s.smoothed is None else asdict(s.smoothed),
+        "roi_hu": s.rois.roi_hu,
+        "empty_hu": s.rois.empty_hu,
+        "own_contrast_hu": s.rois.own_contrast_hu,
+        "contrast_sd_hu": s.rois.sd_hu,
+        "cnr": s.rois.cnr,
+        "own_cnr": s.rois.own_cnr,
+        "smoothed": smoothed if name == "PCCT" else None,
         "exposure_s": s.exposure_s,
         "fwhm_mm": asdict(s.width),
         "blurred": [b.as_dict() for b in s.blurred],
@@ -109,36 +92,31 @@ def _entry(s: Imaged) -> dict[str, Any]:
 
 
 def _checks(m: Measured, found: dict[str, Any], final: float) -> list[Check]:
-    p, published = m.scanners["PCCT"], paper.RESOLUTION
-    e = m.scanners["EID-CT"]
-    last, lost = published["last_kernels_px"]
+    p, e, published = m.scanners["PCCT"], m.scanners["EID-CT"], paper.RESOLUTION
+    (last, lost), cap = published["last_kernels_px"], published["cap_limit_px"]
     areas = np.array([b.segmentation.lumen_area for b in p.blurred])
-    shells = {b: (s, limits(x, m.settings.tolerance)["core_lost"]) for b, (s, x) in m.variants.items()}
-    cause = "; ".join(
-        f"{shell:.2f} mm of fibrous tissue between core and wall: " + ("never" if px is None else f"σ = {px:g}")
-        for shell, px in shells.values()
-    )
     core, fibrous = paper.NOISE_FREE_ROI_HU["foreground"], paper.NOISE_FREE_ROI_HU["background"]
+    joined = math.inf if found["core_lost"] is None else found["core_lost"]
+    shells = {shell: limits(series, m.settings.tolerance) for shell, series in m.variants.values()}
+    thin_side = "; ".join(
+        f"{shell:.2f} mm of fibrous tissue between core and wall: {_lost_at(x, 'σ = ')}" for shell, x in shells.items()
+    )
+    own, roi_hu = e.rois.own_contrast_hu / p.rois.own_contrast_hu, p.rois.roi_hu
+    coarse = (
+        f"the contrast falls to {100 * own:.0f} %, the noise of the ROI means "
+        f"to {100 * e.rois.sd_hu / p.rois.sd_hu:.0f} %: the coarse cells pass little of the noise either. The PCCT "
+        f"blurred to the EID-CT's resolution: contrast of the core {m.smoothed.own_contrast_hu:.1f} HU, CNR "
+        f"{m.smoothed.own_cnr:.2f}"
+    )
     return [
-        around("PCCT core ROI, HU", p.roi_hu[0], core, 8.0),
-        around("PCCT fibrous ROI, HU", p.roi_hu[1], fibrous, 8.0),
-        Check("PCCT fibrous ROI below 100 HU through the blur of edges", p.roi_hu[1], fibrous, high=100.0),
-        Check(
-            "core's boundary visible (half of its basin's depth), up to σ, px", found["basin"], f"{last:g} … {lost:g}",
-            last - _STEP_PX, lost + _STEP_PX,
-        ),
-        _with_cause(
-            Check(
-                "first blur at which the band 20–60 HU joins the rim, σ, px",
-                math.inf if found["core_lost"] is None else found["core_lost"],
-                lost, lost - _STEP_PX, lost + _STEP_PX,
-            ),
-            f"set by the tissue on the fat side, which the paper does not give: {cause}",
-        ),
-        Check(
-            "cap thickness within 20 %, up to σ, px", found["cap"], f"< {published['cap_limit_px']:g}",
-            published["cap_limit_px"] - _STEP_PX, published["cap_limit_px"] + _STEP_PX,
-        ),
+        around("PCCT core ROI, HU", roi_hu[0], core, 8.0),
+        around("PCCT fibrous ROI, HU", roi_hu[1], fibrous, 8.0),
+        Check("PCCT fibrous ROI below 100 HU through the blur of edges", roi_hu[1], fibrous, high=100.0),
+        Check("core's boundary visible (half of its basin's depth), up to σ, px", found["basin"],
+              f"{last:g} … {lost:g}", last - _STEP_PX, lost + _STEP_PX),
+        around("first blur at which the band 20–60 HU joins the rim, σ, px", joined, lost, _STEP_PX).explained(
+              f"set by the tissue on the fat side, which the paper does not give: {thin_side}"),
+        Check("cap thickness within 20 %, up to σ, px", found["cap"], f"< {cap:g}", cap - _STEP_PX, cap + _STEP_PX),
         Check("largest rise of the lumen's area from one blur to the next, %",
               100 * float((np.diff(areas) / areas[0]).max()), "shrinks a little", high=0.0),
         Check("lumen area at the strongest blur, % of the sharp image's", 100 * float(areas[-1] / areas[0]),
@@ -147,29 +125,15 @@ def _checks(m: Measured, found: dict[str, Any], final: float) -> list[Check]:
         Check("EID-CT: core segmented (1: yes)", float(e.blurred[0].segmentation.core_found), "hardly discernible",
               high=0.0),
         Check("EID-CT: depth of the core's basin, HU", e.blurred[0].depth, "boundary not resolved", high=1.0),
-        Check("EID-CT: contrast that the core makes, over the PCCT's", e.own_contrast_hu / p.own_contrast_hu,
-              "hardly discernible", high=0.5),
-        _with_cause(
-            Check("EID-CT: CNR that the core makes, over the PCCT's at equal fluence",
-                  e.own_contrast_hu / e.sd_hu / (p.own_contrast_hu / p.sd_hu), "hardly discernible", high=0.5),
-            f"the contrast falls to {100 * e.own_contrast_hu / p.own_contrast_hu:.0f} %, the noise of the ROI means "
-            f"to {100 * e.sd_hu / p.sd_hu:.0f} %: the coarse cells pass little of the noise either{_same_blur(p)}",
-        ),
+        Check("EID-CT: contrast that the core makes, over the PCCT's", own, "hardly discernible", high=0.5),
+        Check("EID-CT: CNR that the core makes, over the PCCT's at equal fluence",
+              e.rois.own_cnr / p.rois.own_cnr, "hardly discernible", high=0.5).explained(coarse),
     ]  # fmt: skip
 
 
-def _same_blur(p: Imaged) -> str:
-    if p.smoothed is None:
-        return ""
-    s = p.smoothed
-    return (
-        f". The PCCT blurred to the EID-CT's resolution: contrast of the core {s.own_contrast_hu:.1f} HU, CNR "
-        f"{s.own_contrast_hu / s.sd_hu:.2f}"
-    )
-
-
-def _with_cause(check: Check, cause: str) -> Check:
-    return check if check.ok else Check(check.name, check.ours, check.paper, check.low, check.high, cause)
+def _lost_at(found: dict[str, Any], prefix: str = "") -> str:
+    """The first blur at which the core is not segmented."""
+    return "never" if found["core_lost"] is None else f"{prefix}{found['core_lost']:g}"
 
 
 def _intro(m: Measured, found: dict[str, Any], margin: float, final: float) -> str:
@@ -192,32 +156,13 @@ def _intro(m: Measured, found: dict[str, Any], margin: float, final: float) -> s
 def _scanners_section(m: Measured) -> str:
     rows = []
     for name, s in m.scanners.items():
-        b = s.blurred[0]
-        rows.append(
-            [
-                name,
-                f"{s.width.area:.3f} ({s.width.radial:.3f} / {s.width.tangential:.3f})",
-                f"{s.roi_hu[0]:.1f} / {s.roi_hu[1]:.1f}",
-                f"{s.contrast_hu:.1f} ({s.own_contrast_hu:.1f})",
-                f"{s.contrast_hu / s.sd_hu:.2f} ({s.own_contrast_hu / s.sd_hu:.2f})",
-                f"{b.segmentation.lumen_area:.2f}",
-                _or(b.segmentation.core_area, 2),
-                _or(b.cap_line, 3),
-                f"{b.depth:.1f}",
-            ]
-        )
-    if m.scanners["PCCT"].smoothed is not None:
-        f = m.scanners["PCCT"].smoothed
-        rows.append(
-            [
-                "PCCT blurred to the EID-CT's width",
-                f"{m.scanners['EID-CT'].width.area:.3f}",
-                "–",
-                f"{f.contrast_hu:.1f} ({f.own_contrast_hu:.1f})",
-                f"{f.contrast_hu / f.sd_hu:.2f} ({f.own_contrast_hu / f.sd_hu:.2f})",
-                *["–"] * 4,
-            ]
-        )
+        b, (core, fibrous) = s.blurred[0], s.rois.roi_hu
+        width = f"{s.width.area:.3f} ({s.width.radial:.3f} / {s.width.tangential:.3f})"
+        read = [or_dash(b.segmentation.core_area, 2), or_dash(b.cap_line, 3), f"{b.depth:.1f}"]
+        area = f"{b.segmentation.lumen_area:.2f}"
+        rows.append([name, width, f"{core:.1f} / {fibrous:.1f}", *_contrast_cells(s.rois), area, *read])
+    width = f"{m.scanners['EID-CT'].width.area:.3f}"
+    rows.append(["PCCT blurred to the EID-CT's width", width, "–", *_contrast_cells(m.smoothed), *["–"] * 4])
     head = [
         "scanner", "FWHM (radial / tangential), mm", "core / fibrous, HU", "contrast (own), HU", "CNR (own)",
         "lumen, mm²", "core, mm²", "cap, mm", "basin, HU",
@@ -239,20 +184,24 @@ def _scanners_section(m: Measured) -> str:
     )
 
 
+def _contrast_cells(f: RoiFigures) -> list[str]:
+    return [f"{f.contrast_hu:.1f} ({f.own_contrast_hu:.1f})", f"{f.cnr:.2f} ({f.own_cnr:.2f})"]
+
+
 def _blur_section(m: Measured) -> str:
     series = m.scanners["PCCT"].blurred
     sharp = series[0]
     rows = []
     for b in series:
-        d = b.as_dict()
+        s = b.segmentation
         rows.append(
             [
                 f"{b.sigma_px:g}",
-                f"{d['fwhm_mm']:.2f}",
-                f"{100 * d['lumen_mm2'] / sharp.segmentation.lumen_area:.1f}",
+                f"{b.fwhm_mm:.2f}",
+                f"{100 * s.lumen_area / sharp.segmentation.lumen_area:.1f}",
                 f"{b.cap_line:.3f} ({100 * (b.cap_line / sharp.cap_line - 1):+.0f} %)",
-                _or(d["cap_mm"], 3),
-                _or(d["core_mm2"], 2),
+                or_dash(s.cap_thickness, 3),
+                or_dash(s.core_area, 2),
                 f"{b.depth:.1f}",
             ]
         )
@@ -275,7 +224,7 @@ def _variants_section(m: Measured) -> str:
             [
                 f"{bulge:g}{' (default)' if bulge == m.plaque.bulge else ''}",
                 f"{shell:.2f}",
-                "never" if found["core_lost"] is None else f"{found['core_lost']:g}",
+                _lost_at(found),
                 f"{found['basin']:.2f}",
                 f"{found['cap']:.2f}",
                 f"{series[0].depth:.1f}",
@@ -294,85 +243,7 @@ def _variants_section(m: Measured) -> str:
     )
 
 
-def _footer(m: Measured, versions: dict[str, Any]) -> str:
-    seconds = ", ".join(f"{k} {v:.0f} s" for k, v in m.seconds.items())
-    stack = ", ".join(f"{k} {v}" for k, v in versions.items())
+def _footer(m: Measured) -> str:
     change = "" if m.settings.thinning == 1 else f" --set thinning={m.settings.thinning}"
-    return (
-        f"Repeat: `torchpcct study resolution{change}`. Time: {seconds}. No noise is drawn: there is no seed. "
-        f"Environment: {stack}."
-    )
-
-
-def _or(value: float, digits: int) -> str:
-    return "–" if math.isnan(value) else f"{value:.{digits}f}"
-
-
-# --- figures ------------------------------------------------------------------------------------------------------
-
-
-def _images(m: Measured) -> Any:
-    """First row: both scanners; second: PCCT under blur with its segmentation; third: the same, along the vessel."""
-    from recon.study.resolution.blur import blur
-
-    half = 0.5 * PROTOCOL_PIXEL_MM
-    p = m.scanners["PCCT"]
-    height = p.sagittal.shape[0]
-    # The vessel and its surroundings, not all of the inset.
-    rows, columns = slice(48, 208), slice(48, 208)
-    axial = (-half * 160, half * 160, -half * 160, half * 160)
-    tall = slice((height - 160) // 2, (height - 160) // 2 + 160)
-    top = []
-    for name, s in m.scanners.items():
-        top.append(Panel(s.axial[rows, columns].numpy(), axial, f"{name}, axial"))
-        top.append(Panel(s.sagittal[tall, columns].numpy(), axial, "along the vessel"))
-    middle, bottom = [], []
-    for b in p.blurred:
-        outlines = [(b.segmentation.lumen[rows, columns], "tomato")]
-        if b.segmentation.core_found:
-            outlines.append((b.segmentation.core[rows, columns], "gold"))
-        caption = f"{_PX_FWHM * b.sigma_px:.2f} mm"
-        middle.append(Panel(b.image[rows, columns].numpy(), axial, f"σ = {b.sigma_px:g}", outlines, caption))
-        bottom.append(Panel(blur(p.sagittal, b.sigma_px)[tall, columns].numpy(), axial))
-    return panels(
-        [top, middle, bottom], ("no blur", "PCCT axial", "PCCT along"),
-        "Noise-free plaque in different resolutions",
-        "C150 / W600 HU. Outlines: lumen (red), core where segmented (yellow). Below: FWHM of the blur.",
-    )  # fmt: skip
-
-
-def _curves(m: Measured) -> Any:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(12.0, 3.8), dpi=130, layout="constrained")
-    lumen, cap, basin = figure.subplots(1, 3)
-    series = m.scanners["PCCT"].blurred
-    x = [b.sigma_px for b in series]
-    areas = np.array([b.segmentation.lumen_area for b in series])
-    lumen.plot(x, areas / areas[0], "o-", color="black")
-    lumen.axhspan(1 - m.settings.tolerance, 1, color="0.92", label="within tolerance")
-    lumen.set_ylabel("lumen area, of the sharp image's")
-    lumen.set_ylim(0.75, 1.02)
-    values = np.array([b.cap_line for b in series])
-    cap.plot(x, values, "o-", color="black", label="on the line")
-    closest = np.array([b.segmentation.cap_thickness for b in series])
-    cap.plot(x, closest, "x", color="tab:blue", label="smallest distance")
-    low, high = values[0] * (1 - m.settings.tolerance), values[0] * (1 + m.settings.tolerance)
-    cap.axhspan(low, high, color="0.92", label="within tolerance")
-    cap.axhline(m.plaque.cap_thickness, color="0.5", linestyle=":", label="true")
-    cap.axvline(float(paper.RESOLUTION["cap_limit_px"]), color="tab:red", linestyle="--", label="paper's limit")
-    cap.set_ylabel("cap thickness, mm")
-    cap.legend(fontsize=7)
-    for bulge, (shell, variant) in m.variants.items():
-        depth = [b.depth for b in variant]
-        own = bulge == m.plaque.bulge
-        line = basin.plot(x, depth, "o-" if own else "-", label=f"{shell:.2f} mm{' (default)' if own else ''}")[0]
-        kept = [(b.sigma_px, b.depth) for b in variant if b.segmentation.core_found]
-        if kept:
-            basin.plot(*zip(*kept, strict=True), "s", color=line.get_color(), markersize=7)
-    basin.set_ylabel("depth of the core's basin, HU")
-    basin.legend(fontsize=7, title="tissue on the fat side;\nsquares: segmented", title_fontsize=7)
-    for ax in (lumen, cap, basin):
-        ax.set_xlabel("σ of the blur, 0.035 mm pixels")
-        ax.grid(alpha=0.3)
-    return figure
+    note = "no noise is drawn: there is no seed; versions: report.json"
+    return f"Repeat: `torchpcct study resolution{change}`. {time_line(m.seconds, note)}"

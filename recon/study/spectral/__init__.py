@@ -1,1 +1,6 @@
-"""Study spectral."""
+"""The plaque in energy bins: basis materials, monochromatic images, tissue maps, by FBP and joint MBIR.
+
+Read ``settings`` → ``measure`` (the order of the parts, noise and CNR of monochromatic images, joint MBIR) → ``scan``
+(the scan, decomposed ray by ray, and its checks) → ``tissues`` (tissue maps and what they find) → ``report`` →
+``figures``.
+"""

@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from torch import Tensor
 
+from recon.study.figures import extent
 from recon.study.paper import facts as paper
-from recon.study.spectral.scan import PlaqueScan
-from recon.study.spectral.tissues import Tissues
+from recon.study.spectral.measure import Measured
 from torchpcct.spectral import MMD_TISSUES, vmi
 from torchpcct.viz import WINDOW_HU
 
@@ -20,19 +19,15 @@ _COLOURS = ("#2ca02c", "#d62728", "#1f77b4", "#202020")
 _SHOWN_KEV = (40.0, 52.0, 70.0)
 
 
-def _extent(plaque: PlaqueScan) -> tuple[float, float, float, float]:
-    y, x = plaque.grid.extent[1:]
-    return (-x / 2, x / 2, -y / 2, y / 2)
-
-
-def _show(ax: Any, image: Any, plaque: PlaqueScan, title: str, **options: Any) -> Any:
+def _show(ax: Any, image: Any, measured: Measured, title: str, **options: Any) -> Any:
     ax.set_xticks([])
     ax.set_yticks([])
     ax.set_title(title, fontsize=8)
-    return ax.imshow(np.asarray(image), origin="lower", extent=_extent(plaque), interpolation="nearest", **options)
+    edges = extent(measured.scan.grid)
+    return ax.imshow(np.asarray(image), origin="lower", extent=edges, interpolation="nearest", **options)
 
 
-def curves_figure(data: dict[str, Any], plaque: PlaqueScan, images: dict[str, Tensor]) -> Any:
+def curves_figure(measured: Measured) -> Any:
     """Basis images, monochromatic images (noise free above, standard noise below), and CNR against energy."""
     from matplotlib.figure import Figure
 
@@ -40,23 +35,24 @@ def curves_figure(data: dict[str, Any], plaque: PlaqueScan, images: dict[str, Te
     parts: Any = figure.subfigures(2, 1, height_ratios=(1.55, 1.0))
     top, bottom = parts
     axes = top.subplots(2, 5)
-    z = plaque.grid.shape[0] // 2
+    scan, images = measured.scan, measured.images
+    z = scan.grid.shape[0] // 2
     low, high = WINDOW_HU[0] - WINDOW_HU[1] / 2, WINDOW_HU[0] + WINDOW_HU[1] / 2
-    for row, (name, volume) in enumerate((("noise free", images["clean"]), ("standard noise", images["noisy"][0]))):
+    for row, (name, volume) in enumerate((("noise free", images.clean), ("standard noise", images.noisy[0]))):
         middle = volume[:, z]
         for c, material in enumerate(("PE", "PVC")):
-            clean = images["clean"][c, z]
+            clean = images.clean[c, z]
             reach = (float(clean.min()), float(clean.max()))
             if row:
                 spread = 2 * float(middle[c].std())
                 reach = (reach[0] - spread, reach[1] + spread)
-            _show(axes[row, c], middle[c], plaque, f"{material}, {name}", cmap="gray", vmin=reach[0], vmax=reach[1])
+            _show(axes[row, c], middle[c], measured, f"{material}, {name}", cmap="gray", vmin=reach[0], vmax=reach[1])
         for c, energy in enumerate(_SHOWN_KEV):
-            hu = vmi(middle, plaque.basis, [energy])[0]
-            shown = _show(axes[row, 2 + c], hu, plaque, f"{energy:g} keV, {name}", cmap="gray", vmin=low, vmax=high)
+            hu = vmi(middle, scan.basis, [energy])[0]
+            shown = _show(axes[row, 2 + c], hu, measured, f"{energy:g} keV, {name}", cmap="gray", vmin=low, vmax=high)
     top.colorbar(shown, ax=axes[:, -1], shrink=0.7, label="HU")
     left, right = bottom.subplots(1, 2)
-    v = data["vmi"]
+    v = measured.data["vmi"]
     energies = v["energies_kev"]
     left.plot(energies, v["voxel"]["noise_hu"], color="tab:red", label="noise of a voxel")
     left.plot(energies, v["voxel"]["contrast_hu"], color="tab:blue", label="contrast fibrous − core")
@@ -76,30 +72,28 @@ def curves_figure(data: dict[str, Any], plaque: PlaqueScan, images: dict[str, Te
     return figure
 
 
-def tissue_figure(data: dict[str, Any], plaque: PlaqueScan, tissues: Tissues, images: dict[str, Tensor]) -> Any:
+def tissue_figure(measured: Measured) -> Any:
     """Tissue maps of the middle slice: truth, then one column per noise level; rows: FBP, joint MBIR."""
     from matplotlib.colors import ListedColormap
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
-    levels = data["settings"]["noise_levels"]
-    methods = [m for m in ("FBP", "joint MBIR") if m in data["dice"]]
+    levels, dice = measured.settings.noise_levels, measured.data["dice"]
+    tissues, images = measured.tissues, measured.images
+    methods = [m for m in ("FBP", "joint MBIR") if m in dice]
     figure = Figure(figsize=(1.9 * (1 + len(levels)) + 0.4, 2.25 * len(methods) + 0.7), dpi=150, layout="constrained")
     axes = figure.subplots(len(methods), 1 + len(levels), squeeze=False)
     colours = ListedColormap(["white", *_COLOURS])
     k = tissues.middle
     for row, method in enumerate(methods):
-        _show(axes[row, 0], tissues.truth[k] + 1, plaque, "truth" if row == 0 else "", cmap=colours, vmin=0, vmax=4)
+        _show(axes[row, 0], tissues.truth[k] + 1, measured, "truth" if row == 0 else "", cmap=colours, vmin=0, vmax=4)
         axes[row, 0].set_ylabel(method, fontsize=9)
         for c, level in enumerate(levels):
-            if method == "FBP":
-                volume = images["clean"] + level * (images["noisy"][0] - images["clean"])
-            else:
-                volume = images["mbir"][c]
+            volume = images.fbp(level)[0] if images.mbir is None or method == "FBP" else images.mbir[c]
             labels = tissues.labels(volume)[k]
             ax = axes[row, 1 + c]
-            _show(ax, labels + 1, plaque, f"{100 * level:.0f} % noise", cmap=colours, vmin=0, vmax=4)
-            score = data["dice"][method][c]["necrotic_core"]["mean"]
+            _show(ax, labels + 1, measured, f"{100 * level:.0f} % noise", cmap=colours, vmin=0, vmax=4)
+            score = dice[method][c]["necrotic_core"]["mean"]
             ax.set_xlabel(f"core's Dice {score:.2f}", fontsize=7)
     names = [t.replace("_", " ") for t in MMD_TISSUES]
     handles = [Patch(color=c, label=n) for c, n in zip(_COLOURS, names, strict=True)]

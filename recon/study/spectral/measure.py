@@ -12,155 +12,106 @@ materials. Their FBP, and their joint model-based reconstruction, give basis ima
 
 from __future__ import annotations
 
-import itertools
-import logging
 import time
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.pwls.basis_problem import DEFAULT_JOINT_PRIOR, BasisProblem
-from recon.study.report import Report
-from recon.study.spectral.scan import PlaqueScan, second_order_bound, starved_rays, water_hu
+from recon.study.spectral.scan import SpectralScan, second_order_bound, starved_rays, water_hu
+from recon.study.spectral.settings import Settings
 from recon.study.spectral.tissues import RULES, Tissues
-from torchpcct.metrics.placement import place_rois
-from torchpcct.metrics.roi import axial_grid
+from recon.study.study import Clock, Progress, silent
 from torchpcct.spectral import MMD_TISSUES, VMI_ENERGIES_KEV, VmiCurve, vmi, vmi_curve
 
-__all__ = ["Settings", "run"]
-
-log = logging.getLogger(__name__)
-
-Floats = NDArray[np.float64]
-Progress = Callable[[str, float], None]
+__all__ = ["Images", "Measured", "measure"]
 
 LOW_EXPOSURE_S = 0.35
 """The paper's shortest exposure: the decomposition must hold there, too."""
 
 _FAT_MM = 3.2  # from the vessel's axis on there is only fat
-_METHOD = {"nearest": "FBP", "k-means": "FBP, k-means of fractions", "largest": "FBP, largest fraction"}
 _LOW_EXPOSURE_STEP = 8  # views between those that are looked at there
 
 
+@dataclass
+class Images:
+    """Basis images: ``clean`` ``(2, z, y, x)``, ``noisy`` ``(n, 2, z, y, x)`` at the standard noise, both by FBP, and
+    ``mbir``, the first of every noise level, ``(levels, 2, z, y, x)``."""
+
+    clean: Tensor
+    noisy: Tensor
+    mbir: Tensor | None = None
+
+    def fbp(self, level: float) -> Tensor:
+        """FBP at a share of the standard noise, ``(n, 2, z, y, x)``; one image without noise."""
+        return self.clean + level * (self.noisy - self.clean) if level else self.clean[None]
+
+
 @dataclass(frozen=True)
-class Settings:
-    """Settings of the study.
+class Measured:
+    """What the report needs.
 
-    Args:
-        exposure_s: of the standard noise (the paper does not state it; 2.0 s is the exposure of its tables).
-        realizations: of the noise, for tissue maps by FBP.
-        mbir_realizations: of these, how many are reconstructed by joint MBIR at every noise level; 0: none.
-        noise_levels: shares of the standard noise, ascending, 0 first.
-        views: per rotation (paper: 1968).
-        voxel_mm: [paper: 0.2].
-        kernel: of FBP (the paper names none for its spectral images).
-        starved_rays: number of rays from no counts to air that the decomposition is tried on.
-        seed: first seed of the noise.
-
-    Raises:
-        ValueError: a value out of range.
+    Attributes:
+        settings: of the study.
+        data: JSON values by part.
+        scan, tissues, images: geometry, truth and volumes of the figures.
+        seconds: step → seconds; processor_seconds: of all steps.
     """
 
-    exposure_s: float = 2.0
-    realizations: int = 4
-    mbir_realizations: int = 2
-    noise_levels: tuple[float, ...] = (0.0, 0.25, 0.5, 1.0)
-    views: int = 1968
-    voxel_mm: float = 0.2
-    kernel: str = "standard"
-    starved_rays: int = 20_000
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if not self.exposure_s > 0:
-            raise ValueError(f"exposure_s must be greater than 0 s, got {self.exposure_s}")
-        if self.realizations < 1:
-            raise ValueError(f"realizations must be at least 1, got {self.realizations}")
-        if not 0 <= self.mbir_realizations <= self.realizations:
-            raise ValueError(
-                f"mbir_realizations must lie in 0…{self.realizations} (realizations), got {self.mbir_realizations}"
-            )
-        levels = self.noise_levels
-        if not levels or levels[0] != 0 or any(b <= a for a, b in itertools.pairwise(levels)):
-            raise ValueError(f"noise_levels must ascend from 0, got {levels}")
-        if self.views < 60:
-            raise ValueError(f"views must be at least 60, got {self.views}")
-        if self.starved_rays < 100:
-            raise ValueError(f"starved_rays must be at least 100, got {self.starved_rays}")
-
-    @classmethod
-    def quick(cls, **changes: Any) -> Settings:
-        """A first look in under a minute: an eighth of the views, one realisation."""
-        values: dict[str, Any] = {"views": 246, "realizations": 1, "mbir_realizations": 1, "starved_rays": 5000}
-        return cls(**{**values, **changes})
+    settings: Settings
+    data: dict[str, Any]
+    scan: SpectralScan
+    tissues: Tissues
+    images: Images
+    seconds: dict[str, float]
+    processor_seconds: float
 
 
-def run(settings: Settings, progress: Progress | None = None) -> Report:
-    """Run the study.
-
-    Args:
-        settings: see :class:`Settings`.
-        progress: called with the name of the step and its finished fraction.
-    """
-    from recon.study.spectral.report import build_report
-
-    started, spent = time.perf_counter(), time.process_time()
-
-    def tell(step: str, fraction: float) -> None:
-        if progress is not None:
-            progress(step, fraction)
-
-    data: dict[str, Any] = {"settings": asdict(settings), "seconds": {}}
+def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
+    """Scan, decompose, reconstruct, label; nothing is kept in ``folder``."""
+    s, clock, spent = settings, Clock(), time.process_time()
 
     def done(step: str) -> None:
-        data["seconds"][step] = round(time.perf_counter() - started - sum(data["seconds"].values()), 1)
-        tell(step, 1.0)
+        clock.lap(step)
+        progress(step, 1.0)
 
-    plaque = PlaqueScan(settings, lambda f: tell("simulate", f))
-    data["plan"] = plaque.info["plan"]
+    scan = SpectralScan(s, lambda fraction: progress("simulate", fraction))
+    data: dict[str, Any] = {"plan": scan.clean.info["plan"]}
     done("simulate")
-    images = {"clean": plaque.fbp(plaque.exact.line_integrals)}
-    data["second_order_bound"] = second_order_bound(plaque, LOW_EXPOSURE_S)
-    data["starved"] = starved_rays(plaque, settings.starved_rays, settings.seed)
-    data["water"] = {k: v.tolist() for k, v in water_hu(plaque, VMI_ENERGIES_KEV).items()}
+    clean = scan.fbp(scan.exact.line_integrals)
+    data["second_order_bound"] = second_order_bound(scan, LOW_EXPOSURE_S)
+    data["starved"] = starved_rays(scan, s.starved_rays, s.seed)
+    data["water"] = {k: v.tolist() for k, v in water_hu(VMI_ENERGIES_KEV, s.views).items()}
     done("water and starved rays")
-    lines, statistics = _noisy_scans(plaque, images, tell)
-    data["rays"] = [asdict(s) for s in statistics]
-    done("decompose noisy scans")
-    data["vmi"] = _vmi(plaque, images)
-    done("monochromatic images")
-    tissues = Tissues(plaque, data["vmi"]["voxel_covariance"])
-    data["separation"] = tissues.separation()
-    data["misplaced_core"] = tissues.misplaced_core(images["clean"])
-    data["dice"] = {_METHOD[rule]: _dice_fbp(tissues, images, settings, rule) for rule in RULES}
-    done("tissue maps")
-    if settings.mbir_realizations:
-        data["mbir"] = _mbir(plaque, tissues, lines, images, data, tell)
-        done("joint MBIR")
-    data["total_seconds"] = round(time.perf_counter() - started, 1)
-    data["processor_seconds"] = round(time.process_time() - spent, 1)
-    return build_report(data, plaque, tissues, images)
-
-
-def _noisy_scans(plaque: PlaqueScan, images: dict[str, Tensor], tell: Progress) -> tuple[list[Tensor], list[Any]]:
-    """Decompose the noisy scans; their FBP goes to ``images["noisy"]``. Returns what MBIR needs, and statistics."""
-    s = plaque.settings
-    volumes, kept, statistics = [], [], []
+    lines, volumes, data["rays"] = [], [], []
     for k in range(s.realizations):
-        lines, found = plaque.noisy(s.exposure_s, s.seed + k)
-        statistics.append(found)
-        volumes.append(plaque.fbp(lines))
-        if k < s.mbir_realizations:
-            kept.append(lines)
-        tell("decompose noisy scans", (k + 1) / (s.realizations + 1))
-    statistics.append(plaque.noisy(LOW_EXPOSURE_S, s.seed, _LOW_EXPOSURE_STEP)[1])
-    images["noisy"] = torch.stack(volumes)
-    return kept, statistics
+        noisy, statistics = scan.noisy(s.exposure_s, s.seed + k)
+        data["rays"].append(statistics)
+        volumes.append(scan.fbp(noisy))
+        lines += [noisy] if k < s.mbir_realizations else []
+        progress("decompose noisy scans", (k + 1) / (s.realizations + 1))
+    data["rays"].append(scan.noisy(LOW_EXPOSURE_S, s.seed, _LOW_EXPOSURE_STEP)[1])
+    images = Images(clean, torch.stack(volumes))
+    done("decompose noisy scans")
+    data["vmi"] = _vmi(scan, images)
+    done("monochromatic images")
+    tissues = Tissues(scan, data["vmi"]["voxel_covariance"])
+    data["separation"] = tissues.separation()
+    data["misplaced_core"] = tissues.misplaced_core(clean)
+    data["dice"] = {
+        name: [_scores(level, tissues, images.fbp(level), rule) for level in s.noise_levels]
+        for rule, name in RULES.items()
+    }
+    done("tissue maps")
+    if lines:
+        data["mbir"], data["dice"]["joint MBIR"] = _mbir(scan, tissues, lines, images, data["vmi"], progress)
+        done("joint MBIR")
+    return Measured(s, data, scan, tissues, images, clock.seconds, time.process_time() - spent)
 
 
 def _curve(curve: VmiCurve) -> dict[str, Any]:
@@ -174,94 +125,77 @@ def _curve(curve: VmiCurve) -> dict[str, Any]:
     }
 
 
-def _vmi(plaque: PlaqueScan, images: dict[str, Tensor]) -> dict[str, Any]:
+def _vmi(scan: SpectralScan, images: Images) -> dict[str, Any]:
     """Contrast of core and fibrous tissue, noise and CNR against energy."""
-    s = plaque.settings
-    px, py, pz = plaque.plaque.position
-    rois = place_rois(plaque.scene, axial_grid((pz, py, px)))
-    foreground, background = rois.on(plaque.grid)
-    core, fibrous = (roi(images["clean"]).numpy() for roi in (foreground, background))
-    voxel = torch.zeros(plaque.grid.shape, dtype=torch.float64)
-    voxel.view(-1)[int(background.weights.argmax())] = 1.0  # the voxel that the background ROI weighs most
+    foreground, background = scan.rois.on(scan.grid)
+    core, fibrous = (roi(images.clean).numpy() for roi in (foreground, background))
+    voxel = torch.zeros(scan.grid.shape, dtype=torch.float64)
+    most = int(background.weights.argmax())  # the voxel that the background ROI weighs most
+    voxel.view(-1)[most] = 1.0
     functionals = torch.stack([voxel, foreground.weights, background.weights]).to(torch.float32)
-    exact = plaque.fbp.covariance(functionals, plaque.covariance(s.exposure_s))
-    noisy = images["noisy"] - images["clean"]
+    exact = scan.fbp.covariance(functionals, scan.covariance(scan.settings.exposure_s))
     # The noise of the inset is nearly stationary in the plane: all voxels of the ROI's slice, far from rounding errors.
-    z = int(background.weights.argmax()) // (plaque.grid.shape[1] * plaque.grid.shape[2])
-    sampled = torch.cov(noisy[:, :, z].transpose(0, 1).reshape(2, -1).double()).numpy()[(0, 0, 1), (0, 1, 1)]
+    z = most // (scan.grid.shape[1] * scan.grid.shape[2])
+    noise = (images.noisy - images.clean)[:, :, z].transpose(0, 1).reshape(2, -1).double()
     return {
         "energies_kev": list(VMI_ENERGIES_KEV),
-        "roi": rois.as_dict(),
+        "roi": scan.rois.as_dict(),
         "core": core.tolist(),
         "fibrous": fibrous.tolist(),
         "voxel_covariance": exact[0, 0].tolist(),
-        "sampled_covariance": sampled.tolist(),
-        "voxel": _curve(vmi_curve(fibrous, core, exact[0, 0], plaque.basis)),
+        "sampled_covariance": torch.cov(noise).numpy()[(0, 0, 1), (0, 1, 1)].tolist(),
+        "voxel": _curve(vmi_curve(fibrous, core, exact[0, 0], scan.basis)),
         # Protocol of the paper's CNR tables: noise of both ROI means over realisations.
-        "roi_means": _curve(vmi_curve(fibrous, core, exact[1, 1] + exact[2, 2], plaque.basis)),
+        "roi_means": _curve(vmi_curve(fibrous, core, exact[1, 1] + exact[2, 2], scan.basis)),
     }
 
 
-def _summary(scores: list[dict[str, float]]) -> dict[str, Any]:
-    values = np.array([[s[t] for t in MMD_TISSUES] for s in scores])
+def _scores(level: float, tissues: Tissues, volumes: Sequence[Tensor] | Tensor, rule: str = "nearest") -> Any:
+    """Mean and SD of every tissue's Dice coefficient over realisations."""
+    values = np.array([tissues.dice(v, rule) for v in volumes])
     spread = values.std(0, ddof=1) if len(values) > 1 else np.full(len(MMD_TISSUES), np.nan)
-    return {t: {"mean": float(m), "sd": float(d)} for t, m, d in zip(MMD_TISSUES, values.mean(0), spread, strict=True)}
+    scores = zip(MMD_TISSUES, values.mean(0), spread, strict=True)
+    return {"noise": level, **{t: {"mean": float(m), "sd": float(d)} for t, m, d in scores}}
 
 
-def _dice_fbp(tissues: Tissues, images: dict[str, Tensor], settings: Settings, rule: str) -> list[Any]:
-    out = []
-    for level in settings.noise_levels:
-        many = images["clean"] + level * (images["noisy"] - images["clean"]) if level else images["clean"][None]
-        out.append({"noise": level, **_summary([dict(tissues.dice(v, rule)) for v in many])})
-    return out
-
-
-def _at_best(plaque: PlaqueScan, rois: Any, images: Tensor, energy: float) -> dict[str, float]:
+def _at_energy(scan: SpectralScan, images: Tensor, energy: float) -> dict[str, float]:
     """ROI means, and the SD of voxels in fat, of one monochromatic image, HU."""
-    hu = vmi(images, plaque.basis, [energy])[0]
-    _, y, x = (a - c for a, c in zip(plaque.grid.axes, plaque.grid.center, strict=True))
+    hu = vmi(images, scan.basis, [energy])[0]
+    _, y, x = (a - c for a, c in zip(scan.grid.axes, scan.grid.center, strict=True))
     far = torch.from_numpy(np.hypot(y[:, None], x) > _FAT_MM)
-    middle = plaque.grid.shape[0] // 2
+    middle = scan.grid.shape[0] // 2
     fat = hu[middle - 4 : middle + 4][:, far]
-    core, fibrous = (float(roi(hu)) for roi in rois)
+    core, fibrous = (float(roi(hu)) for roi in scan.rois.on(scan.grid))
     return {"core_hu": core, "fibrous_hu": fibrous, "fat_sd_hu": float(fat.double().std())}
 
 
 def _mbir(
-    plaque: PlaqueScan, tissues: Tissues, lines: list[Tensor], images: dict[str, Tensor], data: dict[str, Any],
-    tell: Progress,
-) -> dict[str, Any]:  # fmt: skip
-    """Joint MBIR at every noise level; pictures of the first realisation go to ``images["mbir"]``."""
-    s = plaque.settings
-    problem = BasisProblem(plaque.clean, plaque.model(1.0), plaque.grid)
-    clean = plaque.exact.line_integrals
-    scores, reports, pictures, values = [], [], [], []
-    px, py, pz = plaque.plaque.position
-    rois = place_rois(plaque.scene, axial_grid((pz, py, px))).on(plaque.grid)
-    best = data["vmi"]["voxel"]["optimum_kev"]
+    scan: SpectralScan, tissues: Tissues, lines: list[Tensor], images: Images, curves: dict[str, Any],
+    progress: Progress,
+) -> tuple[dict[str, Any], list[dict[str, Any]]]:  # fmt: skip
+    """Joint MBIR at every noise level, and its scores; volumes of the first realisation go to ``images``."""
+    s = scan.settings
+    problem = BasisProblem(scan.clean, scan.model(1.0), scan.grid)
+    clean, best = scan.exact.line_integrals, curves["voxel"]["optimum_kev"]
     lowest = next((v for v in s.noise_levels if v > 0), 1.0)
-    steps, count = 1 + (len(s.noise_levels) - 1) * len(lines), 0
+    steps, scores, reports, pictures, values = 1 + (len(s.noise_levels) - 1) * len(lines), [], [], [], []
     for level in s.noise_levels:
         # Data without noise take the weights of the lowest noise: it is the prior that changes them.
-        dose = s.exposure_s / (level or lowest) ** 2
-        found = []
+        dose, found = s.exposure_s / (level or lowest) ** 2, []
         for noisy in lines if level else lines[:1]:
-            volume, report = problem.solve(clean + level * (noisy - clean), plaque.window, dose=dose, tolerance=1.0)
+            volume, report = problem.solve(clean + level * (noisy - clean), scan.window, dose=dose, tolerance=1.0)
             found.append(volume)
             reports.append({"noise": level, **report})
-            count += 1
-            tell("joint MBIR", count / steps)
-        scores.append({"noise": level, **_summary([dict(tissues.dice(v)) for v in found])})
+            progress("joint MBIR", len(reports) / steps)
+        scores.append(_scores(level, tissues, found))
         pictures.append(found[0])
-        fbp = images["clean"] + level * (images["noisy"][0] - images["clean"])
-        values.append({"noise": level, "FBP": _at_best(plaque, rois, fbp, best),
-                       "joint MBIR": _at_best(plaque, rois, found[0], best)})  # fmt: skip
-    data["dice"]["joint MBIR"] = scores
-    images["mbir"] = torch.stack(pictures)
+        both = {"FBP": images.fbp(level)[0], "joint MBIR": found[0]}
+        values.append({"noise": level, **{k: _at_energy(scan, v, best) for k, v in both.items()}})
+    images.mbir = torch.stack(pictures)
     return {
         "anisotropy": problem.anisotropy,
         "whitening": problem.whitening.forward.tolist(),
         "prior": asdict(DEFAULT_JOINT_PRIOR),
         "solves": reports,
         "at_best_energy": values,
-    }
+    }, scores

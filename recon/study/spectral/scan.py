@@ -4,23 +4,26 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numba
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.fbp.channels import ChannelFbp, static_fbp
-from recon.study.compare.measure import inset_grid
+from recon.study.paper.plaque_scan import inset_grid
+from recon.study.spectral.settings import Settings
 from torchpcct.acquisition.acquire import acquire
-from torchpcct.acquisition.plan import Effect
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import VolumeGrid
+from torchpcct.metrics.placement import place_rois
+from torchpcct.metrics.roi import axial_grid
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
-from torchpcct.scanner import presets
+from torchpcct.scanner import Scanner, presets
 from torchpcct.scene.bodies import EllipticCylinder
 from torchpcct.scene.plaque import PAPER_POSITION, PATIENT_DIAMETER, plaque_scene
 from torchpcct.scene.scene import Body, Scene
@@ -34,12 +37,7 @@ from torchpcct.spectral import (
     vmi,
 )
 
-if TYPE_CHECKING:
-    from recon.study.spectral.measure import Settings
-
-__all__ = ["PlaqueScan", "RayStatistics", "second_order_bound", "starved_rays", "water_hu"]
-
-Floats = NDArray[np.float64]
+__all__ = ["SpectralScan", "second_order_bound", "starved_rays", "water_hu"]
 
 NOISE_COLUMNS = 32
 """Columns kept on either side of the inset's shadow: the ramp filter's tail falls as 1 / n², its square as 1 / n⁴, so
@@ -49,61 +47,31 @@ _ROD_MM = 8.0
 """Radius of the water rod at the plaque's place."""
 
 _WATER_ROWS, _WATER_VIEWS = 8, 246
+"""Of the scans of water; never more views than the study's own scan."""
 
 
-def narrowed(scan: Scan, grid: VolumeGrid, margin: int = NOISE_COLUMNS) -> Scan:
-    """The readings of a windowed scan within ``margin`` columns of a grid's shadow; every row is kept."""
+def _acquired(
+    scene: Scene, scanner: Scanner, grid: VolumeGrid, progress: Callable[[float], None] | None = None
+) -> tuple[Scan, DetectorWindow]:
+    """The noise-free readings that the FBP of ``grid`` needs, and their window."""
+    scan = acquire(scene, scanner, region=grid, progress=progress)
     assert scan.window is not None
-    part = shadow(scan.geometry, grid, margin=margin)
-    columns = min(part.columns, scan.window.columns)
-    last = scan.window.first_column + scan.window.columns - columns
-    first = np.clip(part.first_column, scan.window.first_column, last)
-    window = DetectorWindow(first, columns, scan.window.first_row, scan.window.rows)
-    return replace(scan, counts=scan.window.crop(scan.counts, window).contiguous(), window=window)
+    window = shadow(scan.geometry, grid).widened(NOISE_COLUMNS, scan.window)
+    return scan.crop(window), window
 
 
-def every(scan: Scan, step: int) -> Scan:
-    """Every ``step``-th view of a windowed scan."""
-    w = scan.window
-    assert w is not None
-    window = DetectorWindow(w.first_column[::step], w.columns, w.first_row, w.rows)
-    views = slice(None, None, step)
-    return replace(scan, counts=scan.counts[:, views].contiguous(), geometry=scan.geometry.select(views), window=window)
-
-
-@dataclass(frozen=True)
-class RayStatistics:
-    """How the decomposed line integrals of noisy rays scatter about the true ones.
-
-    Attributes:
-        exposure_s: of the scan; rays: number of rays.
-        variance_ratio: mean squared error of each component over its Cramér–Rao bound, ``(2,)``.
-        whitened_ratio: half of the mean squared error in the metric of the Fisher information: 1 at the bound.
-        bias: mean error of each component in its standard deviations, ``(2,)``.
-        zero_bins: share of the readings that counted nothing; at_bound, failed: number of rays.
-        rays_per_second: speed of the decomposition by the clock, on ``threads`` threads.
-        rays_per_core_second: the same per second of processor time, whatever else the machine does.
-    """
-
-    exposure_s: float
-    rays: int
-    variance_ratio: list[float]
-    whitened_ratio: float
-    bias: list[float]
-    zero_bins: float
-    at_bound: int
-    failed: int
-    rays_per_second: float
-    rays_per_core_second: float
-    threads: int
-
-
-class PlaqueScan:
+class SpectralScan:
     """The plaque in energy bins: expected counts, their decomposition, and noisy realisations of it.
 
     Args:
         settings: of the study.
         progress: called with the finished fraction of the simulation.
+
+    Attributes:
+        scene, plaque, scanner: what is scanned.
+        grid: of the inset.
+        clean, window: the noise-free scan about the inset, and its window.
+        basis: PE and PVC.
     """
 
     def __init__(self, settings: Settings, progress: Callable[[float], None] | None = None) -> None:
@@ -111,25 +79,13 @@ class PlaqueScan:
         self.scene, self.plaque = plaque_scene()
         self.scanner = presets.pcct(views=settings.views, mode="spectral")
         self.grid = inset_grid(self.plaque, settings.voxel_mm)
-        whole = acquire(self.scene, self.scanner, region=self.grid, progress=progress)
-        self.info = dict(whole.info)
-        self.clean = narrowed(whole, self.grid)
+        self.clean, self.window = _acquired(self.scene, self.scanner, self.grid, progress)
         self.basis = SpectralModel.of(self.scanner, NOISE_FREE_EXPOSURE_S).basis
+        self.rois = place_rois(self.scene, axial_grid(self.grid.center))
 
     def model(self, exposure_s: float) -> SpectralModel:
         """The spectral model at an exposure."""
         return SpectralModel.of(self.scanner, exposure_s)
-
-    @property
-    def window(self) -> DetectorWindow:
-        """Of :attr:`clean` and all line integrals."""
-        assert self.clean.window is not None
-        return self.clean.window
-
-    @property
-    def effects(self) -> list[Effect]:
-        """What the simulation modelled, from its plan."""
-        return [Effect(**e) for e in self.info["plan"]["effects"]]
 
     @cached_property
     def exact(self) -> Decomposition:
@@ -151,63 +107,75 @@ class PlaqueScan:
         """Cramér–Rao covariance ``(3, views, rows, columns)`` in mm² of every ray."""
         return self.exact.covariance * (NOISE_FREE_EXPOSURE_S / exposure_s)
 
-    def noisy(self, exposure_s: float, seed: int, step: int = 1) -> tuple[Tensor, RayStatistics]:
-        """A noisy scan, decomposed: line integrals ``(2, views, rows, columns)`` in mm, and how they scatter.
+    def noisy(self, exposure_s: float, seed: int, step: int = 1) -> tuple[Tensor, dict[str, Any]]:
+        """A noisy scan, decomposed.
 
         Args:
             exposure_s: in s.
             seed: of the noise.
             step: only every so many views.
-        """
-        import numba
 
-        clean = self.clean if step == 1 else every(self.clean, step)
-        scan = clean.with_noise(exposure_s, seed)
-        model = self.model(exposure_s)
+        Returns:
+            Line integrals ``(2, views, rows, columns)`` in mm, and how they scatter about the true ones:
+            ``variance_ratio``: mean squared error of each component over its Cramér–Rao bound; ``whitened_ratio``:
+            half of the mean squared error in the metric of the Fisher information, 1 at the bound; ``bias``: mean error
+            of each component in its standard deviations; ``zero_bins``: share of the readings that counted nothing;
+            ``rays``, ``at_bound``, ``failed``: numbers of rays; ``rays_per_second``: by the clock, on ``threads``
+            threads; ``rays_per_core_second``: of processor time, whatever else the machine does.
+        """
+        clean, views = self.clean, slice(None, None, step)
+        if step > 1:
+            geometry, counts = clean.geometry.select(views), clean.counts[:, views].contiguous()
+            clean = replace(clean, counts=counts, geometry=geometry, window=self.window.select(views))
+        scan, model = clean.with_noise(exposure_s, seed), self.model(exposure_s)
         start, spent = time.perf_counter(), time.process_time()
         found = decompose_scan(scan, model)
         seconds, spent = time.perf_counter() - start, time.process_time() - spent
-        truth, c = self.exact.line_integrals[:, ::step], self.covariance(exposure_s)[:, ::step]
+        truth, c = self.exact.line_integrals[:, views], self.covariance(exposure_s)[:, views]
         error = found.line_integrals - truth
-        rays = error[0].numel()
-        squared = error.square() / c[[0, 2]]
         whitened = c[2] * error[0].square() - 2 * c[1] * error[0] * error[1] + c[0] * error[1].square()
         whitened /= 2 * (c[0] * c[2] - c[1].square())
-        statistics = RayStatistics(
-            exposure_s, rays,
-            [float(v.mean(dtype=torch.float64)) for v in squared],
-            float(whitened.mean(dtype=torch.float64)),
-            [float(v.mean(dtype=torch.float64)) for v in error / c[[0, 2]].sqrt()],
-            scan.zero_fraction, int(found.at_bound.sum()),
-            int((~found.converged).sum()) + int((~torch.isfinite(found.line_integrals)).sum()),
-            rays / seconds, rays / spent, numba.get_num_threads(),
-        )  # fmt: skip
-        return found.line_integrals, statistics
+        rays = error[0].numel()
+        return found.line_integrals, {
+            "exposure_s": exposure_s,
+            "rays": rays,
+            "variance_ratio": [_mean(v) for v in error.square() / c[[0, 2]]],
+            "whitened_ratio": _mean(whitened),
+            "bias": [_mean(v) for v in error / c[[0, 2]].sqrt()],
+            "zero_bins": scan.zero_fraction,
+            "at_bound": int(found.at_bound.sum()),
+            "failed": int((~found.converged).sum()) + int((~torch.isfinite(found.line_integrals)).sum()),
+            "rays_per_second": rays / seconds,
+            "rays_per_core_second": rays / spent,
+            "threads": numba.get_num_threads(),
+        }
 
 
-def second_order_bound(plaque: PlaqueScan, exposure_s: float) -> float:
+def _mean(values: Tensor) -> float:
+    return float(values.mean(dtype=torch.float64))
+
+
+def second_order_bound(scan: SpectralScan, exposure_s: float) -> float:
     """Excess of Bhattacharyya's bound over Cramér–Rao's for the rays behind the patient: mean of both components.
 
     No unbiased estimate can come closer to Cramér–Rao than this, however it is made.
     """
-    model = plaque.model(exposure_s)
-    row = plaque.surround.shape[1] // 2
-    columns = np.unique(plaque.window.column_indices)
-    lines = plaque.surround[:, row, columns].double()
+    model = scan.model(exposure_s)
+    columns = np.unique(scan.window.column_indices)
+    lines = scan.surround[:, scan.surround.shape[1] // 2, columns].double()
     first, second = (cramer_rao(lines, model, columns=columns, order=k)[[0, 2]] for k in (1, 2))
     return float((second / first).mean() - 1.0)
 
 
-def starved_rays(plaque: PlaqueScan, rays: int, seed: int) -> dict[str, float]:
+def starved_rays(scan: SpectralScan, rays: int, seed: int) -> dict[str, float]:
     """Decomposition of rays from no count at all to air: how many fail, and how many end at the bounds.
 
     Rays pass 0 … 600 mm of water at exposures of 1e-6 … 1 of the study's, evenly in the logarithm, through any column.
     """
     rng = np.random.default_rng(seed)
-    model = plaque.model(plaque.settings.exposure_s)
+    model = scan.model(scan.settings.exposure_s)
     columns = rng.integers(0, model.columns, rays)
-    water = plaque.basis.coefficients("water")
-    lengths = torch.from_numpy(np.outer(water, rng.uniform(0.0, 600.0, rays)))
+    lengths = torch.from_numpy(np.outer(scan.basis.coefficients("water"), rng.uniform(0.0, 600.0, rays)))
     level = 10.0 ** rng.uniform(-6, 0, rays)
     mean = model.expected(lengths, columns=columns, scale=level)
     counts = torch.from_numpy(rng.poisson(mean.numpy()).astype(np.float64))
@@ -223,34 +191,27 @@ def starved_rays(plaque: PlaqueScan, rays: int, seed: int) -> dict[str, float]:
     }
 
 
-def water_hu(plaque: PlaqueScan, energies: Any) -> dict[str, Floats]:
+def water_hu(energies: Any, views: int) -> dict[str, NDArray[np.float64]]:
     """HU of water in virtual monochromatic images at every energy, through the whole chain, noise free.
 
     Returns:
         place → ``(E,)`` HU: a water cylinder of the patient's size at its centre and at the plaque's place, and a rod
         of water at the plaque's place in the patient's fat.
     """
-    scanner = presets.pcct(views=_WATER_VIEWS, mode="spectral", rows=_WATER_ROWS)
+    scanner = presets.pcct(views=min(views, _WATER_VIEWS), mode="spectral", rows=_WATER_ROWS)
     x, y, z = PAPER_POSITION
-    there = VolumeGrid((2, 16, 16), (0.25, 0.5, 0.5), (z, y, x))
-    middle = VolumeGrid((2, 16, 16), (0.25, 0.5, 0.5), 0.0)
+    spacing, patient = (0.25, 0.5, 0.5), EllipticCylinder(PATIENT_DIAMETER / 2)
+    there, middle = VolumeGrid((2, 16, 16), spacing, (z, y, x)), VolumeGrid((2, 16, 16), spacing, 0.0)
     model = SpectralModel.of(scanner, NOISE_FREE_EXPOSURE_S)
-    found: dict[str, Floats] = {}
-
-    def record(name: str, images: Tensor) -> None:
-        mean = images.double().mean((-1, -2, -3))
-        found[name] = vmi(mean, model.basis, energies).numpy()
-
-    cylinder = Scene([Body("water", EllipticCylinder(PATIENT_DIAMETER / 2), "water")])
-    scan = acquire(cylinder, scanner, region=there)
-    lines = decompose_surround(scan, model)
-    record("cylinder, centre", static_fbp(lines, scan.geometry, middle))
-    record("cylinder, plaque's place", static_fbp(lines, scan.geometry, there))
+    cylinder = acquire(Scene([Body("water", patient, "water")]), scanner, region=there)
+    lines = decompose_surround(cylinder, model)
     rod = Body("rod", EllipticCylinder(_ROD_MM, position=(x, y, z)), "water", "patient")
-    scene = Scene([Body("patient", EllipticCylinder(PATIENT_DIAMETER / 2), "pericoronary_fat"), rod])
-    held = VolumeGrid((2, 40, 40), (0.25, 0.5, 0.5), (z, y, x))
-    scan = narrowed(acquire(scene, scanner, region=held), held)
-    assert scan.window is not None
-    fbp = ChannelFbp(scan.geometry, scan.window, decompose_surround(scan, model), there)
-    record("rod in fat, plaque's place", fbp(decompose_scan(scan, model).line_integrals))
-    return found
+    scene = Scene([Body("patient", patient, "pericoronary_fat"), rod])
+    scan, window = _acquired(scene, scanner, VolumeGrid((2, 40, 40), spacing, (z, y, x)))
+    fbp = ChannelFbp(scan.geometry, window, decompose_surround(scan, model), there)
+    images = {
+        "cylinder, centre": static_fbp(lines, cylinder.geometry, middle),
+        "cylinder, plaque's place": static_fbp(lines, cylinder.geometry, there),
+        "rod in fat, plaque's place": fbp(decompose_scan(scan, model).line_integrals),
+    }
+    return {k: vmi(v.double().mean((-1, -2, -3)), model.basis, energies).numpy() for k, v in images.items()}

@@ -2,32 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.study.spectral.scan import PlaqueScan
+from recon.study.spectral.scan import SpectralScan
 from torchpcct.geometry import VolumeGrid
+from torchpcct.metrics.plaque_measures import dice
 from torchpcct.scene.scene import Scene
-from torchpcct.spectral import MMD_TISSUES, clean, dice, label, mmd, nearest
+from torchpcct.spectral import MMD_TISSUES, clean, label, mmd, nearest
+from torchpcct.validate import choice
 
 __all__ = ["BODIES", "RULES", "Tissues", "truth_labels"]
-
-Floats = NDArray[np.float64]
 
 BODIES = {"blood_iodine": "lumen", "necrotic_core": "core", "fibrous_tissue": "fibrous", "pericoronary_fat": "patient"}
 """Tissue of the decomposition → body of the scene. The vessel's wall (0.19 mm) is a fifth material, not among them."""
 
-RULES = {
-    "nearest": "the tissue nearest to the mixture, in standard deviations (k-means with centres held at the tissues)",
-    "k-means": "k-means of the fractions, slice by slice, started at the tissues",
-    "largest": "the largest fraction",
-}
-"""How a tissue is read from the fractions. The paper names "a standard 2D k-means" and not its features."""
+RULES = {"nearest": "FBP", "k-means": "FBP, k-means of fractions", "largest": "FBP, largest fraction"}
+"""How a tissue is read from the fractions → name in reports. The paper names "a standard 2D k-means" and not its
+features. ``nearest``: the tissue nearest to the mixture, in standard deviations (k-means with centres held at the
+tissues); ``k-means``: of the fractions, slice by slice, started at the tissues; ``largest``: the largest fraction."""
 
 PURE = 0.5
 """A voxel counts as a tissue if that fills more than this share of it."""
@@ -48,26 +44,30 @@ class Tissues:
     """Tissue maps of the slices through the core.
 
     Args:
-        plaque: the scan, for geometry, basis and detected spectrum.
+        scan: for geometry, basis and detected spectrum.
         covariance: ``(3,)`` C₁₁, C₁₂, C₂₂ of a voxel of the FBP images, the unit of distances.
+
+    Attributes:
+        slices, middle: the slices through the core, and which of them is the plaque's middle.
+        truth: labels of these slices.
+        corners: ``(2, tissues)`` coefficients of the tissues.
     """
 
-    def __init__(self, plaque: PlaqueScan, covariance: Any) -> None:
-        self.basis, self.covariance = plaque.basis, np.asarray(covariance, np.float64)
-        z = plaque.grid.axes[0]
-        core = plaque.scene["core"].shape.bounding_box
+    def __init__(self, scan: SpectralScan, covariance: Any) -> None:
+        self.basis, self.covariance = scan.basis, np.asarray(covariance, np.float64)
+        z = scan.grid.axes[0]
+        core = scan.scene["core"].shape.bounding_box
         inside = np.flatnonzero((z > core[0, 2]) & (z < core[1, 2]))
         self.slices = slice(int(inside[0]), int(inside[-1]) + 1)
-        self.truth = truth_labels(plaque.scene, plaque.grid)[self.slices]
-        self.middle = int(np.abs(z[self.slices] - plaque.plaque.position[2]).argmin())
-        model = plaque.model(1.0)
+        self.truth = truth_labels(scan.scene, scan.grid)[self.slices]
+        self.middle = int(np.abs(z[self.slices] - scan.plaque.position[2]).argmin())
+        model = scan.model(1.0)
         # As the detector sees the tissues behind the patient: iodine's K edge makes blood depend on the spectrum.
         centre = model.columns // 2
-        path = plaque.surround[:, plaque.surround.shape[1] // 2, centre].double().numpy()
+        path = scan.surround[:, scan.surround.shape[1] // 2, centre].double().numpy()
         detected = model.spectra[centre].sum(0) * np.exp(-path @ model.attenuation)
-        self.corners = np.stack(
-            [self.basis.coefficients(t, model.energies, detected) for t in MMD_TISSUES], axis=1
-        )  # (2, tissues)
+        corners = [self.basis.coefficients(t, model.energies, detected) for t in MMD_TISSUES]
+        self.corners = np.stack(corners, axis=1)
 
     def labels(self, images: Tensor, rule: str = "nearest") -> Tensor:
         """Tissue of every voxel of the slices, ``(slices, y, x)``.
@@ -76,18 +76,19 @@ class Tissues:
             images: ``(2, z, y, x)`` basis coefficients on the inset's grid.
             rule: one of :data:`RULES`.
         """
+        choice("rule", rule, RULES)
         fractions = mmd(images[:, self.slices], self.basis, self.corners, self.covariance)
         if rule == "nearest":
             return nearest(fractions, self.basis, self.corners, self.covariance)
         if rule == "k-means":
             return torch.stack([clean(fractions[:, k], window=1) for k in range(fractions.shape[1])])
-        if rule == "largest":
-            return label(fractions)
-        raise ValueError(f"rule must be one of {', '.join(RULES)}, got {rule!r}")
+        return label(fractions)
 
-    def dice(self, images: Tensor, rule: str = "nearest") -> Mapping[str, float]:
-        """Dice coefficient of every tissue over the slices through the core."""
-        return dice(self.labels(images, rule), self.truth)
+    def dice(self, images: Tensor, rule: str = "nearest") -> list[float]:
+        """Dice coefficient of every tissue over the slices through the core; voxels without a true tissue left out."""
+        known = self.truth >= 0
+        found, truth = self.labels(images, rule)[known], self.truth[known]
+        return [dice(found == k, truth == k) for k in range(len(MMD_TISSUES))]
 
     def misplaced_core(self, images: Tensor) -> float:
         """Share of the voxels labelled core that lie outside it, among them all that hold several tissues."""

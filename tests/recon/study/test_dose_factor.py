@@ -8,61 +8,57 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from tiny_studies import TINY as SMALLEST
+from tiny_studies import assert_report_is_whole
 
 from recon.cli import main
-from recon.mbir.mbir import average_onto
 from recon.pwls.qggmrf import quadratic
-from recon.study.compare.measure import inset_grid
-from recon.study.dose_factor import Settings, estimate_seconds, figures, run
+from recon.study import registry
 from recon.study.dose_factor import measure as study
-from recon.study.dose_factor.analysis import analyse
-from recon.study.dose_factor.estimates import controlled
+from recon.study.dose_factor.exact import Exact
+from recon.study.dose_factor.main_scenes import method_entry
+from recon.study.dose_factor.measure import measure
 from recon.study.dose_factor.measures import crop_window
 from recon.study.dose_factor.methods import (
-    METHOD_NAMES,
-    METHODS,
     LinearFilter,
     Misstated,
     Penalised,
     fingerprint,
-    load_methods,
 )
+from recon.study.dose_factor.other_rois import wide_rois
 from recon.study.dose_factor.realisations import Realisations
-from recon.study.dose_factor.report import build_report, headline
-from recon.study.dose_factor.rois import OtherVoxels, Wide
-from recon.study.dose_factor.scene import StudyScene, _tissue_groups
-from recon.study.dose_factor.settings import MAIN_SCENES
+from recon.study.dose_factor.scene import StudyScene
+from recon.study.dose_factor.settings import MAIN_SCENES, Settings
 from recon.study.dose_factor.store import Store
-from torchpcct import VolumeGrid
+from recon.study.dose_factor.variant import Variant
 
-TINY = Settings(
-    n=6, slow_n=3, scene_n=3, doses=(2.0,), scene_doses=(2.0,), methods=("linear",), scenes=("half_size_core",),
-    scene_methods=("linear",), views=48, voxel_mm=0.4, kernels=("soft",), voxels_mm=(0.25,), blurs_mm=(0.4,), block=3,
-)  # fmt: skip
+TINY = Settings(**SMALLEST["dose-factor"])
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    return tmp_path_factory.mktemp("study")
+def folder(tiny):
+    return tiny("dose-factor").folder
 
 
 @pytest.fixture(scope="module")
-def measured(folder):
-    return run(TINY, folder)
+def measured(tiny):
+    return tiny("dose-factor").measured
 
 
 @pytest.fixture(scope="module")
-def analysed(measured):
-    return analyse(measured)
+def analysed(tiny):
+    return tiny("dose-factor").report.data
 
 
-def plain(report):
-    """The report's data without what a clock measured."""
-    data = json.loads(json.dumps(report, default=float))
-    data.pop("seconds", None)
-    for entry in data["methods"]:
-        entry.pop("seconds_per_volume")
-    return data
+@pytest.fixture(scope="module")
+def scene(folder, measured):
+    """The paper's scene: its scan, problem and facts."""
+    return StudyScene("paper", TINY, Store(folder))
+
+
+@pytest.fixture(scope="module")
+def clean_b(scene):
+    return torch.from_numpy(scene.facts.statistic)
 
 
 def test_truth_is_what_the_scanner_sees(measured, analysed):
@@ -95,46 +91,48 @@ def test_nothing_linear_exceeds_the_limit(analysed):
     assert limit["contrast_sd_fat_unknown_hu"] >= limit["contrast_sd_hu"]
 
 
-def test_report_files(measured, tmp_path):
-    report = build_report(measured, 1.0, "torchpcct dose-factor")
-    report.save(tmp_path / "out")
-    data = json.loads((tmp_path / "out" / "report.json").read_text())
+def test_report(tiny, tmp_path):
+    study = tiny("dose-factor")
+    sections = ("physics allows at most", "# Measured dose factors", "half_size_core")
+    data = assert_report_is_whole(study, tmp_path, {"dose_factor.png", "dose_factor_images.png"}, sections)
     assert data["study"] == "dose-factor"
     assert {e["method"] for e in data["methods"]} == {"linear"}
-    text = (tmp_path / "out" / "report.md").read_text()
-    assert text.startswith("The paper assumes 5.7×; measured")
-    assert "physics allows at most" in text.splitlines()[0]
-    assert "half_size_core" in text
-    for name in ("dose_factor.png", "dose_factor_images.png"):
-        assert (tmp_path / "out" / name).read_bytes().startswith(b"\x89PNG")
+    assert study.report.text.startswith("The paper assumes 5.7×; measured")
+    assert sections[0] in study.report.text.splitlines()[0]
 
 
 class _Stop(Exception):
     pass
 
 
-def test_an_interrupted_study_goes_on_to_the_same_report(measured, analysed, folder, tmp_path):
-    for part in ("scans", "scenes"):
-        shutil.copytree(folder / part, tmp_path / part)
+def test_an_interrupted_study_goes_on_to_the_same_figures(measured, folder, tmp_path):
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True, ignore=shutil.ignore_patterns("methods"))
+    (tmp_path / "data" / "paper_2s_3-6.npz").unlink()
 
     def stop(step, fraction):
         if step == "linear" and fraction > 0.3:
             raise _Stop
 
     with pytest.raises(_Stop):
-        run(TINY, tmp_path, stop)
+        measure(TINY, stop, tmp_path)
     done = {p: p.stat().st_mtime_ns for p in (tmp_path / "methods").rglob("*.npz")}
     assert done
     assert not list(tmp_path.rglob("*.part.*"))
-    again = run(TINY, tmp_path)
-    assert plain(analyse(again)) == plain(analysed)
+    again = measure(TINY, folder=tmp_path)
     assert all(p.stat().st_mtime_ns == t for p, t in done.items())
+    for part in ("fbp", "samples", "extra"):
+        own, other = getattr(measured, part), getattr(again, part)
+        assert own.keys() == other.keys()
+        for key, values in own.items():
+            assert values.keys() == other[key].keys()
+            for name, value in values.items():
+                np.testing.assert_array_equal(other[key][name], value)
 
 
 def test_a_finished_study_computes_nothing(measured, folder, monkeypatch):
     calls = []
     monkeypatch.setattr(Store, "piece", _counting(Store.piece, calls))
-    run(TINY, folder)
+    measure(TINY, folder=folder)
     assert not calls
 
 
@@ -149,17 +147,6 @@ def _counting(piece, calls):
     return counted
 
 
-def test_pieces_of_other_settings_or_cut_off_are_made_again(tmp_path, caplog):
-    store = Store(tmp_path)
-    assert store.piece("a/b", "one", lambda: {"x": np.arange(3)})["x"].tolist() == [0, 1, 2]
-    assert store.piece("a/b", "one", lambda: {"x": np.zeros(1)})["x"].tolist() == [0, 1, 2]
-    assert store.piece("a/b", "two", lambda: {"x": np.ones(1)})["x"].tolist() == [1]
-    path = store.path("a/b.npz")
-    path.write_bytes(path.read_bytes()[:100])
-    assert store.piece("a/b", "two", lambda: {"x": np.full(1, 7)})["x"].tolist() == [7]
-    assert "computed again" in caplog.text
-
-
 def test_half_contrast_carries_the_papers_noise(measured):
     paper, half = (measured.samples["linear", name, 2.0]["roi"] for name in ("paper", "half_contrast"))
     difference = paper - half
@@ -167,7 +154,7 @@ def test_half_contrast_carries_the_papers_noise(measured):
     assert np.abs(difference - difference.mean(0)).max() < 0.1
 
 
-def synthetic(measured, slope, sd, n=1500, shift=0.0):
+def synthetic(measured, slope, sd, n=600, shift=0.0):
     """Samples of a method with a known slope, SD and false contrast."""
     rng = np.random.default_rng(0)
     noise = rng.standard_normal((n, 2)) * sd / math.sqrt(2)
@@ -184,41 +171,32 @@ def synthetic(measured, slope, sd, n=1500, shift=0.0):
 
 def test_figures_of_a_method_of_known_slope_and_noise(measured):
     slope, sd = 0.8, 10.0
-    data = analyse(synthetic(measured, slope, sd))
-    entry = data["methods"][0]
+    exact = Exact(synthetic(measured, slope, sd))
+    entry = method_entry(exact, "linear", 2.0)
     assert entry["slope"]["value"] == pytest.approx(slope, rel=1e-6)
     assert entry["contrast_sd_raw_hu"]["value"] == pytest.approx(sd, rel=0.06)
     assert entry["contrast_sd_hu"]["value"] == pytest.approx(sd / slope, rel=0.06)
     assert entry["contrast_sd_hu"]["low"] < entry["contrast_sd_hu"]["value"] < entry["contrast_sd_hu"]["high"]
-    limit = data["ceiling"][0]
+    limit = exact.limits(2.0)
     assert entry["efficiency"]["value"] == pytest.approx((limit["contrast_sd_hu"] * slope / sd) ** 2, rel=0.12)
-    fbp = data["fbp"][0]["doses"][0]
+    fbp = exact.at("soft 0.25 mm", 2.0)
     factor = entry["factors"]["soft 0.25 mm"]
     assert factor["contrast_variance"]["value"] == pytest.approx((fbp["contrast_sd_hu"] * slope / sd) ** 2, rel=0.12)
-    own = slope * data["truth"]["contrasts_hu"]["paper"] / sd
+    own = slope * exact.truth[0] / sd
     assert factor["paper_cnr"]["value"] == pytest.approx((own / fbp["paper_cnr"]) ** 2, rel=0.12)
     # Crops of pure noise: the observer sees nothing.
     assert entry["observer"]["volume"]["auc"]["low"] < 0.5 + 0.05
-    assert entry["false_contrast_hu"]["value"] == pytest.approx(
-        slope * data["truth"]["contrasts_hu"]["absent_core"], abs=1.0
-    )
+    assert entry["false_contrast_hu"]["value"] == pytest.approx(slope * exact.truth[1], abs=1.0)
 
 
 def test_bias_is_reported_as_bias(measured):
-    data = analyse(synthetic(measured, 1.0, 5.0, shift=12.0))
-    entry = data["methods"][0]
+    entry = method_entry(Exact(synthetic(measured, 1.0, 5.0, n=200, shift=12.0)), "linear", 2.0)
     assert entry["false_contrast_hu"]["value"] == pytest.approx(12.0, abs=1.0)
     assert entry["slope"]["value"] == pytest.approx(1.0, rel=1e-6)
-    assert "5.7" in headline(data)
 
 
-def problem_of(folder):
-    scene = StudyScene("paper", TINY, Store(folder))
-    return scene, scene.problem, torch.from_numpy(scene.facts().statistic)
-
-
-def test_methods_are_consistent(measured, folder):
-    scene, problem, b = problem_of(folder)
+def test_methods_are_consistent(scene, clean_b):
+    problem, b = scene.problem, clean_b
     background = 1000.0 * (problem.level / problem.mu_ref - 1.0)
     batch = torch.stack([2.0 * b, torch.zeros_like(b), b])
     linear = LinearFilter(lam=0.01, mu=0.8)(problem, batch, 2.0) - background
@@ -234,71 +212,29 @@ def test_methods_are_consistent(measured, folder):
     assert contrasts[0] == pytest.approx(contrasts[1], abs=20)
 
 
-def test_method_registry(caplog):
-    assert [m.name for m in load_methods(["tv", "linear"])] == ["tv", "linear"]
-    assert fingerprint(LinearFilter()) != fingerprint(LinearFilter(mu=0.7))
-    one, two = load_methods(["mbir_one_pass", "mbir"])
-    assert fingerprint(one) != fingerprint(two)
-    with pytest.raises(ValueError, match="unknown method 'magic'"):
-        load_methods(["magic"])
-
-
-def test_control_variates():
-    rng = np.random.default_rng(3)
-    noise = rng.standard_normal((200, 2))
-    values = np.array([5.0, -2.0]) + noise @ np.array([[2.0, 0.3], [0.1, 1.0]]) + 0.1 * rng.standard_normal((200, 2))
-    found = controlled(values, 7.0 + 3.0 * noise, [7.0, 7.0])
-    np.testing.assert_allclose(found.mean(0), [5.0, -2.0], atol=4 * 0.1 / math.sqrt(200))
-    assert found.std(0).max() < 0.15 < 5 * 0.15 < values.std(0).min()
-    # Noise that has nothing to do with the control stays.
-    free = rng.standard_normal((200, 2))
-    np.testing.assert_allclose(controlled(free, noise, [0.0, 0.0]).mean(0), free.mean(0), atol=0.03)
-
-
-def test_every_method_has_a_name_and_a_colour():
-    assert set(METHOD_NAMES) == set(METHODS)
-    assert set(METHODS) - set(figures._COLORS) == {"mbir_noise_half", "mbir_noise_double"}
-
-
-def test_missing_weights_leave_mbir_out(monkeypatch, caplog):
-    import recon.mbir.mbir
-
-    def missing(**options):
-        raise FileNotFoundError("no weights at nowhere")
-
-    monkeypatch.setattr(recon.mbir.mbir.Mbir, "load", missing)
-    assert [m.name for m in load_methods(METHODS)] == [m for m in METHODS if "mbir" not in m and m != "fbp_cnn"]
-    assert "mbir is left out" in caplog.text
-    with pytest.raises(ValueError, match="no method to run"):
-        load_methods(["mbir"])
-
-
-def test_a_method_that_fails_is_named(measured, folder):
+def test_a_method_that_fails_is_named(scene, clean_b):
     class Broken:
         name = "broken"
 
         def __call__(self, problem, b, exposure_s):
             return b * float("nan")
 
-    scene, _, b = problem_of(folder)
     with pytest.raises(ValueError, match=r"'broken'.*--methods"):
-        study._timed(Broken(), scene, b[None], 2.0)
+        study._timed(Broken(), scene, clean_b[None], 2.0)
 
 
-def test_wider_rois(measured, folder, analysed):
-    scene = StudyScene("paper", TINY, Store(folder))
-    truth = np.array([measured.facts[name].contrast_hu for name in MAIN_SCENES])
-    x = scene.core_center[2]
+def test_wider_rois(analysed):
+    variant = Variant("paper", TINY)
+    paper = variant.rois.as_dict()
+    x = variant.core_center[2]
     for name in TINY.rois:
-        wide = Wide(measured, scene, name, truth)
-        paper = scene.rois.as_dict()
-        assert wide.rois.as_dict()["background_mm2"] > 2 * paper["background_mm2"]
+        pair, wide = variant.wide_rois(name), wide_rois(variant, name)
+        assert pair.as_dict()["background_mm2"] > 2 * paper["background_mm2"]
         # A linear ramp reads as the mean position of the mask.
-        grid = crop_window(scene.grid, scene.core_center)[1]
+        grid = crop_window(variant.grid, variant.core_center)[1]
         ramp = np.broadcast_to(grid.axes[2], grid.shape)
-        at = [np.mean(np.broadcast_to(wide.rois.image.axes[2], m.shape)[m])
-              for m in (wide.rois.foreground, wide.rois.background)]  # fmt: skip
-        np.testing.assert_allclose(wide.means(ramp, scene.grid.spacing[2]), at, atol=1e-9)
+        at = [np.mean(np.broadcast_to(pair.image.axes[2], m.shape)[m]) for m in (pair.foreground, pair.background)]
+        np.testing.assert_allclose(wide.means(ramp, variant.grid.spacing[2]), at, atol=1e-9)
         assert abs(at[0] - x) < 0.1 < abs(at[1] - x)
         # More data in the ROI, less noise; never less than the limit.
         rows = next(e["rows"] for e in analysed["wide_rois"] if e["roi"] == name)
@@ -310,18 +246,7 @@ def test_wider_rois(measured, folder, analysed):
         ratio = (sd / method["contrast_sd_hu"]["value"]) ** 2
         assert method["factors"]["contrast_variance"]["value"] == pytest.approx(ratio, rel=0.02)
     with pytest.raises(ValueError, match="rois must be of section, tissue"):
-        scene.wide_rois("vessel")
-
-
-def test_rois_on_larger_voxels_are_those_of_the_averaged_volume(measured, folder):
-    settings = replace(TINY, voxel_mm=0.2)
-    scene = StudyScene("paper", settings, Store(folder))
-    coarse = inset_grid(scene.plaque, 0.35)
-    rois = OtherVoxels(replace(measured, settings=settings), scene, 0.35, np.zeros(4))
-    volume = torch.randn(scene.grid.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    place = crop_window(scene.grid, scene.core_center)[0]
-    expected = [float(r(average_onto(volume, scene.grid, coarse))) for r in scene.rois.on(coarse)]
-    np.testing.assert_allclose(rois.means(volume[place].numpy(), 0.2), expected, rtol=1e-9)
+        variant.wide_rois("vessel")
 
 
 def test_rougher_outlines_raise_the_limit(analysed):
@@ -340,27 +265,19 @@ def test_worst_case_gain_of_fbp(analysed):
     assert 0 < soft < standard
 
 
-def test_exact_noise_of_wider_rois_is_that_of_fbp(measured, folder):
-    scene = StudyScene("paper", TINY, Store(folder))
-    wide = Wide(measured, scene, "tissue", np.array([measured.facts[k].contrast_hu for k in MAIN_SCENES]))
-    samples = wide.means(measured.fbp["paper", 2.0]["crop"], 0.25)
-    sd = np.sqrt(np.diag(wide.fbp("soft", 0.25)["covariance"]) / 2.0)
-    assert np.abs(samples.mean(0) - wide.fbp("soft", 0.25)["roi_hu"]).max() < 4 * sd.max() / math.sqrt(len(samples))
+def test_exact_noise_of_wider_rois_is_that_of_fbp(measured):
+    rois, first = wide_rois(Variant("paper", TINY), "tissue"), 2 * TINY.rois.index("tissue")
+    samples = rois.means(measured.fbp["paper", 2.0]["crop"], 0.25)
+    expected = rois.means(measured.facts["paper"].fbp_crop["soft 0.25 mm"], 0.25)
+    sd = np.sqrt(np.diag(measured.wide["soft 0.25 mm"])[first : first + 2] / 2.0)
+    assert np.abs(samples.mean(0) - expected).max() < 4 * sd.max() / math.sqrt(len(samples))
     ratio = samples.std(0, ddof=1) / sd
     assert (ratio > 0.3).all()
     assert (ratio < 2.0).all()
 
 
-def test_pitch_of_the_scene():
-    fine, paper = (StudyScene(name, TINY, None).scanner.geometry for name in ("pitch_0.30mm:absent", "paper"))
-    assert (fine.pitch[1], paper.pitch[1]) == (0.30, 0.35)
-    assert (fine.pitch[0], fine.views, fine.sod) == (paper.pitch[0], paper.views, paper.sod)
-    bodies = [StudyScene(name, TINY, None).scene.bodies for name in ("pitch_0.30mm:absent", "absent_core")]
-    assert [b.name for b in bodies[0]] == [b.name for b in bodies[1]]
-
-
-def test_a_method_that_is_told_another_exposure(measured, folder):
-    _, problem, b = problem_of(folder)
+def test_a_method_that_is_told_another_exposure(scene, clean_b):
+    problem, b = scene.problem, clean_b
     linear = LinearFilter()
     told = Misstated("told", linear, 4.0)
     # The data are the same, their weights are not: as if they were those of four times the exposure.
@@ -368,9 +285,9 @@ def test_a_method_that_is_told_another_exposure(measured, folder):
     assert fingerprint(told) != fingerprint(linear)
 
 
-def test_an_fbp_image_as_data(measured, folder):
-    scene, problem, b = problem_of(folder)
-    noise = Realisations(TINY, Store(folder), lambda name: scene)
+def test_an_fbp_image_as_data(scene, clean_b):
+    problem, b = scene.problem, clean_b
+    noise = Realisations(TINY, scene.store, lambda name: scene)
     piece = noise.images("paper", 2.0, range(2))
     assert piece["shape"].shape == (2, 3)
     assert noise.image_statistic("paper", 2.0, range(2)).shape == (2, *b.shape)
@@ -384,54 +301,21 @@ def test_an_fbp_image_as_data(measured, folder):
     )
 
 
-def test_tissue_groups_and_crop():
-    names = ["patient", "wall", "fibrous", "lumen", "core", "stent_0", "stent_0_blood", "fibrous_texture_3"]
-    groups = _tissue_groups(names)
-    assert groups["lumen"] == ["lumen", "stent_0_blood"]
-    assert groups["fibrous"] == ["fibrous", "fibrous_texture_3"]
-    assert groups["stent"] == ["stent_0"]
-    grid = VolumeGrid((30, 24, 24), 0.4, (0.0, 5.0, -5.0))
-    place, crop = crop_window(grid, (0.1, 5.0, -5.3))
-    for axis, part, own in zip(grid.axes, place, crop.axes, strict=True):
-        np.testing.assert_allclose(axis[part], own)
-    with pytest.raises(ValueError, match="leaves the inset"):
-        crop_window(grid, (5.9, 5.0, -5.0))
+def test_command_line(tiny, tmp_path, monkeypatch, capsys):
+    asked = {}
 
+    def run(name, settings, progress, folder):
+        asked.update(name=name, settings=settings, folder=folder)
+        return replace(tiny("dose-factor").report, data=dict(analysed_data))
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"n": 2}, "n must be at least 3"),
-        ({"doses": ()}, "doses is empty"),
-        ({"doses": (0.0,)}, "doses must be different exposures"),
-        ({"methods": ("magic",)}, "'magic' of methods"),
-        ({"scenes": ("nowhere",)}, "'nowhere' of scenes"),
-        ({"kernels": ("bone",)}, "FBP soft"),
-        ({"rois": ("vessel",)}, "'vessel' of rois"),
-    ],
-)
-def test_bad_settings(changes, message):
-    with pytest.raises(ValueError, match=message):
-        Settings(**changes)
-    with pytest.raises(TypeError, match="n must be a whole number"):
-        Settings(n=7.5)
-
-
-def test_estimate_grows_with_the_work():
-    small, large = (sum(estimate_seconds(s).values()) for s in (Settings.quick(), Settings()))
-    assert 0 < small < 600 < large
-
-
-def test_command_line(measured, folder, monkeypatch, capsys):
-    monkeypatch.setattr(Settings, "quick", classmethod(lambda cls, **changes: TINY))
-    assert main(["dose-factor", "--quick", "--out", str(folder)]) == 0
+    analysed_data = tiny("dose-factor").report.data
+    monkeypatch.setattr(registry, "run", run)
+    options = ["--quick", "--n", "9", "--doses", "0.5", "2", "--scenes", "--fast-noise", "--out", str(tmp_path)]
+    assert main(["dose-factor", *options]) == 0
+    expected = Settings.quick(n=9, doses=(0.5, 2.0), scenes=(), fast_noise=True)
+    assert asked == {"name": "dose-factor", "settings": expected, "folder": tmp_path}
     captured = capsys.readouterr()
     assert captured.out.startswith("The paper assumes 5.7×")
-    assert "Command: `torchpcct dose-factor --quick" in captured.out
+    assert "Command: `torchpcct dose-factor --quick --n 9" in captured.out
     assert "min on two idle cores" in captured.err
-
-
-def test_command_line_refuses(tmp_path, capsys):
-    assert main(["dose-factor", "--n", "2", "--out", str(tmp_path / "o")]) == 2
-    assert "n must be at least 3" in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
+    assert json.loads((tmp_path / "report.json").read_text())["command"].startswith("torchpcct dose-factor")

@@ -1,18 +1,17 @@
 """The noise study: exact moments, realisations without reconstruction, and what few runs establish."""
 
 import itertools
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from tiny_studies import assert_report_is_whole
 
 from recon.fbp.exact_noise import roi_adjoints, roi_covariance
 from recon.study import registry
-from recon.study.noise import measure as noise
+from recon.study.noise.claims import CLAIMS
 from recon.study.noise.few_runs import (
-    CLAIMS,
     Table,
     exact_table,
     few_run_tables,
@@ -21,24 +20,15 @@ from recon.study.noise.few_runs import (
     pair_differences,
     resampled_tables,
 )
+from recon.study.noise.settings import Settings
 from recon.study.paper import facts as paper
 from recon.study.paper.tables import published, table_checks
 from torchpcct.metrics.bootstrap import resampling
 
-TINY = noise.Settings(
-    realizations=24,
-    views=48,
-    kernels=("soft", "bone"),
-    voxels_mm=(0.25, 0.40),
-    doses={"1x": 0.35, "5.7x": 2.0},
-    reconstructed=2,
-    experiments=500,
-)
 
-
-@pytest.fixture(scope="module")
-def measured():
-    return noise.measure(TINY)
+@pytest.fixture
+def measured(tiny):
+    return tiny("noise").measured
 
 
 # --- the study ----------------------------------------------------------------------------------------------------
@@ -111,33 +101,28 @@ def test_energy_integrating_rows_are_at_equal_dose(measured):
     assert eid["sd_hu"][0] < pcct["sd_hu"][0]
 
 
-def test_report_files(measured, tmp_path):
-    from recon.study.noise.report import build_report
-
-    build_report(measured).save(tmp_path)
-    data = json.loads((tmp_path / "report.json").read_text())
+def test_report(tiny, tmp_path):
+    sections = (
+        "## Which rankings are established", "## EID-CT at equal dose", "## Agreement", "## What was modelled",
+    )  # fmt: skip
+    data = assert_report_is_whole(tiny("noise"), tmp_path, {"noise_images.png", "noise_cnr.png"}, sections)
     assert len(data["doses"]["1x"]) == 4
     assert data["pairs"]["pairs"] == 6
     claims = {c["claim"]: c for c in data["claims"]}
     assert "soft, 0.25 mm has the highest CNR" in claims
     assert all(0 <= c["ten_run_share"] <= 1 for c in claims.values())
     assert sum(data["ten_run_experiments"]["winners"].values()) == pytest.approx(1.0)
-    text = (tmp_path / "report.md").read_text()
-    for title in (
-        "## Which rankings are established",
-        "## EID-CT at equal dose",
-        "## Agreement",
-        "## What was modelled",
-    ):
-        assert title in text
-    for name in ("noise_images.png", "noise_cnr.png"):
-        assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
+    means = tiny("noise").measured.means[2.0][:10, 1]  # of the first ten runs, bone at 0.25 mm
+    row = data["doses"]["5.7x"][1]["ten_runs"]
+    assert row["cnr"] == pytest.approx((means[:, 1] - means[:, 0]).mean() / np.hypot(*means.std(0, ddof=1)))
+    assert row["cnr_interval"][0] < row["cnr"] < row["cnr_interval"][1]
 
 
-def test_registry_settings():
-    settings = registry.build_settings("noise", quick=True, seed=7, changes=["realizations=12", "eid=False"])
-    assert (settings.realizations, settings.seed, settings.eid) == (12, 7, False)
+def test_settings():
+    settings = registry.build_settings("noise", quick=True, changes=["realizations=12", "eid=False"])
+    assert (settings.realizations, settings.eid) == (12, False)
     assert settings.table_exposure_s == 2.0
+    assert settings.axes[:3] == [("soft", 0.2), ("standard", 0.2), ("soft", 0.25)]
 
 
 @pytest.mark.parametrize(
@@ -145,7 +130,6 @@ def test_registry_settings():
     [
         ({"realizations": 9}, "realizations"),
         ({"views": 4}, "views"),
-        ({"seed": -1}, "seed"),
         ({"doses": {"1x": 1.0}}, "two exposures"),
         ({"kernels": ("soft",), "voxels_mm": (0.2,)}, "two settings"),
         ({"experiments": 1}, "experiments"),
@@ -154,7 +138,7 @@ def test_registry_settings():
 )
 def test_bad_settings(changes, match):
     with pytest.raises(ValueError, match=match):
-        noise.Settings(**changes)
+        Settings(**changes)
 
 
 # --- statistics ---------------------------------------------------------------------------------------------------

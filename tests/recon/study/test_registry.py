@@ -1,10 +1,12 @@
-"""Checks, effects and the study registry."""
+"""Checks, effects, and what the registry promises of every study; see also :mod:`tiny_studies`."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import FrozenInstanceError, fields
 
 import pytest
+from tiny_studies import TINY
 
 from recon.study import registry
 from recon.study.checks import Check, around, checks_section, effects_section
@@ -37,6 +39,51 @@ def test_effects_say_what_is_modelled():
     assert "less than 0.5 HU" in text
 
 
-def test_an_unknown_study_is_refused():
+COUNTS = {
+    "compare": "views", "dose-factor": "views", "detector": "photons", "bowtie": "views", "motion": "thinning",
+    "noise": "views", "resolution": "thinning", "spectral": "views",
+}  # fmt: skip
+"""Study → a field that counts something."""
+
+
+@pytest.mark.parametrize("name", registry.STUDIES)
+def test_settings_of_every_study(name):
+    """Valid as they are, as a first look and at the smallest scale; nonsense is refused by its name."""
+    full, quick = (registry.build_settings(name, quick=q, seed=3) for q in (False, True))
+    assert full != quick
+    kind = type(full)
+    assert kind(**TINY[name]) != quick
+    known = {f.name for f in fields(kind)}
+    assert set(TINY[name]) <= known
+    assert set(kind.QUICK) <= known
+    if "seed" in known:
+        assert full.seed == quick.seed == 3
+        with pytest.raises(ValueError, match="seed"):
+            registry.build_settings(name, seed=-1)
+        with pytest.raises(TypeError, match="seed"):
+            registry.build_settings(name, changes=["seed=two"])
+    with pytest.raises(ValueError, match=COUNTS[name]):
+        kind(**{COUNTS[name]: 0})
+    with pytest.raises(TypeError, match=COUNTS[name]):
+        kind(**{COUNTS[name]: 48.5})
+    with pytest.raises(ValueError, match="nonsense=1: give field=value"):
+        registry.build_settings(name, changes=["nonsense=1"])
+    with pytest.raises(FrozenInstanceError):
+        setattr(full, COUNTS[name], 9)
+    other = registry.build_settings("compare" if name != "compare" else "dose-factor")
+    with pytest.raises(TypeError, match="settings must be"):
+        registry.run(name, other)
+
+
+def test_changes_from_the_command_line():
+    settings = registry.build_settings("compare", quick=True, changes=["views=96", "kernels=['bone']", "pwls=False"])
+    assert (settings.views, settings.kernels, settings.pwls) == (96, ("bone",), False)
+    with pytest.raises(ValueError, match="give field=value"):
+        registry.build_settings("compare", changes=["views"])
+
+
+def test_names():
+    assert set(TINY) == set(COUNTS) == set(registry.STUDIES)
+    assert registry.part("dose", "measure") is registry.part("bowtie", "measure")  # its published name
     with pytest.raises(ValueError, match="unknown study 'x'"):
         registry.build_settings("x")

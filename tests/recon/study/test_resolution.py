@@ -3,24 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from plaque_image import tissue_volume
+from tiny_studies import assert_report_is_whole
 
-from recon.study import registry
-from recon.study.resolution.blur import (
-    FWHM_PER_SIGMA,
-    blur,
-    centers,
-    crossing,
-    measure,
-    point_width,
-    truth,
-)
-from recon.study.resolution.measure import Imaged, Measured, Settings
-from recon.study.resolution.report import build_report, limits
+from recon.study.paper.measures import Truth, measure_plaque
+from recon.study.resolution.blur import FWHM_PER_SIGMA, blur, blur_series, crossing, limits
+from recon.study.resolution.settings import Settings
+from recon.study.resolution.wire import point_width
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.resolution import ellipsoid_distance
 from torchpcct.metrics.roi import axial_grid
@@ -29,7 +22,8 @@ from torchpcct.scene.plaque import plaque_scene
 
 @pytest.fixture(scope="module")
 def plaque():
-    return plaque_scene()
+    scene, shape = plaque_scene()
+    return scene, shape, Truth.of(scene, shape)
 
 
 def test_blur_is_gaussian_and_keeps_the_mean():
@@ -67,34 +61,33 @@ def test_crossing():
 
 
 def test_where_the_plaque_is(plaque):
-    scene, shape = plaque
-    image = axial_grid(shape.position[::-1])
-    masks = truth(scene, image)
-    for name in ("lumen", "core"):
-        assert masks[name].sum() * 0.035**2 == pytest.approx(float(shape.area(name)), rel=0.01)
-    lumen, core = centers(shape)
-    for point, name in ((lumen, "lumen"), (core, "core")):
-        index = [round((p - a[0]) / 0.035) for p, a in zip(point, image.axes[1:], strict=True)]
-        assert masks[name][tuple(index)]
+    _, shape, truth = plaque
+    for point, name in zip(truth.line, ("lumen", "core"), strict=True):
+        mask = truth.masks[name]
+        assert mask.sum() * 0.035**2 == pytest.approx(float(shape.area(name)), rel=0.01)
+        index = [round((p - a[0]) / 0.035) for p, a in zip(point, truth.image.axes[1:], strict=True)]
+        assert mask[tuple(index)]
 
 
-def _ideal(plaque, sigma_px=6.0):
-    """The plaque's axial image with ideal edges, blurred by a system of 0.49 mm, its tissues at their target values."""
-    scene, shape = plaque
-    image = axial_grid(shape.position[::-1])
-    values = {"patient": -100.0, "wall": 60.0, "fibrous": 100.0, "lumen": 470.0, "core": 40.0}
-    labels = scene.labels(image)[0]
-    ideal = torch.zeros(labels.shape, dtype=torch.float64)
-    for name, value in values.items():
-        ideal[torch.from_numpy(labels == scene.index(name))] = value
-    return image, blur(ideal, sigma_px)
+def test_a_disc_is_found_where_it_is():
+    grid = axial_grid((0.0, 0.0, 0.0))
+    disc = ellipsoid_distance(grid.slice, (0.1, 0.2), (1.0, 1.0)) < 0
+    image = torch.from_numpy(np.where(disc, 500.0, -100.0))
+    found = measure_plaque(image, Truth(grid, {"lumen": disc, "core": disc}, ((0.1, 0.2), (0.1, 2.2))))
+    assert found.lumen_dice == 1.0
+    assert found.core_dice == 0.0
+    assert found.as_dict()["lumen_mm2"] == pytest.approx(math.pi, rel=0.01)
+
+
+def _ideal(plaque, sigma_px):
+    """The plaque's axial image with ideal edges, blurred by a system of ``sigma_px``."""
+    scene, _, truth = plaque
+    return blur(tissue_volume(scene, truth.image)[0], sigma_px)
 
 
 @pytest.fixture(scope="module")
 def series(plaque):
-    image, sharp = _ideal(plaque, 4.0)
-    masks, line = truth(plaque[0], image), centers(plaque[1])
-    return [measure(sharp, image, s, masks, line) for s in (0.0, 1.25, 2.5, 3.75, 5.0, 7.5, 10.0)]
+    return blur_series(_ideal(plaque, 4.0), plaque[2], (0.0, 1.25, 2.5, 3.75, 5.0, 7.5, 10.0))
 
 
 def test_blur_takes_cap_core_and_lumen(series):
@@ -109,59 +102,49 @@ def test_blur_takes_cap_core_and_lumen(series):
     assert depths[-1] < 1.0
     found = limits(series, 0.2)
     assert 1.25 < found["cap"] < 5.0
-    assert found["core_lost"] in {b.sigma_px for b in series}
+    assert found["core_lost"] in {b.sigma_px for b in series if not b.segmentation.core_found}
     assert found["basin"] < 7.5
+    assert limits(series[:1], 0.2)["core_lost"] is None
 
 
 def test_a_thicker_blur_before_is_a_thinner_blur_after(plaque, series):
     """Gaussians add in quadrature: the sharper system bears a wider blur before it shows the same."""
-    image, _ = _ideal(plaque)
-    masks, line = truth(plaque[0], image), centers(plaque[1])
-    direct = measure(_ideal(plaque, math.hypot(4.0, 5.0))[1], image, 0.0, masks, line)
+    direct = measure_plaque(_ideal(plaque, math.hypot(4.0, 5.0)), plaque[2])
     twice = next(b for b in series if b.sigma_px == 5.0)
     assert twice.cap_line == pytest.approx(direct.cap_line, abs=0.002)
     assert twice.segmentation.lumen_area == pytest.approx(direct.segmentation.lumen_area, rel=2e-3)
 
 
-def test_a_disc_is_found_where_it_is():
-    grid = axial_grid((0.0, 0.0, 0.0))
-    distance = ellipsoid_distance(grid.slice, (0.1, 0.2), (1.0, 1.0))
-    image = torch.from_numpy(np.where(distance < 0, 500.0, -100.0))
-    masks = {"lumen": distance < 0, "core": distance < 0}
-    found = measure(image, grid, 0.0, masks, ((0.1, 0.2), (0.1, 2.2)))
-    assert found.lumen_dice == 1.0
-    assert found.core_dice == 0.0
-    assert found.as_dict()["lumen_mm2"] == pytest.approx(math.pi, rel=0.01)
+def test_the_scanners(tiny):
+    """The EID-CT is the blunter one; the core's part of the contrast goes first, smoothing the PCCT takes it too."""
+    m = tiny("resolution").measured
+    pcct, eid = m.scanners["PCCT"], m.scanners["EID-CT"]
+    assert 0.2 < pcct.width.area < 0.5 * eid.width.area
+    rois = pcct.rois
+    assert rois.own_contrast_hu == pytest.approx(rois.contrast_hu - (rois.empty_hu[1] - rois.empty_hu[0]))
+    assert eid.rois.own_contrast_hu < 0.5 * rois.own_contrast_hu
+    # The same resolution is the same contrast, whichever scanner made it.
+    assert m.smoothed.own_contrast_hu == pytest.approx(eid.rois.own_contrast_hu, abs=0.1 * rois.own_contrast_hu)
+    assert m.smoothed.sd_hu < rois.sd_hu
+    assert eid.exposure_s == pytest.approx(m.settings.exposure_s * (541 / 626) ** 2)
+    assert [b.sigma_px for b in pcct.blurred] == list(m.settings.sigmas_px)
+    assert len(eid.blurred) == 1
 
 
-def test_report(plaque, series):
+def test_report(tiny, tmp_path):
     """Every row of the list is there; a core that is lost early names its cause."""
-    image, sharp = _ideal(plaque)
-    from recon.study.resolution.blur import SystemWidth
-
-    plan = {"effects": [{"name": "focal spot", "modelled": True, "cost_hu": 3.0, "note": ""}], "tolerance_hu": 0.5}
-    tall = torch.zeros(200, 256, dtype=torch.float64)
-    width = SystemWidth(0.3, 0.3, 0.3, -0.01)
-    pcct = Imaged(sharp, tall, (41.0, 92.0), (95.0, 96.0), 25.0, 2.0, width, list(series), plan)
-    eid = replace(pcct, roi_hu=(66.0, 76.0), blurred=[series[-1]])
-    settings = Settings(sigmas_px=tuple(b.sigma_px for b in series))
-    measured = Measured(
-        settings, plaque[1], image, {"PCCT": pcct, "EID-CT": eid}, {0.45: (0.22, list(series))},
-        {"lumen": 4.1, "core": 1.9},
-    )  # fmt: skip
-    report = build_report(measured)
-    names = [c["name"] for c in report.data["checks"]]
-    assert len(names) == 13
-    assert report.data["final_fwhm_mm"] == pytest.approx(math.hypot(0.3, report.data["margin_fwhm_mm"]))
-    assert set(report.figures) == {"resolution.png", "resolution_images.png"}
-    assert "## What was modelled" in report.text
-    assert pcct.own_contrast_hu == pytest.approx(50.0)
+    study = tiny("resolution")
+    sections = ("## The two scanners", "## PCCT under blur", "## Agreement with the paper", "## What was modelled")
+    data = assert_report_is_whole(study, tmp_path, {"resolution.png", "resolution_images.png"}, sections)
+    assert len(data["checks"]) == 13
+    assert all(c["note"] for c in data["checks"] if not c["ok"] and ("rim" in c["name"] or "CNR" in c["name"]))
+    width = data["scanners"]["PCCT"]["fwhm_mm"]["area"]
+    assert data["final_fwhm_mm"] == pytest.approx(math.hypot(width, data["margin_fwhm_mm"]))
+    assert data["scanners"]["EID-CT"]["smoothed"] is None
 
 
 def test_settings():
-    assert registry.build_settings("resolution", quick=True).thinning == 8
     for change, message in (
-        ({"thinning": 0}, "thinning"),
         ({"sigmas_px": (1.0, 2.0, 3.0)}, "rise from 0"),
         ({"sigmas_px": (0.0, 2.0, 1.0)}, "rise from 0"),
         ({"tolerance": 1.5}, "tolerance"),

@@ -1,44 +1,31 @@
 """The spectral study at small scale: its report, its checks, its tissue maps."""
 
-import json
+import copy
 import math
 
 import numpy as np
 import pytest
 import torch
+from tiny_studies import assert_report_is_whole
 
-from recon.study import registry
-from recon.study.spectral.measure import Settings, run
 from recon.study.spectral.report import checks_of
+from recon.study.spectral.settings import Settings
 from recon.study.spectral.tissues import BODIES, truth_labels
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scene.plaque import plaque_scene
-from torchpcct.spectral import MMD_TISSUES, dice, pe_pvc, vmi
-
-SMALL = Settings(views=60, voxel_mm=0.4, realizations=2, mbir_realizations=1, noise_levels=(0.0, 1.0), starved_rays=300)
+from torchpcct.spectral import MMD_TISSUES, pe_pvc, vmi
 
 
-@pytest.fixture(scope="module")
-def report(tmp_path_factory):
-    steps = []
-    report = run(SMALL, lambda step, fraction: steps.append((step, fraction)))
-    assert {s for s, f in steps if f == 1.0} >= {"simulate", "decompose noisy scans", "tissue maps", "joint MBIR"}
-    report.save(tmp_path_factory.mktemp("spectral"))
-    return report
+def test_report(tiny, tmp_path):
+    study = tiny("spectral")
+    sections = ("## Agreement with the paper", "## What was modelled", "## Environment", "seed 0", "## Tissue maps")
+    assert_report_is_whole(study, tmp_path, {"spectral.png", "tissues.png"}, sections)
+    done = {step for step, fraction in study.steps if fraction == 1.0}
+    assert done >= {"simulate", "decompose noisy scans", "tissue maps", "joint MBIR"}
 
 
-def test_report_stands_for_itself(report, tmp_path):
-    files = report.save(tmp_path)
-    assert {f.name for f in files} == {"report.json", "report.md", "spectral.png", "tissues.png"}
-    data = json.loads((tmp_path / "report.json").read_text())
-    assert data["settings"]["views"] == 60
-    text = (tmp_path / "report.md").read_text()
-    for part in ("Agreement with the paper", "What was modelled", "Environment", "seed 0", "Tissue maps"):
-        assert part in text
-
-
-def test_physics_that_holds_at_any_scale(report):
-    data = report.data
+def test_physics_that_holds_at_any_scale(tiny):
+    data = tiny("spectral").measured.data
     standard, low = data["rays"][0], data["rays"][-1]
     assert standard["whitened_ratio"] == pytest.approx(1.0, abs=0.02)
     assert low["whitened_ratio"] == pytest.approx(1.01, abs=0.03)
@@ -58,20 +45,20 @@ def test_physics_that_holds_at_any_scale(report):
     assert data["mbir"]["anisotropy"] < 0.05
 
 
-def test_mbir_is_less_noisy_than_fbp(report):
+def test_mbir_is_less_noisy_than_fbp(tiny):
     """The gantry turns 6° in each of so few views and smears the vessel: only the fat can be judged."""
-    noisy = report.data["mbir"]["at_best_energy"][-1]
+    data = tiny("spectral").measured.data
+    noisy = data["mbir"]["at_best_energy"][-1]
     assert noisy["noise"] == 1.0
     assert noisy["joint MBIR"]["fat_sd_hu"] < 0.9 * noisy["FBP"]["fat_sd_hu"]
-    clean = report.data["mbir"]["at_best_energy"][0]
+    clean = data["mbir"]["at_best_energy"][0]
     assert clean["joint MBIR"]["fat_sd_hu"] < 0.25 * noisy["joint MBIR"]["fat_sd_hu"]
     for method in ("FBP", "joint MBIR"):
-        assert report.data["dice"][method][0]["pericoronary_fat"]["mean"] > 0.9
+        assert data["dice"][method][0]["pericoronary_fat"]["mean"] > 0.9
 
 
-def test_checks_name_what_fails(report):
-    data = json.loads(json.dumps(report.data, default=float))
-    assert len(checks_of(data)) == len(report.data["checks"])
+def test_checks_name_what_fails(tiny):
+    data = copy.deepcopy(tiny("spectral").measured.data)
     data["water"] = {"cylinder": [0.0, -1.4]}
     data["rays"][0]["whitened_ratio"] = 1.2
     data["starved"]["not_finite"] = 1
@@ -89,8 +76,6 @@ def test_truth_is_the_tissue_that_fills_the_voxel():
     lumen = scene[BODIES["blood_iodine"]].shape
     assert area["blood_iodine"] == pytest.approx(math.pi * lumen.section(0.0)[1] ** 2, rel=0.05)
     assert 0 < float((labels < 0).float().mean()) < 0.1
-    exact = dice(labels, labels)
-    assert all(v == 1.0 for v in exact.values())
 
 
 def test_vmi_of_the_corners_is_the_tissue():
@@ -101,9 +86,9 @@ def test_vmi_of_the_corners_is_the_tissue():
     assert contrast.tolist() == pytest.approx([64, 60], abs=2)
 
 
-def test_settings():
-    assert Settings.quick(seed=3) == Settings(views=246, realizations=1, mbir_realizations=1, starved_rays=5000, seed=3)
-    for change, message in (
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
         ({"exposure_s": 0.0}, "exposure_s"),
         ({"realizations": 0}, "realizations"),
         ({"mbir_realizations": 9}, "mbir_realizations"),
@@ -111,11 +96,8 @@ def test_settings():
         ({"noise_levels": (0.0, 1.0, 0.5)}, "ascend from 0"),
         ({"views": 10}, "views"),
         ({"starved_rays": 1}, "starved_rays"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            Settings(**change)
-
-
-def test_registered():
-    settings = registry.build_settings("spectral", quick=True, changes=["realizations=2"])
-    assert settings.realizations == 2
+    ],
+)
+def test_bad_settings(change, match):
+    with pytest.raises(ValueError, match=match):
+        Settings(**change)

@@ -1,0 +1,51 @@
+"""What the comparison runs over."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+from recon.study.paper import facts as paper
+from recon.study.study import StudySettings
+
+__all__ = ["Settings"]
+
+
+@dataclass(frozen=True)
+class Settings(StudySettings):
+    """Settings of the comparison.
+
+    Args:
+        realizations: noise realisations per dose (paper: 10), at least 3 for an interval.
+        seed: first seed.
+        views: views per rotation. Fewer than the paper's keep the tube load of the whole scan.
+        kernels, voxels_mm, doses: the axes of the tables.
+        pwls: whether to run PWLS.
+        pwls_everywhere: PWLS at the tables' dose for all voxel sizes and at every dose for one; False: one of each.
+
+    Raises:
+        ValueError, TypeError: a count out of range, or none.
+    """
+
+    realizations: int = paper.REALIZATIONS
+    seed: int = 0
+    views: int = paper.FULL_VIEWS["PCCT"]
+    kernels: tuple[str, ...] = paper.KERNELS
+    voxels_mm: tuple[float, ...] = paper.VOXELS_MM
+    doses: dict[str, float] = field(default_factory=lambda: dict(paper.DOSES))
+    pwls: bool = True
+    pwls_everywhere: bool = True
+
+    # An eighth of the views, two kernels, two voxel sizes, two doses: under a minute.
+    QUICK: ClassVar[Mapping[str, Any]] = {
+        "realizations": 5,
+        "views": 246,
+        "kernels": ("soft", "standard"),
+        "voxels_mm": (0.25, 0.40),
+        "doses": {"1x": 0.35, "5.7x": 2.00},
+        "pwls_everywhere": False,
+    }
+
+    def __post_init__(self) -> None:
+        self.check_whole(realizations=3, seed=0, views=8)

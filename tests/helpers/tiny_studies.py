@@ -1,0 +1,82 @@
+"""Every study of the registry at its smallest scale, and what all of their reports must be."""
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from recon.study import registry
+from recon.study.report import Report
+
+TINY: dict[str, dict[str, Any]] = {
+    "compare": {
+        "realizations": 3, "views": 48, "kernels": ("soft",), "voxels_mm": (0.4,), "doses": {"1x": 0.35, "5.7x": 2.0},
+        "pwls": False,
+    },
+    "dose-factor": {
+        "n": 6, "slow_n": 3, "scene_n": 3, "doses": (2.0,), "scene_doses": (2.0,), "methods": ("linear",),
+        "scenes": ("half_size_core",), "scene_methods": ("linear",), "views": 48, "voxel_mm": 0.4, "kernels": ("soft",),
+        "voxels_mm": (0.25,), "blurs_mm": (0.4,), "block": 3,
+    },
+    "detector": {"photons": 4000, "dead_times_ns": (50.0,), "charge_sharing": (0.1,)},
+    "bowtie": {
+        "views": 96, "realizations": 2, "map_mm": 12.0, "histories": 20_000, "plaque_views": 40, "plaque_doses": (2.0,),
+        "plaque_realizations": 4,
+    },
+    "motion": {
+        "thinning": 24, "fractions": (0.2, 1.0), "eid_fractions": (0.2,), "errors": (0.2,), "voxel_mm": 0.4,
+        "realizations": 1, "exposure_s": 20.0, "methods": ("fbp", "pwls"),
+    },
+    "noise": {
+        "realizations": 24, "views": 48, "kernels": ("soft", "bone"), "voxels_mm": (0.25, 0.40),
+        "doses": {"1x": 0.35, "5.7x": 2.0}, "reconstructed": 2, "experiments": 500,
+    },
+    "resolution": {"thinning": 32, "sigmas_px": (0.0, 3.75, 10.0), "bulges_mm": ()},
+    "spectral": {
+        "views": 60, "voxel_mm": 0.4, "realizations": 2, "mbir_realizations": 1, "noise_levels": (0.0, 1.0),
+        "starved_rays": 300,
+    },
+}  # fmt: skip
+"""Study → settings."""
+
+
+@dataclass
+class TinyStudy:
+    """A study that ran: what it measured, its report, the folder of both, and the steps that it told."""
+
+    name: str
+    measured: Any
+    report: Report
+    folder: Path
+    steps: list[tuple[str, float]] = field(default_factory=list)
+
+
+def run_tiny(name: str, folder: Path) -> TinyStudy:
+    """Measure a study at its smallest scale."""
+    steps: list[tuple[str, float]] = []
+    settings = registry.part(name, "settings").Settings(**TINY[name])
+    measured = registry.part(name, "measure").measure(
+        settings, lambda step, fraction: steps.append((step, fraction)), folder
+    )
+    return TinyStudy(name, measured, registry.part(name, "report").build_report(measured), folder, steps)
+
+
+def assert_report_is_whole(tiny: TinyStudy, folder: Path, figures: set[str], sections: tuple[str, ...]) -> dict:
+    """The contract of every report; returns its JSON values as they were written.
+
+    Each study's own test file calls it once: so each study is measured once a session, by the process of that file.
+    """
+    files = tiny.report.save(folder / "new")
+    assert {f.name for f in files} == {"report.json", "report.md", *figures}
+    assert {f.name for f in (folder / "new").iterdir()} == {f.name for f in files}  # nothing half written is left
+    assert all((folder / "new" / name).read_bytes().startswith(b"\x89PNG") for name in figures)
+    data = json.loads((folder / "new" / "report.json").read_text(encoding="utf-8"))
+    assert {"settings", "seconds", "environment"} <= set(data)
+    assert data["settings"].items() >= json.loads(json.dumps(TINY[tiny.name])).items()
+    assert all({"name", "ours", "paper", "low", "high", "ok"} <= set(c) for c in data.get("checks", ()))
+    text = (folder / "new" / "report.md").read_text(encoding="utf-8")
+    for section in sections:
+        assert section in text
+    assert tiny.steps
+    assert all(0.0 <= fraction <= 1.0 for _, fraction in tiny.steps)
+    return data

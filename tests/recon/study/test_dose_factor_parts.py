@@ -1,0 +1,122 @@
+"""Parts of the dose-factor study that need no run of it: settings, methods, pieces on disk, grids, estimates."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from tiny_studies import TINY as SMALLEST
+
+from recon.mbir.mbir import average_onto
+from recon.study.dose_factor.estimates import controlled
+from recon.study.dose_factor.measures import crop_window
+from recon.study.dose_factor.methods import (
+    LinearFilter,
+    fingerprint,
+    load_methods,
+)
+from recon.study.dose_factor.other_rois import averaged_rois
+from recon.study.dose_factor.settings import METHODS, Settings
+from recon.study.dose_factor.store import Store
+from recon.study.dose_factor.tissue_values import tissue_groups
+from recon.study.dose_factor.variant import Variant
+from recon.study.paper.plaque_scan import inset_grid
+from torchpcct import VolumeGrid
+
+TINY = Settings(**SMALLEST["dose-factor"])
+
+
+def test_pieces_of_other_settings_or_cut_off_are_made_again(tmp_path, caplog):
+    store = Store(tmp_path)
+    assert store.piece("a/b", "one", lambda: {"x": np.arange(3)})["x"].tolist() == [0, 1, 2]
+    assert store.piece("a/b", "one", lambda: {"x": np.zeros(1)})["x"].tolist() == [0, 1, 2]
+    assert store.piece("a/b", "two", lambda: {"x": np.ones(1)})["x"].tolist() == [1]
+    path = store.path("a/b.npz")
+    path.write_bytes(path.read_bytes()[:100])
+    assert store.piece("a/b", "two", lambda: {"x": np.full(1, 7)})["x"].tolist() == [7]
+    assert "computed again" in caplog.text
+
+
+def test_method_registry(caplog):
+    assert [m.name for m in load_methods(["tv", "linear"])] == ["tv", "linear"]
+    assert fingerprint(LinearFilter()) != fingerprint(LinearFilter(mu=0.7))
+    one, two = load_methods(["mbir_one_pass", "mbir"])
+    assert fingerprint(one) != fingerprint(two)
+    with pytest.raises(ValueError, match="unknown method 'magic'"):
+        load_methods(["magic"])
+
+
+def test_control_variates():
+    rng = np.random.default_rng(3)
+    noise = rng.standard_normal((200, 2))
+    values = np.array([5.0, -2.0]) + noise @ np.array([[2.0, 0.3], [0.1, 1.0]]) + 0.1 * rng.standard_normal((200, 2))
+    found = controlled(values, 7.0 + 3.0 * noise, [7.0, 7.0])
+    np.testing.assert_allclose(found.mean(0), [5.0, -2.0], atol=4 * 0.1 / math.sqrt(200))
+    assert found.std(0).max() < 0.15 < 5 * 0.15 < values.std(0).min()
+    # Noise that has nothing to do with the control stays.
+    free = rng.standard_normal((200, 2))
+    np.testing.assert_allclose(controlled(free, noise, [0.0, 0.0]).mean(0), free.mean(0), atol=0.03)
+
+
+def test_missing_weights_leave_mbir_out(monkeypatch, caplog):
+    import recon.mbir.mbir
+
+    def missing(**options):
+        raise FileNotFoundError("no weights at nowhere")
+
+    monkeypatch.setattr(recon.mbir.mbir.Mbir, "load", missing)
+    assert [m.name for m in load_methods(METHODS)] == [m for m in METHODS if "mbir" not in m and m != "fbp_cnn"]
+    assert "mbir is left out" in caplog.text
+    with pytest.raises(ValueError, match="no method to run"):
+        load_methods(["mbir"])
+
+
+def test_rois_on_larger_voxels_are_those_of_the_averaged_volume():
+    variant = Variant("paper", replace(TINY, voxel_mm=0.2))
+    coarse = inset_grid(variant.plaque, 0.35)
+    volume = torch.randn(variant.grid.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    place = crop_window(variant.grid, variant.core_center)[0]
+    expected = [float(r(average_onto(volume, variant.grid, coarse))) for r in variant.rois.on(coarse)]
+    np.testing.assert_allclose(averaged_rois(variant, 0.35).means(volume[place].numpy(), 0.2), expected, rtol=1e-9)
+
+
+def test_pitch_of_the_scene():
+    fine, paper = (Variant(name, TINY).scanner.geometry for name in ("pitch_0.30mm:absent", "paper"))
+    assert (fine.pitch[1], paper.pitch[1]) == (0.30, 0.35)
+    assert (fine.pitch[0], fine.views, fine.sod) == (paper.pitch[0], paper.views, paper.sod)
+    bodies = [Variant(name, TINY).scene.bodies for name in ("pitch_0.30mm:absent", "absent_core")]
+    assert [b.name for b in bodies[0]] == [b.name for b in bodies[1]]
+
+
+def test_tissue_groups_and_crop():
+    names = ["patient", "wall", "fibrous", "lumen", "core", "stent_0", "stent_0_blood", "fibrous_texture_3"]
+    groups = tissue_groups(names)
+    assert groups["lumen"] == ["lumen", "stent_0_blood"]
+    assert groups["fibrous"] == ["fibrous", "fibrous_texture_3"]
+    assert groups["stent"] == ["stent_0"]
+    grid = VolumeGrid((30, 24, 24), 0.4, (0.0, 5.0, -5.0))
+    place, crop = crop_window(grid, (0.1, 5.0, -5.3))
+    for axis, part, own in zip(grid.axes, place, crop.axes, strict=True):
+        np.testing.assert_allclose(axis[part], own)
+    with pytest.raises(ValueError, match="leaves the inset"):
+        crop_window(grid, (5.9, 5.0, -5.0))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"n": 2}, "n must be at least 3"),
+        ({"doses": ()}, "doses is empty"),
+        ({"doses": (0.0,)}, "doses must be different exposures"),
+        ({"methods": ("magic",)}, "'magic' of methods"),
+        ({"scenes": ("nowhere",)}, "'nowhere' of scenes"),
+        ({"kernels": ("bone",)}, "FBP soft"),
+        ({"rois": ("vessel",)}, "'vessel' of rois"),
+    ],
+)
+def test_bad_settings(changes, message):
+    with pytest.raises(ValueError, match=message):
+        Settings(**changes)
+    with pytest.raises(TypeError, match="n must be a whole number"):
+        Settings(n=7.5)
