@@ -10,6 +10,7 @@ import shlex
 import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ import torch
 
 from recon.api import reconstruct
 from recon.study import registry
+from recon.study.study import ProgressBars
 from torchpcct import VolumeGrid, __version__
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.files import require_folder, written_whole
@@ -29,40 +31,16 @@ from torchpcct.volume import check_volume_name
 __all__ = ["main"]
 
 
-class _Progress:
-    """A progress bar per step on the terminal's error stream; silent when it is not a terminal or not wanted."""
-
-    def __init__(self, enabled: bool) -> None:
-        self.enabled = enabled
-        self.step: str | None = None
-        self.bar: Any = None
-
-    def __call__(self, step: str, fraction: float) -> None:
-        if not self.enabled:
-            return
-        from tqdm import tqdm  # only a terminal needs it
-
-        if step != self.step:
-            self.close()
-            self.step = step
-            form = "{desc:<28} {bar:30} {percentage:3.0f}% {elapsed}<{remaining}"
-            self.bar = tqdm(total=100, desc=step, unit="%", leave=True, bar_format=form)
-        self.bar.update(100 * fraction - self.bar.n)
-
-    def of(self, step: str) -> Callable[[float], None]:
-        return lambda fraction: self(step, fraction)
-
-    def close(self) -> None:
-        if self.bar is not None:
-            self.bar.close()
-            self.bar = None
-
-
 # --- commands -----------------------------------------------------------------------------------------------------
 
 
-def _run_study(name: str, settings: Any, arguments: argparse.Namespace, progress: _Progress) -> None:
+def _run_study(name: str, settings: Any, arguments: argparse.Namespace, progress: ProgressBars) -> None:
     """Run a study of the registry, save and print its report."""
+    minutes = {part: seconds / 60 for part, seconds in settings.estimated_seconds().items()}
+    if minutes:
+        listed = ", ".join(f"{part} {value:.1f}" for part, value in minutes.items())
+        total = f"about {sum(minutes.values()):.0f} min on two idle cores if nothing is finished yet"
+        print(f"{total} ({listed})", file=sys.stderr)
     folder = arguments.out or Path("out") / name
     start = time.perf_counter()
     report = registry.run(name, settings, progress, folder)
@@ -74,37 +52,22 @@ def _run_study(name: str, settings: Any, arguments: argparse.Namespace, progress
     print(f"\n{time.perf_counter() - start:.0f} s in all. Written: {', '.join(map(str, files))}")
 
 
-def _study(arguments: argparse.Namespace, progress: _Progress) -> None:
-    settings = registry.build_settings(
-        arguments.name, quick=arguments.quick, seed=arguments.seed, changes=arguments.changes
-    )
-    _run_study(arguments.name, settings, arguments, progress)
+def _study(arguments: argparse.Namespace, progress: ProgressBars) -> None:
+    name, changes = arguments.name, arguments.changes
+    settings = registry.build_settings(name, quick=arguments.quick, seed=arguments.seed, changes=changes)
+    _run_study(name, settings, arguments, progress)
 
 
-def _own_settings(arguments: argparse.Namespace, fields: Sequence[str], **changes: Any) -> Any:
-    """Settings of a study that is a command of its own: the options of its ``fields`` that were given."""
-    given = {name: getattr(arguments, name) for name in fields if getattr(arguments, name) is not None}
-    changes.update({name: tuple(v) if isinstance(v, list) else v for name, v in given.items()})
+def _own_study(arguments: argparse.Namespace, progress: ProgressBars) -> None:
+    """A study that is a command of its own, with options named like its settings."""
     kind = registry.part(arguments.command, "settings").Settings
-    return kind.quick(**changes) if arguments.quick else kind(**changes)
+    given = {f.name: getattr(arguments, f.name, None) for f in fields(kind)}
+    changes = {name: tuple(v) if isinstance(v, list) else v for name, v in given.items() if v is not None}
+    settings = kind.quick(**changes) if arguments.quick else kind(**changes)
+    _run_study(arguments.command, settings, arguments, progress)
 
 
-def _compare(arguments: argparse.Namespace, progress: _Progress) -> None:
-    settings = _own_settings(arguments, ("seed", "realizations"), pwls=not arguments.no_pwls)
-    _run_study("compare", settings, arguments, progress)
-
-
-def _dose_factor(arguments: argparse.Namespace, progress: _Progress) -> None:
-    fields = ("seed", "n", "slow_n", "scene_n", "doses", "scene_doses", "methods", "scenes", "scene_methods")
-    settings = _own_settings(arguments, fields, **({"fast_noise": True} if arguments.fast_noise else {}))
-    parts = settings.estimated_seconds()
-    listed = ", ".join(f"{name} {seconds / 60:.1f}" for name, seconds in parts.items())
-    minutes = f"about {sum(parts.values()) / 60:.0f} min on two idle cores if nothing is finished yet"
-    print(f"{minutes} ({listed})", file=sys.stderr)
-    _run_study("dose-factor", settings, arguments, progress)
-
-
-def _simulate(arguments: argparse.Namespace, progress: _Progress) -> None:
+def _simulate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     require_folder(arguments.out)
     from recon.study.paper.plaque_scan import inset_grid  # loads scipy.stats, which takes long
 
@@ -129,7 +92,7 @@ def _simulate(arguments: argparse.Namespace, progress: _Progress) -> None:
     )
 
 
-def _reconstruct(arguments: argparse.Namespace, progress: _Progress) -> None:
+def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     require_folder(arguments.out)
     check_volume_name(arguments.out)
     voxel = number("--voxel", arguments.voxel, positive=True, unit="mm")
@@ -184,19 +147,19 @@ def _command(
 
 def _add_compare(commands: _Commands) -> None:
     parser = _command(
-        commands, "compare", _compare, registry.STUDIES["compare"],
+        commands, "compare", _own_study, registry.STUDIES["compare"],
         "Simulate the paper's plaque scan at full size, reconstruct it by FBP (kernels × voxel sizes) and "
         "PWLS at 1×, 2×, 5.7× and 8× dose, and print the paper's tables with 95 %% intervals beside its numbers.",
         "folder for report.json, report.md and compare.png (default out/compare)",
     )  # fmt: skip
     parser.add_argument("--realizations", type=int, metavar="N", help="per dose (default 10)")
     parser.add_argument("--quick", action="store_true", help="reduced views and settings: a first look, < 60 s")
-    parser.add_argument("--no-pwls", action="store_true", help="FBP only")
+    parser.add_argument("--no-pwls", dest="pwls", action="store_const", const=False, help="FBP only")
 
 
 def _add_dose_factor(commands: _Commands) -> None:
     parser = _command(
-        commands, "dose-factor", _dose_factor, registry.STUDIES["dose-factor"],
+        commands, "dose-factor", _own_study, registry.STUDIES["dose-factor"],
         "Reconstruct the same noise realisations of the paper's scan by every method and measure the dose "
         "at which FBP reaches the same figure: the paper's CNR, slope-corrected contrast variance, observer. Finished "
         "pieces in the folder are kept: after an interruption the same command goes on.",
@@ -210,7 +173,9 @@ def _add_dose_factor(commands: _Commands) -> None:
     parser.add_argument("--methods", nargs="+", metavar="M", help="linear quadratic qggmrf tv mbir_one_pass mbir")
     parser.add_argument("--scenes", nargs="*", metavar="NAME", help="further scenes (none: leave out)")
     parser.add_argument("--scene-methods", nargs="+", metavar="M", help="methods of further scenes")
-    parser.add_argument("--fast-noise", action="store_true", help="draw the noise of AᵀW y, not that of the readings")
+    parser.add_argument(
+        "--fast-noise", action="store_const", const=True, help="draw the noise of AᵀW y, not that of the readings"
+    )
     parser.add_argument("--quick", action="store_true", help="8 realisations, one dose, 246 views: about 90 s")
 
 
@@ -283,7 +248,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     logging.basicConfig(
         level=logging.INFO if options.verbose else logging.WARNING, format="%(levelname)s %(name)s: %(message)s"
     )
-    progress = _Progress(not options.no_progress and sys.stderr.isatty())
+    progress = ProgressBars(not options.no_progress and sys.stderr.isatty())
     try:
         if options.device == "cuda" and not torch.cuda.is_available():
             raise ValueError("--device cuda: PyTorch finds no CUDA device here; use --device cpu")

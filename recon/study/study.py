@@ -24,11 +24,16 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, ClassVar, Self
 
+import numba
 import numpy as np
+import scipy
+import torch
+from tqdm import tqdm
 
+import torchpcct
 from torchpcct.validate import whole
 
-__all__ = ["Clock", "Progress", "StudySettings", "environment", "silent", "time_line"]
+__all__ = ["Clock", "Progress", "ProgressBars", "StudySettings", "environment", "silent", "time_line"]
 
 Progress = Callable[[str, float], None]
 """Called with the name of a step and its finished fraction, 0…1."""
@@ -36,6 +41,39 @@ Progress = Callable[[str, float], None]
 
 def silent(step: str, fraction: float) -> None:
     """The progress of whom nobody watches."""
+
+
+class ProgressBars:
+    """Progress on the terminal's error stream, a bar per step.
+
+    Args:
+        enabled: False: nothing is shown.
+    """
+
+    def __init__(self, enabled: bool) -> None:
+        self.enabled = enabled
+        self._step: str | None = None
+        self._bar: Any = None
+
+    def __call__(self, step: str, fraction: float) -> None:
+        if not self.enabled:
+            return
+        if step != self._step:
+            self.close()
+            self._step = step
+            form = "{desc:<28} {bar:30} {percentage:3.0f}% {elapsed}<{remaining}"
+            self._bar = tqdm(total=100, desc=step, unit="%", leave=True, bar_format=form)
+        self._bar.update(100 * fraction - self._bar.n)
+
+    def of(self, step: str) -> Callable[[float], None]:
+        """The progress of one step."""
+        return lambda fraction: self(step, fraction)
+
+    def close(self) -> None:
+        """End the bar of the last step."""
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None
 
 
 class StudySettings:
@@ -51,6 +89,10 @@ class StudySettings:
     def quick(cls, **changes: Any) -> Self:
         """Settings of a first look in under a minute, with ``changes`` on top."""
         return cls(**{**cls.QUICK, **changes})
+
+    def estimated_seconds(self) -> dict[str, float]:
+        """Rough time of each part in s on two idle cores, nothing finished yet; empty: not known."""
+        return {}
 
     def check_whole(self, **least: int) -> None:
         """Check fields that count something: field → the least value.
@@ -90,12 +132,6 @@ class Clock:
 
 def environment() -> dict[str, Any]:
     """Versions and machine that made a result."""
-    import numba
-    import scipy
-    import torch
-
-    import torchpcct
-
     return {
         "torchpcct": torchpcct.__version__,
         "python": platform.python_version(),

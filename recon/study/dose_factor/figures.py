@@ -7,12 +7,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from recon.study.dose_factor.facts import fbp_label
 from recon.study.dose_factor.measure import Measured
-from recon.study.dose_factor.methods import METHOD_NAMES
-from recon.study.dose_factor.scene import StudyScene
-from recon.study.dose_factor.settings import FBP_BASE
-from recon.study.paper.plaque_scan import inset_grid
+from recon.study.dose_factor.settings import FBP_BASE, METHOD_NAMES, fbp_label
+from recon.study.dose_factor.variant import Variant
+from recon.study.figures import extent, roi_outlines
+from recon.study.paper.facts import ASSUMED_FACTOR
 from torchpcct.metrics.dose_curve import DOSES
 from torchpcct.metrics.roi import sample_axial
 from torchpcct.viz import Panel, panels
@@ -24,7 +23,6 @@ _COLORS = {
     "fbp_cnn": "tab:pink", "mbir_one_pass": "tab:orange", "mbir": "tab:red",
 }  # fmt: skip
 """What is drawn; methods that are told a wrong noise are not."""
-_ASSUMED = 5.7
 
 
 def curves_figure(data: dict[str, Any]) -> Any:
@@ -94,7 +92,7 @@ def _draw(ax: Any, data: dict[str, Any], limit: dict[str, Any], key: str, value:
     ax.plot([1.0, reach], [top, top], color="black", linewidth=1.6, label="limit of the data")
     ax.plot([1.0], [top], "k*", markersize=8)
     ax.axhspan(top, 10.0 * top if rising else 0.1 * top, color="black", alpha=0.06)
-    ax.axvline(_ASSUMED, color="tab:blue", linewidth=0.8, linestyle=":", label="assumed, 5.7×")
+    ax.axvline(ASSUMED_FACTOR, color="tab:blue", linewidth=0.8, linestyle=":", label=f"assumed, {ASSUMED_FACTOR}×")
     ax.set_xscale("log", base=2)
     ax.set_yscale("log")
     ax.set_xticks(relative, [f"{d:g}" for d in relative], fontsize=7)
@@ -110,24 +108,22 @@ def images_figure(measured: Measured, data: dict[str, Any]) -> Any:
     """One realisation with and without the core: FBP, the methods, the truth. C150 / W600."""
     s = measured.settings
     dose = s.doses[-1]
-    scene = StudyScene("paper", s, None)  # type: ignore[arg-type]
-    image = scene.rois.image
-    half_y, half_x = image.extent[1] / 2, image.extent[2] / 2
-    extent = (-half_x, half_x, -half_y, half_y)
+    variant = Variant("paper", s)
+    image = variant.rois.image
     columns: list[tuple[str, Any]] = [("fbp", f"FBP {fbp_label(*FBP_BASE)}")]
     columns += [(m, METHOD_NAMES[m]) for m in measured.methods if m in _COLORS]
     rows: list[list[Panel]] = []
-    outlines = ((scene.rois.foreground[0], "deepskyblue"), (scene.rois.background[0], "tomato"))
     for name in ("paper", "absent_core"):
         row = []
         for method, title in columns:
             volume = measured.volumes.get((method, name, dose))
             if volume is None:
                 continue
-            grid = inset_grid(scene.plaque, FBP_BASE[1] if method == "fbp" else s.voxel_mm)
+            grid = variant.grid_of(FBP_BASE[1] if method == "fbp" else s.voxel_mm)
             section = sample_axial(torch.from_numpy(volume.astype(np.float32)), grid, image)[0]
-            row.append(Panel(section, extent, title if not rows else ""))
-        row.append(Panel(_true_image(measured, name, image), extent, "truth" if not rows else "", outlines))
+            row.append(Panel(section, extent(image), title if not rows else ""))
+        title = "truth" if not rows else ""
+        row.append(Panel(_true_image(measured, name, image), extent(image), title, roi_outlines(variant.rois)))
         rows.append(row)
     footer = "C150 / W600 HU. ROI outlines: necrotic core (blue), fibrous tissue (red)."
     return panels(rows, ("core", "no core"), f"First realisation at {dose:g} s, axial", footer)
@@ -135,7 +131,7 @@ def images_figure(measured: Measured, data: dict[str, Any]) -> Any:
 
 def _true_image(measured: Measured, name: str, image: Any) -> Any:
     facts = measured.facts[name]
-    scene = StudyScene(name, measured.settings, None).scene  # type: ignore[arg-type]
+    scene = Variant(name, measured.settings).scene
     values = np.full(len(scene) + 1, -1000.0)
     for k, body in enumerate(scene.bodies):
         values[k] = facts.amplitudes_hu[facts.tissue(body.name)]

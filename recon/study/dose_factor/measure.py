@@ -8,15 +8,17 @@ Stages, each of them a set of files that are written whole and reused:
 (:mod:`recon.study.dose_factor.realisations`);
 3. methods: ROI means, a crop about the core and segmentation figures of every reconstruction.
 
-Realisation k uses the noise seed ``seed + k`` in every scene, at every dose and for every method. The scenes with half
-and with flipped contrast carry the noise of the paper's scene (the counts behind the core differ by less than 1 %).
+The scenes with half and with flipped contrast carry the noise of the paper's scene (the counts behind the core
+differ by less than 1 %).
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -26,12 +28,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.study.dose_factor.facts import SceneFacts
 from recon.study.dose_factor.measures import crop_window, segmentation
-from recon.study.dose_factor.methods import IMAGE_METHODS, Method, fingerprint, load_methods
+from recon.study.dose_factor.methods import Method, fingerprint, load_methods
 from recon.study.dose_factor.realisations import Realisations, joined
-from recon.study.dose_factor.scene import StudyScene
-from recon.study.dose_factor.settings import MAIN_SCENES, NOISY_SCENES, Settings, with_twin
+from recon.study.dose_factor.scene import SceneFacts, StudyScene
+from recon.study.dose_factor.settings import IMAGE_METHODS, MAIN_SCENES, NOISY_SCENES, Settings, with_twin
 from recon.study.dose_factor.shape_limit import shape_limits
 from recon.study.dose_factor.stability import worst_case_gains
 from recon.study.dose_factor.store import Store
@@ -65,17 +66,17 @@ class Measured:
 
     settings: Settings
     methods: dict[str, str]
-    facts: dict[str, SceneFacts]
-    scenes: tuple[str, ...]
-    left_out: dict[str, str]
-    fbp: dict[tuple[str, float], dict[str, Any]]
-    samples: dict[tuple[str, str, float], dict[str, Any]]
-    extra: dict[tuple[str, str, float], dict[str, Any]]
-    volumes: dict[tuple[str, str, float], Any]
-    wide: dict[str, Any]
-    gains: dict[float, dict[str, float]]
-    shape_limits: dict[float, dict[float, float]]
-    seconds: dict[str, float]
+    facts: dict[str, SceneFacts] = field(default_factory=dict)
+    scenes: tuple[str, ...] = ()
+    left_out: dict[str, str] = field(default_factory=dict)
+    fbp: dict[tuple[str, float], dict[str, Any]] = field(default_factory=dict)
+    samples: dict[tuple[str, str, float], dict[str, Any]] = field(default_factory=dict)
+    extra: dict[tuple[str, str, float], dict[str, Any]] = field(default_factory=dict)
+    volumes: dict[tuple[str, str, float], Any] = field(default_factory=dict)
+    wide: dict[str, Any] = field(default_factory=dict)
+    gains: dict[float, dict[str, float]] = field(default_factory=dict)
+    shape_limits: dict[float, dict[float, float]] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
     total_seconds: float = 0.0
 
 
@@ -95,113 +96,104 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
         with TemporaryDirectory() as kept:
             return measure(settings, progress, kept)
     clock = Clock()
-    measured = _Study(settings, Store(Path(folder)), progress).run()
+    study = _Study(settings, Store(Path(folder)), progress)
+    study.run()
     clock.lap("all")
-    measured.total_seconds = clock.seconds["all"]
-    return measured
+    study.m.total_seconds = clock.seconds["all"]
+    return study.m
 
 
 class _Study:
+    """A measurement under way: the methods, the scenes that are open, and what has been measured."""
+
     def __init__(self, settings: Settings, store: Store, progress: Progress) -> None:
         self.settings, self.store, self.report = settings, store, progress
         self.methods = load_methods(settings.methods)
-        self.seconds: dict[str, float] = {}
+        self.m = Measured(settings, {m.name: fingerprint(m) for m in self.methods})
         self._scenes: dict[str, StudyScene] = {}
         self.noise = Realisations(settings, store, self.scene)
 
     def scene(self, name: str) -> StudyScene:
         """A scene with its scan; problems (Gram operators) are shared where grid, window and surround agree."""
         if name not in self._scenes:
-            scene = StudyScene(name, self.settings, self.store)
-            scene.peers = self._scenes
-            self._scenes[name] = scene
+            self._scenes[name] = StudyScene(name, self.settings, self.store, self._scenes)
         return self._scenes[name]
 
-    def run(self) -> Measured:
-        s = self.settings
-        facts, left_out = self._facts()
-        fbp = {} if s.fast_noise else self._data()
-        samples, volumes = self._main()
-        extra = self._extra()
-        wide = self.scene("paper").wide_covariance() if s.rois else {}
-        for (name, dose), entry in fbp.items():
-            volumes["fbp", name, dose] = entry.pop("first")
+    def run(self) -> None:
+        """All stages."""
+        s, m = self.settings, self.m
+        self._facts()
         if s.fast_noise:
             for name in NOISY_SCENES:
-                volumes["fbp", name, s.doses[-1]] = self.noise.picture(name, s.doses[-1])
-        return Measured(
-            settings=s,
-            methods={m.name: fingerprint(m) for m in self.methods},
-            facts=facts,
-            scenes=self.scenes,
-            left_out=left_out,
-            fbp=fbp,
-            samples=samples,
-            extra=extra,
-            volumes=volumes,
-            wide=wide,
-            gains=self._bounds(worst_case_gains, self.methods),
-            shape_limits=self._bounds(shape_limits),
-            seconds=self.seconds,
-        )
+                m.volumes["fbp", name, s.doses[-1]] = self.noise.picture(name, s.doses[-1])
+        else:
+            self._data()
+        for method in self.methods:
+            self._main(method)
+        self._extra()
+        m.wide = self.scene("paper").wide_covariance() if s.rois else {}
+        m.gains = self._bounds(worst_case_gains, self.methods)
+        m.shape_limits = self._bounds(shape_limits)
 
-    def _facts(self) -> tuple[dict[str, SceneFacts], dict[str, str]]:
+    def _facts(self) -> None:
         """What holds of every scene; further scenes that cannot be simulated are left out, with the reason."""
         names = [*MAIN_SCENES, *(n for name in self.settings.scenes for n in with_twin(name))]
-        facts: dict[str, SceneFacts] = {}
-        left_out: dict[str, str] = {}
         for k, name in enumerate(names):
             self.report("scenes", k / len(names))
             try:
-                facts[name] = self.scene(name).facts()
+                self.m.facts[name] = self.scene(name).facts
             except ValueError as error:
                 if name in MAIN_SCENES:
                     raise
                 log.warning("the scene %s is left out: %s", name, error)
-                left_out[name.partition(":")[0]] = str(error)
+                self.m.left_out[name.partition(":")[0]] = str(error)
             if name not in NOISY_SCENES:
                 self.scene(name).release()
         self.report("scenes", 1.0)
-        self.scenes = tuple(n for n in self.settings.scenes if n not in left_out)
-        return facts, left_out
+        self.m.scenes = tuple(n for n in self.settings.scenes if n not in self.m.left_out)
 
-    def _data(self) -> dict[tuple[str, float], dict[str, Any]]:
-        s = self.settings
-        jobs = [(name, dose, block) for name in NOISY_SCENES for dose in s.doses for block in s.blocks(s.n)]
-        collected: dict[tuple[str, float], list[Any]] = {}
-        for done, (name, dose, block) in enumerate(jobs):
-            self.report("noise realisations, FBP", done / len(jobs))
-            piece = self.noise.data(name, dose, block)
-            collected.setdefault((name, dose), []).append({k: piece[k] for k in ("roi", "crop", "first") if k in piece})
-        self.report("noise realisations, FBP", 1.0)
-        found = {key: joined(pieces) for key, pieces in collected.items()}
+    def _collected(self, step: str, jobs: Sequence[tuple[Any, Callable[[], dict[str, Any]]]]) -> dict[Any, list[Any]]:
+        """The pieces of ``jobs``, each a key and what gives a piece: key → pieces."""
+        found: dict[Any, list[Any]] = {}
+        for done, (key, piece) in enumerate(jobs):
+            self.report(step, done / len(jobs))
+            found.setdefault(key, []).append(piece())
+        if jobs:
+            self.report(step, 1.0)
+        return found
+
+    def _data(self) -> None:
+        s, m = self.settings, self.m
+
+        def without_b(name: str, dose: float, block: range) -> dict[str, Any]:
+            return {k: v for k, v in self.noise.data(name, dose, block).items() if k != "b"}
+
+        jobs = [
+            ((name, dose), partial(without_b, name, dose, block))
+            for name in NOISY_SCENES for dose in s.doses for block in s.blocks(s.n)
+        ]  # fmt: skip
+        for (name, dose), pieces in self._collected("noise realisations, FBP", jobs).items():
+            m.fbp[name, dose] = joined(pieces)
+            m.volumes["fbp", name, dose] = m.fbp[name, dose].pop("first")
         for dose in s.doses:
             pieces = [self.noise.images("paper", dose, block) for block in s.blocks(min(s.n, s.slow_n))]
-            found["paper", dose]["shape"] = np.concatenate([p["shape"] for p in pieces])
-        return found
+            m.fbp["paper", dose]["shape"] = np.concatenate([p["shape"] for p in pieces])
 
     # -- methods --------------------------------------------------------------------------------------------------
 
-    def _main(self) -> tuple[dict[Any, Any], dict[Any, Any]]:
-        s = self.settings
-        samples: dict[Any, Any] = {}
-        volumes: dict[Any, Any] = {}
-        for method in self.methods:
-            n = s.realizations(method.name)
-            jobs = [(name, dose, block) for dose in s.doses for block in s.blocks(n) for name in MAIN_SCENES]
-            collected: dict[Any, list[Any]] = {}
-            for done, (name, dose, block) in enumerate(jobs):
-                self.report(method.name, done / len(jobs))
-                piece = self._method_piece(method, name, dose, block)
-                collected.setdefault((method.name, name, dose), []).append(piece)
-            self.report(method.name, 1.0)
-            for key, pieces in collected.items():
-                entry = joined(pieces)
-                volumes[key] = entry.pop("first")
-                samples[key] = entry
-            spent = [p["seconds"] for pieces in collected.values() for p in pieces]
-            self.seconds[method.name] = float(np.sum(spent)) / (len(MAIN_SCENES) * n * len(s.doses))
-        return samples, volumes
+    def _main(self, method: Method) -> None:
+        s, m = self.settings, self.m
+        n = s.realizations(method.name)
+        jobs = [
+            ((method.name, name, dose), partial(self._method_piece, method, name, dose, block))
+            for dose in s.doses for block in s.blocks(n) for name in MAIN_SCENES
+        ]  # fmt: skip
+        spent = 0.0
+        for key, pieces in self._collected(method.name, jobs).items():
+            m.samples[key] = joined(pieces)
+            m.volumes[key] = m.samples[key].pop("first")
+            spent += sum(float(p["seconds"]) for p in pieces)
+        m.seconds[method.name] = spent / (len(MAIN_SCENES) * n * len(s.doses))
 
     def _method_piece(self, method: Method, name: str, dose: float, block: range) -> dict[str, Any]:
         scene = self.scene(name)
@@ -224,21 +216,14 @@ class _Study:
         place = f"methods/{method.name}/{name}_{dose:g}s_{block.start}-{block.stop}"
         return self.store.piece(place, f"{self.noise.key} {fingerprint(method)} 2", compute)
 
-    def _extra(self) -> dict[Any, Any]:
+    def _extra(self) -> None:
         s = self.settings
         methods = [m for m in self.methods if m.name in s.scene_methods and m.name not in IMAGE_METHODS]
         jobs = [
-            (method, name, dose, block)
-            for name in self.scenes for dose in s.scene_doses for block in s.blocks(s.scene_n) for method in methods
+            ((method.name, name, dose), partial(self._extra_piece, method, name, dose, block))
+            for name in self.m.scenes for dose in s.scene_doses for block in s.blocks(s.scene_n) for method in methods
         ]  # fmt: skip
-        collected: dict[Any, list[Any]] = {}
-        for done, (method, name, dose, block) in enumerate(jobs):
-            self.report("further scenes", done / len(jobs))
-            piece = self._extra_piece(method, name, dose, block)
-            collected.setdefault((method.name, name, dose), []).append(piece)
-        if jobs:
-            self.report("further scenes", 1.0)
-        return {key: joined(pieces) for key, pieces in collected.items()}
+        self.m.extra = {key: joined(pieces) for key, pieces in self._collected("further scenes", jobs).items()}
 
     def _extra_piece(self, method: Method, name: str, dose: float, block: range) -> dict[str, Any]:
         """ROI means with the scene's core and, on the same noise, with fibrous tissue in its place."""
@@ -251,7 +236,7 @@ class _Study:
             for label, other in (("roi", name), ("absent", f"{name}:absent")):
                 if name == "core_for_fibrous" and label == "absent":
                     continue
-                b = torch.from_numpy(self.scene(other).facts().statistic) * dose + noise
+                b = torch.from_numpy(self.scene(other).facts.statistic) * dose + noise
                 volume, _ = _timed(method, scene, b, dose)
                 result[label] = torch.stack([r(volume) for r in rois], dim=-1).numpy()
                 if block.start == 0 and label == "roi":
@@ -271,8 +256,6 @@ class _Study:
 
 
 def _timed(method: Method, scene: StudyScene, b: Tensor, dose: float) -> tuple[Tensor, float]:
-    import time
-
     start = time.perf_counter()
     with torch.no_grad():
         volume = method(scene.problem, b, dose)

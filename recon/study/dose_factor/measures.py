@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 from torch import Tensor
 
+from recon.study.dose_factor.variant import Variant
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.observer import dog_channels
-from torchpcct.metrics.plaque_measures import lumen_area
+from torchpcct.metrics.plaque_measures import LUMEN_HU, cap_on_line, lumen_area
 from torchpcct.metrics.roi import sample_axial
-
-if TYPE_CHECKING:
-    from recon.study.dose_factor.scene import StudyScene
 
 __all__ = ["CROP_MM", "DOG_CHANNELS", "LUMEN_HALF_HU", "OBSERVERS", "crop_window", "observer_channels", "segmentation"]
 
@@ -35,7 +30,7 @@ LUMEN_HALF_HU = 293.0
 contour lies outside the edge: the true volume, averaged over 0.2 mm voxels, has 4.24 mm² there and 4.04 mm² here, of
 4.11 mm²."""
 
-_CAP_STEP_MM = 0.01
+_CAP_CORE_HU, _CAP_STEP_MM = 70.0, 0.01
 
 
 def crop_window(grid: VolumeGrid, center: tuple[float, float, float]) -> tuple[tuple[slice, ...], VolumeGrid]:
@@ -56,49 +51,44 @@ def crop_window(grid: VolumeGrid, center: tuple[float, float, float]) -> tuple[t
     return tuple(places), VolumeGrid(shape, grid.spacing, tuple(middle))
 
 
-def observer_channels(scene: StudyScene, grid: VolumeGrid, observer: str) -> Floats:
+def observer_channels(variant: Variant, grid: VolumeGrid, observer: str) -> Floats:
     """Channels on the crop, ``(1 + DOG_CHANNELS, *crop)``: the core's own shape, then difference-of-Gaussians.
 
     Args:
-        scene: where the core is.
+        variant: where the core is.
         grid: of the volumes.
         observer: ``"axial"`` looks at the protocol's axial image (linear interpolation between two slices), as the
             paper does; ``"volume"`` at all slices of the core.
     """
-    z, y, x = scene.core_center
-    crop = crop_window(grid, scene.core_center)[1]
+    z, y, x = variant.core_center
+    crop = crop_window(grid, variant.core_center)[1]
     if observer == "axial":
         image = VolumeGrid((1, *crop.shape[1:]), crop.spacing, (z, *crop.center[1:]))
         dogs = dog_channels(image.slice, (y, x), DOG_CHANNELS, lowest=_LOWEST_CHANNEL)[:, None]
         depth = np.clip(1.0 - np.abs(crop.axes[0] - z) / crop.spacing[0], 0.0, None)[:, None, None]
     elif observer == "volume":
         image, depth = crop, np.ones((1, 1, 1))
-        dogs = dog_channels(crop, scene.core_center, DOG_CHANNELS, lowest=_LOWEST_CHANNEL)
+        dogs = dog_channels(crop, variant.core_center, DOG_CHANNELS, lowest=_LOWEST_CHANNEL)
     else:
         raise ValueError(f"observer must be one of {', '.join(OBSERVERS)}, got {observer!r}")
-    core = (scene.geometry.labels(image) == scene.geometry.index("core")).astype(np.float64)
+    core = (variant.plain.labels(image) == variant.plain.index("core")).astype(np.float64)
     channels: Floats = np.concatenate([core[None] / np.sqrt(core.sum()), dogs]) * depth
     return channels
 
 
-def segmentation(scene: StudyScene, grid: VolumeGrid, volume: Tensor) -> tuple[float, float, float]:
+def segmentation(variant: Variant, grid: VolumeGrid, volume: Tensor) -> tuple[float, float, float]:
     """Lumen area (mm²), cap thickness (mm) and lumen area at half maximum in the protocol's axial image.
 
     NaN where the edges are lost. The first area is the paper's, at 250 HU; the last at :data:`LUMEN_HALF_HU`. The cap
     is measured on the line from the lumen's to the core's centre, between where the image first falls below 250 HU and
     below 70 HU: the core's whole contour at 70 HU runs into the thin wall (67 HU) beside it.
     """
-    image = scene.rois.image
+    image = variant.rois.image
     section = sample_axial(volume.to(torch.float64), grid, image)
-    lumen, core = np.array(scene.lumen_center[1:]), np.array(scene.core_center[1:])
-    area, half = (lumen_area(section, image, (float(lumen[0]), float(lumen[1])), hu) for hu in (250.0, LUMEN_HALF_HU))
-    length = float(np.hypot(*(core - lumen)))
-    along = np.arange(0.0, length, _CAP_STEP_MM)
-    points = lumen[:, None] + (core - lumen)[:, None] * along / length
-    origin = np.array([a[0] for a in image.axes[1:]])
-    index = (points - origin[:, None]) / np.array(image.spacing[1:])[:, None]
-    profile = map_coordinates(section[0].numpy(), index, order=1, mode="nearest")
-    lumen_end, core_start = (np.flatnonzero(profile < hu) for hu in (250.0, 70.0))
-    if not lumen_end.size or not core_start.size:
-        return area, float("nan"), half
-    return area, float(along[core_start[0]] - along[lumen_end[0]]), half
+    (_, *lumen), (_, *core) = variant.lumen_center, variant.core_center
+    area, half = (lumen_area(section, image, (lumen[0], lumen[1]), hu) for hu in (LUMEN_HU, LUMEN_HALF_HU))
+    cap = cap_on_line(
+        section, image, (lumen[0], lumen[1]), (core[0], core[1]),
+        core_hu=_CAP_CORE_HU, step_mm=_CAP_STEP_MM, interpolate=False,
+    )  # fmt: skip
+    return area, cap, half

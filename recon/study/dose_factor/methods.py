@@ -10,32 +10,22 @@ import hashlib
 import logging
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
 from recon.fbp.inset import to_hu
+from recon.mbir.mbir import ADD_BACK, Mbir
 from recon.mbir.prior import squared_frequencies
 from recon.mbir.unrolled import NormalProblem
-from recon.pwls.inset_problem import DEFAULT_PRIOR
+from recon.pwls.inset_problem import DEFAULT_PRIOR, InsetProblem
 from recon.pwls.model_solver import dot
 from recon.pwls.pwls import solve_normal
 from recon.pwls.qggmrf import QGGMRF, quadratic
+from recon.study.dose_factor.settings import METHODS
 
-if TYPE_CHECKING:
-    from recon.pwls.inset_problem import InsetProblem
-
-__all__ = [
-    "IMAGE_METHODS",
-    "METHODS",
-    "METHOD_NAMES",
-    "LinearFilter",
-    "Method",
-    "Penalised",
-    "fingerprint",
-    "load_methods",
-]
+__all__ = ["LinearFilter", "Method", "Misstated", "Penalised", "fingerprint", "load_methods"]
 
 log = logging.getLogger(__name__)
 
@@ -45,7 +35,7 @@ class Method(Protocol):
 
     @property
     def name(self) -> str:
-        """One of :data:`METHODS`."""
+        """One of :data:`recon.study.dose_factor.settings.METHODS`."""
         ...
 
     def __call__(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> Tensor:
@@ -171,29 +161,6 @@ _BASELINES: dict[str, Any] = {
     "tv": Penalised("tv", QGGMRF(strength=2.0, threshold=30.0)),
 }
 
-_LEARNED = ("fbp_cnn", "mbir_one_pass", "mbir", "mbir_noise_half", "mbir_noise_double")
-
-METHODS = (*_BASELINES, *_LEARNED)
-"""Names, in the order of the tables. ``fbp_cnn`` is MBIR's prior on FBP images, ``mbir_noise_*`` MBIR that takes the
-noise for half or twice of what it is."""
-
-METHOD_NAMES = {
-    "linear": "linear 3-D filter",
-    "linear_z": "linear filter along z",
-    "quadratic": "quadratic PWLS",
-    "qggmrf": "q-GGMRF PWLS",
-    "tv": "smoothed TV",
-    "fbp_cnn": "FBP + MBIR's prior",
-    "mbir_one_pass": "MBIR, one pass",
-    "mbir": "MBIR, two passes",
-    "mbir_noise_half": "MBIR, noise taken for ½",
-    "mbir_noise_double": "MBIR, noise taken for 2×",
-}
-"""As reports call them."""
-
-IMAGE_METHODS = ("fbp_cnn",)
-"""Methods of an image domain: in place of b = AᵀW y they are given G x of an FBP volume x."""
-
 
 def load_methods(names: Iterable[str]) -> list[Method]:
     """The methods of these names; MBIR is left out with a logged warning where its weights are missing.
@@ -218,8 +185,6 @@ def load_methods(names: Iterable[str]) -> list[Method]:
 
 
 def _learned(name: str) -> Method:
-    from recon.mbir.mbir import ADD_BACK, Mbir
-
     prior = Mbir.load(add_back=None if name == "mbir_one_pass" else ADD_BACK)
     factor = {"mbir_noise_half": 4.0, "mbir_noise_double": 0.25}.get(name)
     if factor is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,12 +13,8 @@ from recon.fbp.inset import InsetFbp
 from recon.study.dose_factor.measures import crop_window, segmentation
 from recon.study.dose_factor.scene import StudyScene
 from recon.study.dose_factor.settings import FBP_BASE, NOISY_SCENES, Settings
-from recon.study.paper.plaque_scan import inset_grid
-
-if TYPE_CHECKING:
-    from recon.study.dose_factor.measure import Settings
-    from recon.study.dose_factor.store import Store
-    from torchpcct.scan import Scan
+from recon.study.dose_factor.store import Store
+from torchpcct.scan import Scan
 
 __all__ = ["Realisations", "joined"]
 
@@ -48,7 +44,7 @@ class Realisations:
     def _filtered(self, scene: StudyScene, kernel: str, voxel_mm: float) -> InsetFbp:
         """FBP; the main scenes share geometry, window and surround."""
         if (kernel, voxel_mm) not in self._fbp:
-            self._fbp[kernel, voxel_mm] = InsetFbp(scene.clean, [inset_grid(scene.plaque, voxel_mm)], [kernel])
+            self._fbp[kernel, voxel_mm] = InsetFbp(scene.clean, [scene.grid_of(voxel_mm)], [kernel])
         return self._fbp[kernel, voxel_mm]
 
     def _noisy(self, scene: StudyScene, dose: float, k: int) -> Scan:
@@ -69,7 +65,7 @@ class Realisations:
         scene = self.scene(name)
 
         def compute() -> dict[str, Any]:
-            grid = inset_grid(scene.plaque, FBP_BASE[1])
+            grid = scene.grid_of(FBP_BASE[1])
             fbp = self._filtered(scene, *FBP_BASE)
             rois = scene.rois.on(grid)
             crop = crop_window(grid, scene.core_center)[0]
@@ -97,7 +93,7 @@ class Realisations:
         scene = self.scene(name)
 
         def compute() -> dict[str, Any]:
-            grid = inset_grid(scene.plaque, FBP_BASE[1])
+            grid = scene.grid_of(FBP_BASE[1])
             base, sharp = self._filtered(scene, *FBP_BASE), self._sharp(scene)
             shapes, b = [], []
             for k in block:
@@ -121,14 +117,14 @@ class Realisations:
 
     def statistic(self, name: str, dose: float, block: range) -> Tensor:
         """b of a main scene, ``(block, z, y, x)``."""
-        clean = torch.from_numpy(self.scene(name).facts().statistic) * dose
+        clean = torch.from_numpy(self.scene(name).facts.statistic) * dose
         if self.settings.fast_noise:
             return clean + self.gram_noise(name, dose, block)
         own = name if name in NOISY_SCENES else "paper"
         noisy = torch.from_numpy(self.data(own, dose, block)["b"])
         if own == name:
             return noisy
-        return noisy + (clean - torch.from_numpy(self.scene(own).facts().statistic) * dose)
+        return noisy + (clean - torch.from_numpy(self.scene(own).facts.statistic) * dose)
 
     def image_statistic(self, name: str, dose: float, block: range) -> Tensor:
         """:meth:`images`' b of a main scene, ``(block, z, y, x)``."""

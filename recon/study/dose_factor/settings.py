@@ -8,18 +8,21 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from recon.study.dose_factor.methods import IMAGE_METHODS, METHODS
 from recon.study.paper import facts as paper
 from recon.study.study import StudySettings
 
 __all__ = [
     "EXTRA_SCENES",
     "FBP_BASE",
+    "IMAGE_METHODS",
     "MAIN_SCENES",
+    "METHODS",
+    "METHOD_NAMES",
     "NOISY_SCENES",
     "SLOW_METHODS",
     "WIDE_ROIS",
     "Settings",
+    "fbp_label",
     "with_twin",
 ]
 
@@ -41,6 +44,26 @@ EXTRA_SCENES = (
 )  # fmt: skip
 """Scenes that can expose an invention."""
 
+METHOD_NAMES = {
+    "linear": "linear 3-D filter",
+    "linear_z": "linear filter along z",
+    "quadratic": "quadratic PWLS",
+    "qggmrf": "q-GGMRF PWLS",
+    "tv": "smoothed TV",
+    "fbp_cnn": "FBP + MBIR's prior",
+    "mbir_one_pass": "MBIR, one pass",
+    "mbir": "MBIR, two passes",
+    "mbir_noise_half": "MBIR, noise taken for ½",
+    "mbir_noise_double": "MBIR, noise taken for 2×",
+}
+"""Methods in the order of the tables, as reports call them. ``fbp_cnn`` is MBIR's prior on FBP images, ``mbir_noise_*``
+MBIR that takes the noise for half or twice of what it is."""
+
+METHODS = tuple(METHOD_NAMES)
+
+IMAGE_METHODS = ("fbp_cnn",)
+"""Methods of an image domain: in place of b = AᵀW y they are given G x of an FBP volume x."""
+
 SLOW_METHODS = ("quadratic", "qggmrf", "tv", "fbp_cnn", "mbir_noise_half", "mbir_noise_double")
 """Few realisations place them well enough: iterated to convergence, drawn anew as images, or a test of robustness."""
 
@@ -61,7 +84,7 @@ class Settings(StudySettings):
         doses: exposures in s.
         scene_doses: exposures of the further scenes.
         seed: first seed.
-        methods: names of :data:`recon.study.dose_factor.methods.METHODS`.
+        methods: names of :data:`METHODS`.
         scenes: further scenes, of :data:`EXTRA_SCENES`.
         scene_methods: methods that reconstruct the further scenes.
         views: per rotation; fewer than the paper's keep the tube load of the whole scan.
@@ -157,6 +180,11 @@ class Settings(StudySettings):
             volumes = len(MAIN_SCENES) * self.realizations(name) * len(self.doses)
             parts[name] = (volumes + (extra if name in self.scene_methods else 0)) * _SECONDS[name]
         return parts
+
+
+def fbp_label(kernel: str, voxel_mm: float, blur_mm: float = 0.0) -> str:
+    """Name of an FBP variant."""
+    return f"{kernel} {voxel_mm:.2f} mm" + (f" + {blur_mm:.2f} mm Gauss" if blur_mm else "")
 
 
 def with_twin(name: str) -> list[str]:

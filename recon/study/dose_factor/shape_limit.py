@@ -31,12 +31,12 @@ def shape_limits(noise: Realisations, dose: float) -> dict[float, float]:
         dose: exposure in s.
     """
     scene = noise.scene("paper")
-    facts, grid = scene.facts(), scene.grid
+    facts, grid = scene.facts, scene.grid
 
     def compute() -> dict[str, Any]:
         fine = VolumeGrid(tuple(n * _FACTOR for n in grid.shape), grid.spacing[-1] / _FACTOR, grid.center)
-        labels = np.asarray(scene.geometry.labels(fine))
-        order = [scene.geometry.index(t) for t in facts.tissues]
+        labels = np.asarray(scene.plain.labels(fine))
+        order = [scene.plain.index(t) for t in facts.tissues]
         tissues = np.full(labels.max() + 1, facts.tissues.index("patient"))
         tissues[order] = np.arange(len(order))
         labels = tissues[labels]

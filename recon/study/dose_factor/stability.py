@@ -13,11 +13,9 @@ from recon.fbp.fbp import filter_windowed
 from recon.fbp.inset import InsetFbp
 from recon.mbir.mbir import Mbir
 from recon.sensitivity import worst_case_gain
-from recon.study.dose_factor.facts import fbp_label
-from recon.study.dose_factor.methods import IMAGE_METHODS, Method, fingerprint
+from recon.study.dose_factor.methods import Method, fingerprint
 from recon.study.dose_factor.realisations import Realisations
-from recon.study.dose_factor.settings import FBP_BASE
-from recon.study.paper.plaque_scan import inset_grid
+from recon.study.dose_factor.settings import FBP_BASE, IMAGE_METHODS, fbp_label
 
 __all__ = ["FBP_KERNELS", "worst_case_gains"]
 
@@ -43,7 +41,7 @@ def worst_case_gains(noise: Realisations, methods: list[Method], dose: float) ->
             clean = scene.clean
             assert clean.window is not None
             window = clean.window
-            grid = inset_grid(scene.plaque, FBP_BASE[1])
+            grid = scene.grid_of(FBP_BASE[1])
             fbp = InsetFbp(clean, [grid], [kernel])
             variance = line_integral_variance(clean, dose).to(torch.float32)
             hu = 1000.0 / clean.linearisation.mu_ref

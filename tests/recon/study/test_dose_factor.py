@@ -20,19 +20,20 @@ from recon.study.dose_factor.estimates import controlled
 from recon.study.dose_factor.measure import measure
 from recon.study.dose_factor.measures import crop_window
 from recon.study.dose_factor.methods import (
-    METHODS,
     LinearFilter,
     Misstated,
     Penalised,
     fingerprint,
     load_methods,
 )
+from recon.study.dose_factor.other_rois import averaged_rois, wide_rois
 from recon.study.dose_factor.realisations import Realisations
 from recon.study.dose_factor.report import headline
-from recon.study.dose_factor.rois import OtherVoxels, Wide
-from recon.study.dose_factor.scene import StudyScene, _tissue_groups
-from recon.study.dose_factor.settings import MAIN_SCENES, Settings
+from recon.study.dose_factor.scene import StudyScene
+from recon.study.dose_factor.settings import MAIN_SCENES, METHODS, Settings
 from recon.study.dose_factor.store import Store
+from recon.study.dose_factor.tissue_values import tissue_groups
+from recon.study.dose_factor.variant import Variant
 from recon.study.paper.plaque_scan import inset_grid
 from torchpcct import VolumeGrid
 
@@ -208,7 +209,7 @@ def test_bias_is_reported_as_bias(measured):
 
 def problem_of(folder):
     scene = StudyScene("paper", TINY, Store(folder))
-    return scene, scene.problem, torch.from_numpy(scene.facts().statistic)
+    return scene, scene.problem, torch.from_numpy(scene.facts.statistic)
 
 
 def test_methods_are_consistent(measured, folder):
@@ -274,20 +275,18 @@ def test_a_method_that_fails_is_named(measured, folder):
         study._timed(Broken(), scene, b[None], 2.0)
 
 
-def test_wider_rois(measured, folder, analysed):
-    scene = StudyScene("paper", TINY, Store(folder))
-    truth = np.array([measured.facts[name].contrast_hu for name in MAIN_SCENES])
-    x = scene.core_center[2]
+def test_wider_rois(analysed):
+    variant = Variant("paper", TINY)
+    paper = variant.rois.as_dict()
+    x = variant.core_center[2]
     for name in TINY.rois:
-        wide = Wide(measured, scene, name, truth)
-        paper = scene.rois.as_dict()
-        assert wide.rois.as_dict()["background_mm2"] > 2 * paper["background_mm2"]
+        pair, wide = variant.wide_rois(name), wide_rois(variant, name)
+        assert pair.as_dict()["background_mm2"] > 2 * paper["background_mm2"]
         # A linear ramp reads as the mean position of the mask.
-        grid = crop_window(scene.grid, scene.core_center)[1]
+        grid = crop_window(variant.grid, variant.core_center)[1]
         ramp = np.broadcast_to(grid.axes[2], grid.shape)
-        at = [np.mean(np.broadcast_to(wide.rois.image.axes[2], m.shape)[m])
-              for m in (wide.rois.foreground, wide.rois.background)]  # fmt: skip
-        np.testing.assert_allclose(wide.means(ramp, scene.grid.spacing[2]), at, atol=1e-9)
+        at = [np.mean(np.broadcast_to(pair.image.axes[2], m.shape)[m]) for m in (pair.foreground, pair.background)]
+        np.testing.assert_allclose(wide.means(ramp, variant.grid.spacing[2]), at, atol=1e-9)
         assert abs(at[0] - x) < 0.1 < abs(at[1] - x)
         # More data in the ROI, less noise; never less than the limit.
         rows = next(e["rows"] for e in analysed["wide_rois"] if e["roi"] == name)
@@ -299,18 +298,16 @@ def test_wider_rois(measured, folder, analysed):
         ratio = (sd / method["contrast_sd_hu"]["value"]) ** 2
         assert method["factors"]["contrast_variance"]["value"] == pytest.approx(ratio, rel=0.02)
     with pytest.raises(ValueError, match="rois must be of section, tissue"):
-        scene.wide_rois("vessel")
+        variant.wide_rois("vessel")
 
 
-def test_rois_on_larger_voxels_are_those_of_the_averaged_volume(measured, folder):
-    settings = replace(TINY, voxel_mm=0.2)
-    scene = StudyScene("paper", settings, Store(folder))
-    coarse = inset_grid(scene.plaque, 0.35)
-    rois = OtherVoxels(replace(measured, settings=settings), scene, 0.35, np.zeros(4))
-    volume = torch.randn(scene.grid.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    place = crop_window(scene.grid, scene.core_center)[0]
-    expected = [float(r(average_onto(volume, scene.grid, coarse))) for r in scene.rois.on(coarse)]
-    np.testing.assert_allclose(rois.means(volume[place].numpy(), 0.2), expected, rtol=1e-9)
+def test_rois_on_larger_voxels_are_those_of_the_averaged_volume():
+    variant = Variant("paper", replace(TINY, voxel_mm=0.2))
+    coarse = inset_grid(variant.plaque, 0.35)
+    volume = torch.randn(variant.grid.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    place = crop_window(variant.grid, variant.core_center)[0]
+    expected = [float(r(average_onto(volume, variant.grid, coarse))) for r in variant.rois.on(coarse)]
+    np.testing.assert_allclose(averaged_rois(variant, 0.35).means(volume[place].numpy(), 0.2), expected, rtol=1e-9)
 
 
 def test_rougher_outlines_raise_the_limit(analysed):
@@ -329,22 +326,22 @@ def test_worst_case_gain_of_fbp(analysed):
     assert 0 < soft < standard
 
 
-def test_exact_noise_of_wider_rois_is_that_of_fbp(measured, folder):
-    scene = StudyScene("paper", TINY, Store(folder))
-    wide = Wide(measured, scene, "tissue", np.array([measured.facts[k].contrast_hu for k in MAIN_SCENES]))
-    samples = wide.means(measured.fbp["paper", 2.0]["crop"], 0.25)
-    sd = np.sqrt(np.diag(wide.fbp("soft", 0.25)["covariance"]) / 2.0)
-    assert np.abs(samples.mean(0) - wide.fbp("soft", 0.25)["roi_hu"]).max() < 4 * sd.max() / math.sqrt(len(samples))
+def test_exact_noise_of_wider_rois_is_that_of_fbp(measured):
+    rois, first = wide_rois(Variant("paper", TINY), "tissue"), 2 * TINY.rois.index("tissue")
+    samples = rois.means(measured.fbp["paper", 2.0]["crop"], 0.25)
+    expected = rois.means(measured.facts["paper"].fbp_crop["soft 0.25 mm"], 0.25)
+    sd = np.sqrt(np.diag(measured.wide["soft 0.25 mm"])[first : first + 2] / 2.0)
+    assert np.abs(samples.mean(0) - expected).max() < 4 * sd.max() / math.sqrt(len(samples))
     ratio = samples.std(0, ddof=1) / sd
     assert (ratio > 0.3).all()
     assert (ratio < 2.0).all()
 
 
 def test_pitch_of_the_scene():
-    fine, paper = (StudyScene(name, TINY, None).scanner.geometry for name in ("pitch_0.30mm:absent", "paper"))
+    fine, paper = (Variant(name, TINY).scanner.geometry for name in ("pitch_0.30mm:absent", "paper"))
     assert (fine.pitch[1], paper.pitch[1]) == (0.30, 0.35)
     assert (fine.pitch[0], fine.views, fine.sod) == (paper.pitch[0], paper.views, paper.sod)
-    bodies = [StudyScene(name, TINY, None).scene.bodies for name in ("pitch_0.30mm:absent", "absent_core")]
+    bodies = [Variant(name, TINY).scene.bodies for name in ("pitch_0.30mm:absent", "absent_core")]
     assert [b.name for b in bodies[0]] == [b.name for b in bodies[1]]
 
 
@@ -375,7 +372,7 @@ def test_an_fbp_image_as_data(measured, folder):
 
 def test_tissue_groups_and_crop():
     names = ["patient", "wall", "fibrous", "lumen", "core", "stent_0", "stent_0_blood", "fibrous_texture_3"]
-    groups = _tissue_groups(names)
+    groups = tissue_groups(names)
     assert groups["lumen"] == ["lumen", "stent_0_blood"]
     assert groups["fibrous"] == ["fibrous", "fibrous_texture_3"]
     assert groups["stent"] == ["stent_0"]
