@@ -265,14 +265,3 @@ def test_an_energy_integrating_scan_is_noisy_too():
     assert not clean.counting
     assert torch.equal(acquire(water_cylinder(200.0), eid, exposure_s=0.35, seed=4).counts,
                        clean.with_noise(0.35, 4).counts)  # fmt: skip
-
-
-def test_a_scene_without_any_round_body():
-    """Nothing is the same in all views, so the surround is air."""
-    system = scanner(views=4, rows=1)
-    scene = Scene([Body("rod", EllipticCylinder(8.0, position=(20.0, 10.0, 0.0)), "water")])
-    scan = acquire(scene, system, sub_rays=1)
-    full = acquire(Scene([Body("air", EllipticCylinder(1e-6), "air"), *scene.bodies]), system, sub_rays=1)
-    torch.testing.assert_close(scan.counts, full.counts, rtol=1e-5, atol=0)
-    dark = (scan.counts < 0.7 * scan.air).float().mean()
-    assert 0.01 < float(dark) < 0.1
