@@ -79,13 +79,19 @@ class DetectorWindow:
         Raises:
             ValueError: ``inner`` reaches beyond this window.
         """
+        if not self.holds(inner):
+            raise ValueError("the inner window reaches beyond the outer one")
         columns = torch.from_numpy(inner.column_indices - self.first_column[:, None])
         row = inner.first_row - self.first_row
-        if row < 0 or row + inner.rows > self.rows or int(columns.min()) < 0 or int(columns.max()) >= self.columns:
-            raise ValueError("the inner window reaches beyond the outer one")
         values = values[..., row : row + inner.rows, :]
         index = columns[:, None].to(values.device).expand(*values.shape[:-1], -1)
         return values.gather(-1, index)
+
+    @staticmethod
+    def full(geometry: Geometry) -> DetectorWindow:
+        """The whole detector of ``geometry``."""
+        rows = geometry.rows if isinstance(geometry, ConeBeam) else 1
+        return DetectorWindow(np.zeros(geometry.views, np.int64), geometry.columns, 0, rows)
 
     @staticmethod
     def union(windows: Sequence[DetectorWindow], columns: int) -> DetectorWindow:
@@ -103,6 +109,39 @@ class DetectorWindow:
         last = outer.first_column + outer.columns - width
         first = np.clip(self.first_column - margin, outer.first_column, last)
         return DetectorWindow(first, width, outer.first_row, outer.rows)
+
+    def within(self, outer: DetectorWindow) -> DetectorWindow:
+        """This window, its columns moved into ``outer`` (and cut to its width), its rows cut to those of ``outer``.
+
+        Raises:
+            ValueError: no row in common.
+        """
+        columns = min(self.columns, outer.columns)
+        first = np.clip(self.first_column, outer.first_column, outer.first_column + outer.columns - columns)
+        row = max(self.first_row, outer.first_row)
+        rows = min(self.first_row + self.rows, outer.first_row + outer.rows) - row
+        if rows < 1:
+            raise ValueError("no detector row of the window sees the grid: move the grid or widen the window")
+        return DetectorWindow(first, columns, row, rows)
+
+    def with_rows(self, first_row: int, rows: int) -> DetectorWindow:
+        """The same columns of other rows."""
+        return DetectorWindow(self.first_column, self.columns, first_row, rows)
+
+    def select(self, views: Any) -> DetectorWindow:
+        """The same window for a subset (or reordering) of the views: an index array, mask or slice."""
+        return DetectorWindow(self.first_column[views], self.columns, self.first_row, self.rows)
+
+    def holds(self, inner: DetectorWindow) -> bool:
+        """Whether every reading of ``inner`` is one of this window."""
+        before = inner.first_column - self.first_column
+        row = inner.first_row - self.first_row
+        return bool(
+            before.min() >= 0
+            and before.max() + inner.columns <= self.columns
+            and row >= 0
+            and row + inner.rows <= self.rows
+        )
 
     def fraction(self, geometry: Geometry) -> float:
         """Share of the detector's readings inside the window, 0…1."""

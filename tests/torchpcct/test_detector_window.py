@@ -1,8 +1,10 @@
 """Detector windows: union, margins, cropping."""
 
 import numpy as np
+import pytest
 import torch
 
+from torchpcct import ConeBeam, FanBeam
 from torchpcct.detector_window import DetectorWindow
 
 
@@ -28,3 +30,46 @@ def test_cropping_keeps_each_reading_at_its_cell():
     outer, inner = DetectorWindow(np.array([2, 4]), 6, 1, 3), DetectorWindow(np.array([4, 5]), 3, 2, 1)
     cells = torch.arange(5 * 12.0).reshape(5, 12)
     assert torch.equal(outer.crop(outer.take(cells), inner), inner.take(cells))
+
+
+def test_the_full_window_is_the_whole_detector():
+    for geometry in (FanBeam([0.0, 1.0], 50.0, 90.0, 7, 1.0), ConeBeam([0.0, 1.0, 2.0], 50.0, 90.0, 7, 4, 1.0)):
+        full = DetectorWindow.full(geometry)
+        assert full.fraction(geometry) == 1.0
+        cells = torch.arange(28.0).reshape(4, 7)[: full.rows]
+        assert torch.equal(full.take(cells), cells.expand(geometry.views, -1, -1))
+
+
+def test_a_window_is_moved_and_cut_into_another():
+    outer = DetectorWindow([2, 2, 2], 10, 1, 3)
+    part = DetectorWindow([0, 5, 11], 3, 0, 2).within(outer)
+    assert part == DetectorWindow([2, 5, 9], 3, 1, 1)
+    assert outer.holds(part)
+    assert DetectorWindow([0, 0, 0], 20, 0, 9).within(outer) == outer
+    with pytest.raises(ValueError, match="no detector row"):
+        DetectorWindow([3, 3, 3], 3, 4, 1).within(outer)
+
+
+def test_a_window_of_other_rows_or_views():
+    window = DetectorWindow([2, 4, 6], 5, 1, 3)
+    assert window.with_rows(0, 2) == DetectorWindow([2, 4, 6], 5, 0, 2)
+    assert window.select(slice(None, None, 2)) == DetectorWindow([2, 6], 5, 1, 3)
+    assert window.select([2, 0]) == DetectorWindow([6, 2], 5, 1, 3)
+
+
+@pytest.mark.parametrize(
+    "inner",
+    [
+        DetectorWindow([1, 4], 3, 1, 1),
+        DetectorWindow([2, 8], 3, 1, 1),
+        DetectorWindow([2, 4], 3, 0, 2),
+        DetectorWindow([2, 4], 3, 3, 2),
+    ],
+    ids=["left", "right", "below", "above"],
+)
+def test_cropping_refuses_what_it_does_not_hold(inner):
+    outer = DetectorWindow([2, 4], 6, 1, 3)
+    assert outer.holds(outer)
+    assert not outer.holds(inner)
+    with pytest.raises(ValueError, match="reaches beyond"):
+        outer.crop(torch.zeros(2, 3, 6), inner)
