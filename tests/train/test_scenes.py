@@ -10,7 +10,7 @@ import torch
 from train.scenes.drawing import draw_scene
 from train.scenes.held_out import validation_scenes
 from train.scenes.rasterise import random_scene, rasterise
-from train.scenes.scene import TrainingScene, SceneConfig, Texture, Vessel, Solid, is_paper_family
+from train.scenes.scene import SceneConfig, Solid, Texture, TrainingScene, Vessel, is_paper_family
 
 EXTENT = (9.0, 9.0, 11.2)
 SMALL = (15, 15, 19)
@@ -126,7 +126,9 @@ def test_masks_are_the_contrast() -> None:
     tube = vessel(solids=(PAPER_CORE,))
     image, core, surround = rasterise(TrainingScene(-90.0, (tube,)), (30, 30, 30), (0.2, 0.2, 0.2))
     core_up = replace(tube, solids=(replace(PAPER_CORE, hu=50.0),))
-    assert np.allclose(rasterise(TrainingScene(-90.0, (core_up,)), (30, 30, 30), (0.2,) * 3)[0] - image, 10 * core, atol=1e-3)
+    assert np.allclose(
+        rasterise(TrainingScene(-90.0, (core_up,)), (30, 30, 30), (0.2,) * 3)[0] - image, 10 * core, atol=1e-3
+    )
     fibrous_up = replace(tube, fibrous_hu=102.0)
     assert np.allclose(
         rasterise(TrainingScene(-90.0, (fibrous_up,)), (30, 30, 30), (0.2,) * 3)[0] - image, 10 * surround, atol=1e-3
