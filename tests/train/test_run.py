@@ -99,9 +99,10 @@ def crash_before(monkeypatch):
                 raise Crash
             real(source, target)
 
-        with monkeypatch.context() as patch, pytest.raises(Crash):
+        with monkeypatch.context() as patch:
             patch.setattr(os, "replace", replace)
-            run(out, stub_config(checkpoint_seconds=1e-9), resume=resume)
+            with pytest.raises(Crash):
+                run(out, stub_config(checkpoint_seconds=1e-9), resume=resume)
 
     return crash
 

@@ -124,15 +124,14 @@ def test_tilted_tube_has_the_thickness_asked_for() -> None:
 def test_masks_are_the_contrast() -> None:
     """Core and surround are the derivatives of the image by the HU of the two tissues."""
     tube = vessel(solids=(PAPER_CORE,))
-    image, core, surround = rasterise(TrainingScene(-90.0, (tube,)), (30, 30, 30), (0.2, 0.2, 0.2))
+
+    def paint(vessel: Vessel) -> np.ndarray:
+        return rasterise(TrainingScene(-90.0, (vessel,)), (30, 30, 30), (0.2, 0.2, 0.2))
+
+    image, core, surround = paint(tube)
     core_up = replace(tube, solids=(replace(PAPER_CORE, hu=50.0),))
-    assert np.allclose(
-        rasterise(TrainingScene(-90.0, (core_up,)), (30, 30, 30), (0.2,) * 3)[0] - image, 10 * core, atol=1e-3
-    )
-    fibrous_up = replace(tube, fibrous_hu=102.0)
-    assert np.allclose(
-        rasterise(TrainingScene(-90.0, (fibrous_up,)), (30, 30, 30), (0.2,) * 3)[0] - image, 10 * surround, atol=1e-3
-    )
+    assert np.allclose(paint(core_up)[0] - image, 10 * core, atol=1e-3)
+    assert np.allclose(paint(replace(tube, fibrous_hu=102.0))[0] - image, 10 * surround, atol=1e-3)
     assert float(core.max()) == pytest.approx(1.0)
     assert float(surround.max()) == pytest.approx(1.0)
 
