@@ -176,11 +176,11 @@ class TrainConfig:
         steps: optimisation steps.
         batch: scenes of a step, over all processes.
         learning_rate: of Adam, at the end of the warm-up.
-        warmup: steps over which it rises linearly.
+        warmup: steps over which it rises linearly; it counts only steps that change the weights, as the average does.
         final_fraction: of ``learning_rate`` that the cosine ends with, 0 to 1.
         clip: largest norm of the gradient of the mean loss; longer ones are shortened to it. ``inf`` for none.
         ema: decay per step of the exponential moving average of the weights, in [0, 1); the average is what is
-            validated and shipped. Early in a run the decay is smaller, ``(1 + step) / (10 + step)``.
+            validated and shipped. Early in a run the decay is smaller, ``(1 + n) / (10 + n)`` after n steps.
         checkpoint_seconds: time between checkpoints in s, ≤ 120.
         validate_every: steps between validations; the last step is always validated.
         log_every: steps between rows of the log.
