@@ -4,6 +4,9 @@ import os
 
 import pytest
 
+# Triton reads it when it is first imported, by whichever test: its kernels then run on the CPU, see test_triton.py.
+os.environ.setdefault("TRITON_INTERPRET", "1")
+
 
 @pytest.fixture(scope="session", autouse=True)
 def _cores_are_shared():

@@ -1,1 +1,6 @@
-"""Training of the learned prior: ``python -m train``, see :mod:`train.__main__` and :mod:`train.loop`."""
+"""Training of the learned prior: ``python -m train``, see :mod:`train.__main__`.
+
+Reading order: :mod:`train.config` (what a run is); :mod:`train.scenes`, :mod:`train.data` and :mod:`train.objective`
+(what it sees and minimises); :mod:`train.loop`, which drives a :mod:`train.run` with the gradients of
+:mod:`train.processes`; :mod:`train.checkpoint`, :mod:`train.logs` and :mod:`train.card` (what it leaves behind).
+"""

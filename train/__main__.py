@@ -1,6 +1,6 @@
 """Command line: ``python -m train``, or ``torchrun --nproc_per_node=N -m train`` for N processes.
 
-The numbers of threads are set before torch and numba are loaded, so this module imports them late.
+The numbers of threads are set before torch and numba are loaded, so this module imports all that needs them late.
 """
 
 from __future__ import annotations
@@ -14,10 +14,13 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from recon.mbir.unrolled import Unrolled
     from train.config import TrainConfig
+    from train.data import Data
+    from train.objective import Objective
 
 __all__ = ["build", "main"]
 
@@ -43,7 +46,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def build(config: TrainConfig) -> tuple[Any, Any, Any]:
+def build(config: TrainConfig) -> tuple[Unrolled, Data, Objective]:
     """Model with its starting weights, data, and objective."""
     import torch
 
@@ -57,29 +60,13 @@ def build(config: TrainConfig) -> tuple[Any, Any, Any]:
     return model, Data(config.data), Objective(config.objective)
 
 
-def _configure(arguments: argparse.Namespace) -> TrainConfig:
-    from train.checkpoint import Store
-    from train.config import TrainConfig, load_config, packaged_config
-
-    if arguments.config is not None:
-        config = load_config(arguments.config)
-    elif arguments.quick:
-        config = packaged_config("quick")
-    elif arguments.resume:
-        config = TrainConfig.from_yaml(Store(arguments.out).load()[1]["config"])
-    else:
-        config = packaged_config("default")
-    changes = {k: v for k, v in (("steps", arguments.steps), ("seed", arguments.seed)) if v is not None}
-    return replace(config, **changes)
-
-
 @contextmanager
 def _processes() -> Iterator[None]:
     """The process group that torchrun's environment describes, if any."""
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         yield
         return
-    import torch.distributed as distributed
+    from torch import distributed
 
     distributed.init_process_group("gloo")
     try:
@@ -91,38 +78,52 @@ def _processes() -> Iterator[None]:
 def _run(arguments: argparse.Namespace, command: str) -> int:
     import torch
 
+    from recon.mbir.mbir import WEIGHTS_FORMAT
+    from recon.mbir.weights_io import read_tensors
+    from train.checkpoint import Store
+    from train.config import TrainConfig, load_config, packaged_config
     from train.loop import train
+    from train.run import DivergedError
 
     if arguments.threads is not None:
         torch.set_num_threads(arguments.threads)
     first = int(os.environ.get("RANK", "0")) == 0
-    config = _configure(arguments)
-    with _processes():
-        model, data, objective = build(config)
-        if arguments.weights is not None:
-            from train.card import load_weights
-
-            model.load_state_dict(load_weights(arguments.weights)[0])
-        outcome = train(
-            config,
-            model,
-            data,
-            objective,
-            arguments.out,
-            resume=arguments.resume,
-            command=command,
-            progress=first and not arguments.no_progress,
-            tensorboard=not arguments.no_tensorboard,
-        )
+    try:
+        if arguments.config is not None:
+            config = load_config(arguments.config)
+        elif arguments.resume and not arguments.quick:
+            config = TrainConfig.from_yaml(Store(arguments.out).load()[1]["config"])
+        else:
+            config = packaged_config("quick" if arguments.quick else "default")
+        changes = {k: v for k, v in (("steps", arguments.steps), ("seed", arguments.seed)) if v is not None}
+        config = replace(config, **changes)
+        with _processes():
+            model, data, objective = build(config)
+            if arguments.weights is not None:
+                model.load_state_dict(read_tensors(arguments.weights, WEIGHTS_FORMAT)[0])
+            state, number = train(
+                config,
+                model,
+                data,
+                objective,
+                arguments.out,
+                resume=arguments.resume,
+                command=command,
+                progress=first and not arguments.no_progress,
+                tensorboard=not arguments.no_tensorboard,
+            )
+    except (ValueError, OSError, DivergedError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
     if not first:
         return 0
-    if not outcome.finished:
-        print(f"stopped at step {outcome.step} of {config.steps}; continue with: "
+    if state.step < config.steps:
+        print(f"stopped at step {state.step} of {config.steps}; continue with: "
               f"python -m train --out {shlex.quote(str(arguments.out))} --resume")  # fmt: skip
-        return 128 + outcome.signal if outcome.signal else 1
-    skipped = f", {outcome.skipped} steps skipped" if outcome.skipped else ""
-    score = "none" if outcome.score is None else f"{outcome.score:.5g}"
-    print(f"{outcome.step} steps in {outcome.seconds / 60:.1f} min{skipped}; best validation score {score}; "
+        return 128 + number if number else 1
+    skipped = f", {state.skipped} steps skipped" if state.skipped else ""
+    score = f"{state.best['score']:.5g}" if state.best else "none"
+    print(f"{state.step} steps in {state.seconds / 60:.1f} min{skipped}; best validation score {score}; "
           f"weights and card in {arguments.out}")  # fmt: skip
     return 0
 
@@ -144,14 +145,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.environ["OMP_NUM_THREADS"] = os.environ["NUMBA_NUM_THREADS"] = str(arguments.threads)
     logging.basicConfig(format="%(message)s")
     logging.getLogger("train").setLevel(logging.INFO)
-    from train.checkpoint import CheckpointError
-    from train.loop import DivergedError
-
     try:
         return _run(arguments, shlex.join(["python", "-m", "train", *words]))
-    except (ValueError, OSError, CheckpointError, DivergedError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
     except KeyboardInterrupt:
         # The second Ctrl-C, or one before the first step.
         print(f"stopped at once; --resume continues from the last checkpoint in {arguments.out}", file=sys.stderr)

@@ -4,48 +4,32 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import platform
 from collections.abc import Mapping
 from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import safetensors
 from torch import Tensor
 
 from recon.mbir.mbir import WEIGHTS_FORMAT
-from train.checkpoint import digest, read_tensors, write_atomically, write_tensors
+from recon.mbir.weights_io import digest, write_tensors
+from recon.study.study import environment
+from torchpcct.files import written_whole
 from train.config import TrainConfig
 
-__all__ = ["export", "finite", "hardware", "load_weights", "versions"]
-
-PACKAGES = ("torchpcct", "torch", "numpy", "scipy", "numba", "safetensors")
+__all__ = ["export", "finite"]
 
 
-def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that the result depends on."""
-    found = {"python": platform.python_version()}
-    for name in PACKAGES:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found
-
-
-def hardware() -> dict[str, Any]:
-    """CPU model, logical cores this process may use, and the system."""
-    model = platform.processor() or platform.machine()
+def _cpu() -> str:
+    """Model of the processor."""
     try:
-        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                model = line.split(":", 1)[1].strip()
-                break
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
-        pass
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return {"cpu": model, "cores": cores, "system": f"{platform.system()} {platform.machine()}"}
+        lines = []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return (names or [platform.processor() or platform.machine()])[0]
 
 
 def finite(value: Any) -> Any:
@@ -66,9 +50,11 @@ def export(folder: Path, weights: Mapping[str, Tensor], config: TrainConfig, sta
         folder: existing.
         weights: state of the model.
         config: of the run.
-        state: fields of :class:`train.loop.State` as of now; ``best`` describes the weights.
+        state: fields of :class:`train.run.State` as of now; ``best`` describes the weights.
     """
     best = state["best"]
+    versions = {**environment(), "safetensors": safetensors.__version__}
+    system = f"{platform.system()} {versions.pop('machine')}"
     card = {
         "validation": {"score": best["score"], **best["figures"]},
         "step": best["step"],
@@ -83,24 +69,17 @@ def export(folder: Path, weights: Mapping[str, Tensor], config: TrainConfig, sta
         "sessions": state["sessions"],
         "threads": state["machine"].get("threads"),
         "processes": state["machine"].get("processes"),
-        "hardware": hardware(),
-        "versions": versions(),
+        "hardware": {"cpu": _cpu(), "cores": versions.pop("cores"), "system": system},
+        "versions": versions,
         "written": datetime.now(UTC).isoformat(timespec="seconds"),
     }
     # Enough to build the model that the weights belong to, without the card.
     header = {"prior": card["config"]["prior"], "unroll": config.unroll, "step": best["step"], "score": best["score"]}
     write_tensors(folder / "weights.safetensors", WEIGHTS_FORMAT, weights, header)
-    write_atomically(folder / "card.json", (json.dumps(card, indent=2, ensure_ascii=False) + "\n").encode())
-    write_atomically(folder / "card.md", _markdown(card, config).encode())
-
-
-def load_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Weights of :func:`export`, with ``prior``, ``unroll``, ``step`` and ``score``.
-
-    Raises:
-        CheckpointError: missing, damaged, or another kind of file.
-    """
-    return read_tensors(path, WEIGHTS_FORMAT)
+    texts = {"card.json": json.dumps(card, indent=2, ensure_ascii=False) + "\n", "card.md": _markdown(card, config)}
+    for name, text in texts.items():
+        with written_whole(folder / name) as part:
+            part.write_text(text, encoding="utf-8")
 
 
 def _markdown(card: Mapping[str, Any], config: TrainConfig) -> str:

@@ -1,44 +1,170 @@
 """Configuration of a training run and its YAML form.
 
 A YAML file holds the fields that differ from the defaults of :class:`TrainConfig`. Sections (``prior``, ``data``,
-``objective``) are mappings. Unknown keys are errors, so that a misspelt one does not silently train the default.
+``objective``) are mappings. Unknown keys are errors, so that a misspelt one does not silently train the default. Every
+class checks its own values, whether they come from YAML or from Python.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import math
-import types
-import typing
+import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Self
 
 import yaml
 
-if TYPE_CHECKING:
-    from train.data import DataConfig
-    from train.objective import ObjectiveConfig
+from recon.mbir.prior import PriorConfig
+from torchpcct.validate import number, numbers, whole
+from train.scenes.scene import SceneConfig
 
-__all__ = ["TrainConfig", "differences", "load_config", "packaged_config"]
+__all__ = ["DataConfig", "ObjectiveConfig", "Situation", "TrainConfig", "differences", "load_config", "packaged_config"]
 
 LONGEST_INTERVAL = 120.0
 """Largest ``checkpoint_seconds``: what a killed run may lose, in s."""
 
 
-# Imported when used: the data bring compiled kernels along, which reading a file does not need.
-def _data_config() -> DataConfig:
-    from train.data import DataConfig
+def _set(config: object, **values: Any) -> None:
+    """Put checked values into a frozen dataclass."""
+    for name, value in values.items():
+        object.__setattr__(config, name, value)
 
-    return DataConfig()
+
+def _section(cls: Any, values: Any, where: str) -> Any:
+    """Dataclass ``cls`` from plain values; ``where`` is its name in messages."""
+    if isinstance(values, cls):
+        return values
+    label = where or "the configuration"
+    if not isinstance(values, Mapping):
+        raise ValueError(f"{label} must be a mapping of names to values, got {values!r}")
+    known = [f.name for f in fields(cls)]
+    for key in values:
+        if key not in known:
+            name = f"{where}.{key}" if where else str(key)
+            raise ValueError(f"unknown key {name!r}; known in {label}: {', '.join(known)}")
+    try:
+        return cls(**values)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{where}: {error}" if where else str(error)) from error
 
 
-def _objective_config() -> ObjectiveConfig:
-    from train.objective import ObjectiveConfig
+@dataclass(frozen=True)
+class Situation:
+    """Where the inset lies and what the scan is like.
 
-    return ObjectiveConfig()
+    Args:
+        x, y: centre of the inset, mm.
+        patient_mm: diameter of the adipose cylinder.
+        pitch_scale: factor on the detector's pitch.
+    """
+
+    x: float
+    y: float
+    patient_mm: float = 240.0
+    pitch_scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        _set(self, x=number("x", self.x), y=number("y", self.y))
+        _set(self, **{k: number(k, getattr(self, k), positive=True) for k in ("patient_mm", "pitch_scale")})
+
+
+_SITUATIONS = (
+    Situation(42.0, 0.0),
+    Situation(-20.0, 38.0),
+    Situation(5.0, -8.0),
+    Situation(30.0, -55.0, patient_mm=280.0),
+    Situation(-50.0, -20.0, patient_mm=200.0),
+    Situation(10.0, 40.0, pitch_scale=1.15),
+)
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """What the training draws.
+
+    Args:
+        shape: voxels of the training inset (z, y, x).
+        voxel_mm: voxel size; 0.2 is the one that :func:`recon.mbir.mbir.reconstruct_mbir` works at.
+        exposure_s: range of the exposure, log-uniform.
+        views: views of the scans whose Gram operators are taken (their exposure is that of the whole scan).
+        situations: one Gram operator each; one is drawn per step.
+        scenes: changes of :class:`train.scenes.scene.SceneConfig`.
+        core_roi, tissue_roi: ranges of the radii of the random ROIs, mm.
+        flat_roi: share of ROIs that are discs of one slice, as in an axial image, instead of balls.
+
+    Raises:
+        TypeError, ValueError: a value is out of its range, or ``scenes`` or a situation has an unknown key.
+    """
+
+    shape: tuple[int, int, int] = (20, 24, 24)
+    voxel_mm: float = 0.2
+    exposure_s: tuple[float, float] = (0.2, 16.0)
+    views: int = 984
+    situations: tuple[Situation, ...] = _SITUATIONS
+    scenes: dict[str, Any] = field(default_factory=dict)
+    core_roi: tuple[float, float] = (0.25, 0.8)
+    tissue_roi: tuple[float, float] = (0.15, 0.45)
+    flat_roi: float = 0.6
+
+    def __post_init__(self) -> None:
+        if len(self.shape) != 3:
+            raise ValueError(f"shape must be 3 numbers (z, y, x), got {self.shape!r}")
+        if not self.situations:
+            raise ValueError("situations must name at least one scan")
+        _section(SceneConfig, self.scenes, "scenes")
+        _set(
+            self,
+            shape=tuple(whole(f"shape[{i}]", n) for i, n in enumerate(self.shape)),
+            voxel_mm=number("voxel_mm", self.voxel_mm, positive=True),
+            views=whole("views", self.views),
+            situations=tuple(_section(Situation, s, f"situations[{i}]") for i, s in enumerate(self.situations)),
+            flat_roi=number("flat_roi", self.flat_roi, low=0.0, high=1.0),
+        )
+        for name in ("exposure_s", "core_roi", "tissue_roi"):
+            low, high = numbers(name, getattr(self, name), 2, positive=True)
+            if low > high:
+                raise ValueError(f"{name} must be a range, the lower end first, got {getattr(self, name)}")
+            _set(self, **{name: (low, high)})
+
+
+@dataclass(frozen=True)
+class ObjectiveConfig:
+    """Weights of the terms of :mod:`train.objective` and size of the validation.
+
+    Args:
+        data: of eᵀH e.
+        white: of ‖e‖², against ``data``.
+        contrast: of the ROI contrast's error.
+        bias_start, bias: κ at the start, and from the share ``bias_ramp`` of the training on; geometric in between.
+        contrast_sd: an ROI contrast error, in noise units, that counts as 1.
+        validation_exposures_s: exposures of the validation scans.
+        validation_draws: noise draws of each validation scene, contrast and exposure; 2 give a variance.
+
+    Raises:
+        TypeError, ValueError: a value is out of its range.
+    """
+
+    data: float = 30.0
+    white: float = 0.05
+    contrast: float = 1.0
+    bias_start: float = 0.5
+    bias: float = 8.0
+    bias_ramp: float = 0.7
+    contrast_sd: float = 0.15
+    validation_exposures_s: tuple[float, ...] = (0.35, 2.0)
+    validation_draws: int = 6
+
+    def __post_init__(self) -> None:
+        for name in ("data", "white", "contrast", "bias"):
+            _set(self, **{name: number(name, getattr(self, name), low=0.0)})
+        for name in ("bias_start", "bias_ramp", "contrast_sd"):
+            _set(self, **{name: number(name, getattr(self, name), positive=True)})
+        exposures = numbers("validation_exposures_s", self.validation_exposures_s, positive=True)
+        _set(
+            self, validation_exposures_s=exposures, validation_draws=whole("validation_draws", self.validation_draws, 2)
+        )
 
 
 @dataclass(frozen=True)
@@ -50,20 +176,20 @@ class TrainConfig:
         steps: optimisation steps.
         batch: scenes of a step, over all processes.
         learning_rate: of Adam, at the end of the warm-up.
-        warmup: steps over which it rises linearly.
+        warmup: steps over which it rises linearly; it counts only steps that change the weights, as the average does.
         final_fraction: of ``learning_rate`` that the cosine ends with, 0 to 1.
         clip: largest norm of the gradient of the mean loss; longer ones are shortened to it. ``inf`` for none.
         ema: decay per step of the exponential moving average of the weights, in [0, 1); the average is what is
-            validated and shipped. Early in a run the decay is smaller, ``(1 + step) / (10 + step)``.
+            validated and shipped. Early in a run the decay is smaller, ``(1 + n) / (10 + n)`` after n steps.
         checkpoint_seconds: time between checkpoints in s, ≤ 120.
         validate_every: steps between validations; the last step is always validated.
         log_every: steps between rows of the log.
         prior: arguments of :class:`recon.mbir.prior.PriorConfig`.
         unroll: steps K of :class:`recon.mbir.unrolled.Unrolled`.
-        data, objective: of :mod:`train.data` and :mod:`train.objective`; their defaults if left out.
+        data, objective: :class:`DataConfig` and :class:`ObjectiveConfig`, or mappings of their fields.
 
     Raises:
-        ValueError: a value is out of its range, or ``prior`` has an unknown key.
+        TypeError, ValueError: a value is out of its range, or a section has an unknown key.
     """
 
     seed: int = 0
@@ -79,61 +205,47 @@ class TrainConfig:
     log_every: int = 1
     prior: dict[str, Any] = field(default_factory=dict)
     unroll: int = 8
-    data: DataConfig = field(default_factory=_data_config)
-    objective: ObjectiveConfig = field(default_factory=_objective_config)
+    data: DataConfig = field(default_factory=DataConfig)
+    objective: ObjectiveConfig = field(default_factory=ObjectiveConfig)
 
     def __post_init__(self) -> None:
         lowest = {"seed": 0, "steps": 1, "batch": 1, "warmup": 0, "validate_every": 1, "log_every": 1, "unroll": 1}
         for name, least in lowest.items():
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < least:
-                raise ValueError(f"{name} must be an integer of at least {least}, got {value!r}")
-        for name in ("learning_rate", "clip", "checkpoint_seconds"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)!r}")
-        if not math.isfinite(self.learning_rate):
-            raise ValueError(f"learning_rate must be finite, got {self.learning_rate!r}")
-        if not self.checkpoint_seconds <= LONGEST_INTERVAL:
-            raise ValueError(f"checkpoint_seconds must be at most {LONGEST_INTERVAL}, got {self.checkpoint_seconds!r}")
-        if not 0 <= self.final_fraction <= 1:
-            raise ValueError(f"final_fraction must be from 0 to 1, got {self.final_fraction!r}")
-        if not 0 <= self.ema < 1:
-            raise ValueError(f"ema must be from 0 to below 1, got {self.ema!r}")
-        from recon.mbir.prior import PriorConfig
-
-        _build(PriorConfig, self.prior, "prior")
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> TrainConfig:
-        """From plain values; fields left out keep their defaults.
-
-        Raises:
-            ValueError: an unknown key, a value of the wrong kind or out of range; the message names it.
-        """
-        config: TrainConfig = _build(cls, values, "")
-        return config
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain values for JSON and YAML (tuples as lists)."""
-        plain: dict[str, Any] = _plain(self)
-        return plain
+            whole(name, getattr(self, name), least)
+        _set(
+            self,
+            learning_rate=number("learning_rate", self.learning_rate, positive=True),
+            final_fraction=number("final_fraction", self.final_fraction, low=0.0, high=1.0),
+            clip=number("clip", self.clip, positive=True, finite=False),
+            ema=number("ema", self.ema, low=0.0),
+            checkpoint_seconds=number(
+                "checkpoint_seconds", self.checkpoint_seconds, positive=True, high=LONGEST_INTERVAL
+            ),
+            data=_section(DataConfig, self.data, "data"),
+            objective=_section(ObjectiveConfig, self.objective, "objective"),
+        )
+        if self.ema >= 1:
+            raise ValueError(f"ema must be less than 1, got {self.ema:g}")
+        _section(PriorConfig, self.prior, "prior")
 
     @classmethod
-    def from_yaml(cls, text: str) -> TrainConfig:
-        """From YAML.
+    def from_yaml(cls, text: str) -> Self:
+        """From YAML; fields left out keep their defaults.
 
         Raises:
-            ValueError: not a mapping of known keys to values of the right kind.
+            ValueError: not a mapping of known keys to values of the right kind and range; the message names the key.
         """
         try:
             values = yaml.safe_load(text)
         except yaml.YAMLError as error:
             raise ValueError(f"not YAML: {error}") from error
-        if values is None:
-            values = {}
-        if not isinstance(values, dict):
-            raise ValueError(f"a configuration is a mapping of names to values, got {type(values).__name__}")
-        return cls.from_dict(values)
+        config: Self = _section(cls, {} if values is None else values, "")
+        return config
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values for JSON and YAML (tuples as lists)."""
+        plain: dict[str, Any] = json.loads(json.dumps(asdict(self)))
+        return plain
 
     def to_yaml(self) -> str:
         """All fields as YAML, such that :meth:`from_yaml` gives an equal configuration."""
@@ -170,90 +282,5 @@ def differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     out: dict[str, Any] = {}
     for key, value in values.items():
-        if isinstance(value, dict):
-            out.update(_flat(value, f"{prefix}{key}."))
-        else:
-            out[prefix + key] = value
+        out.update(_flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value})
     return out
-
-
-def _plain(value: Any) -> Any:
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value) if f.init}
-    if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
-    if isinstance(value, Path):
-        return str(value)
-    return value
-
-
-def _hints(cls: type) -> dict[str, Any]:
-    # The sections of TrainConfig are imported for the type checker only.
-    names: dict[str, Any] = {}
-    if cls is TrainConfig:
-        from train.data import DataConfig
-        from train.objective import ObjectiveConfig
-
-        names = {"DataConfig": DataConfig, "ObjectiveConfig": ObjectiveConfig}
-    return typing.get_type_hints(cls, localns=names)
-
-
-def _build(cls: Any, values: Any, where: str) -> Any:
-    """Dataclass ``cls`` from plain values; ``where`` is its name in messages."""
-    label = where or "the configuration"
-    if not isinstance(values, Mapping):
-        raise ValueError(f"{label} must be a mapping of names to values, got {values!r}")
-    known = [f.name for f in dataclasses.fields(cls) if f.init]
-    for key in values:
-        if key not in known:
-            name = f"{where}.{key}" if where else str(key)
-            raise ValueError(f"unknown key {name!r}; known in {label}: {', '.join(known)}")
-    hints = _hints(cls)
-    arguments = {k: _convert(hints[k], v, f"{where}.{k}" if where else k) for k, v in values.items()}
-    try:
-        return cls(**arguments)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{where}: {error}" if where else str(error)) from error
-
-
-def _convert(hint: Any, value: Any, where: str) -> Any:
-    """A YAML value as the type of its field."""
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if origin in (typing.Union, types.UnionType):
-        if value is None and type(None) in arguments:
-            return None
-        rest = [a for a in arguments if a is not type(None)]
-        if len(rest) == 1:
-            return _convert(rest[0], value, where)
-        return value
-    if dataclasses.is_dataclass(hint):
-        return value if isinstance(value, typing.cast(type, hint)) else _build(hint, value, where)
-    if hint is float:
-        return _float(value, where)
-    if hint in (int, bool, str):
-        if not isinstance(value, hint) or (hint is int and isinstance(value, bool)):
-            raise ValueError(f"{where} must be of type {hint.__name__}, got {value!r}")
-        return value
-    if origin is tuple:
-        if not isinstance(value, (list, tuple)):
-            raise ValueError(f"{where} must be a list, got {value!r}")
-        if len(arguments) == 2 and arguments[1] is Ellipsis:
-            return tuple(_convert(arguments[0], v, where) for v in value)
-        if len(value) != len(arguments):
-            raise ValueError(f"{where} must have {len(arguments)} values, got {value!r}")
-        return tuple(_convert(a, v, where) for a, v in zip(arguments, value, strict=True))
-    if origin is dict and not isinstance(value, Mapping):
-        raise ValueError(f"{where} must be a mapping, got {value!r}")
-    return value
-
-
-def _float(value: Any, where: str) -> float:
-    # YAML 1.1 reads 1e-3, without a point, as text.
-    if not isinstance(value, bool) and isinstance(value, (int, float, str)):
-        try:
-            return float(value)
-        except ValueError:
-            pass
-    raise ValueError(f"{where} must be a number, got {value!r}")

@@ -2,8 +2,7 @@
 
 For a scene x and an exposure, β = H x + noise of covariance H is distributed as AᵀW y of a scan (up to the model error
 of the Gram operator, see :mod:`recon.gram.gram`), so thousands of scans a minute cost a few FFTs. The Gram operators
-are
-those of real scanners: several inset positions, patient sizes and pitches, each made when it is first asked for.
+are those of real scanners: several inset positions, patient sizes and pitches, each made when it is first asked for.
 """
 
 from __future__ import annotations
@@ -11,88 +10,29 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from recon.gram.gram import Gram
 from recon.mbir.unrolled import NormalProblem
+from recon.pwls.inset_problem import InsetProblem
+from torchpcct.acquisition.acquire import acquire
 from torchpcct.geometry import VolumeGrid
+from torchpcct.scanner import presets
+from torchpcct.scene import Body, EllipticCylinder, Scene
+from train.config import DataConfig, Situation
 from train.scenes.rasterise import random_scene
 from train.scenes.scene import SceneConfig
 
-__all__ = ["Batch", "Data", "DataConfig", "Situation", "seed_of"]
+__all__ = ["Batch", "Data", "seed_of", "situation_gram"]
 
 
-@dataclass(frozen=True)
-class Situation:
-    """Where the inset lies and what the scan is like.
-
-    Args:
-        x, y: centre of the inset, mm.
-        patient_mm: diameter of the adipose cylinder.
-        pitch_scale: factor on the detector's pitch.
-    """
-
-    x: float
-    y: float
-    patient_mm: float = 240.0
-    pitch_scale: float = 1.0
-
-
-_SITUATIONS = (
-    Situation(42.0, 0.0),
-    Situation(-20.0, 38.0),
-    Situation(5.0, -8.0),
-    Situation(30.0, -55.0, patient_mm=280.0),
-    Situation(-50.0, -20.0, patient_mm=200.0),
-    Situation(10.0, 40.0, pitch_scale=1.15),
-)
-
-
-@dataclass(frozen=True)
-class DataConfig:
-    """What the training draws.
-
-    Args:
-        shape: voxels of the training inset (z, y, x).
-        voxel_mm: voxel size; 0.2 is the one that :func:`recon.mbir.mbir.reconstruct_mbir` works at.
-        exposure_s: range of the exposure, log-uniform.
-        views: views of the scans whose Gram operators are taken (their exposure is that of the whole scan).
-        situations: one Gram operator each; one is drawn per step.
-        scenes: changes of :class:`train.scenes.scene.SceneConfig`.
-        core_roi, tissue_roi: ranges of the radii of the random ROIs, mm.
-        flat_roi: share of ROIs that are discs of one slice, as in an axial image, instead of balls.
-    """
-
-    shape: tuple[int, int, int] = (20, 24, 24)
-    voxel_mm: float = 0.2
-    exposure_s: tuple[float, float] = (0.2, 16.0)
-    views: int = 984
-    situations: tuple[Situation, ...] = _SITUATIONS
-    scenes: dict[str, Any] = field(default_factory=dict)
-    core_roi: tuple[float, float] = (0.25, 0.8)
-    tissue_roi: tuple[float, float] = (0.15, 0.45)
-    flat_roi: float = 0.6
-
-    def __post_init__(self) -> None:
-        set_ = object.__setattr__
-        set_(self, "shape", tuple(int(n) for n in self.shape))
-        set_(self, "exposure_s", tuple(float(v) for v in self.exposure_s))
-        set_(self, "core_roi", tuple(float(v) for v in self.core_roi))
-        set_(self, "tissue_roi", tuple(float(v) for v in self.tissue_roi))
-        set_(self, "situations", tuple(s if isinstance(s, Situation) else Situation(**s) for s in self.situations))
-        low, high = self.exposure_s
-        if not 0 < low <= high:
-            raise ValueError(f"exposure_s must be a range of positive times, got {self.exposure_s}")
-        if not self.voxel_mm > 0:
-            raise ValueError(f"voxel_mm must be positive, got {self.voxel_mm}")
-        if not 0 <= self.flat_roi <= 1:
-            raise ValueError(f"flat_roi must be from 0 to 1, got {self.flat_roi}")
-        if not self.situations:
-            raise ValueError("situations must name at least one scan")
+def seed_of(*key: int | str) -> int:
+    """A seed below 2⁶³ that depends on every part of the key and on their order."""
+    text = ",".join(str(part) for part in key)
+    return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "little") >> 1
 
 
 @dataclass(frozen=True)
@@ -163,27 +103,14 @@ class Data:
 
 def situation_gram(situation: Situation, config: DataConfig) -> tuple[Gram, float]:
     """The Gram operator of the training inset in one situation, per second of exposure, and 1 HU in mm⁻¹."""
-    from recon.pwls.inset_problem import InsetProblem
-    from torchpcct.acquisition.acquire import acquire
-    from torchpcct.scanner import presets
-    from torchpcct.scene import Body, EllipticCylinder, Scene
-
     scanner = presets.pcct(views=config.views)
     g = scanner.geometry
-    if situation.pitch_scale != 1.0:
-        pitch = tuple(p * situation.pitch_scale for p in g.pitch)
-        scanner = replace(scanner, geometry=replace(g, pitch=pitch))
+    scanner = replace(scanner, geometry=replace(g, pitch=tuple(p * situation.pitch_scale for p in g.pitch)))
     patient = Scene((Body("patient", EllipticCylinder(situation.patient_mm / 2), "pericoronary_fat"),))
     grid = VolumeGrid(config.shape, config.voxel_mm, (0.0, situation.y, situation.x))
     clean = acquire(patient, scanner, region=grid)
     problem = InsetProblem(clean, grid, nodes=1)
     return problem.gram.without_projector(), problem.mu_ref / 1000.0
-
-
-def seed_of(*numbers: int) -> int:
-    """A seed below 2⁶³ that depends on every number and on their order."""
-    text = ",".join(str(int(n)) for n in numbers)
-    return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "little") >> 1
 
 
 def _random_contrast(
@@ -194,11 +121,10 @@ def _random_contrast(
     if not inside.any():
         inside = around
     flat = float(torch.rand((), generator=generator)) < config.flat_roi
-    first = _ball(inside, config.core_roi, config.voxel_mm, generator)
+    first = _ball(inside, config.core_roi, config.voxel_mm, generator, inside)
     # The tissue next to the core is what the study's background ROI lies in, and hardest: half of all draws.
-    near = around & _within(
-        first, around.shape, 0.7 + 0.5 * float(torch.rand((), generator=generator)), config.voxel_mm
-    )
+    margin = 0.7 + 0.5 * float(torch.rand((), generator=generator))
+    near = around & _within(first, margin, config.voxel_mm)
     second = _ball(near if near.any() else around, config.tissue_roi, config.voxel_mm, generator, around)
     if flat:
         first, second = _fullest_slice(first), _fullest_slice(second)
@@ -209,13 +135,9 @@ def _random_contrast(
 
 
 def _ball(
-    mask: Tensor,
-    radius_mm: tuple[float, float],
-    voxel_mm: float,
-    generator: torch.Generator,
-    within: Tensor | None = None,
+    mask: Tensor, radius_mm: tuple[float, float], voxel_mm: float, generator: torch.Generator, within: Tensor
 ) -> Tensor:
-    """The voxels of ``within`` (default: ``mask``) in a ball about a random voxel of ``mask``."""
+    """The voxels of ``within`` in a ball about a random voxel of ``mask``."""
     places = torch.nonzero(mask)
     low, high = radius_mm
     radius = low + (high - low) * float(torch.rand((), generator=generator))
@@ -223,7 +145,9 @@ def _ball(
     if len(places) == 0:
         return torch.zeros_like(mask)
     centre = places[min(int(draw * len(places)), len(places) - 1)]
-    return (mask if within is None else within) & (_squared(mask.shape, centre) <= (radius / voxel_mm) ** 2)
+    z, y, x = (torch.arange(n) - int(c) for n, c in zip(mask.shape, centre, strict=True))
+    near = z[:, None, None] ** 2 + y[:, None] ** 2 + x**2 <= (radius / voxel_mm) ** 2
+    return near & within
 
 
 def _fullest_slice(mask: Tensor) -> Tensor:
@@ -234,18 +158,13 @@ def _fullest_slice(mask: Tensor) -> Tensor:
     return out
 
 
-def _within(ball: Tensor, shape: torch.Size, margin_mm: float, voxel_mm: float) -> Tensor:
+def _within(ball: Tensor, margin_mm: float, voxel_mm: float) -> Tensor:
     """Voxels within ``margin_mm`` of the box that holds ``ball``."""
     places = torch.nonzero(ball)
     if len(places) == 0:
-        return torch.ones(shape, dtype=torch.bool)
-    out = torch.zeros(shape, dtype=torch.bool)
+        return torch.ones_like(ball)
+    out = torch.zeros_like(ball)
     reach = round(margin_mm / voxel_mm)
     low, high = places.amin(0) - reach, places.amax(0) + reach + 1
     out[tuple(slice(max(int(a), 0), int(b)) for a, b in zip(low, high, strict=True))] = True
     return out
-
-
-def _squared(shape: torch.Size, centre: Tensor) -> Tensor:
-    z, y, x = (torch.arange(n) - int(c) for n, c in zip(shape, centre, strict=True))
-    return z[:, None, None] ** 2 + y[:, None] ** 2 + x**2

@@ -15,8 +15,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
+from tqdm import tqdm
 
-from train.checkpoint import write_atomically
+from torchpcct.files import written_whole
 
 __all__ = ["Logs", "Table", "save_picture"]
 
@@ -40,49 +42,32 @@ class Table:
     def __init__(self, path: Path, after: int = 0) -> None:
         self.path = path
         self.columns: list[str] = []
-        self._rows: list[list[str]] = []
-        if path.exists():
-            self._read(after)
-        if self.columns:
-            self._rewrite()
-        else:
-            path.unlink(missing_ok=True)
+        self._rows: list[dict[str, str]] = []
         self._file: Any = None
-
-    def _read(self, after: int) -> None:
-        text = self.path.read_text(encoding="utf-8")
-        # Without its line end the last row may be cut short anywhere, also within a number.
-        whole = text[: text.rfind("\n") + 1]
-        rows = [row for row in csv.reader(io.StringIO(whole)) if row]
-        if not rows:
-            return
-        for row in rows[1:]:
-            if len(row) == len(rows[0]) and row[0].isdigit() and int(row[0]) <= after:
-                self._rows.append(row)
-        self.columns = rows[0] if self._rows else []
-
-    @property
-    def steps(self) -> list[int]:
-        """First column."""
-        return [int(row[0]) for row in self._rows]
+        if path.exists():
+            text = path.read_text(encoding="utf-8")
+            # Without its line end the last row may be cut short anywhere, also within a number.
+            rows = list(csv.DictReader(io.StringIO(text[: text.rfind("\n") + 1])))
+            self._rows = [r for r in rows if None not in r.values() and r["step"].isdigit() and int(r["step"]) <= after]
+            if self._rows:
+                self.columns = list(self._rows[0])
+                self._rewrite()
+            else:
+                path.unlink()
 
     def append(self, step: int, values: Mapping[str, float]) -> None:
         """Add a row, at once visible to other processes."""
-        names = ["step", *values]
-        fresh = [n for n in names if n not in self.columns]
-        cells = {"step": str(step), **{k: _number(v) for k, v in values.items()}}
+        row = {"step": str(step), **{k: _number(v) for k, v in values.items()}}
+        fresh = [n for n in row if n not in self.columns]
+        self._rows.append(row)
         if fresh:
             self.close()
             self.columns += fresh
-            self._rows = [row + [""] * (len(self.columns) - len(row)) for row in self._rows]
-        row = [cells.get(name, "") for name in self.columns]
-        self._rows.append(row)
-        if fresh:
             self._rewrite()
             return
         if self._file is None:
             self._file = open(self.path, "a", encoding="utf-8", newline="")  # noqa: SIM115 (stays open)
-        self._file.write(_lines([row]))
+        self._writer(self._file).writerow(row)
         self._file.flush()
 
     def sync(self) -> None:
@@ -97,18 +82,18 @@ class Table:
             self._file = None
 
     def _rewrite(self) -> None:
-        write_atomically(self.path, _lines([self.columns, *self._rows]).encode())
+        with written_whole(self.path) as part, open(part, "w", encoding="utf-8", newline="") as file:
+            writer = self._writer(file)
+            writer.writeheader()
+            writer.writerows(self._rows)
+
+    def _writer(self, file: Any) -> csv.DictWriter[str]:
+        return csv.DictWriter(file, self.columns, lineterminator="\n")
 
 
 def _number(value: float) -> str:
     value = float(value)
     return str(int(value)) if value.is_integer() and abs(value) < 2**53 else repr(value)
-
-
-def _lines(rows: list[list[str]]) -> str:
-    buffer = io.StringIO(newline="")
-    csv.writer(buffer, lineterminator="\n").writerows(rows)
-    return buffer.getvalue()
 
 
 def save_picture(path: Path, image: NDArray[Any]) -> None:
@@ -121,8 +106,6 @@ def save_picture(path: Path, image: NDArray[Any]) -> None:
     Raises:
         ValueError: not a 2-D array with pixels.
     """
-    from PIL import Image
-
     image = np.asarray(image)
     if image.ndim != 2 or image.size == 0:
         raise ValueError(f"a picture must be a 2-D array, got shape {image.shape}")
@@ -131,9 +114,8 @@ def save_picture(path: Path, image: NDArray[Any]) -> None:
     grey = np.rint(255 * np.nan_to_num(shade.clip(0, 1))).astype(np.uint8)
     factor = max(1, math.ceil(SMALLEST_PICTURE / min(grey.shape)))
     grey = grey.repeat(factor, 0).repeat(factor, 1)
-    buffer = io.BytesIO()
-    Image.fromarray(grey).save(buffer, format="PNG")
-    write_atomically(path, buffer.getvalue())
+    with written_whole(path) as part:
+        Image.fromarray(grey).save(part, format="PNG")
 
 
 class Logs:
@@ -160,8 +142,6 @@ class Logs:
         self.pictures = folder / "pictures"
         self.pictures.mkdir(exist_ok=True)
         self._writer = _writer(folder / "tensorboard", step + 1) if tensorboard else None
-        from tqdm import tqdm
-
         self._bar = tqdm(
             total=steps,
             initial=step,
@@ -198,7 +178,8 @@ class Logs:
         self.validation.append(step, values)
         self._events("validation", step, values)
         for name, image in pictures.items():
-            save_picture(self.pictures / f"{_file_name(name)}_{step:06d}.png", image)
+            name = re.sub(r"[^\w.-]+", "_", name).strip("._") or "picture"
+            save_picture(self.pictures / f"{name}_{step:06d}.png", image)
         self.message(f"step {step}: validation score {score:.5g}")
 
     def message(self, text: str) -> None:
@@ -225,10 +206,6 @@ class Logs:
         if self._writer is not None:
             for name, value in values.items():
                 self._writer.add_scalar(f"{group}/{name}", value, step)
-
-
-def _file_name(name: str) -> str:
-    return re.sub(r"[^\w.-]+", "_", name).strip("._") or "picture"
 
 
 def _writer(folder: Path, purge_step: int) -> Any:

@@ -16,58 +16,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from recon.mbir.unrolled import NormalProblem
+from train.config import ObjectiveConfig
 from train.data import Batch, Data, seed_of
 from train.scenes.held_out import validation_scenes
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-__all__ = ["Loss", "Objective", "ObjectiveConfig", "Validation"]
-
-
-@dataclass(frozen=True)
-class ObjectiveConfig:
-    """Weights of the terms and size of the validation.
-
-    Args:
-        data: of eᵀH e.
-        white: of ‖e‖², against ``data``.
-        contrast: of the ROI contrast's error.
-        bias_start, bias: κ at the start, and from the share ``bias_ramp`` of the training on; geometric in between.
-        contrast_sd: an ROI contrast error, in noise units, that counts as 1.
-        validation_exposures_s: exposures of the validation scans.
-        validation_draws: noise draws of each validation scene, contrast and exposure.
-    """
-
-    data: float = 30.0
-    white: float = 0.05
-    contrast: float = 1.0
-    bias_start: float = 0.5
-    bias: float = 8.0
-    bias_ramp: float = 0.7
-    contrast_sd: float = 0.15
-    validation_exposures_s: tuple[float, ...] = (0.35, 2.0)
-    validation_draws: int = 6
-
-    def __post_init__(self) -> None:
-        for name in ("data", "white", "contrast", "bias", "contrast_sd"):
-            value = getattr(self, name)
-            if not (isinstance(value, int | float) and math.isfinite(value) and value >= 0):
-                raise ValueError(f"{name} must be a finite number of at least 0, got {value!r}")
-        for name in ("bias_start", "bias_ramp"):
-            value = getattr(self, name)
-            if not (isinstance(value, int | float) and math.isfinite(value) and value > 0):
-                raise ValueError(f"{name} must be a finite number greater than 0, got {value!r}")
-        object.__setattr__(self, "validation_exposures_s", tuple(float(v) for v in self.validation_exposures_s))
-        if self.validation_draws < 2:
-            raise ValueError(f"validation_draws must be at least 2 to give a variance, got {self.validation_draws}")
+__all__ = ["Loss", "Objective", "Validation"]
 
 
 @dataclass(frozen=True)
@@ -165,8 +126,7 @@ class Objective:
                 found = torch.stack([(v * roi).sum(dim=(1, 2, 3)) for v in volumes]).double()
                 if i < 2:
                     middle = d.shape[0] // 2
-                    both = torch.cat([truth[0, middle], volumes[0][0, middle]], dim=1)
-                    pictures[f"{exposure:g}s_{i}"] = both.numpy()
+                    pictures[f"{exposure:g}s_{i}"] = torch.cat([truth[0, middle], volumes[0][0, middle]], dim=1).numpy()
                 true = (truth * roi).sum(dim=(1, 2, 3))
                 mean = found.mean(1)
                 slopes.append(float((mean[0] - mean[1]) / (true[0] - true[1])))

@@ -7,7 +7,6 @@ over the same extent and averaged onto the grid that was asked for. Weights and 
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 import time
@@ -23,6 +22,7 @@ from torch import Tensor
 from recon.fbp.inset import to_hu
 from recon.mbir.prior import PriorConfig
 from recon.mbir.unrolled import NormalProblem, Unrolled, minimise_passes, residual
+from recon.mbir.weights_io import read_tensors
 from recon.pwls.inset_problem import InsetProblem
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
@@ -67,24 +67,20 @@ class Mbir:
 
         Raises:
             FileNotFoundError: no such file.
-            ValueError: a file that holds no weights of this model.
+            ValueError: a file that is damaged or holds no weights of this model.
         """
         source = Path(path) if path is not None else Path(str(resources.files("recon") / "mbir" / "weights" / SHIPPED))
         if not source.is_file():
             raise FileNotFoundError(f"no weights at {source}: train them (python -m train) or name a file")
-        from safetensors import SafetensorError, safe_open
-
         try:
-            with safe_open(str(source), framework="pt") as file:
-                header = file.metadata() or {}
-                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            if header.get("format") != WEIGHTS_FORMAT:
-                raise ValueError(f"{source} holds {header.get('format', 'something else')!r}, not {WEIGHTS_FORMAT!r}")
-            config = json.loads(header["metadata"])
+            tensors, config = read_tensors(source, WEIGHTS_FORMAT)
             model = Unrolled(PriorConfig(**config["prior"]), steps=config["unroll"], add_back=add_back)
             model.load_state_dict(tensors)
-        except (SafetensorError, KeyError, TypeError, RuntimeError, json.JSONDecodeError) as error:
-            raise ValueError(f"{source} holds no weights of this unrolled reconstruction: {error}") from error
+        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+            raise ValueError(
+                f"{source} holds no weights of this unrolled reconstruction: {error} (shipped weights come back with "
+                "a new installation of the package)"
+            ) from error
         return cls(model)
 
     def problem(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> NormalProblem:

@@ -10,7 +10,7 @@ import torch
 from train.scenes.drawing import draw_scene
 from train.scenes.held_out import validation_scenes
 from train.scenes.rasterise import random_scene, rasterise
-from train.scenes.scene import Scene, SceneConfig, Texture, Vessel, Volume, is_paper_family
+from train.scenes.scene import SceneConfig, Solid, Texture, TrainingScene, Vessel, is_paper_family
 
 EXTENT = (9.0, 9.0, 11.2)
 SMALL = (15, 15, 19)
@@ -40,7 +40,7 @@ def vessel(**changes: object) -> Vessel:
     return replace(base, **changes)
 
 
-PAPER_CORE = Volume("core", "ellipsoid", 40.0, (0.6, 0.0, 0.0), (0.6, 0.985, 0.985), cap=0.17, contrast=-52.0)
+PAPER_CORE = Solid("core", "ellipsoid", 40.0, (0.6, 0.0, 0.0), (0.6, 0.985, 0.985), cap=0.17, contrast=-52.0)
 
 
 def test_same_seed_same_scene_and_batches_split() -> None:
@@ -75,7 +75,7 @@ def test_content_of_many_scenes() -> None:
         "free": sum(bool(s.free) for s in batch.scenes),
         "two": sum(len(s.vessels) == 2 for s in batch.scenes),
         "texture": sum(bool(s.textures) for s in batch.scenes),
-        "calcium": sum(any(v.kind == "calcification" for w in s.vessels for v in w.volumes) for s in batch.scenes),
+        "calcium": sum(any(v.kind == "calcification" for w in s.vessels for v in w.solids) for s in batch.scenes),
         "virtual": sum(bool(s.cores) and s.contrast == 0 for s in batch.scenes),
     }
     assert all(10 <= n <= 90 for n in counts.values()), counts
@@ -93,8 +93,8 @@ def test_ellipsoid_has_its_volume_at_any_offset(axes: tuple, spacing: tuple) -> 
     for _ in range(4):
         q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
         centre = tuple(rng.uniform(-0.2, 0.2, 3))
-        body = Volume("free", "ellipsoid", 1.0, centre, axes, rotation=tuple(q.ravel()))
-        image = rasterise(Scene(0.0, free=(body,)), shape, spacing)[0].astype(np.float64)
+        body = Solid("free", "ellipsoid", 1.0, centre, axes, rotation=tuple(q.ravel()))
+        image = rasterise(TrainingScene(0.0, free=(body,)), shape, spacing)[0].astype(np.float64)
         assert image.sum() * math.prod(spacing) == pytest.approx(4 / 3 * math.pi * math.prod(axes), rel=0.01)
         where = np.meshgrid(
             *[(np.arange(n) - (n - 1) / 2) * s for n, s in zip(shape, spacing, strict=True)], indexing="ij"
@@ -116,21 +116,22 @@ def test_voxels_are_averages_of_finer_ones() -> None:
 def test_tilted_tube_has_the_thickness_asked_for() -> None:
     """Across the tube, not across the slice: a slice of the tilted one is longer by 1 / cos."""
     tube = vessel(slope=(math.tan(0.6), 0.0), position=(0.0, 0.0), lumen_radius=0.6, lumen_hu=92.0, wall_hu=92.0)
-    image = rasterise(Scene(-90.0, (tube,)), (21, 60, 60), (0.2, 0.2, 0.2))[0]
+    image = rasterise(TrainingScene(-90.0, (tube,)), (21, 60, 60), (0.2, 0.2, 0.2))[0]
     area = float((image[10] + 90.0).sum()) / 182.0 * 0.04
     assert area == pytest.approx(math.pi * 1.68**2 / math.cos(0.6), rel=0.01)
 
 
 def test_masks_are_the_contrast() -> None:
     """Core and surround are the derivatives of the image by the HU of the two tissues."""
-    tube = vessel(volumes=(PAPER_CORE,))
-    image, core, surround = rasterise(Scene(-90.0, (tube,)), (30, 30, 30), (0.2, 0.2, 0.2))
-    core_up = replace(tube, volumes=(replace(PAPER_CORE, hu=50.0),))
-    assert np.allclose(rasterise(Scene(-90.0, (core_up,)), (30, 30, 30), (0.2,) * 3)[0] - image, 10 * core, atol=1e-3)
-    fibrous_up = replace(tube, fibrous_hu=102.0)
-    assert np.allclose(
-        rasterise(Scene(-90.0, (fibrous_up,)), (30, 30, 30), (0.2,) * 3)[0] - image, 10 * surround, atol=1e-3
-    )
+    tube = vessel(solids=(PAPER_CORE,))
+
+    def paint(vessel: Vessel) -> np.ndarray:
+        return rasterise(TrainingScene(-90.0, (vessel,)), (30, 30, 30), (0.2, 0.2, 0.2))
+
+    image, core, surround = paint(tube)
+    core_up = replace(tube, solids=(replace(PAPER_CORE, hu=50.0),))
+    assert np.allclose(paint(core_up)[0] - image, 10 * core, atol=1e-3)
+    assert np.allclose(paint(replace(tube, fibrous_hu=102.0))[0] - image, 10 * surround, atol=1e-3)
     assert float(core.max()) == pytest.approx(1.0)
     assert float(surround.max()) == pytest.approx(1.0)
 
@@ -144,19 +145,19 @@ def test_equal_extents_give_equal_scenes_at_other_spacings() -> None:
 
 
 def test_paper_family_is_recognised() -> None:
-    assert is_paper_family(Scene(-90.0, (vessel(volumes=(PAPER_CORE,)),)))
+    assert is_paper_family(TrainingScene(-90.0, (vessel(solids=(PAPER_CORE,)),)))
     turned = replace(PAPER_CORE, semi_axes=(1.1, 0.5, 0.9), contrast=-36.0)
-    assert is_paper_family(Scene(-90.0, (vessel(diameter=2.6), vessel(diameter=3.6, volumes=(turned,)))))
+    assert is_paper_family(TrainingScene(-90.0, (vessel(diameter=2.6), vessel(diameter=3.6, solids=(turned,)))))
     others = (
-        vessel(diameter=2.9, volumes=(PAPER_CORE,)),
-        vessel(volumes=(PAPER_CORE, PAPER_CORE)),
-        vessel(volumes=(replace(PAPER_CORE, contrast=-80.0),)),
-        vessel(volumes=(replace(PAPER_CORE, contrast=52.0),)),
-        vessel(volumes=(replace(PAPER_CORE, semi_axes=(0.6, 0.7, 0.985)),)),
-        vessel(volumes=(replace(PAPER_CORE, shape="superquadric", exponent=4.0),)),
+        vessel(diameter=2.9, solids=(PAPER_CORE,)),
+        vessel(solids=(PAPER_CORE, PAPER_CORE)),
+        vessel(solids=(replace(PAPER_CORE, contrast=-80.0),)),
+        vessel(solids=(replace(PAPER_CORE, contrast=52.0),)),
+        vessel(solids=(replace(PAPER_CORE, semi_axes=(0.6, 0.7, 0.985)),)),
+        vessel(solids=(replace(PAPER_CORE, shape="superquadric", exponent=4.0),)),
         vessel(),
     )
-    assert not any(is_paper_family(Scene(-90.0, (v,))) for v in others)
+    assert not any(is_paper_family(TrainingScene(-90.0, (v,))) for v in others)
 
 
 def test_paper_family_is_never_drawn(monkeypatch: pytest.MonkeyPatch) -> None:

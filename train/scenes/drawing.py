@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from train.scenes.scene import Bump, Range, Scene, SceneConfig, Texture, Triple, Vessel, Volume, is_paper_family
+from train.scenes.scene import Bump, Range, SceneConfig, Solid, Texture, TrainingScene, Triple, Vessel, is_paper_family
 
 __all__ = ["Draw", "draw_scene"]
 
@@ -24,6 +24,10 @@ class Draw:
 
     def log(self, range_: Range) -> float:
         return math.exp(self((math.log(range_[0]), math.log(range_[1]))))
+
+    def axes(self, range_: Range) -> Triple:
+        """Three semi-axes, log-uniform."""
+        return self.log(range_), self.log(range_), self.log(range_)
 
     def chance(self, probability: float) -> bool:
         return bool(self.rng.random() < probability)
@@ -47,7 +51,7 @@ class Draw:
         )
 
 
-def draw_scene(seed: int, extent_mm: Triple, config: SceneConfig | None = None) -> Scene:
+def draw_scene(seed: int, extent_mm: Triple, config: SceneConfig | None = None) -> TrainingScene:
     """A random scene for an inset of ``extent_mm`` = ``(z, y, x)``, outside the paper's family.
 
     Depends on the seed and on the extent only, not on voxels. Positions are uniform in the inset (vessel axes in its
@@ -61,10 +65,10 @@ def draw_scene(seed: int, extent_mm: Triple, config: SceneConfig | None = None) 
             return scene
 
 
-def _draw(draw: Draw, extent: Triple, config: SceneConfig) -> Scene:
+def _draw(draw: Draw, extent: Triple, config: SceneConfig) -> TrainingScene:
     background = draw(config.muscle if draw.chance(config.muscle_probability) else config.fat)
     vessels: tuple[Vessel, ...] = ()
-    free: tuple[Volume, ...] = ()
+    free: tuple[Solid, ...] = ()
     if draw.chance(config.free_probability):
         free = tuple(_draw_free(draw, extent, config, background) for _ in range(draw.count(*config.free_count)))
     else:
@@ -78,28 +82,25 @@ def _draw(draw: Draw, extent: Triple, config: SceneConfig) -> Scene:
                     # Beneath the first, where the two cross elsewhere.
                     vessels = (other, *vessels)
                     break
-    textures: tuple[Texture, ...] = ()
-    if draw.chance(config.texture_probability):
-        textures = tuple(
-            Texture(draw(config.texture_sd), draw.log(config.texture_length), draw.seed()) for _ in range(2)
-        )
-    return Scene(background, vessels, free, textures)
+    count = 2 if draw.chance(config.texture_probability) else 0
+    textures = [Texture(draw(config.texture_sd), draw.log(config.texture_length), draw.seed()) for _ in range(count)]
+    return TrainingScene(background, vessels, free, tuple(textures))
 
 
-def _draw_free(draw: Draw, extent: Triple, config: SceneConfig, background: float) -> Volume:
+def _draw_free(draw: Draw, extent: Triple, config: SceneConfig, background: float) -> Solid:
     shape = ("ellipsoid", "superquadric", "tube")[draw.count(0, 2)]
-    axes = [draw.log(config.free_size) for _ in range(3)]
+    axes = draw.axes(config.free_size)
     if shape == "tube":
         # An ellipsoid longer than any inset: a body of slowly varying section.
-        axes[2] = 5.0 * max(extent)
-    centre = tuple(draw((-0.5 * e, 0.5 * e)) for e in extent[::-1])
+        axes = (*axes[:2], 5.0 * max(extent))
+    x, y, z = (draw((-0.5 * e, 0.5 * e)) for e in extent[::-1])
     contrast = draw(config.free_contrast)
-    return Volume(
+    return Solid(
         kind="free",
         shape=shape,
         hu=background + contrast,
-        centre=(centre[0], centre[1], centre[2]),
-        semi_axes=(axes[0], axes[1], axes[2]),
+        centre=(x, y, z),
+        semi_axes=axes,
         exponent=draw.log(config.exponent) if shape == "superquadric" else 2.0,
         rotation=draw.rotation(),
         contrast=contrast,
@@ -143,29 +144,20 @@ def _draw_vessel(draw: Draw, extent: Triple, config: SceneConfig, cores: bool | 
         narrowing=_bumps(draw, extent, config.narrowing, config.bump_width, 2),
         swelling=_bumps(draw, extent, config.swelling, config.bump_width, 2),
     )
-    volumes: list[Volume] = []
+    solids: list[Solid] = []
     if cores is not None:
         weights = np.cumsum(config.core_counts) / sum(config.core_counts)
         number = 1 + int(np.searchsorted(weights, draw.rng.random())) if cores else 1
         for _ in range(min(number, len(weights))):
             contrast = draw.log(config.core_contrast) * (-1.0 if draw.chance(config.core_negative) else 1.0)
             contrast = contrast if cores else 0.0
-            volumes.append(_draw_core(draw, extent, config, vessel, contrast))
+            solids.append(_draw_core(draw, extent, config, vessel, contrast))
     if draw.chance(config.calcification_probability):
         for _ in range(draw.count(1, 2)):
             (u, w), z, _, _ = _place(draw, extent, vessel, math.pi)
-            axes = [draw.log(config.calcification_size) for _ in range(3)]
-            volumes.append(
-                Volume(
-                    kind="calcification",
-                    shape="ellipsoid",
-                    hu=draw(config.calcification_hu),
-                    centre=(u, w, z),
-                    semi_axes=(axes[0], axes[1], axes[2]),
-                    rotation=draw.rotation(),
-                )
-            )
-    return replace(vessel, volumes=tuple(volumes))
+            axes, hu = draw.axes(config.calcification_size), draw(config.calcification_hu)
+            solids.append(Solid("calcification", "ellipsoid", hu, (u, w, z), axes, rotation=draw.rotation()))
+    return replace(vessel, solids=tuple(solids))
 
 
 def _place(
@@ -193,7 +185,7 @@ def _place(
     return (r * c, r * s), z, direction, thickness
 
 
-def _draw_core(draw: Draw, extent: Triple, config: SceneConfig, vessel: Vessel, contrast: float) -> Volume:
+def _draw_core(draw: Draw, extent: Triple, config: SceneConfig, vessel: Vessel, contrast: float) -> Solid:
     shape = ("ellipsoid", "superquadric", "crescent", "rod")[draw.count(0, 3)]
     (u, w), z, direction, thickness = _place(draw, extent, vessel, 1.0)
     inner = 0.5 * vessel.diameter * vessel.aspect - vessel.wall
@@ -212,7 +204,7 @@ def _draw_core(draw: Draw, extent: Triple, config: SceneConfig, vessel: Vessel, 
     rotation: tuple[float, ...] = (c, s, 0.0, -s, c, 0.0, 0.0, 0.0, 1.0)
     if shape in ("ellipsoid", "superquadric") and draw.chance(0.5):
         rotation = draw.rotation()
-    return Volume(
+    return Solid(
         kind="core",
         shape=shape,
         hu=vessel.fibrous_hu + contrast,

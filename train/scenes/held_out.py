@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from train.scenes.drawing import Draw
 from train.scenes.rasterise import check_grid, rasterise
-from train.scenes.scene import Scene, Triple, Vessel, Volume
+from train.scenes.scene import Solid, TrainingScene, Triple, Vessel
 
 __all__ = ["ValidationScenes", "validation_scenes"]
 
@@ -35,7 +35,7 @@ class ValidationScenes:
     core: torch.Tensor
     core_roi: torch.Tensor
     fibrous_roi: torch.Tensor
-    scenes: tuple[Scene, ...]
+    scenes: tuple[TrainingScene, ...]
 
 
 def validation_scenes(
@@ -57,51 +57,38 @@ def validation_scenes(
     shape, spacing = check_grid(grid_shape, spacing_mm)
     extent = (shape[0] * spacing[0], shape[1] * spacing[1], shape[2] * spacing[2])
     rng = np.random.default_rng(seed)
-    images, cores, core_rois, fibrous_rois, scenes = [], [], [], [], []
+    found, scenes = [], []
     for index in range(size):
         draw = Draw(int(rng.integers(2**62)))
         scene = _validation_scene(draw, extent, large=bool(index % 2), crescent=bool(index // 2 % 2))
         base, weight, fibrous = rasterise(_with_contrast(scene, 0.0), shape, spacing)
         core_roi = weight > 0.99
         near = ndimage.distance_transform_edt(weight < 0.5, sampling=spacing) <= 1.5
-        tissue = (fibrous > 0.99) & near
         fibrous_roi = ndimage.binary_erosion(fibrous > 0.99, np.ones((3, 3, 3))) & near
         if fibrous_roi.sum() < 20:
-            fibrous_roi = tissue
+            fibrous_roi = (fibrous > 0.99) & near
         if not core_roi.any() or not fibrous_roi.any():
             raise ValueError(
                 f"grid {shape} at {spacing} mm leaves no voxel wholly inside core or fibrous tissue of validation "
                 f"scene {index}: take smaller voxels or a larger inset"
             )
-        images.append(np.stack([base + contrast * weight for contrast in contrasts]))
-        cores.append(weight)
-        core_rois.append(core_roi.astype(np.float32))
-        fibrous_rois.append(fibrous_roi.astype(np.float32))
+        each = np.stack([base + contrast * weight for contrast in contrasts])
+        found.append((each, weight, core_roi.astype(np.float32), fibrous_roi.astype(np.float32)))
         scenes.append(_with_contrast(scene, contrasts[0]))
-    return ValidationScenes(
-        torch.from_numpy(np.stack(images)),
-        torch.tensor(contrasts, dtype=torch.float32),
-        torch.from_numpy(np.stack(cores)),
-        torch.from_numpy(np.stack(core_rois)),
-        torch.from_numpy(np.stack(fibrous_rois)),
-        tuple(scenes),
+    image, core, inside, around = (torch.from_numpy(np.stack(maps)) for maps in zip(*found, strict=True))
+    return ValidationScenes(image, torch.tensor(contrasts, dtype=torch.float32), core, inside, around, tuple(scenes))
+
+
+def _with_contrast(scene: TrainingScene, contrast: float) -> TrainingScene:
+    """The scene, whose only solids are cores, with another contrast of all of them."""
+    vessels = (
+        replace(v, solids=tuple(replace(s, contrast=contrast, hu=v.fibrous_hu + contrast) for s in v.solids))
+        for v in scene.vessels
     )
+    return replace(scene, vessels=tuple(vessels))
 
 
-def _with_contrast(scene: Scene, contrast: float) -> Scene:
-    """The scene with another contrast of all cores."""
-
-    def change(vessel: Vessel) -> Vessel:
-        volumes = tuple(
-            replace(v, contrast=contrast, hu=vessel.fibrous_hu + contrast) if v.kind == "core" else v
-            for v in vessel.volumes
-        )
-        return replace(vessel, volumes=volumes)
-
-    return replace(scene, vessels=tuple(change(vessel) for vessel in scene.vessels))
-
-
-def _validation_scene(draw: Draw, extent: Triple, *, large: bool, crescent: bool) -> Scene:
+def _validation_scene(draw: Draw, extent: Triple, *, large: bool, crescent: bool) -> TrainingScene:
     diameter = 4.4 if large else 2.6
     wall = 0.25 if large else 0.15
     inner = 0.5 * diameter - wall
@@ -121,7 +108,7 @@ def _validation_scene(draw: Draw, extent: Triple, *, large: bool, crescent: bool
         axes = (0.27 * thickness, 0.4 * inner, 0.9 if large else 0.75)
         r, exponent = edge + cap + 0.27 * thickness, 4.0
     fibrous = draw((80.0, 110.0))
-    core = Volume(
+    core = Solid(
         kind="core",
         shape="crescent" if crescent else "superquadric",
         hu=fibrous,
@@ -147,6 +134,6 @@ def _validation_scene(draw: Draw, extent: Triple, *, large: bool, crescent: bool
         lumen_angle=0.0,
         eccentricity=eccentricity,
         eccentric_angle=direction,
-        volumes=(core,),
+        solids=(core,),
     )
-    return Scene(draw((-100.0, -80.0)), (vessel,))
+    return TrainingScene(draw((-100.0, -80.0)), (vessel,))

@@ -54,7 +54,6 @@ def _quadric(x: float, y: float, z: float, row: Any, cell: float) -> float:
     x2 = abs(row[9] * x + row[10] * y + row[11] * z)
     if max(x0 - row[12], x1 - row[13], x2 - row[14]) > row[17]:
         return FAR
-    s = 0.0
     p = row[15]
     x0, x1, x2 = x0 / row[12], x1 / row[13], x2 / row[14]
     s = np.sqrt(x0 * x0 + x1 * x1 + x2 * x2) if p == 2.0 else (x0**p + x1**p + x2**p) ** (1.0 / p)
@@ -72,8 +71,21 @@ def _quadric(x: float, y: float, z: float, row: Any, cell: float) -> float:
     curvature = (p - 1.0) * (c0 + c1 + c2 - (c0 * g0 * g0 + c1 * g1 * g1 + c2 * g2 * g2) / g)
     g = np.sqrt(g)
     # The correction is a series in cell · curvature: it means nothing where the cell is larger than the edge is round.
-    correction = min(curvature / g * cell / 24.0, 0.25) * cell
-    return (s - 1.0) / g + correction
+    return (s - 1.0) / g + min(curvature / g * cell / 24.0, 0.25) * cell
+
+
+@numba.njit(cache=True, fastmath=True)
+def _height(z: float, z_first: float, z_step: float, heights: int) -> Any:
+    """Where z lies in a tube's tables: the index below it, and the share of the way to the next one."""
+    f = min(max((z - z_first) / z_step, 0.0), heights - 1.001)
+    k = int(f)
+    return k, f - k
+
+
+@numba.njit(cache=True, fastmath=True)
+def _at(row: Any, k: int, f: float) -> float:
+    """A row of a tube's tables at a height of :func:`_height`."""
+    return row[k] + f * (row[k + 1] - row[k])
 
 
 @numba.njit(cache=True, fastmath=True)
@@ -92,36 +104,31 @@ def _distances(
     d: Any,
 ) -> bool:
     """Distances ``d`` of a point to all bodies; returns whether any is worth looking at."""
-    last = tables.shape[2] - 2
     for v in range(tables.shape[0]):
         t = tables[v]
         local[v, 0] = FAR
-        f = min(max((z - z_first) / z_step, 0.0), last + 0.999)
-        k = int(f)
-        f -= k
-        vx = x - (t[0, k] + f * (t[0, k + 1] - t[0, k]))
-        vy = y - (t[1, k] + f * (t[1, k + 1] - t[1, k]))
+        k, f = _height(z, z_first, z_step, tables.shape[2])
+        vx = x - _at(t[0], k, f)
+        vy = y - _at(t[1], k, f)
         if vx * vx + vy * vy > tubes[v, 6] ** 2:
             continue
-        tx, ty = t[2, k] + f * (t[2, k + 1] - t[2, k]), t[3, k] + f * (t[3, k + 1] - t[3, k])
+        tx, ty = _at(t[2], k, f), _at(t[3], k, f)
         foot = z + (vx * tx + vy * ty) / (1.0 + tx * tx + ty * ty)
-        f = min(max((foot - z_first) / z_step, 0.0), last + 0.999)
-        k = int(f)
-        f -= k
-        vx = x - (t[0, k] + f * (t[0, k + 1] - t[0, k]))
-        vy = y - (t[1, k] + f * (t[1, k + 1] - t[1, k]))
+        k, f = _height(foot, z_first, z_step, tables.shape[2])
+        vx = x - _at(t[0], k, f)
+        vy = y - _at(t[1], k, f)
         vz = z - foot
-        tx, ty = t[2, k] + f * (t[2, k + 1] - t[2, k]), t[3, k] + f * (t[3, k + 1] - t[3, k])
+        tx, ty = _at(t[2], k, f), _at(t[3], k, f)
         m = np.sqrt(1.0 + tx * tx)
         n = np.sqrt(1.0 + tx * tx + ty * ty)
         u = (vx - tx * vz) / m
         w = (m * m * vy - tx * ty * vx - ty * vz) / (m * n)
-        radius = t[4, k] + f * (t[4, k + 1] - t[4, k])
+        radius = _at(t[4], k, f)
         c, s = tubes[v, 1], tubes[v, 2]
         local[v, 0] = _ellipse(c * u + s * w, c * w - s * u, radius, radius * tubes[v, 0], cell)
-        du = u - (t[5, k] + f * (t[5, k + 1] - t[5, k]))
-        dw = w - (t[6, k] + f * (t[6, k + 1] - t[6, k]))
-        a, b = t[7, k] + f * (t[7, k + 1] - t[7, k]), t[8, k] + f * (t[8, k + 1] - t[8, k])
+        du = u - _at(t[5], k, f)
+        dw = w - _at(t[6], k, f)
+        a, b = _at(t[7], k, f), _at(t[8], k, f)
         c, s = tubes[v, 4], tubes[v, 5]
         local[v, 1] = _ellipse(c * du + s * dw, c * dw - s * du, a, b, cell)
         local[v, 2], local[v, 3], local[v, 4], local[v, 5] = u, w, foot, n
@@ -156,12 +163,9 @@ def _reach(
     """Interval of x outside of which no body touches the row at ``(y, z)``."""
     low, high = FAR, -FAR
     for v in range(tables.shape[0]):
-        f = min(max((z - z_first) / z_step, 0.0), tables.shape[2] - 1.001)
-        k = int(f)
-        f -= k
-        x0 = tables[v, 0, k] + f * (tables[v, 0, k + 1] - tables[v, 0, k])
-        y0 = tables[v, 1, k] + f * (tables[v, 1, k + 1] - tables[v, 1, k])
-        square = tubes[v, 6] ** 2 - (y - y0) ** 2
+        k, f = _height(z, z_first, z_step, tables.shape[2])
+        x0 = _at(tables[v, 0], k, f)
+        square = tubes[v, 6] ** 2 - (y - _at(tables[v, 1], k, f)) ** 2
         if square > 0.0:
             low, high = min(low, x0 - np.sqrt(square)), max(high, x0 + np.sqrt(square))
     for m in range(bodies.shape[0]):
@@ -240,27 +244,23 @@ def _fill(
                         near = True
                         if bodies[m, 0] >= 3:
                             fine = 2
+                cz, cy, cx = 1, 1, 1
                 if not near or fine * base == 1:
-                    _mix(d, voxel, fraction)
-                    for c in range(maps):
-                        value = 0.0
-                        for m in range(count + 1):
-                            value += weights[c, m] * fraction[m]
-                        out[c, k, j, i] = value
-                    continue
-                cz, cy, cx = fine * cells[0], fine * cells[1], fine * cells[2]
-                cell = voxel / fine if base == 1 else (volume / (cz * cy * cx)) ** (1.0 / 3.0)
-                total[:] = 0.0
-                for kk in range(cz):
-                    zz = z + ((kk + 0.5) / cz - 0.5) * dz
-                    for jj in range(cy):
-                        yy = y + ((jj + 0.5) / cy - 0.5) * dy
-                        for ii in range(cx):
-                            xx = x + ((ii + 0.5) / cx - 0.5) * dx
-                            _distances(xx, yy, zz, cell, bodies, tables, tubes, quadrics, z_first, z_step, local, d)
-                            _mix(d, cell, fraction)
-                            for m in range(count + 1):
-                                total[m] += fraction[m]
+                    _mix(d, voxel, total)
+                else:
+                    cz, cy, cx = fine * cells[0], fine * cells[1], fine * cells[2]
+                    cell = voxel / fine if base == 1 else (volume / (cz * cy * cx)) ** (1.0 / 3.0)
+                    total[:] = 0.0
+                    for kk in range(cz):
+                        zz = z + ((kk + 0.5) / cz - 0.5) * dz
+                        for jj in range(cy):
+                            yy = y + ((jj + 0.5) / cy - 0.5) * dy
+                            for ii in range(cx):
+                                xx = x + ((ii + 0.5) / cx - 0.5) * dx
+                                _distances(xx, yy, zz, cell, bodies, tables, tubes, quadrics, z_first, z_step, local, d)
+                                _mix(d, cell, fraction)
+                                for m in range(count + 1):
+                                    total[m] += fraction[m]
                 for c in range(maps):
                     value = 0.0
                     for m in range(count + 1):

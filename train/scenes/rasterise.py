@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from train.scenes.drawing import draw_scene
 from train.scenes.paint_kernels import KINDS, QUADRIC_COLUMNS, TABLE_ROWS, TUBE_COLUMNS, paint
-from train.scenes.scene import Scene, SceneConfig, Triple, Volume
+from train.scenes.scene import SceneConfig, Solid, TrainingScene, Triple
 
 __all__ = ["SceneBatch", "check_grid", "random_scene", "rasterise"]
 
@@ -41,10 +41,10 @@ class SceneBatch:
     surround: torch.Tensor
     has_core: torch.Tensor
     contrast: torch.Tensor
-    scenes: tuple[Scene, ...]
+    scenes: tuple[TrainingScene, ...]
 
 
-def rasterise(scene: Scene, shape: tuple[int, int, int], spacing_mm: Triple) -> NDArray[np.float32]:
+def rasterise(scene: TrainingScene, shape: tuple[int, int, int], spacing_mm: Triple) -> NDArray[np.float32]:
     """Image in HU, volume fraction of the cores and of their fibrous layers: ``(3, nz, ny, nx)`` float32."""
     diagonal = math.sqrt(sum(s * s for s in spacing_mm))
     half = 0.5 * shape[0] * spacing_mm[0]
@@ -57,46 +57,28 @@ def rasterise(scene: Scene, shape: tuple[int, int, int], spacing_mm: Triple) -> 
     roles: list[str] = [""]
     tubes, tables, quadrics = [], [], []
 
-    def add(volume: Volume, tube: int) -> None:
-        quadrics.append(
-            (
-                *volume.centre,
-                *volume.rotation,
-                *volume.semi_axes,
-                volume.exponent,
-                volume.cap,
-                diagonal,
-            )
-        )
-        bodies.append((KINDS[volume.kind], tube, len(quadrics) - 1))
-        values.append(volume.hu)
-        roles.append("core" if volume.kind == "core" else volume.kind)
+    def add(solid: Solid, tube: int) -> None:
+        quadrics.append((*solid.centre, *solid.rotation, *solid.semi_axes, solid.exponent, solid.cap, diagonal))
+        bodies.append((KINDS[solid.kind], tube, len(quadrics) - 1))
+        values.append(solid.hu)
+        roles.append("core" if solid.kind == "core" else solid.kind)
 
     for index, vessel in enumerate(scene.vessels):
         table = vessel.tables(z)
         steepest = math.sqrt(1.0 + float(np.max(table[2] ** 2 + table[3] ** 2)))
-        angle, lumen_angle = vessel.angle, vessel.lumen_angle
         # Calcifications may stick out of the vessel.
-        outside = max((max(v.semi_axes) for v in vessel.volumes if v.kind == "calcification"), default=0.0)
-        tubes.append(
-            (
-                vessel.aspect,
-                math.cos(angle),
-                math.sin(angle),
-                vessel.wall,
-                math.cos(lumen_angle),
-                math.sin(lumen_angle),
-                steepest * (float(table[4].max()) + outside + 1.5 * diagonal),
-            )
-        )
+        outside = max((max(s.semi_axes) for s in vessel.solids if s.kind == "calcification"), default=0.0)
+        reach = steepest * (float(table[4].max()) + outside + 1.5 * diagonal)
+        turns = [(math.cos(a), math.sin(a)) for a in (vessel.angle, vessel.lumen_angle)]
+        tubes.append((vessel.aspect, *turns[0], vessel.wall, *turns[1], reach))
         tables.append(table)
         bodies += [(KINDS[name], index, -1) for name in ("wall", "fibrous", "lumen")]
         values += [vessel.wall_hu, vessel.fibrous_hu, vessel.lumen_hu]
         roles += ["wall", "surround" if vessel.cores else "fibrous", "lumen"]
-        for volume in vessel.volumes:
-            add(volume, index)
-    for volume in scene.free:
-        add(volume, -1)
+        for solid in vessel.solids:
+            add(solid, index)
+    for solid in scene.free:
+        add(solid, -1)
     groups: list[tuple[str, ...]] = [("core",), ("surround",)]
     if scene.textures:
         groups += [("", "free"), ("wall", "fibrous", "surround", "core")]

@@ -1,13 +1,12 @@
 """The 3-D scenes in HU that a learned prior is trained with: what they consist of, and how they are distributed.
 
-A scene (:class:`Scene`) is drawn in mm and HU, without a grid (:mod:`train.scenes.drawing`);
+A scene (:class:`TrainingScene`) is drawn in mm and HU, without a grid (:mod:`train.scenes.drawing`);
 :mod:`train.scenes.rasterise` gives its area-averaged voxel values, and :mod:`train.scenes.held_out` a family of its own
 to select checkpoints with. It holds either vessels (bent, tilted tubes: wall, fibrous layer, eccentric and narrowing
 lumen; soft inclusions, called cores, and calcifications in the fibrous layer) or free-standing bodies of random
 contrast, in fat or in a tissue like muscle. Cores have contrasts of both signs. The plaque of the paper
-(:mod:`torchpcct.scene.plaque.plaque`) is never
-drawn: outer sections are centred on a smooth centreline, with no ``cos²`` bulge to one side, and
-:func:`is_paper_family` rejects what comes close in the parameters that both constructions share.
+(:mod:`torchpcct.scene.plaque.plaque`) is never drawn: outer sections are centred on a smooth centreline, with no
+``cos²`` bulge to one side, and :func:`is_paper_family` rejects what comes close in the parameters that both share.
 
 A vessel scene without a core still has a *virtual* one where it could have been: a core of contrast 0 that leaves no
 trace in the image but has a mask, so that a loss on ROI contrast also sees true contrasts of 0.
@@ -24,7 +23,7 @@ from numpy.typing import NDArray
 
 from train.scenes.paint_kernels import TABLE_ROWS
 
-__all__ = ["Bump", "Scene", "SceneConfig", "Texture", "Vessel", "Volume", "is_paper_family"]
+__all__ = ["Bump", "SceneConfig", "Solid", "Texture", "TrainingScene", "Vessel", "is_paper_family"]
 
 Range = tuple[float, float]
 Triple = tuple[float, float, float]
@@ -114,7 +113,7 @@ class Bump:
 
 
 @dataclass(frozen=True)
-class Volume:
+class Solid:
     """A superquadric ``Σ |xᵢ / aᵢ|ᵖ ≤ 1``; an ellipsoid for ``exponent`` 2.
 
     Args:
@@ -151,7 +150,7 @@ class Vessel:
         lumen_radius, lumen_aspect, lumen_angle: likewise for the lumen, before ``narrowing``.
         eccentricity, eccentric_angle: displacement of the lumen over the largest possible one, and its direction.
         wander_x, wander_y, narrowing, swelling: sums of Gaussians along z.
-        volumes: cores, then calcifications.
+        solids: cores, then calcifications.
     """
 
     position: tuple[float, float]
@@ -172,12 +171,12 @@ class Vessel:
     wander_y: tuple[Bump, ...] = ()
     narrowing: tuple[Bump, ...] = ()
     swelling: tuple[Bump, ...] = ()
-    volumes: tuple[Volume, ...] = ()
+    solids: tuple[Solid, ...] = ()
 
     @property
-    def cores(self) -> tuple[Volume, ...]:
+    def cores(self) -> tuple[Solid, ...]:
         """The cores, virtual ones (contrast 0) included."""
-        return tuple(v for v in self.volumes if v.kind == "core")
+        return tuple(s for s in self.solids if s.kind == "core")
 
     def tables(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
         """Centre, slope, radius and lumen at heights ``z``: ``(len(TABLE_ROWS), len(z))``."""
@@ -233,7 +232,7 @@ class Texture:
 
 
 @dataclass(frozen=True)
-class Scene:
+class TrainingScene:
     """All parameters of a scene, mm and HU, about the grid's centre.
 
     Args:
@@ -243,11 +242,11 @@ class Scene:
 
     background: float
     vessels: tuple[Vessel, ...] = ()
-    free: tuple[Volume, ...] = ()
+    free: tuple[Solid, ...] = ()
     textures: tuple[Texture, ...] = ()
 
     @property
-    def cores(self) -> tuple[Volume, ...]:
+    def cores(self) -> tuple[Solid, ...]:
         """Cores of all vessels, virtual ones included."""
         return tuple(core for vessel in self.vessels for core in vessel.cores)
 
@@ -257,7 +256,7 @@ class Scene:
         return self.cores[0].contrast if self.cores else 0.0
 
 
-def is_paper_family(scene: Scene) -> bool:
+def is_paper_family(scene: TrainingScene) -> bool:
     """Whether a scene is close to the paper's plaque in everything that describes it.
 
     True if some vessel has an outer diameter within 10 % of 3.36 mm and holds exactly one core, an ellipsoid whose

@@ -1,0 +1,69 @@
+"""The configuration of a run and its YAML form."""
+
+from dataclasses import replace
+
+import pytest
+
+from train.config import TrainConfig, differences, load_config, packaged_config
+
+
+def test_round_trip(tmp_path):
+    config = TrainConfig(steps=7, clip=float("inf"), prior={"levels": 2, "thresholds": [0.1, 1.0]}, learning_rate=1e-5)
+    assert TrainConfig.from_yaml(config.to_yaml()).to_yaml() == config.to_yaml()
+    assert TrainConfig.from_yaml(config.to_yaml()) == config
+    (tmp_path / "c.yaml").write_text(config.to_yaml())
+    assert load_config(tmp_path / "c.yaml") == config
+    assert TrainConfig.from_yaml("") == TrainConfig()
+    assert TrainConfig.from_yaml("learning_rate: 1e-3").learning_rate == 1e-3
+    assert differences(config.as_dict(), replace(config, seed=3).as_dict()) == ["seed"]
+
+
+def test_sections_from_plain_values():
+    text = "data: {shape: [8, 9, 10], situations: [{x: 1, y: 2}]}\nobjective: {validation_exposures_s: [1]}"
+    config = TrainConfig.from_yaml(text)
+    assert config.data.shape == (8, 9, 10)
+    assert config.data.situations[0].patient_mm == 240.0
+    assert config.objective.validation_exposures_s == (1.0,)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("stepps: 3", "unknown key 'stepps'"),
+        ("prior: {levels: 2, filterz: 3}", r"unknown key 'prior\.filterz'"),
+        ("data: {nonsense: 1}", r"unknown key 'data\.nonsense'"),
+        ("data: {scenes: {nonsense: 1}}", r"data: unknown key 'scenes\.nonsense'"),
+        ("data: {situations: [{x: 1}]}", r"data: situations\[0\]: .*'y'"),
+        ("data: {shape: [8, 9]}", "data: shape must be 3 numbers"),
+        ("data: {shape: [8, 9, 0]}", r"data: shape\[2\] must be at least 1"),
+        ("data: {exposure_s: [2, 1]}", "data: exposure_s must be a range"),
+        ("data: {situations: []}", "data: situations must name"),
+        ("objective: {nonsense: 1}", r"unknown key 'objective\.nonsense'"),
+        ("objective: {bias: -1}", "objective: bias must be at least 0"),
+        ("objective: {bias_ramp: 0}", "objective: bias_ramp must be greater than 0"),
+        ("objective: {validation_draws: 1}", "objective: validation_draws must be at least 2"),
+        ("prior: {filters: 32}", "prior: filters"),
+        ("steps: 3.5", "steps must be a whole number"),
+        ("steps: true", "steps must be a whole number"),
+        ("steps: 0", "steps must be at least 1"),
+        ("learning_rate: fast", "learning_rate must be a number"),
+        ("learning_rate: .nan", "learning_rate must be finite"),
+        ("checkpoint_seconds: 121", "checkpoint_seconds must be at most 120"),
+        ("ema: 1.0", "ema must be less than 1"),
+        ("final_fraction: 2", "final_fraction must lie in"),
+        ("prior: 3", "prior must be a mapping"),
+        ("- 3", "mapping"),
+        ("a: [", "not YAML"),
+    ],
+)
+def test_bad_values_name_the_key(text, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        TrainConfig.from_yaml(text)
+    (tmp_path / "bad.yaml").write_text(text)
+    with pytest.raises(ValueError, match=r"bad\.yaml"):
+        load_config(tmp_path / "bad.yaml")
+
+
+def test_packaged():
+    assert packaged_config("default").steps > packaged_config("quick").steps
+    assert packaged_config("finish").objective.bias_start == 4.0

@@ -1,0 +1,71 @@
+"""The command line, ``python -m train``, on a tiny model."""
+
+import json
+import signal
+import subprocess
+import sys
+
+import pytest
+from tiny_training import ROOT, StubData, StubObjective, assert_same_run, send, stub_model
+
+from train import __main__ as command_line
+
+
+@pytest.fixture
+def objective(monkeypatch):
+    stub = StubObjective()
+    monkeypatch.setattr(command_line, "build", lambda config: (stub_model(config.seed), StubData(), stub))
+    return stub
+
+
+def test_command_line(tmp_path, objective, capsys):
+    out = tmp_path / "runs" / "x"
+    common = ["--out", str(out), "--no-progress", "--no-tensorboard"]
+    start = ["--quick", "--steps", "12", "--seed", "4"]
+    objective.at = {6: send(signal.SIGTERM)}
+    assert command_line.main([*start, *common]) == 128 + signal.SIGTERM
+    message = capsys.readouterr().out
+    assert f"python -m train --out {out} --resume" in message
+    assert "stopped at step 8 of 12" in message
+    assert command_line.main([*start, *common]) == 1
+    assert "--resume" in capsys.readouterr().err
+    assert command_line.main(["--resume", "--seed", "5", *common]) == 1
+    assert "seed" in capsys.readouterr().err
+    objective.at = {}
+    assert command_line.main(["--resume", *common]) == 0
+    assert "weights and card in" in capsys.readouterr().out
+    assert json.loads((out / "card.json").read_text())["config"]["seed"] == 4
+    weights = out / "weights.safetensors"
+    plain = ["--no-progress", "--no-tensorboard"]
+    assert command_line.main([*start, "--out", str(tmp_path / "y"), "--weights", str(weights), *plain]) == 0
+    assert command_line.main([*start, "--out", str(tmp_path / "z"), "--weights", str(out / "card.md")]) == 1
+    assert "card.md is damaged or not a safetensors file" in capsys.readouterr().err
+
+
+def test_second_interrupt_stops_at_once(tmp_path, objective, capsys):
+    common = ["--no-progress", "--no-tensorboard"]
+    objective.at = {6: send(signal.SIGINT, signal.SIGINT)}
+    assert command_line.main(["--quick", "--steps", "12", "--out", str(tmp_path / "x"), *common]) == 130
+    assert "stopped at once" in capsys.readouterr().err
+    objective.at = {}
+    assert command_line.main(["--resume", "--out", str(tmp_path / "x"), *common]) == 0
+    command_line.main(["--quick", "--steps", "12", "--out", str(tmp_path / "y"), *common])
+    assert_same_run(tmp_path / "x", tmp_path / "y")
+
+
+def test_refusals(tmp_path, objective, capsys):
+    for words in (["--quick", "--config", "x.yaml"], ["--threads", "0"], ["--resume", "--weights", "x"]):
+        with pytest.raises(SystemExit):
+            command_line.main(words)
+    (tmp_path / "c.yaml").write_text("stepps: 1")
+    assert command_line.main(["--config", str(tmp_path / "c.yaml"), "--out", str(tmp_path / "o")]) == 1
+    assert "c.yaml: unknown key 'stepps'" in capsys.readouterr().err
+    assert command_line.main(["--config", str(tmp_path / "none.yaml")]) == 1
+    assert command_line.main(["--resume", "--out", str(tmp_path / "none")]) == 1
+    assert "no checkpoint" in capsys.readouterr().err
+
+
+def test_nothing_heavy_is_loaded_before_the_numbers_of_threads_are_set():
+    code = "import sys, train.__main__; print({'torch', 'numpy', 'numba'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert done.stdout == "set()\n"
