@@ -17,12 +17,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.fbp.inset import to_hu
 from torchpcct import counting_noise as noise
 from torchpcct.acquisition.transmission import Beam, BodySet, expected_readings, sub_rays
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import FanBeam, VolumeGrid
 from torchpcct.scanner.linearisation import WaterLinearisation
+from torchpcct.volume import to_hu
 
 if TYPE_CHECKING:
     from torchpcct.scanner import Scanner

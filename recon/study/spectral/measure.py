@@ -24,6 +24,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from recon.fbp.exact_noise import functional_covariance
 from recon.pwls.basis_problem import DEFAULT_JOINT_PRIOR, BasisProblem
 from recon.study.report import Report
 from recon.study.spectral.scan import PlaqueScan, second_order_bound, starved_rays, water_hu
@@ -124,7 +125,7 @@ def run(settings: Settings, progress: Progress | None = None) -> Report:
     plaque = PlaqueScan(settings, lambda f: tell("simulate", f))
     data["plan"] = plaque.info["plan"]
     done("simulate")
-    images = {"clean": plaque.fbp(plaque.exact.line_integrals)}
+    images = {"clean": plaque.fbp.images(plaque.exact.line_integrals)[0][0]}
     data["second_order_bound"] = second_order_bound(plaque, LOW_EXPOSURE_S)
     data["starved"] = starved_rays(plaque, settings.starved_rays, settings.seed)
     data["water"] = {k: v.tolist() for k, v in water_hu(plaque, VMI_ENERGIES_KEV).items()}
@@ -154,7 +155,7 @@ def _noisy_scans(plaque: PlaqueScan, images: dict[str, Tensor], tell: Progress) 
     for k in range(s.realizations):
         lines, found = plaque.noisy(s.exposure_s, s.seed + k)
         statistics.append(found)
-        volumes.append(plaque.fbp(lines))
+        volumes.append(plaque.fbp.images(lines)[0][0])
         if k < s.mbir_realizations:
             kept.append(lines)
         tell("decompose noisy scans", (k + 1) / (s.realizations + 1))
@@ -184,7 +185,7 @@ def _vmi(plaque: PlaqueScan, images: dict[str, Tensor]) -> dict[str, Any]:
     voxel = torch.zeros(plaque.grid.shape, dtype=torch.float64)
     voxel.view(-1)[int(background.weights.argmax())] = 1.0  # the voxel that the background ROI weighs most
     functionals = torch.stack([voxel, foreground.weights, background.weights]).to(torch.float32)
-    exact = plaque.fbp.covariance(functionals, plaque.covariance(s.exposure_s))
+    exact = functional_covariance(plaque.fbp, functionals, plaque.covariance(s.exposure_s))
     noisy = images["noisy"] - images["clean"]
     # The noise of the inset is nearly stationary in the plane: all voxels of the ROI's slice, far from rounding errors.
     z = int(background.weights.argmax()) // (plaque.grid.shape[1] * plaque.grid.shape[2])

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.fbp.channels import ChannelFbp, static_fbp
+from recon.fbp.inset import InsetFbp, static_fbp
 from recon.study.compare.measure import inset_grid
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.acquisition.plan import Effect
@@ -143,9 +143,9 @@ class PlaqueScan:
         return decompose_surround(self.clean, self.model(NOISE_FREE_EXPOSURE_S))
 
     @cached_property
-    def fbp(self) -> ChannelFbp:
+    def fbp(self) -> InsetFbp:
         """FBP of the two basis images."""
-        return ChannelFbp(self.clean.geometry, self.window, self.surround, self.grid, self.settings.kernel)
+        return InsetFbp(self.clean, [self.grid], [self.settings.kernel], surround=self.surround)
 
     def covariance(self, exposure_s: float) -> Tensor:
         """Cramér–Rao covariance ``(3, views, rows, columns)`` in mm² of every ray."""
@@ -250,7 +250,6 @@ def water_hu(plaque: PlaqueScan, energies: Any) -> dict[str, Floats]:
     scene = Scene([Body("patient", EllipticCylinder(PATIENT_DIAMETER / 2), "pericoronary_fat"), rod])
     held = VolumeGrid((2, 40, 40), (0.25, 0.5, 0.5), (z, y, x))
     scan = narrowed(acquire(scene, scanner, region=held), held)
-    assert scan.window is not None
-    fbp = ChannelFbp(scan.geometry, scan.window, decompose_surround(scan, model), there)
-    record("rod in fat, plaque's place", fbp(decompose_scan(scan, model).line_integrals))
+    fbp = InsetFbp(scan, [there], ["standard"], surround=decompose_surround(scan, model))
+    record("rod in fat, plaque's place", fbp.images(decompose_scan(scan, model).line_integrals)[0][0])
     return found
