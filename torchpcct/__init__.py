@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 # core from the other pool: several times slower. OpenMP reads it when torch loads, so it stands before anything else.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
+from torchpcct.files import VERSION
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
 
 if TYPE_CHECKING:
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     from torchpcct.scan import Scan
     from torchpcct.volume import Volume
 
-__version__ = "0.1.0"
+__version__ = VERSION
 
 __all__ = [
     "ConeBeam",

@@ -190,14 +190,15 @@ def compound_poisson(
     out = torch.empty_like(flat)
     _compound_rows(flat.numpy(), weight.numpy(), first, float(scale), _key(seed), out.numpy())
     if electronic:
-        added = torch.empty_like(flat)
-        _normal_rows(first, _key(seed, _ELECTRONICS), added.numpy())
+        added = normal(tuple(flat.shape), first, seed, flat.dtype, purpose=_ELECTRONICS)
         out.add_(added, alpha=float(electronic))
     return out.reshape(mean.shape)
 
 
-def normal(shape: tuple[int, ...], first_index: Any, seed: int, dtype: torch.dtype = torch.float32) -> Tensor:
+def normal(
+    shape: tuple[int, ...], first_index: Any, seed: int, dtype: torch.dtype = torch.float32, purpose: int = _QUANTA
+) -> Tensor:
     """Standard normal numbers keyed like :func:`poisson`; ``shape`` is ``(..., n)``."""
     out = torch.empty((math.prod(shape[:-1]), shape[-1]), dtype=dtype)
-    _normal_rows(_first(first_index, out.shape[0]), _key(seed), out.numpy())
+    _normal_rows(_first(first_index, out.shape[0]), _key(seed, purpose), out.numpy())
     return out.reshape(shape)

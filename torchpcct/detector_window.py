@@ -63,6 +63,11 @@ class DetectorWindow:
         return int(self.first_column.size)
 
     @property
+    def shape(self) -> tuple[int, int, int]:
+        """``(views, rows, columns)``."""
+        return self.views, self.rows, self.columns
+
+    @property
     def column_indices(self) -> NDArray[np.int64]:
         """Detector column of every window cell, ``(views, columns)``."""
         return self.first_column[:, None] + np.arange(self.columns)
@@ -145,7 +150,7 @@ class DetectorWindow:
 
     def fraction(self, geometry: Geometry) -> float:
         """Share of the detector's readings inside the window, 0…1."""
-        return self.views * self.rows * self.columns / math.prod(geometry.shape)
+        return math.prod(self.shape) / math.prod(geometry.shape)
 
 
 def shadow(geometry: Geometry, grid: VolumeGrid, margin: int = 0, motion: Any = None) -> DetectorWindow:

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all: the one way in which this repository writes."""
+"""Files that appear whole or not at all, say what wrote them, and are refused when they are damaged or foreign."""
 
 from __future__ import annotations
 
@@ -6,8 +6,12 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
-__all__ = ["require_folder", "written_whole"]
+__all__ = ["VERSION", "read_hdf5", "require_folder", "written_whole"]
+
+VERSION = "0.1.0"
+"""Of this software, as in pyproject.toml; files carry it."""
 
 
 def require_folder(path: str | os.PathLike[str]) -> None:
@@ -38,6 +42,27 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
         _sync(target.parent)
     finally:
         part.unlink(missing_ok=True)
+
+
+@contextmanager
+def read_hdf5(path: str | os.PathLike[str], kind: str) -> Iterator[Any]:
+    """Open an HDF5 file whose attribute ``format`` is ``torchpcct-KIND``, for a block that reads it.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: the file is truncated, of another format, or the block does not find what it looks for.
+    """
+    import h5py
+
+    try:
+        with h5py.File(path, "r") as file:
+            if file.attrs.get("format") != f"torchpcct-{kind}":
+                raise ValueError(f"{path} is an HDF5 file, but not a torchpcct {kind}")
+            yield file
+    except FileNotFoundError:
+        raise
+    except (OSError, KeyError, RuntimeError) as error:
+        raise ValueError(f"{path} cannot be read as a torchpcct {kind} (truncated or foreign): {error}") from error
 
 
 def _sync(path: Path) -> None:

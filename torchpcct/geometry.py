@@ -23,50 +23,16 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "ConeBeam",
-    "FanBeam",
-    "Geometry",
-    "ParallelBeam",
-    "VolumeGrid",
-    "full_turn",
-]
+from torchpcct.validate import choice, number, per_axis, whole
+
+__all__ = ["ConeBeam", "FanBeam", "Geometry", "ParallelBeam", "VolumeGrid", "full_turn"]
 
 Floats = NDArray[np.float64]
-_DETECTORS = ("flat", "curved")
 
 
 def full_turn(views: int, start: float = 0.0) -> Floats:
     """``views`` equally spaced source angles over 2π, ``(views,)`` rad float64, the first at ``start``."""
-    return np.arange(_count("views", views), dtype=np.float64) * (2.0 * math.pi / views) + start
-
-
-def _count(name: str, value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise TypeError(f"{name} must be a whole number, got {value!r} ({type(value).__name__})")
-    if value < 1:
-        raise ValueError(f"{name} must be at least 1, got {value}")
-    return int(value)
-
-
-def _number(name: str, value: Any, *, positive: bool = False) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        raise TypeError(f"{name} must be a number in mm, got {value!r} ({type(value).__name__})") from None
-    if not math.isfinite(number):
-        raise ValueError(f"{name} must be finite, got {value!r}")
-    if positive and number <= 0:
-        raise ValueError(f"{name} must be greater than 0 mm, got {number}")
-    return number
-
-
-def _per_axis(name: str, value: Any, axes: int, *, positive: bool = False) -> tuple[float, ...]:
-    if isinstance(value, Sequence | np.ndarray) and not isinstance(value, str):
-        if len(value) != axes:
-            raise ValueError(f"{name} must be one number or {axes} numbers (one per axis), got {value!r}")
-        return tuple(_number(f"{name}[{i}]", v, positive=positive) for i, v in enumerate(value))
-    return (_number(name, value, positive=positive),) * axes
+    return np.arange(whole("views", views), dtype=np.float64) * (2.0 * math.pi / views) + start
 
 
 def _angles(value: Any) -> Floats:
@@ -143,9 +109,9 @@ class ParallelBeam(Geometry):
     def __post_init__(self) -> None:
         set_ = object.__setattr__
         set_(self, "angles", _angles(self.angles))
-        set_(self, "columns", _count("columns", self.columns))
-        set_(self, "pitch", _number("pitch", self.pitch, positive=True))
-        set_(self, "offset", _number("offset", self.offset))
+        set_(self, "columns", whole("columns", self.columns))
+        set_(self, "pitch", number("pitch", self.pitch, positive=True, unit="mm"))
+        set_(self, "offset", number("offset", self.offset, unit="mm"))
 
     @property
     def column_positions(self) -> Floats:
@@ -163,16 +129,15 @@ class _Divergent(Geometry):
     def _validate_divergent(self) -> None:
         set_ = object.__setattr__
         set_(self, "angles", _angles(self.angles))
-        set_(self, "sod", _number("sod", self.sod, positive=True))
-        set_(self, "sdd", _number("sdd", self.sdd, positive=True))
-        set_(self, "columns", _count("columns", self.columns))
+        set_(self, "sod", number("sod", self.sod, positive=True, unit="mm"))
+        set_(self, "sdd", number("sdd", self.sdd, positive=True, unit="mm"))
+        set_(self, "columns", whole("columns", self.columns))
         if self.sdd <= self.sod:
             raise ValueError(
                 f"sdd ({self.sdd} mm) must be greater than sod ({self.sod} mm): "
                 "sdd is the distance from the source to the detector, not from the isocentre"
             )
-        if self.detector not in _DETECTORS:
-            raise ValueError(f"detector must be one of {_DETECTORS}, got {self.detector!r}")
+        choice("detector", self.detector, ("flat", "curved"))
 
     def _validate_arc(self, pitch: float, offset: float) -> None:
         if self.detector == "curved":
@@ -237,8 +202,8 @@ class FanBeam(_Divergent):
 
     def __post_init__(self) -> None:
         self._validate_divergent()
-        object.__setattr__(self, "pitch", _number("pitch", self.pitch, positive=True))
-        object.__setattr__(self, "offset", _number("offset", self.offset))
+        object.__setattr__(self, "pitch", number("pitch", self.pitch, positive=True, unit="mm"))
+        object.__setattr__(self, "offset", number("offset", self.offset, unit="mm"))
         self._validate_arc(self.pitch, self.offset)
 
     @property
@@ -276,9 +241,9 @@ class ConeBeam(_Divergent):
 
     def __post_init__(self) -> None:
         self._validate_divergent()
-        object.__setattr__(self, "rows", _count("rows", self.rows))
-        object.__setattr__(self, "pitch", _per_axis("pitch", self.pitch, 2, positive=True))
-        object.__setattr__(self, "offset", _per_axis("offset", self.offset, 2))
+        object.__setattr__(self, "rows", whole("rows", self.rows))
+        object.__setattr__(self, "pitch", per_axis("pitch", self.pitch, 2, positive=True, unit="mm"))
+        object.__setattr__(self, "offset", per_axis("offset", self.offset, 2, unit="mm"))
         self._validate_arc(self.pitch[1], self.offset[1])
 
     @property
@@ -325,10 +290,10 @@ class VolumeGrid:
             raise TypeError(f"shape must be (y, x) or (z, y, x), got {self.shape!r}")
         if len(self.shape) not in (2, 3):
             raise ValueError(f"shape must have 2 or 3 axes, (y, x) or (z, y, x), got {self.shape!r}")
-        set_(self, "shape", tuple(_count(f"shape[{i}]", n) for i, n in enumerate(self.shape)))
+        set_(self, "shape", tuple(whole(f"shape[{i}]", n) for i, n in enumerate(self.shape)))
         set_(self, "ndim", len(self.shape))
-        set_(self, "spacing", _per_axis("spacing", self.spacing, self.ndim, positive=True))
-        set_(self, "center", _per_axis("center", self.center, self.ndim))
+        set_(self, "spacing", per_axis("spacing", self.spacing, self.ndim, positive=True, unit="mm"))
+        set_(self, "center", per_axis("center", self.center, self.ndim, unit="mm"))
 
     @property
     def axes(self) -> tuple[Floats, ...]:

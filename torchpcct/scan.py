@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -14,16 +15,16 @@ from torch import Tensor
 
 from torchpcct import counting_noise as noise
 from torchpcct.detector_window import DetectorWindow
-from torchpcct.files import written_whole
+from torchpcct.files import VERSION, read_hdf5, written_whole
 from torchpcct.geometry import ConeBeam
 from torchpcct.scanner.linearisation import WaterLinearisation
+from torchpcct.validate import number
 
 __all__ = ["NOISE_FREE_EXPOSURE_S", "Scan"]
 
 NOISE_FREE_EXPOSURE_S = 1.0
 """The exposure that the expected readings of a noise-free scan stand for."""
 
-_FORMAT = "torchpcct-scan"
 _VERSION = 2
 """2: energy-integrating scans with their noise model. Counting scans are still written as version 1."""
 # Compress in blocks of whole views: fast to write, and a window of views can be read without the rest.
@@ -74,8 +75,8 @@ class Scan:
 
     def __post_init__(self) -> None:
         g, w = self.geometry, self.window
-        cells = g.shape if w is None else (w.views, w.rows, w.columns)
-        if tuple(self.counts.shape[-3:]) != tuple(cells) or self.counts.ndim not in (3, 4):
+        cells = g.shape if w is None else w.shape
+        if tuple(self.counts.shape[-3:]) != cells or self.counts.ndim not in (3, 4):
             raise ValueError(f"counts have shape {tuple(self.counts.shape)}, expected (…, {cells})")
         expected_air = (*self.counts.shape[:-3], g.rows, g.columns)
         if tuple(self.air.shape) != expected_air:
@@ -101,8 +102,7 @@ class Scan:
         self._check_noise_model()
 
     def _check_noise_model(self) -> None:
-        if not 0 <= self.electronic_noise < np.inf:
-            raise ValueError(f"electronic_noise must be finite and ≥ 0 keV, got {self.electronic_noise}")
+        number("electronic_noise", self.electronic_noise, low=0.0, unit="keV")
         if self.quantum is None:
             return
         if self.counting:
@@ -187,8 +187,7 @@ class Scan:
         """
         if not self.noise_free:
             raise ValueError("the variance follows from expected readings: give the noise-free scan")
-        if exposure_s is None or not exposure_s > 0:
-            raise ValueError(f"exposure_s must be greater than 0 s, got {exposure_s}")
+        number("exposure_s", exposure_s, positive=True, unit="s")
         self._require_noise_model()
         inverse = (self.counts * (exposure_s / NOISE_FREE_EXPOSURE_S)).reciprocal_()
         if self.quantum is None:
@@ -198,13 +197,11 @@ class Scan:
 
     def _first_index(self) -> Any:
         """Global index of the first reading of every detector row held in ``counts``."""
-        g, w = self.geometry, self.window
-        first_row, rows = (0, g.rows) if w is None else (w.first_row, w.rows)
-        first_column = np.zeros(g.views, np.int64) if w is None else w.first_column
-        line = np.arange(g.views)[:, None] * g.rows + first_row + np.arange(rows)
-        index = line * g.columns + first_column[:, None]
+        g, w = self.geometry, self.window or DetectorWindow.full(self.geometry)
+        line = np.arange(g.views)[:, None] * g.rows + w.first_row + np.arange(w.rows)
+        index = line * g.columns + w.first_column[:, None]
         bins = self.counts.shape[0] if self.counts.ndim == 4 else 1
-        return (np.arange(bins)[:, None, None] * (g.views * g.rows * g.columns) + index).reshape(-1)
+        return (np.arange(bins)[:, None, None] * math.prod(g.shape) + index).reshape(-1)
 
     def _at_window(self, cells: Tensor) -> Tensor:
         """``(..., rows, columns)`` values of the cells as seen by the stored readings, ``(..., views | 1, r, c)``."""
@@ -256,12 +253,10 @@ class Scan:
         """Write HDF5; the file appears under its name only when it is complete."""
         import h5py
 
-        from torchpcct import __version__
-
         g = self.geometry
         with written_whole(path) as part, h5py.File(part, "w") as file:
             version = 1 if self.counting else _VERSION
-            file.attrs.update(format=_FORMAT, version=version, software=f"torchpcct {__version__}")
+            file.attrs.update(format="torchpcct-scan", version=version, software=f"torchpcct {VERSION}")
             file.attrs["counting"] = self.counting
             file.attrs["info"] = json.dumps(dict(self.info), default=str)
             if self.exposure_s is not None:
@@ -300,24 +295,15 @@ class Scan:
             FileNotFoundError: no such file.
             ValueError: the file is truncated, is no torchpcct scan, or is of a newer format.
         """
-        import h5py
-
-        try:
-            with h5py.File(path, "r") as file:
-                if file.attrs.get("format") != _FORMAT:
-                    raise ValueError(f"{path} is an HDF5 file, but not a torchpcct scan")
-                if int(file.attrs["version"]) > _VERSION:
-                    raise ValueError(
-                        f"{path} has format version {file.attrs['version']}, this software reads up to {_VERSION}: "
-                        "update torchpcct"
-                    )
-                if not file.attrs.get("complete", False):
-                    raise ValueError(f"{path} was not written to its end: simulate it again")
-                return cls._from_file(file)
-        except (OSError, KeyError, RuntimeError) as error:
-            if isinstance(error, FileNotFoundError):
-                raise
-            raise ValueError(f"{path} cannot be read as a torchpcct scan (truncated or foreign): {error}") from error
+        with read_hdf5(path, "scan") as file:
+            if int(file.attrs["version"]) > _VERSION:
+                raise ValueError(
+                    f"{path} has format version {file.attrs['version']}, this software reads up to {_VERSION}: "
+                    "update torchpcct"
+                )
+            if not file.attrs.get("complete", False):
+                raise ValueError(f"{path} was not written to its end: simulate it again")
+            return cls._from_file(file)
 
     @classmethod
     def _from_file(cls, file: Any) -> Scan:
@@ -350,6 +336,6 @@ class Scan:
 
 
 def check_exposure(exposure_s: float | None) -> None:
-    """Raise ``ValueError`` unless the exposure is None (noise free) or a finite time > 0 s."""
-    if exposure_s is not None and not (np.isfinite(exposure_s) and exposure_s > 0):
-        raise ValueError(f"exposure_s must be greater than 0 s (or None for a noise-free scan), got {exposure_s}")
+    """Raise ``ValueError`` unless the exposure is a finite time > 0 s, or None (noise free)."""
+    if exposure_s is not None:
+        number("exposure_s", exposure_s, positive=True, unit="s")

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpcct.files import written_whole
+from torchpcct.files import read_hdf5, written_whole
 from torchpcct.geometry import VolumeGrid
 
 __all__ = ["Volume", "check_volume_name", "to_hu"]
@@ -98,18 +98,9 @@ class Volume:
         Raises:
             ValueError: the file is truncated, or is no torchpcct volume.
         """
-        import h5py
-
-        try:
-            with h5py.File(path, "r") as file:
-                if file.attrs.get("format") != "torchpcct-volume":
-                    raise ValueError(f"{path} is an HDF5 file, but not a torchpcct volume")
-                data = torch.from_numpy(file["data"][()])
-                grid = VolumeGrid(
-                    tuple(int(n) for n in data.shape), tuple(file.attrs["spacing_mm"]), tuple(file.attrs["center_mm"])
-                )
-                return cls(data, grid, json.loads(file.attrs["report"]))
-        except (OSError, KeyError) as error:
-            if isinstance(error, FileNotFoundError):
-                raise
-            raise ValueError(f"{path} cannot be read as a torchpcct volume (truncated or foreign): {error}") from error
+        with read_hdf5(path, "volume") as file:
+            data = torch.from_numpy(file["data"][()])
+            grid = VolumeGrid(
+                tuple(int(n) for n in data.shape), tuple(file.attrs["spacing_mm"]), tuple(file.attrs["center_mm"])
+            )
+            return cls(data, grid, json.loads(file.attrs["report"]))

@@ -18,6 +18,7 @@ import json
 import math
 import os
 import platform
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -30,7 +31,9 @@ import torch
 from torchpcct.detector_window import shadow
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
 from torchpcct.projector import Projector
-from torchpcct.projector.analytic import Ellipsoid, Gaussian, line_integrals, rasterize
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "helpers"))  # where pytest finds them, too
+from analytic import Ellipsoid, Gaussian, line_integrals, rasterize
 
 Pass = Callable[[], Any]
 

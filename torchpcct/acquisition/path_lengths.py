@@ -8,17 +8,17 @@ the chord of the outermost body. They are the columns of the linear model that t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from torchpcct.acquisition.transmission import sub_rays as sub_rays_of
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam
-
-if TYPE_CHECKING:
-    from torchpcct.scene.scene import Scene
+from torchpcct.scene.chords import chord_lengths
+from torchpcct.scene.scene import Scene
 
 __all__ = ["tissue_path_lengths"]
 
@@ -57,22 +57,19 @@ def tissue_path_lengths(
         ValueError: no names, an unknown or repeated body, a moving scene, a window of other views, a bad ``sub_rays``.
         TypeError: a geometry that is not a cone beam.
     """
-    from torchpcct.acquisition.transmission import sub_rays as sub_rays_of
-    from torchpcct.scene.chords import chord_lengths
-
     if not isinstance(geometry, ConeBeam):
         raise TypeError(f"geometry must be a ConeBeam, got {type(geometry).__name__}")
     if not scene.is_static:
         raise ValueError("the scene moves: path lengths are those of one place, give scene.with_motion(None)")
     if window is None:
-        window = DetectorWindow(np.zeros(geometry.views, np.int64), geometry.columns, 0, geometry.rows)
+        window = DetectorWindow.full(geometry)
     if window.views != geometry.views:
         raise ValueError(f"window has {window.views} views, the geometry {geometry.views}: they must be equal")
     used, mixing = _mixing(scene, names)
     shapes = [scene.shapes[b] for b in used]
     active = (focal_spot[0] > 0, focal_spot[1] > 0, True, True, view_step > 0)
     points = sub_rays_of(sub_rays, active)
-    out = torch.empty((len(names), geometry.views, window.rows, window.columns), dtype=dtype)
+    out = torch.empty((len(names), *window.shape), dtype=dtype)
     cells = window.rows * window.columns
     step = max(1, _LINES // (cells * len(points)))
     for first in range(0, geometry.views, step):

@@ -2,7 +2,9 @@
 
 Every effect of the finite beam and of the spectrum can be switched off; a scene that does not need it should not pay
 for it. :func:`make_plan` computes a sparse sample of the scan with everything on and densely sampled, then without
-each effect in turn, and keeps the effects whose omission would cost more than the stated tolerance.
+each effect in turn, and keeps the effects whose omission would cost more than the stated tolerance. What the detector
+makes of the readings is its own choice (dead time, charge sharing): the plan says so and holds the map that the scan
+applies.
 """
 
 from __future__ import annotations
@@ -11,19 +13,23 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from torchpcct.acquisition.transmission import SUB_RAY_COUNTS, Beam, BodySet, expected_readings, sub_rays
+from torchpcct.acquisition.bodies import Bodies
+from torchpcct.acquisition.transmission import SUB_RAY_COUNTS, Beam, expected_readings, sub_rays
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import ConeBeam, VolumeGrid
+from torchpcct.scanner.pileup import PileUpMap
+from torchpcct.scanner.scanner import Scanner
 
-if TYPE_CHECKING:
-    from torchpcct.scanner import Scanner
-    from torchpcct.scene import Scene
+__all__ = ["NOISE_MARGIN_COLUMNS", "Effect", "Plan", "make_plan"]
 
-__all__ = ["Effect", "Plan", "make_plan"]
+NOISE_MARGIN_COLUMNS = 128
+"""Columns kept on either side of a region's shadow. The ramp filter reaches further, but its tail falls as 1 / n²:
+noise beyond 128 columns adds less than 1 % to the spectrum of the filtered noise at the lowest frequency that a
+1 mm ROI can tell from zero."""
 
 _PROBE_VIEWS, _PROBE_ROWS = 6, 3
 # Sub-rays of the runs that weigh the effects, and of the one that a smaller number of sub-rays must reproduce.
@@ -33,7 +39,6 @@ _PEAK_ERROR = 1e-3
 
 _LEFT_OUT = (
     ("scatter", "no scatter model: an anti-scatter grid and correction are assumed, as in the paper"),
-    ("pile-up, charge sharing", "behind the body the count rate is far below the detector's limit"),
     (
         "focal spot intensity, heel effect",
         "the focal spot is a uniform rectangle, the spectrum the same over the field",
@@ -61,6 +66,7 @@ class Plan:
         points: ``(sub-rays, 5)`` beam samples of :func:`torchpcct.acquisition.transmission.sub_rays`.
         active: the readings that see the varying bodies; None: no view differs from another.
         kept: the readings that the scan will hold; None: the whole detector.
+        pile_up: what the detector's dead time makes of the readings; None: it has none.
         sampling_error: rms error of a line integral by the finite number of sub-rays, relative to the inset's peak.
         readings, seconds, bytes: size, estimated time and memory.
         tolerance_hu: the tolerance that decided.
@@ -70,6 +76,7 @@ class Plan:
     points: Any
     active: DetectorWindow | None
     kept: DetectorWindow | None
+    pile_up: PileUpMap | None
     sampling_error: float
     readings: int
     seconds: float
@@ -101,148 +108,169 @@ class Plan:
         }
 
 
-def _hu_cost(difference: Any, mask: Any, chord: Any, mu_water: float) -> float:
-    """Error of the line integrals as a CT number: rms over the shadow, spread over the bodies' mean chord."""
-    if not mask.any():
-        return 0.0
-    rms = math.sqrt(float(np.mean(difference[mask] ** 2)))
-    return 1000.0 * rms / (mu_water * max(float(chord[mask].mean()), 1e-6))
-
-
-def active_window(geometry: ConeBeam, low: Any, high: Any) -> DetectorWindow:
-    """Window of the readings that see the box ``low … high`` (x, y, z) mm; the whole detector if it is too large."""
-    whole = DetectorWindow(np.zeros(geometry.views, np.int64), geometry.columns, 0, geometry.rows)
-    extent = np.maximum(high - low, 1e-3)[::-1]
-    box = VolumeGrid((1, 1, 1), tuple(extent), tuple(((low + high) / 2)[::-1]))
+def active_window(geometry: ConeBeam, bodies: Bodies) -> DetectorWindow:
+    """The readings that see the bodies that vary; the whole detector if they are too large."""
+    extent = np.maximum(bodies.high - bodies.low, 1e-3)[::-1]
+    box = VolumeGrid((1, 1, 1), tuple(extent), tuple(((bodies.low + bodies.high) / 2)[::-1]))
     try:
         # Four columns more for the beam's width: a focal spot and a cell are wider than a ray.
         return shadow(geometry, box, margin=4)
     except ValueError:
-        return whole
+        return DetectorWindow.full(geometry)
 
 
-class Probe:
+def _kept_window(geometry: ConeBeam, region: VolumeGrid, bodies: Bodies) -> DetectorWindow:
+    """The readings around the shadow of ``region``, every row; it must hold all bodies that vary."""
+    kept = shadow(geometry, region, margin=NOISE_MARGIN_COLUMNS).with_rows(0, geometry.rows)
+    if bodies.varying:
+        # Without the four columns for the beam's width.
+        seen = active_window(geometry, bodies)
+        inside = (seen.first_column + 4 >= kept.first_column) & (
+            seen.first_column + seen.columns - 4 <= kept.first_column + kept.columns
+        )
+        if not inside.all():
+            raise ValueError(
+                "region does not hold all bodies that differ between views (box "
+                f"{np.round(bodies.low, 1)} … {np.round(bodies.high, 1)} mm): enlarge it, or acquire without region"
+            )
+    return kept
+
+
+class _Probe:
     """A sparse sample of the scan: a few views and rows, all columns that see the varying bodies."""
 
-    def __init__(self, scene: Scene, scanner: Scanner, build: Any, low: Any, high: Any, view_step: float) -> None:
+    def __init__(self, bodies: Bodies, scanner: Scanner) -> None:
         g = scanner.geometry
         views = np.unique(np.linspace(0, g.views - 1, min(_PROBE_VIEWS, g.views)).astype(int))
         self.geometry = g.select(views)
-        self.window = active_window(self.geometry, low, high)
-        keep = min(_PROBE_ROWS, self.window.rows)
-        first = self.window.first_row + (self.window.rows - keep) // 2
-        self.window = DetectorWindow(self.window.first_column, self.window.columns, first, keep)
-        self.scanner, self.build, self.view_step = scanner, build, view_step
-        self.seconds_per_reading_ray = 0.0
+        seen = active_window(self.geometry, bodies)
+        rows = min(_PROBE_ROWS, seen.rows)
+        self.window = seen.with_rows(seen.first_row + (seen.rows - rows) // 2, rows)
+        self.bodies, self.scanner = bodies, scanner
+        self.seconds = 0.0
 
     def run(
-        self, active: Sequence[bool], count: int, *, empty: bool = False, mono: bool = False, still: bool = False
+        self, active: Sequence[bool], count: int, *, background: bool = False, mono: bool = False, still: bool = False
     ) -> Any:
-        """Line integrals of the probe, ``(views, rows, columns)``."""
+        """Line integrals of the probe, ``(views, rows, columns)``.
+
+        Args:
+            active, count: of :func:`~torchpcct.acquisition.transmission.sub_rays`.
+            background: without the bodies that vary. mono: at the mean energy. still: as if nothing moved.
+        """
         energies, spectra = self.scanner.weights()
         spectra = spectra.sum(0, keepdims=True)
         if mono:
             mean = np.einsum("bce,e->bc", spectra, energies) / spectra.sum(-1)
             energies = np.array([float(mean.mean())])
             spectra = spectra.sum(-1, keepdims=True)
-        bodies: BodySet = self.build(energies, self.geometry, empty=empty, still=still)
+        g, w = self.geometry, self.window
+        bodies = self.bodies.symmetric(energies, g) if background else self.bodies.at(energies, g, still=still)
+        beam = Beam(spectra, self.scanner.row_factor, self.scanner.source.focal_spot, sub_rays(count, active))
         start = time.perf_counter()
-        readings = expected_readings(
-            self.geometry,
-            self.window,
-            bodies,
-            Beam(spectra, self.scanner.row_factor, self.scanner.source.focal_spot, sub_rays(count, active)),
-            np.full(self.geometry.views, self.view_step),
-        ).numpy()
+        readings = expected_readings(g, w, bodies, beam, np.full(g.views, self.bodies.view_step)).numpy()
         self.seconds = time.perf_counter() - start
         air = np.einsum("bce,r->rc", spectra, self.scanner.row_factor)
-        w = self.window
         air = air[w.first_row : w.first_row + w.rows][:, w.column_indices].transpose(1, 0, 2)
         return np.log(air) - np.log(readings[0])
 
 
+def _detector_effects(scanner: Scanner) -> list[Effect]:
+    """Pile-up and charge sharing, as the scanner's detector has them."""
+    dead_ns, merge_ns, shared = (
+        float(getattr(scanner.detector, name, 0.0)) for name in ("dead_time_ns", "merge_ns", "charge_sharing")
+    )
+    far = "behind the body the count rate is far below the detector's limit"
+    if not (dead_ns or shared):
+        return [Effect("pile-up, charge sharing", False, None, far)]
+    lost = f"dead time {dead_ns:g} ns, merging time {merge_ns:g} ns at {scanner.source.current_ma:g} mA"
+    split = f"{100 * shared:g} % of the interactions" if shared else "switched off"
+    return [
+        Effect("pile-up", dead_ns > 0, None, lost if dead_ns else far),
+        Effect("charge sharing", shared > 0, None, split),
+    ]
+
+
 def make_plan(
-    scene: Scene,
-    scanner: Scanner,
-    build: Any,
-    box: tuple[Any, Any],
-    kept: DetectorWindow | None,
-    view_step: float,
-    tolerance_hu: float,
-    sub_ray_count: int | None = None,
-    moving: bool = False,
-    invariant: bool = False,
+    bodies: Bodies, scanner: Scanner, region: VolumeGrid | None, tolerance_hu: float, sub_ray_count: int | None = None
 ) -> Plan:
-    """Decide what to model for ``scene``; see :class:`Plan`. Called by :func:`torchpcct.acquire`.
+    """Decide what to model; see :class:`Plan`. Called by :func:`torchpcct.acquire`.
 
     Args:
-        build: ``build(energies, geometry, empty=, still=) -> BodySet`` of the scene.
-        box: corners (x, y, z) mm of the bodies that differ between views.
-        kept: the readings that the scan will hold.
-        view_step: angle in rad during which one view is read.
+        bodies: the scene, prepared for the scanner's geometry.
+        scanner: what scans it.
+        region: grid around whose shadow readings are kept; None: the whole detector.
+        tolerance_hu: effects of the beam that would change less are left out.
         sub_ray_count: force a number of sub-rays instead of choosing it.
-        moving, invariant: whether bodies move; whether no view differs from another.
+
+    Raises:
+        ValueError: bodies that vary outside ``region``, a region outside the field of view.
     """
-    probe = Probe(scene, scanner, build, *box, view_step)
-    probe.run((True,) * 5, 16)  # compile, so that the time measured below is run time
+    g = scanner.geometry
+    kept = None if region is None else _kept_window(g, region, bodies)
+    probe = _Probe(bodies, scanner)
     everything = (True,) * 5
+    probe.run(everything, 16)  # compile, so that the time measured below is run time
     reference = probe.run(everything, _EFFECT_SUB_RAYS)
     per_ray = probe.seconds / (reference.size * _EFFECT_SUB_RAYS)
-    background = probe.run(everything, 16, empty=True)
-    inset = reference - background
+    inset = reference - probe.run(everything, 16, background=True)
     peak = float(np.abs(inset).max())
     mask = np.abs(inset) > 1e-3 * peak
     mu_water = scanner.water_linearisation().mu_ref
     # The rms error is spread over half the diagonal of the bodies' box: a chord typical of the inset.
-    span = float(np.linalg.norm((box[1] - box[0])[:2])) / 2
-    chord = np.full(reference.shape, max(span, 1.0))
+    chord = max(float(np.linalg.norm((bodies.high - bodies.low)[:2])) / 2, 1.0)
 
-    effects = []
+    def cost(difference: Any) -> float:
+        """Error of the line integrals as a CT number: rms over the shadow, spread over the bodies' chord."""
+        if not mask.any():
+            return 0.0
+        rms = math.sqrt(float(np.mean(difference[mask] ** 2)))
+        return 1000.0 * rms / (mu_water * chord)
+
+    mono = probe.run(everything, _EFFECT_SUB_RAYS, mono=True) - probe.run(everything, 16, background=True, mono=True)
+    scale = float((inset * mono).sum() / max(float((mono * mono).sum()), 1e-300))
+    hardening = "after the best single scale factor"
+    effects = [Effect("polychromatic spectrum", True, cost(inset - scale * mono), hardening)]
     active = list(everything)
     for axes, name, note in (
         ((0, 1), "focal spot", "mm: " + " × ".join(f"{s:g}" for s in scanner.source.focal_spot)),
         ((2, 3), "cell aperture", "averaged over the cell"),
-        ((4,), "gantry turn during a view", f"{math.degrees(view_step):.3f}°"),
+        ((4,), "gantry turn during a view", f"{math.degrees(bodies.view_step):.3f}°"),
     ):
         without = tuple(i not in axes for i in range(5))
-        cost = _hu_cost(probe.run(without, _EFFECT_SUB_RAYS) - reference, mask, chord, mu_water)
-        on = cost > tolerance_hu
-        effects.append(Effect(name, on, cost, note))
+        omitted = cost(probe.run(without, _EFFECT_SUB_RAYS) - reference)
+        effects.append(Effect(name, omitted > tolerance_hu, omitted, note))
         for axis in axes:
-            active[axis] = on
-    if moving:
-        cost = _hu_cost(probe.run(everything, _EFFECT_SUB_RAYS, still=True) - reference, mask, chord, mu_water)
-        effects.append(Effect("motion", True, cost, "exact in every view"))
-    else:
+            active[axis] = omitted > tolerance_hu
+    if bodies.scene.is_static:
         effects.append(Effect("motion", False, 0.0, "nothing moves"))
-    mono = probe.run(everything, _EFFECT_SUB_RAYS, mono=True) - probe.run(everything, 16, empty=True, mono=True)
-    scale = float((inset * mono).sum() / max(float((mono * mono).sum()), 1e-300))
-    cost = _hu_cost(inset - scale * mono, mask, chord, mu_water)
-    effects.insert(0, Effect("polychromatic spectrum", True, cost, "after the best single scale factor"))
-    effects += [Effect(name, False, None, note) for name, note in _LEFT_OUT]
+    else:
+        omitted = cost(probe.run(everything, _EFFECT_SUB_RAYS, still=True) - reference)
+        effects.append(Effect("motion", True, omitted, "exact in every view"))
+    scatter, *beam = (Effect(name, False, None, note) for name, note in _LEFT_OUT)
+    effects += [scatter, *_detector_effects(scanner), *beam]
 
     # Full-sampled reference with only the chosen effects: what the number of sub-rays must reproduce.
     chosen = tuple(active)
     target = probe.run(chosen, _TARGET_SUB_RAYS)
     count, error = 1, 0.0
-    for candidate in SUB_RAY_COUNTS if sub_ray_count is None else (sub_ray_count,):
-        count = candidate
-        difference = probe.run(chosen, count) - target
-        error = math.sqrt(float(np.mean(difference**2))) / max(peak, 1e-300)
+    for count in SUB_RAY_COUNTS if sub_ray_count is None else (sub_ray_count,):
+        error = math.sqrt(float(np.mean((probe.run(chosen, count) - target) ** 2))) / max(peak, 1e-300)
         if error <= _PEAK_ERROR:
             break
-    g = scanner.geometry
-    window = None if invariant else active_window(g, *box)
-    busy = g.rows * g.columns if window is None else window.views * window.rows * window.columns
-    held = math.prod(g.shape) if kept is None else kept.views * kept.rows * kept.columns
+    points = sub_rays(count, chosen)
+    window = active_window(g, bodies) if bodies.varying else None
+    busy = g.rows * g.columns if window is None else math.prod(window.shape)
+    held = math.prod(g.shape if kept is None else kept.shape)
     return Plan(
         effects=tuple(effects),
-        points=sub_rays(count, chosen),
+        points=points,
         active=window,
         kept=kept,
+        pile_up=PileUpMap.of(scanner),
         sampling_error=error,
         readings=held,
-        seconds=busy * len(sub_rays(count, chosen)) * per_ray + held * 8e-9,
+        seconds=busy * len(points) * per_ray + held * 8e-9,
         bytes=held * 4 * 2 + busy * 8,
         tolerance_hu=tolerance_hu,
     )

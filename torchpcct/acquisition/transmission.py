@@ -28,32 +28,14 @@ from numba import njit, prange
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchpcct.acquisition.bodies import BodySet
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam
 from torchpcct.scene.chords import interval
 
-__all__ = ["SUB_RAY_COUNTS", "Beam", "BodySet", "compress", "expected_readings", "sub_rays"]
+__all__ = ["SUB_RAY_COUNTS", "Beam", "compress", "expected_readings", "sub_rays"]
 
 Floats = NDArray[np.float64]
-
-
-class BodySet(NamedTuple):
-    """Packed bodies, ready for the kernel.
-
-    Attributes:
-        kinds, params: of :func:`torchpcct.scene.chords.pack`.
-        contrast: ``(bodies, energies)`` Δμ in mm⁻¹.
-        offsets: ``(bodies, views, 3)`` displacement in mm at the middle of each view.
-        drift: ``(bodies, views, 3)`` displacement in mm over the duration of each view.
-        circle: ``(x, y, radius)`` in mm around all bodies at rest, seen along z; radius inf: every reading sees them.
-    """
-
-    kinds: NDArray[np.int64]
-    params: Floats
-    contrast: Floats
-    offsets: Floats
-    drift: Floats
-    circle: tuple[float, float, float]
 
 
 class Beam(NamedTuple):
@@ -123,12 +105,13 @@ def _nodes(count: int) -> Floats:
 def compress(contrast: Floats, longest_mm: float = 1000.0, tolerance: float = 1e-9) -> tuple[Floats, Floats]:
     """Factor ``contrast`` (bodies, energies) = coefficients (bodies, rank) @ basis (rank, energies).
 
-    The rank is the smallest for which a chord of ``longest_mm`` changes the line integral by less than ``tolerance``.
+    The rank is the smallest for which a chord of ``longest_mm`` changes the line integral by less than ``tolerance``;
+    0 without bodies.
     """
     u, s, vt = np.linalg.svd(contrast, full_matrices=False)
-    for rank in range(1, s.size + 1):
+    for rank in range(s.size + 1):
         coefficients, basis = u[:, :rank] * s[:rank], vt[:rank]
-        if np.abs(contrast - coefficients @ basis).max() * longest_mm <= tolerance:
+        if np.abs(contrast - coefficients @ basis).max(initial=0.0) * longest_mm <= tolerance:
             break
     return np.ascontiguousarray(coefficients), np.ascontiguousarray(basis)
 
@@ -280,8 +263,7 @@ def expected_readings(
         ``(bins, views, window.rows, window.columns)`` float64.
     """
     coefficients, basis = compress(bodies.contrast)
-    bins = beam.spectra.shape[0]
-    out = np.empty((bins, geometry.views, window.rows, window.columns))
+    out = np.empty((len(beam.spectra), *window.shape))
     dv, du = geometry.pitch
     # Half the beam's width anywhere between source and detector, and the drift during a view.
     nearest = math.hypot(bodies.circle[0], bodies.circle[1])

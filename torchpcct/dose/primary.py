@@ -26,7 +26,7 @@ from torchpcct.dose.coefficients import (
 )
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scene.chords import interval
-from torchpcct.scene.scene import resolve_material
+from torchpcct.scene.materials import material
 
 if TYPE_CHECKING:
     from torchpcct.scanner import Scanner
@@ -168,7 +168,7 @@ def primary_dose(
         media = list(scene.materials)
     else:
         labels = np.zeros(points.shape[:-1], dtype=np.int64)
-        media = [resolve_material(medium)]
+        media = [material(medium)]
     per_gram = mass_energy_absorption if quantity == "absorbed" else mass_interaction
     deposit = np.stack([per_gram(m, energies) * energies for m in media]) * MGY_PER_KEV_PER_G
 

@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 from typing import Any, cast
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import Geometry, VolumeGrid
-from torchpcct.projector.cpu.engine import Engine
-from torchpcct.projector.cuda import passes as gpu
+from torchpcct.projector.engine import Engine
+from torchpcct.projector.tables import Tables
 
 __all__ = ["Projector"]
 
@@ -24,7 +23,7 @@ class _Pass(torch.autograd.Function):
 
     @staticmethod
     def forward(x: Tensor, engine: Engine, transposed: bool) -> Tensor:
-        return _run(x, engine, transposed)
+        return engine.apply(x, transposed)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -46,23 +45,6 @@ class _Pass(torch.autograd.Function):
 
 def _apply(x: Tensor, engine: Engine, transposed: bool) -> Tensor:
     return cast(Tensor, _Pass.apply(x, engine, transposed))
-
-
-def _run(x: Tensor, engine: Engine, transposed: bool) -> Tensor:
-    inner, outer = engine.range_shape, engine.domain_shape
-    if not transposed:
-        inner, outer = outer, inner
-    lead = x.shape[: x.dim() - len(inner)]
-    batch = math.prod(lead)
-    if batch == 0:
-        return x.new_zeros((*lead, *outer))
-    if x.device.type == "cuda" and gpu.available() and gpu.trusted(engine, x.device, x.dtype):
-        passes = engine.on(x.device)
-        flat = x.detach().reshape(batch, *inner)
-        return (passes.adjoint(flat) if transposed else passes.forward(flat)).reshape(*lead, *outer)
-    array = x.detach().reshape(batch, *inner).cpu().contiguous().numpy()
-    result = engine.adjoint(array) if transposed else engine.forward(array)
-    return torch.from_numpy(np.ascontiguousarray(result)).reshape(*lead, *outer).to(x.device)
 
 
 class Projector(nn.Module):
@@ -111,18 +93,18 @@ class Projector(nn.Module):
         self.geometry = geometry
         self.grid = grid
         self.window = window
-        self._engine = Engine(geometry, grid, window, motion, memory)
+        self._engine = Engine(Tables(geometry, grid, window, motion, memory))
         self._adjoint: list[_Adjoint] = []  # in a list: a submodule that holds its parent would recurse
 
     @property
     def domain_shape(self) -> tuple[int, ...]:
         """Shape of one volume, ``(y, x)`` or ``(z, y, x)``."""
-        return self._engine.domain_shape
+        return self._engine.tables.domain_shape
 
     @property
     def range_shape(self) -> tuple[int, ...]:
         """Shape of one set of line integrals, ``(views, columns)`` or ``(views, rows, columns)``."""
-        return self._engine.range_shape
+        return self._engine.tables.range_shape
 
     @property
     def T(self) -> _Adjoint:
@@ -157,9 +139,7 @@ class Projector(nn.Module):
         arrays = batch * item * (math.prod(self.domain_shape) + math.prod(self.range_shape))
         if not batch:
             return 0
-        if torch.device(device).type == "cpu":
-            return arrays + self._engine.workspace(batch, item)
-        return arrays + gpu.workspace(self._engine, batch, item)
+        return arrays + self._engine.workspace(batch, item, torch.device(device).type)
 
     def extra_repr(self) -> str:
         return f"{type(self.geometry).__name__}, {self.domain_shape} -> {self.range_shape}"

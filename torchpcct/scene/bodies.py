@@ -8,12 +8,13 @@ frame, so that ``scanner = position + rotation @ local``. Exact chords of rays t
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from torchpcct.validate import number, numbers
 
 __all__ = ["Box", "Ellipsoid", "EllipticCylinder", "Shape", "rotation_matrix"]
 
@@ -39,26 +40,6 @@ def rotation_matrix(axis: ArrayLike, angle: float) -> Floats:
     x, y, z = a / length
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * (cross @ cross)
-
-
-def number(name: str, value: Any, *, positive: bool = False, finite: bool = True) -> float:
-    """``value`` as a float, or a ``TypeError`` / ``ValueError`` that names it."""
-    try:
-        result = float(value)
-    except (TypeError, ValueError):
-        raise TypeError(f"{name} must be a number, got {value!r} ({type(value).__name__})") from None
-    if math.isnan(result) or (finite and math.isinf(result)):
-        raise ValueError(f"{name} must be {'finite' if finite else 'a number'}, got {value!r}")
-    if positive and result <= 0:
-        raise ValueError(f"{name} must be greater than 0, got {result:g}")
-    return result
-
-
-def numbers(name: str, value: Any, count: int, *, positive: bool = False) -> tuple[float, ...]:
-    """``value`` as ``count`` finite floats, or an error that names it."""
-    if not isinstance(value, Sequence | np.ndarray) or isinstance(value, str) or len(value) != count:
-        raise ValueError(f"{name} must be {count} numbers, got {value!r}")
-    return tuple(number(f"{name}[{i}]", v, positive=positive) for i, v in enumerate(value))
 
 
 def _rotation(value: Any) -> Matrix:

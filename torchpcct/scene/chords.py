@@ -13,7 +13,7 @@ Quadrics and boxes are met at most once. The tubes of :mod:`torchpcct.scene.tube
   crossings; the interval returned starts at the first entry and has the exact TOTAL length inside.
 
 numba's ``cache=True`` does not see a change of a function that is called from another file: after a change of
-``_rays.py`` touch the files whose kernels call :func:`interval`, or clear their caches.
+``chord_kernels.py`` touch the files whose kernels call :func:`interval`, or clear their caches.
 """
 
 from __future__ import annotations

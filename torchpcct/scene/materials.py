@@ -20,6 +20,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchpcct.scene.materials_tables import FORMULAS, TABLES
+
 __all__ = [
     "FRACTION_TOLERANCE",
     "MATERIALS",
@@ -252,18 +254,17 @@ class _Registry(Mapping[str, Material]):
 
     def __getitem__(self, name: str) -> Material:
         if name not in self._built:
-            from torchpcct.scene.materials_tables import FACTORIES
-
-            self._built[name] = FACTORIES[name]()
+            if name in FORMULAS:
+                self._built[name] = compound(name, *FORMULAS[name])
+            else:
+                self._built[name] = Material(name, *TABLES[name])
         return self._built[name]
 
     def __iter__(self) -> Iterator[str]:
-        from torchpcct.scene.materials_tables import FACTORIES
-
-        return iter(FACTORIES)
+        return iter((*TABLES, *FORMULAS))
 
     def __len__(self) -> int:
-        return sum(1 for _ in self)
+        return len(TABLES) + len(FORMULAS)
 
 
 MATERIALS: Mapping[str, Material] = _Registry()
@@ -273,9 +274,16 @@ PLAQUE_MATERIALS = ("vessel_wall", "fibrous_tissue", "necrotic_core", "blood_iod
 """Names of the five tissues of the plaque scene."""
 
 
-def material(name: str) -> Material:
-    """The material of the registry :data:`MATERIALS` with this name; a ``ValueError`` lists the known names."""
-    try:
-        return MATERIALS[name]
-    except KeyError:
-        raise ValueError(f"unknown material {name!r}: known are {', '.join(sorted(MATERIALS))}") from None
+def material(value: Material | str) -> Material:
+    """A material from itself or from its name in the registry :data:`MATERIALS`.
+
+    Raises:
+        ValueError: a name that the registry does not hold. TypeError: neither a material nor a name.
+    """
+    if isinstance(value, Material):
+        return value
+    if not isinstance(value, str):
+        raise TypeError(f"material must be a Material or its name, got {value!r} ({type(value).__name__})")
+    if value not in MATERIALS:
+        raise ValueError(f"unknown material {value!r}: use a Material or one of {', '.join(sorted(MATERIALS))}")
+    return MATERIALS[value]

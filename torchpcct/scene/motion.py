@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from torchpcct.scene.bodies import number
+from torchpcct.validate import number
 
 __all__ = ["SinusoidalMotion"]
 
@@ -40,10 +40,10 @@ class SinusoidalMotion:
     def __post_init__(self) -> None:
         if not isinstance(self.body, str):
             raise TypeError(f"body must be the name of a body, got {self.body!r} ({type(self.body).__name__})")
-        for name in ("amplitude", "rate_bpm", "phase", "direction"):
+        # A negative amplitude is another direction: turn that by π instead.
+        object.__setattr__(self, "amplitude", number("amplitude", self.amplitude, low=0.0, unit="mm"))
+        for name in ("rate_bpm", "phase", "direction"):
             object.__setattr__(self, name, number(name, getattr(self, name), positive=name == "rate_bpm"))
-        if self.amplitude < 0:
-            raise ValueError(f"amplitude must be 0 mm or more, got {self.amplitude:g}: turn direction by π instead")
 
     @property
     def _unit(self) -> NDArray[np.float64]:

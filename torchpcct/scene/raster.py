@@ -2,28 +2,21 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from torchpcct.geometry import VolumeGrid
-from torchpcct.scene.chords import interval
+from torchpcct.scene.bodies import Shape
+from torchpcct.scene.chords import interval, pack
+from torchpcct.validate import whole
 
-if TYPE_CHECKING:
-    from torchpcct.scene.scene import Scene
-
-__all__ = ["grid_points", "volume_fractions"]
+__all__ = ["volume_fractions"]
 
 Floats = NDArray[np.float64]
-
-
-def grid_points(grid: VolumeGrid) -> Floats:
-    """Voxel centres ``(*grid.shape, 3)`` as x, y, z in mm; a 2-D grid lies in the plane z = 0."""
-    axes = grid.axes if grid.ndim == 3 else (np.zeros(1), *grid.axes)
-    z, y, x = np.meshgrid(*axes, indexing="ij")
-    return np.stack([x, y, z], axis=-1).reshape(*grid.shape, 3)
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
@@ -49,15 +42,16 @@ def _fill(kinds: Any, params: Any, zs: Any, ys: Any, x_edge: float, dx: float, l
                     out[b, k, j, last] += (t1 - last) * share
 
 
-def volume_fractions(scene: Scene, grid: VolumeGrid, oversample: int = 4) -> Floats:
-    """Share of each voxel that each body fills itself, without the bodies inside it.
+def volume_fractions(shapes: Sequence[Shape], parents: Sequence[int], grid: VolumeGrid, oversample: int = 4) -> Floats:
+    """Share of each voxel that each of ``B`` nested bodies fills itself, without the bodies inside it.
 
     Each voxel row is crossed by ``oversample²`` lines along x (a rank-1 lattice over the row's y, z section; 2-D grids:
     ``oversample`` lines over y in the plane z = 0), each cut exactly: only y and z are sampled. The fractions of all
     bodies and of the surroundings add up to 1 in every voxel.
 
     Args:
-        scene: bodies at rest.
+        shapes: of the bodies, at rest.
+        parents: index of the body around each, −1 for none.
         grid: 2-D or 3-D voxel grid.
         oversample: lines per voxel edge, at least 1.
 
@@ -67,30 +61,27 @@ def volume_fractions(scene: Scene, grid: VolumeGrid, oversample: int = 4) -> Flo
     Raises:
         ValueError: ``oversample`` below 1. TypeError: not a whole number, or not a grid.
     """
-    if isinstance(oversample, bool) or not isinstance(oversample, int | np.integer):
-        raise TypeError(f"oversample must be a whole number, got {oversample!r}")
-    if oversample < 1:
-        raise ValueError(f"oversample must be at least 1, got {oversample}")
+    oversample = whole("oversample", oversample)
     if not isinstance(grid, VolumeGrid):
         raise TypeError(f"grid must be a VolumeGrid, got {type(grid).__name__}")
-    kinds, params = scene.pack()
+    kinds, params = pack(shapes)
     y, x = grid.axes[-2:]
     dy, dx = grid.spacing[-2:]
     if grid.ndim == 3:
-        lines = int(oversample) ** 2
+        lines = oversample**2
         step = np.arange(lines) + 0.5
         # Golden-ratio lattice: no two lines share a y or a z, so edges parallel to an axis are resolved to 1 / lines.
         across, along = step / lines, np.mod(step * 0.6180339887498949, 1.0)
         zs = grid.axes[0][:, None] + (along - 0.5) * grid.spacing[0]
     else:
-        lines = int(oversample)
+        lines = oversample
         across = (np.arange(lines) + 0.5) / lines
         zs = np.zeros((1, lines))
     ys = y[:, None] + (across - 0.5) * dy
-    whole = np.zeros((kinds.size, zs.shape[0], y.size, x.size))
-    _fill(kinds, params, zs, ys, float(x[0] - dx / 2.0), float(dx), lines, whole)
-    own = whole.copy()
-    for k, parent in enumerate(scene.parents):
+    filled = np.zeros((kinds.size, zs.shape[0], y.size, x.size))
+    _fill(kinds, params, zs, ys, float(x[0] - dx / 2.0), float(dx), lines, filled)
+    own = filled.copy()
+    for k, parent in enumerate(parents):
         if parent >= 0:
-            own[parent] -= whole[k]
+            own[parent] -= filled[k]
     return np.clip(own, 0.0, 1.0, out=own).reshape(kinds.size, *grid.shape)

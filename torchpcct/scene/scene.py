@@ -13,17 +13,16 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scene.bodies import Shape
+from torchpcct.scene.materials import Material
+from torchpcct.scene.materials import material as material_of
 from torchpcct.scene.motion import SinusoidalMotion
-
-if TYPE_CHECKING:
-    from torchpcct.scene.materials import Material
 
 __all__ = ["Body", "Scene"]
 
@@ -31,23 +30,6 @@ Floats = NDArray[np.float64]
 
 # Bodies may touch: relative overlap of two surfaces that still counts as touching.
 _TOUCH = 1e-7
-
-
-def resolve_material(material: Any) -> Material:
-    """A material from itself or from its name in the registry.
-
-    Raises:
-        ValueError: a name that the registry does not hold. TypeError: neither a material nor a name.
-    """
-    from torchpcct.scene.materials import MATERIALS, Material
-
-    if isinstance(material, Material):
-        return material
-    if not isinstance(material, str):
-        raise TypeError(f"material must be a Material or its name, got {material!r} ({type(material).__name__})")
-    if material not in MATERIALS:
-        raise ValueError(f"unknown material {material!r}: use a Material or one of {', '.join(sorted(MATERIALS))}")
-    return MATERIALS[material]
 
 
 @dataclass(frozen=True)
@@ -156,16 +138,7 @@ class Scene:
     @property
     def materials(self) -> tuple[Material, ...]:
         """Material of each body, names looked up in the registry."""
-        return tuple(resolve_material(b.material) for b in self.bodies)
-
-    @property
-    def contrast_pairs(self) -> tuple[tuple[Material, Material | None], ...]:
-        """``(material, parent's material)`` of each body: a chord counts with the difference of their attenuations.
-
-        ``None``: nothing attenuates around the body. A pair of equal materials contributes nothing to any reading.
-        """
-        materials = self.materials
-        return tuple((m, None if p < 0 else materials[p]) for m, p in zip(materials, self.parents, strict=True))
+        return tuple(material_of(b.material) for b in self.bodies)
 
     def inside(self, name: str) -> tuple[str, ...]:
         """The body ``name`` and all bodies inside it, at any depth."""
@@ -306,7 +279,7 @@ class Scene:
 
     def pack(self) -> tuple[NDArray[np.int64], Floats]:
         """The shapes at rest as arrays for the kernels of :mod:`torchpcct.scene.chords`: kinds ``(B,)``, params."""
-        from torchpcct.scene.chords import pack
+        from torchpcct.scene.chords import pack  # it stands beside kernels, which need numba, a slow import
 
         return pack(self.shapes)
 
@@ -319,9 +292,7 @@ class Scene:
         Returns:
             ``(...)`` or ``grid.shape``, int64.
         """
-        from torchpcct.scene.raster import grid_points
-
-        points = grid_points(where) if isinstance(where, VolumeGrid) else np.asarray(where, dtype=np.float64)
+        points = _voxel_centres(where) if isinstance(where, VolumeGrid) else np.asarray(where, dtype=np.float64)
         labels = np.full(points.shape[:-1], -1, dtype=np.int64)
         for k, (body, parent) in enumerate(zip(self.bodies, self.parents, strict=True)):
             labels[(labels == parent) & body.shape.contains(points)] = k
@@ -332,9 +303,9 @@ class Scene:
 
         See :func:`torchpcct.scene.raster.volume_fractions`; ``(B, *grid.shape)`` float64.
         """
-        from torchpcct.scene.raster import volume_fractions
+        from torchpcct.scene.raster import volume_fractions  # its kernels need numba, a slow import
 
-        return volume_fractions(self, grid, oversample)
+        return volume_fractions(self.shapes, self.parents.tolist(), grid, oversample)
 
     def render(
         self, grid: VolumeGrid, values: Mapping[str, float], outside: float = 0.0, oversample: int = 4
@@ -364,6 +335,13 @@ class Scene:
             raise ValueError(f"energy_kev must be one energy greater than 0 keV, got {energy_kev!r}")
         mu = [float(np.ravel(m.attenuation(energy))[0]) for m in self.materials]
         return self.render(grid, dict(zip(self.names, mu, strict=True)), oversample=oversample)
+
+
+def _voxel_centres(grid: VolumeGrid) -> Floats:
+    """``(*grid.shape, 3)`` as x, y, z in mm; a 2-D grid lies in the plane z = 0."""
+    axes = grid.axes if grid.ndim == 3 else (np.zeros(1), *grid.axes)
+    z, y, x = np.meshgrid(*axes, indexing="ij")
+    return np.stack([x, y, z], axis=-1).reshape(*grid.shape, 3)
 
 
 def _format(point: Floats) -> str:

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from torchpcct.scene.bodies import FAR, Floats, Shape, along_axis, disc_points, number
+from torchpcct.scene.bodies import FAR, Floats, Shape, along_axis, disc_points
+from torchpcct.validate import number
 
 __all__ = ["BulgedTube", "NarrowedTube"]
 
@@ -30,9 +31,7 @@ class _Tube(Shape):
         super().__post_init__()
         set_ = object.__setattr__
         set_(self, "radius", number("radius", self.radius, positive=True))
-        set_(self, "amplitude", number("amplitude", self.amplitude))
-        if self.amplitude < 0:
-            raise ValueError(f"amplitude must be 0 mm or more, got {self.amplitude:g}")
+        set_(self, "amplitude", number("amplitude", self.amplitude, low=0.0, unit="mm"))
         set_(self, "bulge_length", number("bulge_length", self.bulge_length, positive=True))
         set_(self, "half_length", number("half_length", self.half_length, positive=True, finite=False))
 

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchpcct import counting_noise as noise
-from torchpcct.acquisition.transmission import Beam, BodySet, expected_readings, sub_rays
+from torchpcct.acquisition.bodies import BodySet
+from torchpcct.acquisition.transmission import Beam, expected_readings, sub_rays
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import FanBeam, VolumeGrid
 from torchpcct.scanner.linearisation import WaterLinearisation

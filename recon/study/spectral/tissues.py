@@ -12,7 +12,6 @@ from torch import Tensor
 
 from recon.study.spectral.scan import PlaqueScan
 from torchpcct.geometry import VolumeGrid
-from torchpcct.scene.raster import volume_fractions
 from torchpcct.scene.scene import Scene
 from torchpcct.spectral import MMD_TISSUES, clean, dice, label, mmd, nearest
 
@@ -39,7 +38,7 @@ def truth_labels(scene: Scene, grid: VolumeGrid) -> Tensor:
 
     −1: no tissue fills half of it, or it is vessel wall, which the decomposition does not know.
     """
-    fractions = volume_fractions(scene, grid)
+    fractions = scene.volume_fractions(grid)
     parts = np.stack([fractions[scene.index(BODIES[t])] for t in MMD_TISSUES])
     labels = np.where(parts.max(0) > PURE, parts.argmax(0), -1)
     return torch.from_numpy(labels.astype(np.int64))

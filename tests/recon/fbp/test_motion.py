@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from analytic import Gaussian, line_integrals
 
 from recon.fbp.backproject import BackprojectionPlan, backproject
 from recon.fbp.fbp import fbp
@@ -17,7 +18,6 @@ from recon.pwls.qggmrf import QGGMRF
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
-from torchpcct.projector.analytic import Gaussian, line_integrals
 from torchpcct.scanner import presets
 from torchpcct.scene import Body, Scene, SinusoidalMotion
 from torchpcct.scene.bodies import Ellipsoid, EllipticCylinder

@@ -162,6 +162,34 @@ def test_plan_models_only_what_the_scene_needs(plaque):
     assert len(coarse.points) == 1
 
 
+def test_the_plan_says_what_the_detector_does():
+    """Pile-up and charge sharing are modelled exactly if the detector has them, and then the readings show it."""
+    system = presets.pcct(views=2, rows=1, columns=100, energy_bin_kev=5.0)
+
+    def scan(**changes):
+        detector = replace(system.detector, **changes)
+        scan = acquire(water_cylinder(200.0), system.replace(detector=detector), sub_rays=1)
+        return {e["name"]: e["modelled"] for e in scan.info["plan"]["effects"]}, scan.air
+
+    effects, ideal = scan()
+    assert effects["pile-up, charge sharing"] is False
+    for changes, expected in (({"dead_time_ns": 50.0}, (True, False)), ({"charge_sharing": 0.1}, (False, True))):
+        effects, air = scan(**changes)
+        assert (effects["pile-up"], effects["charge sharing"]) == expected
+        assert (air != ideal).all()
+
+
+def test_a_scene_without_symmetric_bodies():
+    """Nothing lies around the only body: rays that miss it read air."""
+    ball = Ellipsoid(4.0, position=(30.0, 0.0, 0.0))
+    region = VolumeGrid((24, 24, 24), 0.5, (0.0, 0.0, 30.0))
+    scan = acquire(Scene([Body("ball", ball, "water")]), scanner(8, 2), region=region, sub_rays=16)
+    torch.testing.assert_close(scan.surround, scan.air, rtol=1e-6, atol=0)
+    p = scan.line_integrals()
+    assert p.max() == pytest.approx(8.0 * scan.linearisation.mu_ref, rel=0.02)
+    assert p.amin(dim=-1).abs().max() < 1e-6
+
+
 def test_sub_rays_do_not_shift_a_reading():
     for count in SUB_RAY_COUNTS:
         points = sub_rays(count)

@@ -187,7 +187,8 @@ def test_mass_is_kept_by_every_blur(monkeypatch):
 
 def test_path_lengths_see_the_beam_of_the_readings():
     """Readings of one energy and a weak contrast are the path lengths times that contrast, finite beam included."""
-    from torchpcct.acquisition.transmission import Beam, BodySet, expected_readings, sub_rays
+    from torchpcct.acquisition.bodies import BodySet
+    from torchpcct.acquisition.transmission import Beam, expected_readings, sub_rays
     from torchpcct.scene.chords import pack
 
     g, views = GEOMETRY, GEOMETRY.views

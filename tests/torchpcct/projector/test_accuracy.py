@@ -7,13 +7,13 @@ import math
 import numpy as np
 import pytest
 import torch
+from analytic import Ellipsoid, Gaussian, line_integrals, rasterize
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchpcct.detector_window import shadow
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
 from torchpcct.projector import Projector
-from torchpcct.projector.analytic import Ellipsoid, Gaussian, line_integrals, rasterize
 
 
 def _error(geometry, grid, bodies, window=None, sub=1, dtype=torch.float64):

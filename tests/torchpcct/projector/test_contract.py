@@ -41,8 +41,10 @@ def test_dense_matrix_of_both_directions_agrees(name):
     A = _projector(name)
     n, m = torch.Size(A.domain_shape).numel(), torch.Size(A.range_shape).numel()
     forward = A(torch.eye(n, dtype=torch.float64).reshape(n, *A.domain_shape)).reshape(n, m)
-    adjoint = A.T(torch.eye(m, dtype=torch.float64).reshape(m, *A.range_shape)).reshape(m, n)
-    torch.testing.assert_close(forward, adjoint.T, rtol=0, atol=1e-12 * float(forward.abs().max()))
+    # Cone-beam volumes pass one by one: a random part of the readings.
+    some = torch.randperm(m, generator=torch.Generator().manual_seed(0))[: 120 if len(A.domain_shape) == 3 else m]
+    adjoint = A.T(torch.eye(m, dtype=torch.float64)[some].reshape(-1, *A.range_shape)).reshape(-1, n)
+    torch.testing.assert_close(forward[:, some], adjoint.T, rtol=0, atol=1e-12 * float(forward.abs().max()))
     assert float(forward.min()) > -1e-12 * float(forward.max())
 
 

@@ -9,13 +9,14 @@ import numba
 import numpy as np
 import pytest
 import torch
+from analytic import Gaussian, line_integrals, rasterize
 from geometries import REGISTRY
 
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
 from torchpcct.projector import Projector
-from torchpcct.projector.analytic import Gaussian, line_integrals, rasterize
-from torchpcct.projector.cpu import plane_passes as plane
+from torchpcct.projector.cpu import plane_passes
+from torchpcct.projector.cpu.plane_kernels import _mixing_stride
 
 NAMES = sorted(REGISTRY)
 SOME = [
@@ -108,7 +109,7 @@ def test_views_in_any_order_and_repeated(name):
 def test_symmetric_views_share_work_and_read_the_same(name, operations, reach):
     geometry, grid, _ = REGISTRY[name]()
     A = Projector(geometry, grid)
-    passes = A._engine._plane
+    passes = A._engine.cpu
     x = _random((3, *grid.shape))
     assert (passes.operations, len(passes.tables(np.dtype(np.float64), passes.lanes(3)).reach)) == (operations, reach)
     singly = torch.cat([Projector(geometry.select([v]), grid)(x) for v in range(geometry.views)], dim=-2)
@@ -121,10 +122,10 @@ def test_views_whose_displaced_grids_lie_too_far_apart_are_projected_singly(monk
     geometry, grid, _ = REGISTRY["fan_symmetric_shifted_grid"]()
     x = _random(grid.shape)
     together, expect = Projector(geometry, grid), Projector(geometry, grid)(x)
-    assert together._engine._plane.operations == 8
-    monkeypatch.setattr(plane, "_FAR", 0.1)
+    assert together._engine.cpu.operations == 8
+    monkeypatch.setattr(plane_passes, "_FAR", 0.1)
     singly = Projector(geometry, grid)
-    assert singly._engine._plane.operations == 1
+    assert singly._engine.cpu.operations == 1
     torch.testing.assert_close(singly(x), expect, rtol=1e-12, atol=1e-12)
 
 
@@ -380,10 +381,10 @@ def test_working_memory_does_not_grow_with_the_batch(name):
 def test_a_small_memory_limit_gives_the_same_bits(name):
     case = REGISTRY[name]()
     whole = Projector(*case)
-    forward, adjoint, per_view = whole._engine._volume_bytes(4)
+    forward, adjoint, per_view = whole._engine.cpu.bytes(4)
     limit = max(forward, adjoint + 2 * per_view)
     limited = Projector(*case, memory=limit)
-    assert limited._engine._views_at_once(4) < whole._engine._views_at_once(4) == whole.range_shape[0]
+    assert limited._engine.cpu.views_at_once(4) < whole._engine.cpu.views_at_once(4) == whole.range_shape[0]
     x, y = _random((2, *whole.domain_shape), torch.float32), _random((2, *whole.range_shape), torch.float32)
     assert torch.equal(limited(x), whole(x))
     assert torch.equal(limited.T(y), whole.T(y))
@@ -417,8 +418,6 @@ def test_nan_and_inf_do_not_leak_into_other_cells_of_slabs_far_apart():
 @pytest.mark.parametrize("tasks", [1, 2, 6, 12, 13, 64, 100])
 def test_tasks_of_the_plane_adjoint_are_mixed(tasks):
     # Threads take runs of tasks; rows come first, and with symmetric views nearly all work is in the rows.
-    from torchpcct.projector.cpu.plane_kernels import _mixing_stride
-
     order = np.arange(tasks) * _mixing_stride(tasks) % tasks
     assert sorted(order) == list(range(tasks))
     rows_of_each_thread = [(part < tasks // 2).sum() for part in np.array_split(order, 2)]

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from analytic import Ellipsoid, Gaussian, line_integrals, rasterize
 
 from torchpcct.detector_window import shadow
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
 from torchpcct.projector import Projector
-from torchpcct.projector.analytic import Ellipsoid, Gaussian, line_integrals, rasterize
 from torchpcct.projector.vectors import to_vectors
 
 ANGLES = full_turn(6, 0.2)

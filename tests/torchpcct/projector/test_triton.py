@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 
 import pytest
@@ -16,7 +17,7 @@ from triton import knobs
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid
 from torchpcct.projector import Projector
-from torchpcct.projector.cuda import passes as gpu
+from torchpcct.projector.cuda.passes import GpuPasses, slices
 
 pytestmark = [
     pytest.mark.skipif(not knobs.runtime.interpret, reason="triton was imported without TRITON_INTERPRET=1"),
@@ -37,7 +38,7 @@ CASES = {
 @pytest.mark.parametrize("name", sorted(CASES))
 def test_same_weights_as_the_cpu(name):
     A = Projector(*CASES[name])
-    passes = gpu.GpuPasses(A._engine, CPU)
+    passes = A._engine.on(CPU)
     generator = torch.Generator().manual_seed(0)
     x = torch.randn((1, *A.domain_shape), generator=generator, dtype=torch.float64)
     y = torch.randn((1, *A.range_shape), generator=generator, dtype=torch.float64)
@@ -49,34 +50,31 @@ def test_same_weights_as_the_cpu(name):
 def test_slices_that_fit_the_memory_give_the_same_bits(name):
     geometry, grid, window = CASES[name]
     geometry = geometry.select([0, 0, 0])
-    whole = gpu.GpuPasses(Projector(geometry, grid, window)._engine, CPU)
-    least = next(m for m in range(1, 10**6, 8) if _fits(geometry, grid, window, m))
-    limited = Projector(geometry, grid, window, memory=least)
-    passes = gpu.GpuPasses(limited._engine, CPU)
-    assert gpu._slice(limited._engine, least, 2, 4)[0] == 1
+
+    def passes(memory=None):
+        return Projector(geometry, grid, window, memory=memory)._engine.on(CPU)
+
+    whole = passes()
     generator = torch.Generator().manual_seed(0)
-    x, y = (torch.randn((2, *shape), generator=generator) for shape in (limited.domain_shape, limited.range_shape))
-    assert torch.equal(passes.forward(x), whole.forward(x))
-    assert torch.equal(passes.adjoint(y), whole.adjoint(y))
-    assert limited.memory_estimate(2, device="cuda") < Projector(geometry, grid, window).memory_estimate(
-        2, device="cuda"
-    )
-    with pytest.raises(ValueError, match="bytes of working memory at least"):
-        gpu.GpuPasses(Projector(geometry, grid, window, memory=1)._engine, CPU).forward(x)
-
-
-def _fits(geometry, grid, window, memory):
-    try:
-        gpu._slice(Projector(geometry, grid, window, memory=memory)._engine, memory, 2, 4)
-    except ValueError:
-        return False
-    return True
+    shapes = (whole.tables.domain_shape, whole.tables.range_shape)
+    x, y = (torch.randn((2, *shape), generator=generator) for shape in shapes)
+    with pytest.raises(ValueError, match="bytes of working memory at least") as refusal:
+        passes(1).forward(x)
+    least = int(re.search(r"needs (\d+) bytes", str(refusal.value)).group(1))
+    with pytest.raises(ValueError, match=f"needs {least} bytes"):
+        passes(least - 1).forward(x)
+    limited = passes(least)
+    assert slices(limited.tables, least, 2, 4)[0] == 1
+    assert torch.equal(limited.forward(x), whole.forward(x))
+    assert torch.equal(limited.adjoint(y), whole.adjoint(y))
+    free, tight = (Projector(geometry, grid, window, memory=m) for m in (None, least))
+    assert tight.memory_estimate(2, device="cuda") < free.memory_estimate(2, device="cuda")
 
 
 def test_a_deviating_kernel_is_refused(monkeypatch):
-    engine = Projector(*(FanBeam([0.0], 60.0, 110.0, 1, 1.0), VolumeGrid((1, 1), 3.0)))._engine
-    assert gpu.agrees(engine, CPU, torch.float32)
-    forward = gpu.GpuPasses.forward
-    monkeypatch.setattr(gpu.GpuPasses, "forward", lambda self, x: 1.001 * forward(self, x))
+    engine = Projector(FanBeam([0.0], 60.0, 110.0, 1, 1.0), VolumeGrid((1, 1), 3.0))._engine
+    assert engine.agrees(CPU, torch.float32)
+    forward = GpuPasses.forward
+    monkeypatch.setattr(GpuPasses, "forward", lambda self, x: 1.001 * forward(self, x))
     with pytest.warns(RuntimeWarning, match=r"differs from the CPU's by 1\.0e-03"):
-        assert not gpu.agrees(engine, CPU, torch.float32)
+        assert not engine.agrees(CPU, torch.float32)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from plaque_recipes import BASIS_FORMULAS, PLAQUE_RECIPES, elastin_formula, plaque_tissue
 
 from torchpcct.scene.materials import (
     MATERIALS,
@@ -19,7 +20,6 @@ from torchpcct.scene.materials import (
     material,
     mixture,
 )
-from torchpcct.scene.materials_tables import BASIS_FORMULAS, PLAQUE_RECIPES, elastin_formula, plaque_tissue
 
 
 @pytest.mark.parametrize("name", list(PLAQUE_RECIPES))

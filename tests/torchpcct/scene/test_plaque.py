@@ -179,7 +179,7 @@ def test_volume_fractions_of_the_inset(paper):
     [
         (lambda: Plaque(wall_thickness=2.0), ValueError, "wall_thickness"),
         (lambda: Plaque(lumen_narrowing=0.5), ValueError, "lumen_narrowing must be at least 1"),
-        (lambda: Plaque(bulge=-0.1), ValueError, "bulge must be 0 mm or more"),
+        (lambda: Plaque(bulge=-0.1), ValueError, "bulge must be at least 0 mm"),
         (lambda: Plaque(position=(1.0, 2.0)), ValueError, "position must be 3 numbers"),
         (lambda: plaque_scene(core_semi_axes=(1.0, 1.2, 1.2)), ValueError, "'core' leaves its parent 'fibrous'"),
         (lambda: plaque_scene(patient_diameter=60.0), ValueError, "'wall' leaves its parent 'patient'"),

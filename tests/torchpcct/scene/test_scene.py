@@ -6,8 +6,6 @@ import sys
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scene import (
@@ -23,7 +21,7 @@ from torchpcct.scene import (
     rotation_matrix,
 )
 from torchpcct.scene.materials import MATERIALS
-from torchpcct.scene.phantoms.quality import CTDI_HOLES, ctdi, random_ellipsoids, water_cylinder
+from torchpcct.scene.phantoms.quality import CTDI_HOLES, ctdi, water_cylinder
 
 TILT = rotation_matrix((1.0, 2.0, -0.5), 0.7)
 SHAPES = [
@@ -109,10 +107,10 @@ def test_rotational_symmetry_is_recognised():
         (lambda: Ellipsoid(1.0, rotation=np.eye(2)), ValueError, "3 × 3"),
         (lambda: Ellipsoid("a"), TypeError, "must be a number"),
         (lambda: EllipticCylinder(1.0, -1.0), ValueError, "half_length must be greater"),
-        (lambda: BulgedTube(1.0, -0.1, 3.0), ValueError, "amplitude must be 0 mm or more"),
+        (lambda: BulgedTube(1.0, -0.1, 3.0), ValueError, "amplitude must be at least 0 mm"),
         (lambda: rotation_matrix((0, 0, 0), 1.0), ValueError, "axis must be 3 finite"),
         (lambda: Box(1.0).level(np.zeros(2)), ValueError, "shape"),
-        (lambda: SinusoidalMotion("a", -1.0), ValueError, "amplitude must be 0 mm or more"),
+        (lambda: SinusoidalMotion("a", -1.0), ValueError, "amplitude must be at least 0 mm"),
         (lambda: SinusoidalMotion("a", 1.0, rate_bpm=0.0), ValueError, "rate_bpm must be greater"),
         (lambda: SinusoidalMotion(3, 1.0), TypeError, "name of a body"),  # type: ignore[arg-type]
         (lambda: Scene([]), ValueError, "at least one body"),
@@ -163,9 +161,6 @@ def test_tree():
     assert scene.parents.tolist() == [-1, 0, 1, 0]
     assert scene.inside("ball") == ("ball", "core")
     assert scene.names == ("outer", "ball", "core", "box")
-    pairs = scene.contrast_pairs
-    assert pairs[0] == (MATERIALS["pericoronary_fat"], None)
-    assert pairs[2] == (MATERIALS["necrotic_core"], MATERIALS["water"])
     energies = np.array([40.0, 64.0, 80.0])
     contrast = scene.contrast(energies)
     assert contrast.shape == (4, 3)
@@ -291,20 +286,6 @@ def test_ctdi():
     assert scene.shapes[2].position == pytest.approx((150 * math.cos(0.3), 150 * math.sin(0.3), 0.0))
     lengths = chord_lengths(ctdi(), (-626.0, 0.0, 0.0), (1.0, 0.0, 0.0))[:, 0]
     assert lengths == pytest.approx([320.0, 13.0, 13.0, 0.0, 13.0, 0.0], abs=1e-9)
-
-
-@settings(max_examples=10, deadline=None)
-@given(seed=st.integers(0, 1000), count=st.integers(1, 6))
-def test_random_ellipsoids_are_a_valid_scene(seed, count):
-    scene = random_ellipsoids(count, 30.0, 12.0, np.random.default_rng(seed), size=(0.05, 0.2))
-    assert len(scene) == count + 1
-    again = random_ellipsoids(count, 30.0, 12.0, np.random.default_rng(seed), size=(0.05, 0.2))
-    assert again.shapes == scene.shapes
-
-
-def test_random_ellipsoids_that_do_not_fit():
-    with pytest.raises(ValueError, match="ellipsoids fit"):
-        random_ellipsoids(50, 10.0, 10.0, np.random.default_rng(0), size=(0.4, 0.5))
 
 
 def test_import_does_not_load_numba():

@@ -1,4 +1,4 @@
-"""Time and error of the chord kernels (``pytest -n 0 -m bench -s tests/test_scene_speed.py``)."""
+"""Time and error of the chord kernels (``pytest -n 0 -m bench -s tests/torchpcct/scene/test_speed.py``)."""
 
 import math
 import time

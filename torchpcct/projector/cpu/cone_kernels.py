@@ -25,7 +25,7 @@ __all__ = ["backproject", "padded", "project"]
 
 # NaN and Inf must survive, so only the flags that leave them alone.
 _FLAGS = {"contract", "nsz", "arcp", "reassoc"}
-# Slabs farther apart than this part of a layer are interpolated one by one (see layers.layer_spacing).
+# Slabs farther apart than this part of a layer are interpolated one by one (see tables.layer_spacing).
 MAX_LAYERS_PER_SLAB = 0.4
 # Slabs closer to the source than this part of the source-detector distance are behind it.
 NEAREST = 1e-6

@@ -136,7 +136,7 @@ def _beyond(reach):
 def project(lanes, reach, segments, offset, start, by_row, by_column, p, q, gain, weight, apart, out):
     """Lane readings of all canonical views, ``out``: ``(views, columns * lanes)``, overwritten.
 
-    ``by_row, by_column``: ``(slabs, knots * lanes)``. ``apart``: ``(2, 2 * lanes)``, see ``lanes.sum_edges``.
+    ``by_row, by_column``: ``(slabs, knots * lanes)``. ``apart``: ``(2, 2 * lanes)``, see ``simd.sum_edges``.
     """
     width = len(lanes)
     real = by_row.dtype.type

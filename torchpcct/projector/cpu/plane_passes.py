@@ -6,9 +6,18 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from torchpcct.geometry import Geometry, VolumeGrid
+from torchpcct.projector.cpu.plane_kernels import (
+    backproject,
+    cell_values,
+    collect,
+    deal,
+    load_image,
+    project,
+    tabulate,
+)
 from torchpcct.projector.cpu.symmetry import Orbits, address, find_orbits, no_orbits, place
-from torchpcct.projector.rays import Rays, Segments, slab_lattice, split
+from torchpcct.projector.rays import Segments, slab_lattice
+from torchpcct.projector.tables import Tables
 
 __all__ = ["PlanePasses"]
 
@@ -17,7 +26,7 @@ _WIDTHS = (1, 2, 4, 8)
 _NEAR, _FAR = 1.0, 2.0
 
 
-class _Tables:
+class _LaneTables:
     """Edge lines, gains and slab weights of the projected views, and the lanes' places, in one dtype.
 
     ``apart``: ``(2, 2 * lanes)`` per axis: at an edge of the slope q, lane l reads ``q * apart[l] + apart[lanes + l]``
@@ -25,8 +34,6 @@ class _Tables:
     """
 
     def __init__(self, passes: PlanePasses, dtype: np.dtype, width: int, steepest: float) -> None:
-        from torchpcct.projector.cpu import plane_kernels
-
         n = int(passes.entries)
         self.p, self.q, self.gain = (np.empty(n, dtype=dtype) for _ in range(3))
         part = passes.placement.part
@@ -43,7 +50,7 @@ class _Tables:
         rays = passes.rays
         pose = np.ascontiguousarray(rays.pose[passes.orbits.views])
         first = np.ascontiguousarray(rays.first[passes.orbits.views])
-        plane_kernels.tabulate(
+        tabulate(
             passes.segments, passes.offset, pose, rays.edges, rays.centers, first, passes.lattice,
             np.array(passes.placement.shape), rays.parallel, bias, np.ascontiguousarray(part.T), self.p, self.q,
             self.gain, self.weight,
@@ -59,21 +66,15 @@ def _lane_range(part: NDArray[np.float64], steepest: float) -> tuple[NDArray[np.
 
 
 class PlanePasses:
-    """Forward and adjoint passes of a 2-D scan on arrays with one leading batch axis.
+    """Forward and adjoint passes of a 2-D scan on arrays with one leading batch axis."""
 
-    Args:
-        geometry, grid: the scan and the pixels. rays: its rays.
-        windowed: only a part of the detector is read, which breaks symmetries.
-    """
-
-    def __init__(self, geometry: Geometry, grid: VolumeGrid, rays: Rays, windowed: bool) -> None:
-        self.grid, self.rays = grid, rays
-        segments = split(rays, grid)
-        self._lay_out(segments, find_orbits(geometry, grid, rays, windowed))
+    def __init__(self, tables: Tables) -> None:
+        self.grid, self.rays = tables.grid, tables.rays
+        self._lay_out(tables.segments, find_orbits(tables.geometry, tables.grid, tables.rays, tables.windowed))
         if self.placement.apart:
-            self._steepest = float(np.abs(_Tables(self, np.dtype(np.float64), 1, 0.0).q).max())
+            self._steepest = float(np.abs(_LaneTables(self, np.dtype(np.float64), 1, 0.0).q).max())
             if _lane_range(self.placement.part, self._steepest)[1].max() > _FAR:
-                self._lay_out(segments, no_orbits(geometry.views))
+                self._lay_out(tables.segments, no_orbits(tables.rays.views))
 
     def _lay_out(self, segments: Segments, orbits: Orbits) -> None:
         rays, grid = self.rays, self.grid
@@ -91,12 +92,12 @@ class PlanePasses:
         self.inverse = np.array([_inverse(a, ny, nx) for a in self.addresses])
         self.lattice = slab_lattice(self.placement.center, self.placement.shape, grid.spacing[-2:])
         self._steepest = 0.0
-        self._tables: dict[tuple[np.dtype, int], _Tables] = {}
+        self._tables: dict[tuple[np.dtype, int], _LaneTables] = {}
 
-    def tables(self, dtype: np.dtype, width: int) -> _Tables:
+    def tables(self, dtype: np.dtype, width: int) -> _LaneTables:
         key = (dtype, width if self.placement.apart else 1)
         if key not in self._tables:
-            self._tables[key] = _Tables(self, dtype, width, self._steepest)
+            self._tables[key] = _LaneTables(self, dtype, width, self._steepest)
         return self._tables[key]
 
     @property
@@ -130,8 +131,6 @@ class PlanePasses:
         return itemsize * (lanes * (knots + readings) + 3 * self.entries + weights)
 
     def forward(self, x: NDArray) -> NDArray:
-        from torchpcct.projector.cpu import plane_kernels as kernels
-
         ny, nx = self.grid.shape
         images = x.reshape(x.shape[0], ny * nx)
         y = np.empty((x.shape[0], self.rays.views, self.rays.columns), dtype=x.dtype)
@@ -146,19 +145,17 @@ class PlanePasses:
             for axis, shape in enumerate(self._size(len(t.reach))):
                 lines = np.empty((*shape, width), dtype=x.dtype)
                 slabs, pixels = (ny, nx) if axis == 0 else (nx, ny)
-                kernels.load_image(images, self._lane_table(n, count, width, axis), places[axis], slabs, pixels, lines)
+                load_image(images, self._lane_table(n, count, width, axis), places[axis], slabs, pixels, lines)
                 sums.append(lines.reshape(shape[0], -1))
-            kernels.project(
+            project(
                 (0,) * width, t.reach, self.segments, self.offset, self.start, *sums, t.p, t.q, t.gain, t.weight,
                 t.apart, out,
             )  # fmt: skip
             orbits = self.orbits
-            kernels.deal(out.reshape(len(out), -1, width), orbits.target, orbits.reverse, count, y[n : n + count])
+            deal(out.reshape(len(out), -1, width), orbits.target, orbits.reverse, count, y[n : n + count])
         return y
 
     def adjoint(self, y: NDArray) -> NDArray:
-        from torchpcct.projector.cpu import plane_kernels as kernels
-
         ny, nx = self.grid.shape
         x = np.empty((y.shape[0], ny, nx), dtype=y.dtype)
         width = self.lanes(y.shape[0])
@@ -171,12 +168,12 @@ class PlanePasses:
         for n in range(0, y.shape[0], step):
             part = y[n : n + step]
             orbits = self.orbits
-            kernels.cell_values(part, orbits.target, orbits.reverse, self.segments, self.offset, t.gain, values)
-            kernels.backproject(
+            cell_values(part, orbits.target, orbits.reverse, self.segments, self.offset, t.gain, values)
+            backproject(
                 (0,) * width, t.reach, self.segments, self.offset, t.p, t.q, t.weight, t.apart, values.reshape(-1),
                 size, places, by_row, by_column,
             )  # fmt: skip
-            kernels.collect(by_row, by_column, self.inverse, self.operations, x[n : n + step])
+            collect(by_row, by_column, self.inverse, self.operations, x[n : n + step])
         return x
 
     def _lane_table(self, first: int, count: int, width: int, axis: int) -> NDArray[np.int64]:

@@ -1,1 +1,5 @@
-"""CUDA passes of the projector."""
+"""The passes of CUDA devices.
+
+Read :mod:`~torchpcct.projector.cuda.passes` (tables on the device, slices that fit its memory, launches), then the
+Triton :mod:`~.kernels`, twins of the CPU's. They run on the CPU, too, under Triton's interpreter: so they are tested.
+"""

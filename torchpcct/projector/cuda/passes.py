@@ -1,23 +1,17 @@
-"""CUDA passes: tables on the device, Triton kernels, and the check against the CPU before they are used."""
+"""CUDA passes: tables on the device, Triton kernels, slices that fit the memory."""
 
 from __future__ import annotations
 
 import importlib.util
 import math
-import warnings
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-if TYPE_CHECKING:
-    from torchpcct.projector.cpu.engine import Engine
+from torchpcct.projector.tables import Tables
 
-__all__ = ["GpuPasses", "agrees", "available", "workspace"]
-
-_TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-10}
-_CHECKED: dict[tuple[str, torch.dtype], bool] = {}
+__all__ = ["GpuPasses", "available", "slices", "workspace"]
 
 
 def available() -> bool:
@@ -25,11 +19,11 @@ def available() -> bool:
     return importlib.util.find_spec("triton") is not None
 
 
-def cell_table(engine: Engine) -> tuple[np.ndarray, np.ndarray]:
-    """Per view and column ``p0, q0, p1, q1, l0, l1, path, square`` (see ``volume_kernels``) and the main axis."""
-    rays, lattice = engine.rays, engine.lattice
+def cell_table(tables: Tables) -> tuple[np.ndarray, np.ndarray]:
+    """Per view and column ``p0, q0, p1, q1, l0, l1, path, square`` (see ``cone_kernels``) and the main axis."""
+    rays, lattice = tables.rays, tables.lattice
     axes = np.zeros((rays.views, rays.columns), dtype=np.int32)
-    for v, axis, start, count in engine.segments.table:
+    for v, axis, start, count in tables.segments.table:
         axes[v, start : start + count] = axis
     table = np.empty((rays.views, rays.columns, 8))
     columns = np.arange(rays.columns)
@@ -61,49 +55,49 @@ def cell_table(engine: Engine) -> tuple[np.ndarray, np.ndarray]:
 
 
 class GpuPasses:
-    """Forward and adjoint passes of an engine on one device (any device under the Triton interpreter).
+    """Forward and adjoint passes of a scan on one device (any device under the Triton interpreter).
 
     Args:
-        engine: the scan. device: where the tables live and the passes run.
+        tables: of the scan.
+        device: where the tables live and the passes run.
+        nearest, layers_per_slab: limits of the CPU's cone-beam kernels (``NEAREST``, ``MAX_LAYERS_PER_SLAB``).
     """
 
-    def __init__(self, engine: Engine, device: torch.device) -> None:
-        from torchpcct.projector.cpu import cone_kernels as volume_kernels
-
-        self.engine, self.device = engine, device
-        cells, axes = cell_table(engine)
+    def __init__(self, tables: Tables, device: torch.device, nearest: float, layers_per_slab: float) -> None:
+        self.tables, self.device = tables, device
+        cells, axes = cell_table(tables)
         self.cells, self.axes = torch.as_tensor(cells, device=device), torch.as_tensor(axes, device=device)
-        self.pose = torch.as_tensor(engine.rays.pose, device=device)
-        self.segments = torch.as_tensor(engine.segments.table, device=device)
-        self.plane = engine.grid.ndim == 2
-        self.heights = (0.0, 1.0, 0.0, 1.0) if self.plane else engine._heights()
-        self.layer = 1.0 if self.plane else engine._layer
-        self.limits = (volume_kernels.NEAREST, volume_kernels.MAX_LAYERS_PER_SLAB)
+        self.pose = torch.as_tensor(tables.pose, device=device)
+        self.segments = torch.as_tensor(tables.segments.table, device=device)
+        self.plane = tables.grid.ndim == 2
+        self.heights = (0.0, 1.0, 0.0, 1.0) if self.plane else tables.heights
+        self.layer = 1.0 if self.plane else tables.layer
+        self.limits = (nearest, layers_per_slab)
 
     def _shape(self) -> tuple[int, int, int]:
-        nz, ny, nx = (1, *self.engine.grid.shape) if self.plane else self.engine.grid.shape
+        nz, ny, nx = (1, *self.tables.grid.shape) if self.plane else self.tables.grid.shape
         return nz, ny, nx
 
     def _budget(self) -> int | None:
         """Bytes of working memory allowed, None for no limit."""
-        if self.engine.memory is None and self.device.type == "cuda":
+        if self.tables.memory is None and self.device.type == "cuda":
             return int(torch.cuda.mem_get_info(self.device)[0]) // 2
-        return self.engine.memory
+        return self.tables.memory
 
     def forward(self, x: Tensor) -> Tensor:
         """``(batch, *domain_shape)`` to ``(batch, *range_shape)``."""
-        rays, batch = self.engine.rays, x.shape[0]
+        rays, batch = self.tables.rays, x.shape[0]
         out = x.new_empty((batch, rays.views, rays.rows, rays.columns))
-        step = _slice(self.engine, self._budget(), batch, x.element_size())[0]
+        step = slices(self.tables, self._budget(), batch, x.element_size())[0]
         for n in range(0, batch, step):
             self._forward_slice(x[n : n + step], out[n : n + step])
-        return out.reshape(batch, *self.engine.range_shape)
+        return out.reshape(batch, *self.tables.range_shape)
 
     def _forward_slice(self, x: Tensor, out: Tensor) -> None:
-        from torchpcct.projector.cuda.kernels import project_kernel
+        from torchpcct.projector.cuda.kernels import project_kernel  # Triton may be missing
 
         nz, ny, nx = self._shape()
-        rays, batch = self.engine.rays, x.shape[0]
+        rays, batch = self.tables.rays, x.shape[0]
         if self.plane:
             lines, knots = x.contiguous(), 1
         else:
@@ -119,18 +113,18 @@ class GpuPasses:
     def adjoint(self, y: Tensor) -> Tensor:
         """``(batch, *range_shape)`` to ``(batch, *domain_shape)``."""
         batch = y.shape[0]
-        out = y.new_empty((batch, *self.engine.domain_shape))
-        step, views = _slice(self.engine, self._budget(), batch, y.element_size())
+        out = y.new_empty((batch, *self.tables.domain_shape))
+        step, views = slices(self.tables, self._budget(), batch, y.element_size())
         for n in range(0, batch, step):
             out[n : n + step] = self._adjoint_slice(y[n : n + step], views)
         return out
 
     def _adjoint_slice(self, y: Tensor, views: int) -> Tensor:
         """The whole sum, ``views`` at a time: each voxel's sum goes on where the views before left it."""
-        from torchpcct.projector.cuda.kernels import backproject_kernel
+        from torchpcct.projector.cuda.kernels import backproject_kernel  # Triton may be missing
 
         nz, ny, nx = self._shape()
-        rays, batch, start = self.engine.rays, y.shape[0], self.engine.segments.start
+        rays, batch, start = self.tables.rays, y.shape[0], self.tables.segments.start
         along, block = (min(64, _power_of_two(max(nx, ny))), 1) if self.plane else (1, min(64, _power_of_two(nz)))
         parts = [y.new_zeros((batch, ny, nx, nz)), y.new_zeros((batch, nx, ny, nz))]
         for begin in range(0, rays.views, views):
@@ -154,19 +148,19 @@ class GpuPasses:
 
     def _slant(self, dtype: torch.dtype, begin: int, stop: int) -> Tensor:
         _, _, row0, pitch = self.heights
-        rows = torch.arange(self.engine.rays.rows, device=self.device, dtype=torch.float64)
+        rows = torch.arange(self.tables.rays.rows, device=self.device, dtype=torch.float64)
         pose = self.pose[begin:stop]
         rise = row0 + (rows + 0.5) * pitch + (pose[:, 7] - pose[:, 2])[:, None]
         return torch.sqrt(1.0 + rise[:, :, None] ** 2 / self.cells[begin:stop, None, :, 7]).to(dtype)
 
 
-def _slice_bytes(engine: Engine, itemsize: int) -> tuple[int, int, int]:
+def _slice_bytes(tables: Tables, itemsize: int) -> tuple[int, int, int]:
     """Working memory per volume: forward; adjoint; adjoint per view (also per view of a whole batch: the slants)."""
-    rays, voxels = engine.rays, math.prod(engine.grid.shape)
+    rays, voxels = tables.rays, math.prod(tables.grid.shape)
     readings = rays.rows * rays.columns
-    if engine.grid.ndim == 2:
+    if tables.grid.ndim == 2:
         return itemsize * voxels, 2 * itemsize * voxels, itemsize * readings
-    lines = voxels + voxels // engine.grid.shape[0]
+    lines = voxels + voxels // tables.grid.shape[0]
     # Running sums and a copy in their order; two partial volumes; slants, slanted readings, a copy, running sums.
     return (
         itemsize * (lines + voxels),
@@ -175,82 +169,40 @@ def _slice_bytes(engine: Engine, itemsize: int) -> tuple[int, int, int]:
     )
 
 
-def _tables(engine: Engine) -> int:
-    rays = engine.rays
-    return rays.views * (68 * rays.columns + 64) + 32 * len(engine.segments.table)
+def _table_bytes(tables: Tables) -> int:
+    rays = tables.rays
+    return rays.views * (68 * rays.columns + 64) + 32 * len(tables.segments.table)
 
 
-def _slice(engine: Engine, budget: int | None, batch: int, itemsize: int) -> tuple[int, int]:
+def slices(tables: Tables, budget: int | None, batch: int, itemsize: int) -> tuple[int, int]:
     """Volumes per launch and, for the adjoint, views at a time, so that the working memory stays within the budget.
 
     Raises:
         ValueError: ``Projector``'s ``memory`` is less than one volume and one view need.
     """
-    views = engine.rays.views
+    views = tables.rays.views
     if budget is None:
         return batch, views
-    forward, adjoint, per_view = _slice_bytes(engine, itemsize)
-    room = budget - _tables(engine)
+    forward, adjoint, per_view = _slice_bytes(tables, itemsize)
+    room = budget - _table_bytes(tables)
     volumes = min(batch, room // max(forward, adjoint + views * per_view))
     if volumes >= 1:
         return volumes, views
     least = max(forward, adjoint + per_view)
-    if room < least and engine.memory is not None:
+    if room < least and tables.memory is not None:
         raise ValueError(
-            f"a pass of this scan needs {least + _tables(engine)} bytes of working memory at least, memory allows "
-            f"{engine.memory}: raise it, or use fewer voxels or float32"
+            f"a pass of this scan needs {least + _table_bytes(tables)} bytes of working memory at least, memory allows "
+            f"{tables.memory}: raise it, or use fewer voxels or float32"
         )
     return 1, max(1, min(views, (room - adjoint) // per_view))
 
 
-def workspace(engine: Engine, batch: int, itemsize: int) -> int:
-    """Bytes that one pass on a CUDA device holds besides input and output, within the engine's limit if it has one."""
-    volumes, views = _slice(engine, engine.memory, batch, itemsize)
-    forward, adjoint, per_view = _slice_bytes(engine, itemsize)
-    return _tables(engine) + volumes * max(forward, adjoint + views * per_view)
+def workspace(tables: Tables, batch: int, itemsize: int) -> int:
+    """Bytes that one pass on a CUDA device holds besides input and output, within the scan's limit if it has one."""
+    volumes, views = slices(tables, tables.memory, batch, itemsize)
+    forward, adjoint, per_view = _slice_bytes(tables, itemsize)
+    return _table_bytes(tables) + volumes * max(forward, adjoint + views * per_view)
 
 
 def _power_of_two(n: int) -> int:
     return 1 << max(0, (n - 1).bit_length())
-
-
-def agrees(engine: Engine, device: torch.device, dtype: torch.dtype) -> bool:
-    """True if the device's kernels reproduce the CPU's on random data of this engine, both ways; warns if not."""
-    generator = torch.Generator().manual_seed(0)
-    passes: Any = GpuPasses(engine, device)
-    for here, there, shape in (
-        (passes.forward, engine.forward, engine.domain_shape),
-        (passes.adjoint, engine.adjoint, engine.range_shape),
-    ):
-        given = torch.randn((1, *shape), generator=generator, dtype=dtype)
-        expect = torch.from_numpy(np.ascontiguousarray(there(given.numpy())))
-        found = here(given.to(device)).cpu()
-        error = float((found - expect).norm() / expect.norm().clamp_min(torch.finfo(dtype).tiny))
-        if not error <= _TOLERANCE[dtype]:
-            warnings.warn(
-                f"the Triton projector on {device} differs from the CPU's by {error:.1e} (allowed "
-                f"{_TOLERANCE[dtype]:.0e}); the CPU's is used instead. Check the installed triton version.",
-                RuntimeWarning,
-                stacklevel=2,
-            )
-            return False
-    return True
-
-
-def trusted(engine: Engine, device: torch.device, dtype: torch.dtype) -> bool:
-    """:func:`agrees`, checked once per device, dtype and kind of scan, on a scan of a few views and voxels."""
-    from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid
-    from torchpcct.projector.cpu.engine import Engine as Small
-
-    kind = type(engine.geometry).__name__
-    key = (f"{device} {kind}", dtype)
-    if key not in _CHECKED:
-        angles = [0.1, 1.9, 4.0]
-        plane, volume = VolumeGrid((9, 8), 2.0, (1.0, -2.0)), VolumeGrid((5, 7, 6), (1.5, 2.0, 2.2), (0.4, 1.0, -2.0))
-        small = {
-            "ParallelBeam": lambda: Small(ParallelBeam(angles, 15, 1.9), plane, None),
-            "FanBeam": lambda: Small(FanBeam(angles, 60.0, 110.0, 21, 2.1), plane, None),
-            "ConeBeam": lambda: Small(ConeBeam(angles, 60.0, 110.0, 14, 9, (1.8, 2.5)), volume, None),
-        }[kind]()
-        _CHECKED[key] = agrees(small, device, dtype)
-    return _CHECKED[key]

@@ -1,16 +1,15 @@
-"""Test objects of CT quality assurance as scenes: water cylinder, CTDI phantom, ellipsoids."""
+"""Test objects of CT quality assurance as scenes: water cylinder, CTDI phantom."""
 
 from __future__ import annotations
 
 import math
 from typing import Any
 
-import numpy as np
-
-from torchpcct.scene.bodies import Ellipsoid, EllipticCylinder, number, rotation_matrix
+from torchpcct.scene.bodies import EllipticCylinder
 from torchpcct.scene.scene import Body, Scene
+from torchpcct.validate import number
 
-__all__ = ["CTDI_HOLES", "ctdi", "random_ellipsoids", "water_cylinder"]
+__all__ = ["CTDI_HOLES", "ctdi", "water_cylinder"]
 
 # Names of the CTDI phantom's inserts, the centre first, then counter-clockwise from +x.
 CTDI_HOLES = ("centre", "peripheral_0", "peripheral_90", "peripheral_180", "peripheral_270")
@@ -65,48 +64,4 @@ def ctdi(
     ]
     for name, (x, y) in zip(CTDI_HOLES, places, strict=True):
         bodies.append(Body(name, EllipticCylinder(hole, half, position=(x, y, 0.0)), insert, "phantom"))
-    return Scene(bodies)
-
-
-def random_ellipsoids(
-    count: int,
-    radius: float,
-    half_height: float,
-    rng: np.random.Generator,
-    *,
-    size: tuple[float, float] = (0.05, 0.3),
-    materials: tuple[Any, ...] = ("water",),
-    body: Any = "water",
-) -> Scene:
-    """Ellipsoids of random size and rotation, apart from each other, in an upright cylinder ``"body"``; for tests.
-
-    Args:
-        count: number of ellipsoids, named ``"ellipsoid_0"``…
-        radius, half_height: of the cylinder that holds them, mm.
-        rng: source of all randomness.
-        size: range of the semi-axes in units of ``radius`` (and at most ``half_height``).
-        materials: drawn from at random for the ellipsoids.
-        body: material of the cylinder.
-
-    Raises:
-        ValueError: they do not fit: fewer, or smaller ones.
-    """
-    bodies = [Body("body", EllipticCylinder(radius, half_height), body)]
-    balls: list[tuple[Any, float]] = []
-    for _ in range(200 * count):
-        if len(balls) == count:
-            break
-        axes = np.minimum(rng.uniform(size[0], size[1], 3) * radius, 0.95 * half_height)
-        reach = float(axes.max())
-        r, phi = (radius - reach) * math.sqrt(rng.uniform()), rng.uniform(0.0, 2.0 * math.pi)
-        z = rng.uniform(-1.0, 1.0) * (half_height - reach)
-        centre = np.array([r * math.cos(phi), r * math.sin(phi), z])
-        if all(np.linalg.norm(centre - other) > reach + far for other, far in balls):
-            turn = rotation_matrix(rng.normal(size=3), rng.uniform(0.0, math.pi))
-            material = materials[int(rng.integers(len(materials)))]
-            shape = Ellipsoid(tuple(axes), position=tuple(centre), rotation=turn)
-            bodies.append(Body(f"ellipsoid_{len(balls)}", shape, material, "body"))
-            balls.append((centre, reach))
-    if len(balls) < count:
-        raise ValueError(f"only {len(balls)} of {count} ellipsoids fit: ask for fewer or smaller ones (size={size})")
     return Scene(bodies)

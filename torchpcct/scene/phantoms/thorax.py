@@ -14,9 +14,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from torchpcct.scene.bodies import EllipticCylinder, number, numbers
+from torchpcct.scene.bodies import EllipticCylinder
 from torchpcct.scene.plaque.plaque import Plaque
 from torchpcct.scene.scene import Body, Scene
+from torchpcct.validate import number, numbers
 
 __all__ = ["HEART_CENTER_MM", "RIB_ANGLES_DEG", "thorax"]
 

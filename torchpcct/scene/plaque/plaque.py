@@ -16,18 +16,17 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from torchpcct.scene.bodies import Ellipsoid, EllipticCylinder, Floats, number, numbers
+from torchpcct.scene.bodies import Ellipsoid, EllipticCylinder, Floats
+from torchpcct.scene.materials import Material, material
 from torchpcct.scene.motion import SinusoidalMotion
-from torchpcct.scene.scene import Body, Scene, resolve_material
+from torchpcct.scene.scene import Body, Scene
 from torchpcct.scene.tubes import BulgedTube, NarrowedTube
-
-if TYPE_CHECKING:
-    from torchpcct.scene.materials import Material
+from torchpcct.validate import number, numbers
 
 __all__ = ["Plaque", "interpolate_material", "plaque_scene"]
 
@@ -83,10 +82,8 @@ class Plaque:
         for name in ("vessel_diameter", "wall_thickness", "cap_thickness", "bulge_length", "core_scale"):
             set_(self, name, number(name, getattr(self, name), positive=True))
         set_(self, "vessel_length", number("vessel_length", self.vessel_length, positive=True, finite=False))
-        set_(self, "bulge", number("bulge", self.bulge))
+        set_(self, "bulge", number("bulge", self.bulge, low=0.0, unit="mm"))
         set_(self, "lumen_narrowing", number("lumen_narrowing", self.lumen_narrowing))
-        if self.bulge < 0:
-            raise ValueError(f"bulge must be 0 mm or more, got {self.bulge:g}")
         if self.lumen_narrowing < 1:
             raise ValueError(
                 f"lumen_narrowing must be at least 1, got {self.lumen_narrowing:g}: a wider lumen would cross the wall"
@@ -225,9 +222,7 @@ def interpolate_material(name: str, start: Any, end: Any, weight: float) -> Mate
     Raises:
         ValueError: an element's partial density would be negative.
     """
-    from torchpcct.scene.materials import Material
-
-    a, b, w = resolve_material(start), resolve_material(end), number("weight", weight)
+    a, b, w = material(start), material(end), number("weight", weight)
     partial: dict[str, float] = {}
     for element in sorted({*a.mass_fractions, *b.mass_fractions}):
         first = a.density_g_cm3 * a.mass_fractions.get(element, 0.0)

@@ -12,9 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from torchpcct.scene.bodies import Ellipsoid, EllipticCylinder, number
+from torchpcct.scene.bodies import Ellipsoid, EllipticCylinder
+from torchpcct.scene.materials import calcification
 from torchpcct.scene.plaque.plaque import PAPER_POSITION, Plaque, interpolate_material, plaque_scene
 from torchpcct.scene.scene import Body, Scene
+from torchpcct.validate import number, whole
 
 __all__ = ["VARIANTS", "calcification_bodies", "plaque_variant", "stent_bodies", "textured"]
 
@@ -36,8 +38,6 @@ def calcification_bodies(
         material: another material or its name.
     """
     if material is None:
-        from torchpcct.scene.materials import calcification
-
         material = calcification(hu)
     shape = Ellipsoid(semi_axes, position=tuple(plaque.to_scanner(center)), rotation=plaque.orientation)
     return (Body("calcification", shape, material, "fibrous"),)
@@ -68,10 +68,7 @@ def stent_bodies(
     Raises:
         ValueError: rings that overlap, are thicker than the lumen, or leave the vessel.
     """
-    if isinstance(rings, bool) or not isinstance(rings, int):
-        raise TypeError(f"rings must be a whole number, got {rings!r}")
-    if rings < 1:
-        raise ValueError(f"rings must be at least 1, got {rings}")
+    rings = whole("rings", rings)
     height = number("strut", strut, positive=True) / 2.0
     if number("spacing", spacing, positive=True) <= strut:
         raise ValueError(f"spacing ({spacing:g} mm) must be greater than strut ({strut:g} mm)")

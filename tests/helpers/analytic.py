@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpcct.detector_window import DetectorWindow
-from torchpcct.geometry import Geometry, VolumeGrid, _number, _per_axis
+from torchpcct.geometry import Geometry, VolumeGrid
 from torchpcct.projector.rays import rays_of
+from torchpcct.validate import number, per_axis
 
 __all__ = ["Ellipsoid", "Gaussian", "line_integrals", "rasterize"]
 
@@ -37,10 +38,10 @@ class _Body:
         axes = len(self.center) if isinstance(self.center, Sequence | np.ndarray) else 0
         if axes not in (2, 3):
             raise ValueError(f"center must be (y, x) or (z, y, x) in mm, got {self.center!r}")
-        set_(self, "center", _per_axis("center", self.center, axes))
-        set_(self, "radii", _per_axis("radii", self.radii, axes, positive=True))
-        set_(self, "angle", _number("angle", self.angle))
-        set_(self, "value", _number("value", self.value))
+        set_(self, "center", per_axis("center", self.center, axes))
+        set_(self, "radii", per_axis("radii", self.radii, axes, positive=True))
+        set_(self, "angle", number("angle", self.angle))
+        set_(self, "value", number("value", self.value))
 
     @property
     def _frame(self) -> tuple[Floats, Floats]:

@@ -1,0 +1,130 @@
+"""Which passes a tensor takes: the CPU's, or on CUDA the Triton twins, once they have reproduced the CPU's."""
+
+from __future__ import annotations
+
+import math
+import threading
+import warnings
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
+from torchpcct.projector.cuda import passes as cuda
+from torchpcct.projector.tables import Tables
+
+__all__ = ["Engine"]
+
+# numba's fallback threading layer must not be entered from two threads at once.
+_LAUNCH = threading.Lock()
+_TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-10}
+_CHECKED: dict[tuple[str, torch.dtype], bool] = {}
+
+
+class _CpuPasses(Protocol):
+    def forward(self, x: NDArray) -> NDArray: ...
+
+    def adjoint(self, y: NDArray) -> NDArray: ...
+
+    def workspace(self, batch: int, itemsize: int) -> int: ...
+
+
+class Engine:
+    """Forward and adjoint passes of one scan on tensors with any number of leading batch axes."""
+
+    def __init__(self, tables: Tables) -> None:
+        self.tables = tables
+        self._devices: dict[torch.device, cuda.GpuPasses] = {}
+
+    @cached_property
+    def cpu(self) -> _CpuPasses:
+        # The numba kernels are imported when first needed: importing the package stays quick.
+        if self.tables.grid.ndim == 3:
+            from torchpcct.projector.cpu.cone_passes import ConePasses
+
+            return ConePasses(self.tables)
+        from torchpcct.projector.cpu.plane_passes import PlanePasses
+
+        return PlanePasses(self.tables)
+
+    def on(self, device: torch.device) -> cuda.GpuPasses:
+        """The Triton passes, with their tables on ``device``."""
+        if device not in self._devices:
+            from torchpcct.projector.cpu.cone_kernels import MAX_LAYERS_PER_SLAB, NEAREST
+
+            self._devices[device] = cuda.GpuPasses(self.tables, device, NEAREST, MAX_LAYERS_PER_SLAB)
+        return self._devices[device]
+
+    def apply(self, x: Tensor, transposed: bool) -> Tensor:
+        """One pass, ``(..., *domain_shape)`` to ``(..., *range_shape)`` or, ``transposed``, back; no autograd."""
+        inner, outer = self.tables.domain_shape, self.tables.range_shape
+        if transposed:
+            inner, outer = outer, inner
+        lead = x.shape[: x.dim() - len(inner)]
+        batch = math.prod(lead)
+        if batch == 0:
+            return x.new_zeros((*lead, *outer))
+        flat = x.detach().reshape(batch, *inner)
+        if x.device.type == "cuda" and cuda.available() and self._trusted(x.device, x.dtype):
+            passes = self.on(x.device)
+            return (passes.adjoint(flat) if transposed else passes.forward(flat)).reshape(*lead, *outer)
+        return self._on_cpu(flat, transposed).reshape(*lead, *outer).to(x.device)
+
+    def _on_cpu(self, x: Tensor, transposed: bool) -> Tensor:
+        array, memory = x.cpu().contiguous().numpy(), self.tables.memory
+        if memory is not None and (need := self.cpu.workspace(len(array), array.itemsize)) > memory:
+            raise ValueError(
+                f"a pass of this scan needs {need} bytes of working memory, memory allows {memory}: raise it, or use "
+                "fewer voxels, fewer columns, float32" + (", or a smaller batch" if self.tables.grid.ndim == 2 else "")
+            )
+        with _LAUNCH:
+            result = self.cpu.adjoint(array) if transposed else self.cpu.forward(array)
+        return torch.from_numpy(np.ascontiguousarray(result))
+
+    def workspace(self, batch: int, itemsize: int, device: str) -> int:
+        """Bytes that one pass holds besides its input and output (the larger of the two directions)."""
+        return self.cpu.workspace(batch, itemsize) if device == "cpu" else cuda.workspace(self.tables, batch, itemsize)
+
+    def agrees(self, device: torch.device, dtype: torch.dtype) -> bool:
+        """True if the device's kernels reproduce the CPU's on random data of this scan, both ways; warns if not."""
+        generator = torch.Generator().manual_seed(0)
+        passes = self.on(device)
+        for transposed, shape in ((False, self.tables.domain_shape), (True, self.tables.range_shape)):
+            given = torch.randn((1, *shape), generator=generator, dtype=dtype)
+            expect = self._on_cpu(given, transposed)
+            there = given.to(device)
+            found = (passes.adjoint(there) if transposed else passes.forward(there)).cpu()
+            error = float((found - expect).norm() / expect.norm().clamp_min(torch.finfo(dtype).tiny))
+            if not error <= _TOLERANCE[dtype]:
+                warnings.warn(
+                    f"the Triton projector on {device} differs from the CPU's by {error:.1e} (allowed "
+                    f"{_TOLERANCE[dtype]:.0e}); the CPU's is used instead. Check the installed triton version.",
+                    RuntimeWarning,
+                    stacklevel=2,
+                )
+                return False
+        return True
+
+    def _trusted(self, device: torch.device, dtype: torch.dtype) -> bool:
+        """:meth:`agrees`, checked once per device, dtype and kind of scan, on a scan of a few views and voxels."""
+        kind = type(self.tables.geometry)
+        key = (f"{device} {kind.__name__}", dtype)
+        if key not in _CHECKED:
+            _CHECKED[key] = Engine(Tables(*_SMALL[kind])).agrees(device, dtype)
+        return _CHECKED[key]
+
+
+_ANGLES = (0.1, 1.9, 4.0)
+_PLANE = VolumeGrid((9, 8), 2.0, (1.0, -2.0))
+_SMALL: dict[type[Geometry], tuple[Geometry, VolumeGrid]] = {
+    ParallelBeam: (ParallelBeam(_ANGLES, 15, 1.9), _PLANE),
+    FanBeam: (FanBeam(_ANGLES, 60.0, 110.0, 21, 2.1), _PLANE),
+    ConeBeam: (
+        ConeBeam(_ANGLES, 60.0, 110.0, 14, 9, (1.8, 2.5)),
+        VolumeGrid((5, 7, 6), (1.5, 2.0, 2.2), (0.4, 1.0, -2.0)),
+    ),
+}

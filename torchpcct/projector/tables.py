@@ -1,0 +1,105 @@
+"""What one geometry, grid and window come to, computed once for all passes: rays, slabs, depth layers."""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchpcct.detector_window import DetectorWindow
+from torchpcct.geometry import Geometry, VolumeGrid
+from torchpcct.projector.rays import Segments, check_motion, check_pair, check_source, rays_of, slab_lattice, split
+
+__all__ = ["Tables", "layer_spacing"]
+
+# Row edges may move by this part of the blur between two depth layers (see layer_spacing).
+LAYER_SHIFT = 0.04
+
+
+class Tables:
+    """Tables of one scan.
+
+    Args:
+        geometry, grid, window, motion, memory: as for ``Projector``.
+
+    Raises:
+        TypeError, ValueError: see ``rays.check_pair``, ``rays.check_source`` and ``Projector``.
+    """
+
+    def __init__(
+        self,
+        geometry: Geometry,
+        grid: VolumeGrid,
+        window: DetectorWindow | None = None,
+        motion: Any = None,
+        memory: int | None = None,
+    ) -> None:
+        check_pair(geometry, grid, window)
+        if memory is not None and (isinstance(memory, bool) or not isinstance(memory, int) or memory < 1):
+            raise ValueError(f"memory must be a number of bytes ≥ 1 or None, got {memory!r}")
+        self.memory = memory
+        # Symmetric views share their work only if all of the detector is read and nothing moves.
+        self.geometry, self.grid, self.windowed = geometry, grid, window is not None or motion is not None
+        self.rays = rays_of(geometry, window)
+        if motion is not None:
+            self.rays = self.rays.moved(check_motion(motion, geometry.views, grid.ndim))
+        check_source(self.rays, grid)
+        self.lattice = slab_lattice(grid.center[-2:], grid.shape[-2:], grid.spacing[-2:])
+
+    @property
+    def domain_shape(self) -> tuple[int, ...]:
+        return tuple(self.grid.shape)
+
+    @property
+    def range_shape(self) -> tuple[int, ...]:
+        r = self.rays
+        return (r.views, r.rows, r.columns) if self.grid.ndim == 3 else (r.views, r.columns)
+
+    @cached_property
+    def segments(self) -> Segments:
+        return split(self.rays, self.grid)
+
+    @cached_property
+    def pose(self) -> NDArray[np.float64]:
+        """``(views, 8)``, see :attr:`Rays.pose`."""
+        return self.rays.pose
+
+    @cached_property
+    def heights(self) -> tuple[float, float, float, float]:
+        """Lower edge of the grid along z, its pitch, lower edge of the first row kept, row pitch, mm (cone beam)."""
+        z, dz = self.grid.axes[0][0], self.grid.spacing[0]
+        return (z - dz / 2, dz, self.rays.row_edge + self.rays.first_row * self.rays.row_pitch, self.rays.row_pitch)
+
+    @cached_property
+    def layer(self) -> float:
+        """Spacing of the depth layers (cone beam), see :func:`layer_spacing`."""
+        _, _, row0, row_pitch = self.heights
+        return layer_spacing(self.pose, self.grid, row0, row_pitch, self.rays.rows)
+
+
+def layer_spacing(pose: NDArray[np.float64], grid: VolumeGrid, row0: float, row_pitch: float, rows: int) -> float:
+    """Spacing of depth layers in the ray parameter λ; layers replace slabs where slabs are closer than this.
+
+    The heights of the row edges grow with λ, so each slab needs its own interpolation along z. Where the magnification
+    changes little (a small grid), slabs are instead shared linearly between two layers, and only layers are
+    interpolated. Between two layers the row edges move by at most ``LAYER_SHIFT`` of the blur that the voxel and the
+    row have anyway; the error is of second order in it.
+    """
+    z, hz = grid.axes[0], grid.spacing[0]
+    reach = max(abs(z[0] - hz / 2 - pose[:, 2]).max(), abs(z[-1] + hz / 2 - pose[:, 2]).max())
+    ends = np.array([row0, row0 + rows * row_pitch])
+    rise = np.abs(ends + (pose[:, 7] - pose[:, 2])[:, None]).max()
+    # Depths of the grid's corners and centre in every view; rows are finest, and moves largest, at the nearest.
+    x, y = (grid.center[i] + grid.extent[i] / 2 * np.array([-1, -1, 1, 1, 0]) for i in (2, 1))
+    y[:4] = y[[0, 2, 0, 2]]
+    offset = np.stack([x, y], axis=-1) - pose[:, None, :2]
+    depth = (offset * pose[:, None, 3:5]).sum(axis=-1) / (pose[:, None, 3:5] ** 2).sum(axis=-1)
+    near = depth.min()
+    if near <= 0:
+        return 1e-6  # slabs one by one
+    depth = depth[:, 4].min()
+    blur = math.hypot(hz, depth * row_pitch)
+    return float(min(LAYER_SHIFT * blur / max(min(rise, reach / depth), 1e-12), near / 4))
