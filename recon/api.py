@@ -10,6 +10,8 @@ from typing import Any, overload
 import torch
 
 from recon.fbp.inset import InsetFbp
+from recon.mbir.mbir import reconstruct_mbir
+from recon.pwls.inset_problem import reconstruct_pwls
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
 from torchpcct.volume import Volume
@@ -74,12 +76,8 @@ def reconstruct(
     if method == "fbp":
         volumes = _fbp(scans, grid, progress, **options)
     elif method == "mbir":
-        from recon.mbir.mbir import reconstruct_mbir
-
         volumes = reconstruct_mbir(scans, grid, progress=progress, **options)
     elif method == "pwls":
-        from recon.pwls.inset_problem import reconstruct_pwls
-
         volumes = reconstruct_pwls(scans, grid, progress=progress, **options)
     else:
         raise ValueError(f"unknown method {method!r}: use one of {', '.join(METHODS)}")

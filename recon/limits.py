@@ -25,8 +25,11 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy import ndimage
 from torch import Tensor
-from torch.nn import functional as F
+
+from recon.conjugate_gradient import conjugate_gradient
+from recon.linear_operator import gaussian_kernel, separable_filter
 
 __all__ = ["contrast_limit", "deformation_limit", "known_inside", "outline_maps"]
 
@@ -53,8 +56,6 @@ def known_inside(fractions: NDArray[np.float64], rings: int = 0) -> NDArray[np.b
         raise ValueError(f"rings must be at least 0, got {rings}")
     pure = np.asarray(fractions) > 0.999
     if rings:
-        from scipy import ndimage
-
         pure = np.stack([ndimage.binary_erosion(p, iterations=rings, border_value=1) for p in pure])
     return np.asarray(pure, dtype=bool)
 
@@ -184,17 +185,11 @@ def deformation_limit(
     change = torch.from_numpy(np.asarray(outlines, dtype=np.float32)) * displacement_mm
     # White noise through a kernel of unit norm and σ = ℓ/√2 has unit variance and the correlation exp(−r²/2ℓ²).
     sd = correlation_mm / math.sqrt(2.0) / voxel_mm
-    reach = math.ceil(4 * sd)
-    kernel = torch.exp(-0.5 * (torch.arange(-reach, reach + 1) / sd) ** 2)
+    kernel = gaussian_kernel(sd, math.ceil(4 * sd), change)
     kernel = kernel / kernel.norm()
 
     def smooth(v: Tensor) -> Tensor:
-        v = v[:, None]
-        for axis in range(3):
-            shape, pad = [1] * 5, [0] * 3
-            shape[2 + axis], pad[axis] = len(kernel), reach
-            v = F.conv3d(v, kernel.reshape(shape), padding=tuple(pad))
-        return v[:, 0]
+        return separable_filter(v, kernel, "constant")
 
     unknown = (lambda z: (change * smooth(z)).sum(0), lambda y: smooth(change * y))
     return _smallest_sd(gram, masks, unknown, tuple(change.shape), contrast, hu, iterations, tolerance)
@@ -212,35 +207,20 @@ def _smallest_sd(
 ) -> float:
     """√(tᵀ C t), C the covariance of the values of ``masks``, t the contrast; ``unknown``: B and Bᵀ."""
     forward, transposed = unknown
+    count = len(masks)
 
-    def curve(a: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
+    def curve(v: Tensor) -> Tensor:
+        """The inverse covariance of all unknowns, ``(1, values + fields)``."""
+        a, z = v[0, :count], v[0, count:].reshape(shape)
         y = gram.apply((torch.einsum("k,kzyx->zyx", a, masks) + forward(z)) * hu) * hu
-        return torch.einsum("kzyx,zyx->k", masks, y), transposed(y) + z
+        return torch.cat([torch.einsum("kzyx,zyx->k", masks, y), (transposed(y) + z).flatten()])[None]
 
     diagonal = torch.stack([(m * gram.apply(m * hu)).sum() * hu for m in masks])
     # The mean of the other diagonal, from a random vector of signs (Hutchinson).
-    signs = torch.randint(0, 2, shape, generator=torch.Generator().manual_seed(0)).to(torch.float32) * 2 - 1
-    own = float((signs * curve(torch.zeros(len(masks)), signs)[1]).mean().clamp_min(1.0))
-    target = torch.zeros(len(masks))
-    target[contrast[0]], target[contrast[1]] = 1.0, -1.0
-    a, z = torch.zeros_like(target), torch.zeros(shape)
-    ra, rz = target.clone(), torch.zeros(shape)
-    pa, pz = ra / diagonal, rz / own
-    size = _dot(ra, pa) + _dot(rz, pz)
-    start = size
-    for _ in range(iterations):
-        qa, qz = curve(pa, pz)
-        step = size / (_dot(pa, qa) + _dot(pz, qz))
-        a, z = a + step * pa, z + step * pz
-        ra, rz = ra - step * qa, rz - step * qz
-        ya, yz = ra / diagonal, rz / own
-        new = _dot(ra, ya) + _dot(rz, yz)
-        if new <= tolerance**2 * start:
-            break
-        pa, pz = ya + new / size * pa, yz + new / size * pz
-        size = new
-    return float((a * target).sum().clamp_min(0.0).sqrt())
-
-
-def _dot(a: Tensor, b: Tensor) -> float:
-    return float((a * b).sum(dtype=torch.float64))
+    signs = torch.randint(0, 2, shape, generator=torch.Generator().manual_seed(0)).flatten().to(torch.float32) * 2 - 1
+    own = float((signs * curve(torch.cat([torch.zeros(count), signs])[None])[0, count:]).mean().clamp_min(1.0))
+    scale = torch.cat([diagonal, torch.full((math.prod(shape),), own)])
+    target = torch.zeros_like(scale)[None]
+    target[0, contrast[0]], target[0, contrast[1]] = 1.0, -1.0
+    solved = conjugate_gradient(curve, target, lambda v: v / scale, iterations=iterations, tolerance=tolerance)
+    return float((solved * target).sum().clamp_min(0.0).sqrt())

@@ -16,9 +16,14 @@ from torch import Tensor
 from torchpcct.files import read_hdf5, written_whole
 from torchpcct.geometry import VolumeGrid
 
-__all__ = ["Volume", "check_volume_name"]
+__all__ = ["Volume", "check_volume_name", "to_hu"]
 
 _NIFTI, _HDF5 = (".nii", ".nii.gz"), (".h5", ".hdf5")
+
+
+def to_hu(attenuation: Tensor, mu_water: float) -> Tensor:
+    """CT numbers from attenuation in mm⁻¹: 1000 (μ / μ_water − 1), so that water reads 0 and air −1000."""
+    return 1000.0 * (attenuation / mu_water - 1.0)
 
 
 def check_volume_name(path: str | os.PathLike[str]) -> None:

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from recon.gram.gram import Gram
-from recon.mbir.unrolled import NormalProblem
+from recon.mbir.unrolled import NormalisedProblem
 from recon.pwls.inset_problem import InsetProblem
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.geometry import VolumeGrid
@@ -47,7 +47,7 @@ class Batch:
         voxels: ``(size,)`` voxels of the smaller ROI, 0 if none.
     """
 
-    problem: NormalProblem
+    problem: NormalisedProblem
     truth: Tensor
     contrast: Tensor
     voxels: Tensor
@@ -87,7 +87,7 @@ class Data:
         scaled = (hu * exposure).reshape(-1, 1, 1, 1)
         signal = gram.apply(truth) * scaled
         b = torch.cat([signal + first, signal + second])
-        problem = NormalProblem.from_statistic(gram, b, torch.cat([exposure, exposure]), hu, c.voxel_mm)
+        problem = NormalisedProblem.from_statistic(gram, b, torch.cat([exposure, exposure]), hu, c.voxel_mm)
         return Batch(problem, truth, contrast, voxels)
 
     def _scene(self, seed: int, gram: Gram, hu: float) -> tuple[Tensor, ...]:
@@ -110,7 +110,7 @@ def situation_gram(situation: Situation, config: DataConfig) -> tuple[Gram, floa
     grid = VolumeGrid(config.shape, config.voxel_mm, (0.0, situation.y, situation.x))
     clean = acquire(patient, scanner, region=grid)
     problem = InsetProblem(clean, grid, nodes=1)
-    return problem.gram.without_projector(), problem.mu_ref / 1000.0
+    return problem.gram, problem.mu_ref / 1000.0
 
 
 def _random_contrast(

@@ -23,7 +23,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from recon.mbir.unrolled import NormalProblem
+from recon.mbir.unrolled import NormalisedProblem
 from train.config import ObjectiveConfig
 from train.data import Batch, Data, seed_of
 from train.scenes.held_out import validation_scenes
@@ -121,7 +121,7 @@ class Objective:
                 exposures = torch.full((c.validation_draws,), exposure)
                 volumes = []
                 for signal in gram.apply(truth) * (hu * exposure):  # the same noise for all contrasts
-                    problem = NormalProblem.from_statistic(gram, signal + noise, exposures, hu, d.voxel_mm)
+                    problem = NormalisedProblem.from_statistic(gram, signal + noise, exposures, hu, d.voxel_mm)
                     volumes.append(model(problem) * problem.scale_hu.reshape(-1, 1, 1, 1))
                 found = torch.stack([(v * roi).sum(dim=(1, 2, 3)) for v in volumes]).double()
                 if i < 2:

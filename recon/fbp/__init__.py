@@ -1,6 +1,7 @@
 """Filtered backprojection.
 
 Read :mod:`~recon.fbp.fbp` (the whole in one call), then :mod:`~recon.fbp.ramp` (kernels), :mod:`~recon.fbp.filter_plan`
-(rows, from one window of columns to another), :mod:`~recon.fbp.angular_weights`, :mod:`~recon.fbp.backproject`,
-:mod:`~recon.fbp.inset` (a small inset of a scan: what studies use) and :mod:`~recon.fbp.exact_noise` (its covariance).
+(rows, from one window of columns to another), :mod:`~recon.fbp.angular_weights` and :mod:`~recon.fbp.backproject`. CPU
+passes lie beside them in ``*_kernels``. :mod:`~recon.fbp.inset` is the FBP of a small inset of a scan, in HU or in
+channels: what studies use. :mod:`~recon.fbp.exact_noise` gives its covariance without a single noisy scan.
 """

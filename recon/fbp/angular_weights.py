@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam
 
-__all__ = ["angular_weights", "arc", "parker_share", "view_steps"]
+__all__ = ["angular_weights", "parker_share", "view_steps"]
 
 Floats = NDArray[np.float64]
 
@@ -68,13 +68,6 @@ def view_steps(
     out = np.empty_like(wrapped)
     out[order] = share[group]
     return out, start, span
-
-
-def arc(geometry: Geometry) -> tuple[float, float]:
-    """Start and span of the arc of views in rad (span π for a closed parallel scan, 2π for a closed divergent one)."""
-    if isinstance(geometry, ParallelBeam):
-        return view_steps(geometry.angles, math.pi, PARALLEL_GAP_RAD)[1:]
-    return view_steps(geometry.angles)[1:]
 
 
 def parker_share(beta: Floats, gamma: Floats, half_fan: float) -> Floats:

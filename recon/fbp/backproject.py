@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.polynomial import Chebyshev, Polynomial
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.fbp.filter_plan import full_window
+from recon.fbp import backproject_kernels as kernels
 from recon.linear_operator import apply_linear
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
@@ -29,8 +30,6 @@ _ATAN_TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-11}
 
 def _atan_polynomial(reach: float, columns_per_rad: float, dtype: torch.dtype) -> tuple[float, ...]:
     """Coefficients c of ``2 atan(t) ≈ t · c(t²)`` for |t| ≤ reach, highest power first."""
-    from numpy.polynomial import Chebyshev, Polynomial
-
     tolerance = _ATAN_TOLERANCE[dtype] / max(columns_per_rad, 1.0)
     reach = max(reach, 1e-3)
     u = 0.5 * reach**2 * (1.0 - np.cos((np.arange(200) + 0.5) / 200 * math.pi))
@@ -180,8 +179,6 @@ class BackprojectionPlan:
 
     def forward(self, data: Tensor) -> Tensor:
         """``(..., views, [rows,] columns)`` to ``(..., [z,] y, x)``."""
-        from recon.fbp import backproject_kernels as kernels
-
         n = 3 if self.cone else 2
         lead, shape = data.shape[:-n], data.shape[-n:]
         out = data.new_empty((math.prod(lead), *self.grid.shape))
@@ -198,8 +195,6 @@ class BackprojectionPlan:
 
     def transpose(self, volume: Tensor) -> Tensor:
         """``(..., [z,] y, x)`` to ``(..., views, [rows,] columns)``: the exact transpose of :meth:`forward`."""
-        from recon.fbp import backproject_kernels as kernels
-
         n = self.grid.ndim
         lead = volume.shape[:-n]
         w = self.window
@@ -265,7 +260,7 @@ def backproject(
         TypeError: data that are not float32 or float64 tensors, or not a geometry.
     """
     if window is None:
-        window = full_window(geometry)
+        window = DetectorWindow.full(geometry)
     check_data("filtered", filtered, data_shape(geometry, window))
     plan = BackprojectionPlan(geometry, grid, window, motion)
     return apply_linear(filtered, plan.forward, plan.transpose)

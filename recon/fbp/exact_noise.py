@@ -27,7 +27,7 @@ from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.roi import RoiMean
 from torchpcct.scan import Scan
 
-__all__ = ["RoiAdjoints", "line_integral_variance", "roi_adjoints", "roi_covariance"]
+__all__ = ["RoiAdjoints", "functional_covariance", "line_integral_variance", "roi_adjoints", "roi_covariance"]
 
 FILTER_MARGIN_COLUMNS = 32
 """Columns on either side of the shadow whose noise is counted. The filter's tail falls as 1 / n², its square as
@@ -110,7 +110,7 @@ def roi_adjoints(clean: Scan, fbp: InsetFbp, rois: Sequence[Sequence[RoiMean]]) 
     for start, trace in traces:
         padded = torch.zeros((*trace.shape[:2], rows, trace.shape[-1]), dtype=trace.dtype)
         padded[:, :, start - first : start - first + trace.shape[-2]] = trace
-        vectors.append(torch.stack(list(_filtered(fbp, padded, window, clean))))
+        vectors.append(torch.stack(list(_filtered(fbp, padded, window, 1000.0 / fbp.linearisation.mu_ref))))
     return RoiAdjoints(window, vectors)
 
 
@@ -132,14 +132,47 @@ def roi_covariance(
         ValueError: a scan that is noisy or not windowed.
     """
     results = []
-    for grid, grid_rois in zip(
-        fbp.grids, rois, strict=True
-    ):  # the vectors of many ROIs are large: one kernel at a time
+    # The vectors of many ROIs are large: one kernel at a time.
+    for grid, grid_rois in zip(fbp.grids, rois, strict=True):
         first, trace = _traces(fbp, grid, grid_rois, clean)
         window = _near(fbp, clean, first, trace.shape[-2])
         variance = line_integral_variance(clean.crop(window), exposure_s)
-        results.append(np.array([_gram(h, variance) for h in _filtered(fbp, trace, window, clean)]))
+        vectors = _filtered(fbp, trace, window, 1000.0 / fbp.linearisation.mu_ref)
+        results.append(np.array([_gram(h, variance) for h in vectors]))
     return results
+
+
+def functional_covariance(fbp: InsetFbp, functionals: Tensor, ray_covariance: Tensor) -> NDArray[np.float64]:
+    """Exact covariance of linear functionals of two channels: one adjoint pass per functional, no Monte Carlo.
+
+    FBP is linear and rays are independent, so with h the adjoint of a functional's weights the covariance between
+    channel c of functional i and channel d of functional j is Σ_rays h_i h_j C_cd.
+
+    Args:
+        fbp: of one grid with one kernel.
+        functionals: ``(functionals, *grid.shape)`` weights on the volume: one voxel, an ROI mean.
+        ray_covariance: ``(3, views, rows, columns)`` C₁₁, C₁₂, C₂₂ on the window, as
+            :func:`torchpcct.spectral.cramer_rao` gives it.
+
+    Returns:
+        ``(functionals, functionals, 3)`` float64.
+
+    Raises:
+        ValueError: wrong shapes, a scan that is not windowed.
+    """
+    w, (grid,) = fbp.window, fbp.grids
+    if w is None:
+        raise ValueError("the noise of functionals needs a windowed scan: acquire it with region=")
+    if tuple(ray_covariance.shape) != (3, w.views, w.rows, w.columns):
+        raise ValueError(
+            f"ray_covariance must have the shape {(3, w.views, w.rows, w.columns)}, got {tuple(ray_covariance.shape)}"
+        )
+    if tuple(functionals.shape[1:]) != grid.shape:
+        raise ValueError(f"functionals must have the shape (n, *{grid.shape}), got {tuple(functionals.shape)}")
+    traces = BackprojectionPlan(fbp.geometry, grid, fbp.shadow).transpose(functionals.to(ray_covariance.dtype))
+    seen = w.with_rows(fbp.shadow.first_row, fbp.shadow.rows)
+    (h,) = _filtered(fbp, traces, seen, 1.0)
+    return np.stack([_gram(h, c) for c in w.crop(ray_covariance, seen)], axis=-1)
 
 
 def _traces(fbp: InsetFbp, grid: VolumeGrid, rois: Sequence[RoiMean], clean: Scan) -> tuple[int, Tensor]:
@@ -159,17 +192,16 @@ def _near(fbp: InsetFbp, clean: Scan, first_row: int, rows: int) -> DetectorWind
     """Where the filtered traces are not negligible."""
     assert clean.window is not None
     near = fbp.shadow.widened(FILTER_MARGIN_COLUMNS, clean.window)
-    return DetectorWindow(near.first_column, near.columns, first_row, rows)
+    return near.with_rows(first_row, rows)
 
 
-def _filtered(fbp: InsetFbp, traces: Tensor, window: DetectorWindow, clean: Scan) -> Iterator[Tensor]:
-    """Adjoint vectors in HU of every kernel, ``(rois, views, rows, columns)`` on ``window``."""
-    s = fbp.shadow
-    traced = DetectorWindow(s.first_column, s.columns, window.first_row, window.rows)
+def _filtered(fbp: InsetFbp, traces: Tensor, window: DetectorWindow, scale: float) -> Iterator[Tensor]:
+    """``scale`` times the adjoint vectors of every kernel, ``(rois, views, rows, columns)`` on ``window``."""
+    traced = fbp.shadow.with_rows(window.first_row, window.rows)
     weights = angular_weights(fbp.geometry)
     for kernel in fbp.kernels:
         plan = FilterPlan(fbp.geometry, (kernel,), weights, window, traced)
-        yield torch.stack([plan.transpose(t[None]).mul_(1000.0 / clean.linearisation.mu_ref) for t in traces])
+        yield torch.stack([plan.transpose(t[None]).mul_(scale) for t in traces])
 
 
 def _gram(vectors: Tensor, variance: Tensor) -> list[list[float]]:

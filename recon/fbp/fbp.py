@@ -13,12 +13,12 @@ from torch import Tensor
 
 from recon.fbp.angular_weights import angular_weights
 from recon.fbp.backproject import BackprojectionPlan, backproject, check_data, data_shape
-from recon.fbp.filter_plan import FilterPlan, full_window, kernel_names
+from recon.fbp.filter_plan import FilterPlan, kernel_names
 from recon.linear_operator import apply_linear
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import ConeBeam, Geometry, VolumeGrid
 
-__all__ = ["backproject", "fbp", "filter_sinogram", "filter_windowed", "interleave", "memory_estimate"]
+__all__ = ["backproject", "fbp", "filter_sinogram", "filter_windowed", "interleave"]
 
 G = TypeVar("G", bound=Geometry)
 
@@ -78,7 +78,7 @@ def filter_sinogram(
         ValueError: a wrong shape, an unknown kernel, a window beyond the detector, views that do not suffice.
         TypeError: data that are not float32 or float64 tensors.
     """
-    whole = full_window(geometry)
+    whole = DetectorWindow.full(geometry)
     check_data("sinogram", sinogram, data_shape(geometry, whole))
     return _filter(sinogram, geometry, kernel, weights, whole, whole if window is None else window)
 
@@ -133,7 +133,7 @@ def interleave(sinogram: Tensor, geometry: G) -> tuple[Tensor, G]:
     Raises:
         ValueError, TypeError: a wrong shape or dtype.
     """
-    check_data("sinogram", sinogram, data_shape(geometry, full_window(geometry)))
+    check_data("sinogram", sinogram, data_shape(geometry, DetectorWindow.full(geometry)))
     # the mean of a reading and a zero is half the reading
     spread = torch.stack([2.0 * sinogram, torch.zeros_like(sinogram)], dim=-1).flatten(-2)
     if isinstance(geometry, ConeBeam):
@@ -179,7 +179,7 @@ def fbp(
     Raises:
         ValueError, TypeError: as :func:`filter_sinogram` and :func:`backproject`.
     """
-    check_data("sinogram", sinogram, data_shape(geometry, full_window(geometry)))
+    check_data("sinogram", sinogram, data_shape(geometry, DetectorWindow.full(geometry)))
     if window is None:
         window = _shadow_or_whole(geometry, grid, motion)
     plan = BackprojectionPlan(geometry, grid, window, motion)
@@ -191,29 +191,4 @@ def _shadow_or_whole(geometry: Geometry, grid: VolumeGrid, motion: Any = None) -
     try:
         return shadow(geometry, grid, margin=1, motion=motion)
     except ValueError:
-        return full_window(geometry)  # a grid larger than the field of view: the backprojection decides
-
-
-def memory_estimate(
-    geometry: Geometry, grid: VolumeGrid, *, kernels: int = 1, batch: int = 1, dtype: torch.dtype = torch.float32
-) -> int:
-    """Memory in bytes that :func:`fbp` needs beside the sinogram, at its peak and without gradients.
-
-    Args:
-        geometry, grid: as for :func:`fbp`.
-        kernels: number of reconstruction kernels.
-        batch: number of sinograms (product of the leading dimensions).
-        dtype: ``torch.float32`` or ``torch.float64``.
-
-    Returns:
-        Bytes of the filtered data, the volumes, and the buffers of one chunk of views.
-
-    Raises:
-        ValueError: views that do not suffice for the geometry, a grid outside the field of view.
-    """
-    window = _shadow_or_whole(geometry, grid)
-    BackprojectionPlan(geometry, grid, window)
-    plan = FilterPlan(geometry, ("ram-lak",) * kernels, angular_weights(geometry), full_window(geometry), window)
-    filtered = batch * kernels * window.views * window.rows * window.columns
-    volumes = batch * kernels * grid.voxels
-    return (filtered + volumes) * dtype.itemsize + plan.buffer_bytes(dtype.itemsize)
+        return DetectorWindow.full(geometry)  # a grid larger than the field of view: the backprojection decides

@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from recon.fbp.filter_kernels import align, unalign
 from recon.fbp.ramp import fast_length, ramp_kernel
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam
@@ -32,12 +33,6 @@ def _lookup(kernels: NDArray[np.float64], lag: NDArray[np.int64]) -> NDArray[np.
     """``kernels[:, lag]``, zero where the lag lies beyond the samples (no data at that distance)."""
     inside = lag < kernels.shape[1]
     return np.where(inside, kernels[:, np.where(inside, lag, 0)], 0.0)
-
-
-def full_window(geometry: Geometry) -> DetectorWindow:
-    """The window that is the whole detector."""
-    rows = geometry.rows if isinstance(geometry, ConeBeam) else 1
-    return DetectorWindow(np.zeros(geometry.views, np.int64), geometry.columns, 0, rows)
 
 
 @dataclass(frozen=True)
@@ -117,17 +112,6 @@ class FilterPlan:
         width = self._length if self.by_matrix else self._length + 6 * self._fft_size
         return max(1, min(self.window_in.views, CHUNK_BYTES // (8 * self.window_out.rows * width)))
 
-    def buffer_bytes(self, itemsize: int) -> int:
-        """Memory of :meth:`forward` beside its input and output: frame, spectra, responses and weights."""
-        width, kernels, rows = self._length, len(self.kernels), self.window_out.rows
-        if self.by_matrix:
-            responses = width * self.window_out.columns * kernels * (itemsize + 16)
-        else:
-            width += 6 * self._fft_size
-            responses = 4 * 8 * self._fft_size * kernels
-        weights = (self.angular.size + rows * self.geometry.columns) * (8 + itemsize)
-        return self.chunk * rows * width * itemsize + responses + weights
-
     def _responses(self, like: Tensor) -> Tensor:
         """Matrices ``(K, length, width_out)``, or frequency responses ``(K, size // 2 + 1)``."""
         low = int((self.window_in.first_column - self.window_out.first_column).min())
@@ -147,8 +131,6 @@ class FilterPlan:
 
     def forward(self, data: Tensor) -> Tensor:
         """Weight and filter: ``(..., V, rows_in, width_in)`` to ``(..., K, V, rows_out, width_out)``."""
-        from recon.fbp.filter_kernels import align
-
         a, b = self.window_in, self.window_out
         lead = data.shape[:-3]
         data = data.reshape(math.prod(lead), *data.shape[-3:])
@@ -178,8 +160,6 @@ class FilterPlan:
 
     def transpose(self, gradient: Tensor) -> Tensor:
         """Transpose of :meth:`forward`: ``(..., K, V, rows_out, width_out)`` to ``(..., V, rows_in, width_in)``."""
-        from recon.fbp.filter_kernels import unalign
-
         a, b = self.window_in, self.window_out
         lead = gradient.shape[:-4]
         gradient = gradient.reshape(math.prod(lead), *gradient.shape[-4:])

@@ -1,4 +1,9 @@
-"""FBP of a small inset from a scan: filter once, backproject onto any number of grids."""
+"""FBP of a small inset from a scan: filter once, backproject onto any number of grids.
+
+A windowed scan is split by linearity: its surround, the same in every view and noise free, is filtered once; the
+difference of each realisation to the surround is zero outside the window and is filtered from the window alone. The sum
+equals the FBP of the whole rows.
+"""
 
 from __future__ import annotations
 
@@ -8,23 +13,19 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.fbp.angular_weights import angular_weights
-from recon.fbp.fbp import backproject, fbp, filter_sinogram, filter_windowed
+from recon.fbp.backproject import backproject
+from recon.fbp.fbp import fbp, filter_sinogram, filter_windowed
 from torchpcct.detector_window import DetectorWindow, shadow
-from torchpcct.geometry import Geometry, VolumeGrid
+from torchpcct.geometry import ConeBeam, Geometry, VolumeGrid
 from torchpcct.scan import Scan
 from torchpcct.scene.motion import SinusoidalMotion
+from torchpcct.volume import to_hu
 
-__all__ = ["InsetFbp", "to_hu", "view_motion"]
-
-
-def to_hu(attenuation: Tensor, mu_water: float) -> Tensor:
-    """CT numbers from attenuation in mm⁻¹: 1000 (μ / μ_water − 1), so that water reads 0 and air −1000."""
-    return 1000.0 * (attenuation / mu_water - 1.0)
+__all__ = ["InsetFbp", "require_inside", "static_fbp", "view_motion"]
 
 
 def view_motion(motion: SinusoidalMotion, geometry: Geometry, rotation_s: float) -> NDArray[np.float64]:
@@ -47,15 +48,51 @@ def view_motion(motion: SinusoidalMotion, geometry: Geometry, rotation_s: float)
     return np.ascontiguousarray(motion.displacement(times)[:, ::-1])
 
 
+def static_fbp(lines: Tensor, geometry: ConeBeam, grid: VolumeGrid, kernel: str = "standard") -> Tensor:
+    """FBP of readings that are the same in every view (rotationally symmetric objects).
+
+    Args:
+        lines: ``(..., rows, columns)`` line integrals of one view.
+        geometry: of the whole scan.
+        grid: ``(z, y, x)`` grid in the field of view.
+        kernel: reconstruction kernel.
+
+    Returns:
+        ``(..., *grid.shape)``, unit of ``lines`` per mm.
+
+    Raises:
+        ValueError: a wrong shape, a grid outside the field of view.
+    """
+    part = shadow(geometry, grid, margin=1)
+    return backproject(_static(lines, geometry, kernel, part), geometry, grid, part)
+
+
+def _static(lines: Tensor, geometry: ConeBeam, kernel: str | Sequence[str], part: DetectorWindow) -> Tensor:
+    """Filtered readings ``([kernels,] ..., views, rows, columns)`` on ``part`` of lines that all views share."""
+    weights = angular_weights(geometry)
+    if not np.allclose(weights, weights[0, 0], rtol=1e-6, atol=0):
+        whole = lines.unsqueeze(-3).expand(*lines.shape[:-2], *geometry.shape)
+        return filter_sinogram(whole, geometry, kernel, part)
+    one = geometry.select([0])
+    return part.take(filter_sinogram(lines.unsqueeze(-3), one, kernel, weights=weights[:1, :1]).squeeze(-3))
+
+
+def require_inside(inner: DetectorWindow, window: DetectorWindow) -> None:
+    """Refuse a grid whose shadow ``inner`` the scan's window does not hold (ValueError)."""
+    if not window.holds(inner):
+        raise ValueError(
+            "the grid reaches beyond the region that this scan was acquired for: acquire it with a larger region"
+        )
+
+
 class InsetFbp:
-    """FBP in HU of one or several grids from scans that share geometry, window and surround.
+    """FBP of one or several grids from scans that share geometry, window and surround.
 
-    A windowed scan is split by linearity: its surround, the same in every view and noise free, is filtered once; the
-    difference of each realisation to the surround is zero outside the window and is filtered from the window alone.
-    The sum equals the FBP of the whole rows.
+    A counting-mode scan is reconstructed in HU: call the object with it. Channels of line integrals (energy bins,
+    basis materials) on the scan's window go to :meth:`images`.
 
-    The same split compensates motion: the surround stands still while the inset moves, so the surround is
-    backprojected at rest, the difference with the grid displaced in every view, and the sum shows the inset at rest.
+    The split of the readings also compensates motion: the surround stands still while the inset moves, so the surround
+    is backprojected at rest, the difference with the grid displaced in every view, and the sum shows the inset at rest.
     Backprojecting whole readings with the displacement would move the patient's body with the vessel. The difference
     of the logarithms is linear in the inset up to beam hardening (the inset is seen through the same fat everywhere)
     and in the surround up to the fat that the inset displaces, which moves with it as part of the difference.
@@ -64,83 +101,92 @@ class InsetFbp:
         scan: any scan of the family; its noise does not matter.
         grids: ``(z, y, x)`` grids inside the field of view.
         kernels: reconstruction kernels.
+        surround: line integrals of every cell outside the window, the same in all views: ``(channels, rows, columns)``
+            for channels; None: ``(rows, columns)`` of the counting-mode scan.
         motion: displacement of the inset in every view, ``(views, 3)`` z, y, x mm (:func:`view_motion`); None: at
             rest.
 
     Raises:
-        ValueError: a grid outside the field of view or the scan's window; an unknown kernel; motion in a scan that was
-            acquired without ``region`` (its surround is not known).
+        ValueError: a spectral scan without ``surround``; a grid outside the field of view or the scan's window; an
+            unknown kernel; a surround of a wrong shape, or motion, in a scan that was acquired without ``region`` (its
+            surround is not known).
     """
 
-    def __init__(self, scan: Scan, grids: Sequence[VolumeGrid], kernels: Sequence[str], *, motion: Any = None) -> None:
-        if scan.counts.ndim != 3:
+    def __init__(
+        self,
+        scan: Scan,
+        grids: Sequence[VolumeGrid],
+        kernels: Sequence[str],
+        *,
+        surround: Tensor | None = None,
+        motion: Any = None,
+    ) -> None:
+        if surround is None and scan.counts.ndim != 3:
             raise ValueError("FBP in HU needs a counting-mode scan; decompose or sum the energy bins before")
         self.geometry, self.window, self.linearisation = scan.geometry, scan.window, scan.linearisation
         self.grids, self.kernels = tuple(grids), tuple(kernels)
-        if motion is not None and scan.window is None:
+        if scan.window is None and motion is not None:
             raise ValueError("motion compensation needs the surround at rest: acquire the scan with region=")
+        if scan.window is None and surround is not None:
+            raise ValueError("a scan of the whole detector has no surround: acquire it with region=")
         self.motion = motion
         paths = (None,) if motion is None else (None, motion)
         windows = [shadow(self.geometry, grid, margin=1, motion=path) for grid in self.grids for path in paths]
         self.shadow = DetectorWindow.union(windows, self.geometry.columns)
-        self.surround: Tensor | None = None
+        self._lines: Tensor | None = None
         if scan.window is not None:
-            _require_inside(self.shadow, scan.window)
-            self._surround_lines = scan.surround_line_integrals()
-            self.surround = self._filter_surround()
+            require_inside(self.shadow, scan.window)
+            self._lines = scan.surround_line_integrals() if surround is None else surround
+            cells = self.geometry.shape[1:]
+            if tuple(self._lines.shape[-2:]) != cells:
+                raise ValueError(
+                    f"surround must have the shape (channels, {cells[0]}, {cells[1]}), got {tuple(self._lines.shape)}"
+                )
+            # (kernels, [channels,] views, rows, columns) on the grids' shadow.
+            self._surround = _static(self._lines, self.geometry, self.kernels, self.shadow)
 
-    def _filter_surround(self) -> Tensor:
-        """The surround, filtered, on the grids' shadow: ``(kernels, views, rows, columns)``."""
-        g, s = self.geometry, self.shadow
-        weights = angular_weights(g)
-        if not np.allclose(weights, weights[0, 0], rtol=1e-6, atol=0):
-            return filter_sinogram(self._surround_lines.expand(g.shape), g, self.kernels, s)
-        one = g.select([0])
-        filtered = filter_sinogram(self._surround_lines[None], one, self.kernels, weights=weights[:1, :1])[:, 0]
-        rows = filtered[:, s.first_row : s.first_row + s.rows]
-        return rows[..., torch.from_numpy(s.column_indices)].movedim(2, 1)
+    @cached_property
+    def _rest(self) -> list[Tensor]:
+        """The surround on every grid, per mm."""
+        return [backproject(self._surround, self.geometry, grid, self.shadow) for grid in self.grids]
 
-    def filtered(self, scan: Scan) -> Tensor:
-        """Filtered readings of a windowed scan on the grids' shadow, ``(kernels, views, rows, columns)``."""
-        assert self.surround is not None
-        return self._difference(scan) + self.surround
+    def images(self, lines: Tensor) -> list[Tensor]:
+        """Images of line integrals on the window.
 
-    def _difference(self, scan: Scan) -> Tensor:
-        """What the inset adds to the surround, filtered, on the grids' shadow."""
-        if self.surround is None or scan.window != self.window or scan.window is None:
-            raise ValueError("this scan has another window than the one that InsetFbp was made for")
-        difference = scan.line_integrals() - scan._at_window(self._surround_lines)
-        return filter_windowed(difference, self.geometry, scan.window, self.kernels, self.shadow)
+        Args:
+            lines: ``(..., [channels,] views, rows, columns)`` on the scan's window (whole detector: without one), e.g.
+                :attr:`torchpcct.spectral.Decomposition.line_integrals` in mm.
+
+        Returns:
+            ``(kernels, ..., [channels,] *grid.shape)`` for every grid: unit of ``lines`` per mm (basis coefficients:
+            dimensionless).
+
+        Raises:
+            ValueError, TypeError: a wrong shape or dtype.
+        """
+        g, part = self.geometry, self.shadow
+        if self.window is None or self._lines is None:
+            return [fbp(lines, g, grid, self.kernels) for grid in self.grids]
+        channels = tuple(self._lines.shape[:-2])
+        if lines.ndim < 3 or tuple(lines.shape[lines.ndim - 3 - len(channels) : -3]) != channels:
+            raise ValueError(f"lines must have the channels {channels} before the views, got {tuple(lines.shape)}")
+        difference = lines - self.window.take(self._lines.to(lines.dtype))
+        filtered = filter_windowed(difference, g, self.window, self.kernels, part)
+        if self.motion is None:
+            filtered = filtered + self._over_batch(self._surround.to(lines.dtype), filtered)
+            return [backproject(filtered, g, grid, part) for grid in self.grids]
+        moving = [backproject(filtered, g, grid, part, motion=self.motion) for grid in self.grids]
+        return [self._over_batch(rest, m) + m for rest, m in zip(self._rest, moving, strict=True)]
+
+    @staticmethod
+    def _over_batch(surround: Tensor, like: Tensor) -> Tensor:
+        """``(kernels, *rest)`` with axes of length 1 where ``like`` has its batch, after the kernels."""
+        return surround.reshape(len(surround), *[1] * (like.ndim - surround.ndim), *surround.shape[1:])
 
     def __call__(self, scan: Scan) -> list[Tensor]:
         """Volumes in HU, one ``(kernels, *grid.shape)`` float32 tensor per grid."""
         if scan.geometry != self.geometry:
             raise ValueError("this scan has another geometry than the one that InsetFbp was made for")
-        mu = self.linearisation.mu_ref
-        if self.window is None:
-            lines = scan.line_integrals()
-            return [to_hu(fbp(lines, self.geometry, grid, self.kernels), mu) for grid in self.grids]
-        if self.motion is None:
-            data = self.filtered(scan)
-            return [to_hu(backproject(data, self.geometry, grid, self.shadow), mu) for grid in self.grids]
-        moving = self._difference(scan)
-        return [
-            to_hu(rest + backproject(moving, self.geometry, grid, self.shadow, motion=self.motion), mu)
-            for rest, grid in zip(self._rest, self.grids, strict=True)
-        ]
-
-    @cached_property
-    def _rest(self) -> list[Tensor]:
-        """The surround on every grid, mm⁻¹."""
-        assert self.surround is not None
-        return [backproject(self.surround, self.geometry, grid, self.shadow) for grid in self.grids]
-
-
-def _require_inside(inner: DetectorWindow, outer: DetectorWindow) -> None:
-    columns = (inner.first_column >= outer.first_column) & (
-        inner.first_column + inner.columns <= outer.first_column + outer.columns
-    )
-    if not columns.all() or inner.first_row < outer.first_row:
-        raise ValueError(
-            "the grid reaches beyond the region that this scan was acquired for: acquire it with a larger region"
-        )
+        if scan.window != self.window:
+            raise ValueError("this scan has another window than the one that InsetFbp was made for")
+        return [to_hu(v, self.linearisation.mu_ref) for v in self.images(scan.line_integrals())]

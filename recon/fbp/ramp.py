@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.fft import next_fast_len
 
-__all__ = ["KERNELS", "apodization", "fast_length", "ramp_filter", "ramp_kernel"]
+__all__ = ["KERNELS", "apodization", "fast_length", "ramp_kernel"]
 
 Floats = NDArray[np.float64]
 
@@ -130,47 +131,4 @@ def ramp_kernel(n: int, pitch: float, kernel: str = "ram-lak", *, equiangular: b
 
 def fast_length(n: int) -> int:
     """The smallest length ≥ ``n`` whose only prime factors are 2, 3 and 5 and that is even (fast real FFTs)."""
-    best = 1 << max(n - 1, 1).bit_length()
-    five = 1
-    while five < best:
-        three = five
-        while three < best:
-            two = 2 * three
-            while two < n:
-                two *= 2
-            best = min(best, two)
-            three *= 3
-        five *= 5
-    return best
-
-
-def ramp_filter(
-    n: int, pitch: float, kernel: str = "ram-lak", *, equiangular: bool = False, length: int | None = None
-) -> Floats:
-    """Frequency response of the ramp filter for rows of ``n`` columns.
-
-    It is the DFT of the spatial kernel, so that the response at frequency 0 is right; sampling ``|f|`` instead loses
-    the mean of the image (Kak and Slaney, chapter 3.3).
-
-    Args:
-        n: detector columns.
-        pitch: column pitch, mm at the isocentre, or rad when ``equiangular``.
-        kernel: name of the apodisation window, see :func:`apodization`.
-        equiangular: see :func:`ramp_kernel`.
-        length: FFT length, at least ``2 n − 1`` for a linear convolution (default: the next fast length from ``2 n``).
-
-    Returns:
-        ``(length // 2 + 1,)`` float64, in pitch⁻¹ (the sum's factor ``pitch`` included): multiply the ``rfft`` of the
-        zero-padded row by it.
-
-    Raises:
-        ValueError: ``length < 2 n − 1``, or what :func:`ramp_kernel` refuses.
-    """
-    h = ramp_kernel(n, pitch, kernel, equiangular=equiangular) * pitch
-    size = fast_length(2 * n) if length is None else int(length)
-    if size < 2 * n - 1:
-        raise ValueError(f"length must be at least 2 n − 1 = {2 * n - 1} to avoid wrap-around, got {size}")
-    circular = np.zeros(size)
-    circular[:n] = h
-    circular[size - n + 1 :] = h[:0:-1]
-    return np.fft.rfft(circular).real.copy()
+    return 2 * int(next_fast_len((n + 1) // 2, real=True))

@@ -7,9 +7,9 @@ a banded matrix along z for every frequency (see :mod:`recon.gram.impulse_respon
     G x = K₀x + ½ Σ_c [ b_c · (K_c x) + K_c (b_c · x) ],      b = y, x (, y², yx, x²),
 
 with the K_c fitted to exact impulse responses at a few nodes. The form is self-adjoint, and its local spectra are
-kept positive definite (:mod:`recon.gram.positive_definite`). What it cannot hold is the
-irregular beat of the voxel lattice with the detector's cells: 2–3 % on white noise at 0.2 mm voxels, 0.1 % on tissue
-shapes. It is a model: :func:`recon.pwls.pwls.pwls` removes its error with exact projections.
+kept positive definite (:mod:`recon.gram.positive_definite`). What it cannot hold is the irregular beat of the voxel
+lattice with the detector's cells: 2–3 % on white noise at 0.2 mm voxels, 0.1 % on tissue shapes. It is a model: who
+needs the exact operator removes its error with exact projections.
 """
 
 from __future__ import annotations
@@ -19,9 +19,11 @@ import math
 from typing import Any
 
 import torch
+from scipy.fft import next_fast_len
 from torch import Tensor
 
 from recon.gram.impulse_response import Nodes, kernel_at, node_positions, slice_reach
+from recon.gram.kernels import banded_add
 from recon.gram.positive_definite import cholesky, make_definite
 
 __all__ = ["Gram", "check_weights"]
@@ -36,7 +38,8 @@ class Gram:
     """A fast, self-adjoint model of x ↦ AᵀW A x on an inset.
 
     Args:
-        projector: the exact operator A (:class:`torchpcct.projector.Projector`) of the inset, usually with a window.
+        projector: the exact operator A (:class:`torchpcct.projector.Projector`) of the inset, usually with a window; it
+            is not kept.
         weights: W, inverse variances of the line integrals, ``range_shape``, finite and ≥ 0 (zeros are dead readings).
         nodes: positions at which the exact impulse response is taken: 1 (shift invariant, fastest), 5 (linear in
             position) or 9 (quadratic, most accurate). Each costs about one pass of the projector; the result can be
@@ -49,32 +52,30 @@ class Gram:
 
     def __init__(self, projector: Any, weights: Tensor, nodes: int = 9) -> None:
         check_weights(weights, projector.range_shape)
-        self.projector = projector
-        self.weights = weights
+        self.dtype = weights.dtype
         self.grid = projector.grid
         self.factor = 1.0
         self._flat = self.grid.ndim == 2
         ny, nx = self.grid.shape[-2:]
-        self.padded = (_fast(2 * ny - 1), _fast(2 * nx - 1))
+        self.padded = (next_fast_len(2 * ny - 1, real=True), next_fast_len(2 * nx - 1, real=True))
         positions = node_positions(nodes if min(ny, nx) > 4 else 1)
-        kernels = self._fit(positions)
+        kernels = self._fit(projector, weights.detach().cpu(), positions)
         self._periodic = _periodic_mean(kernels[0])
         self._spectra = make_definite(_spectra(kernels, self.padded))
-        self._basis = self._polynomials(len(self._spectra)).to(weights.dtype)
+        self._basis = self._polynomials(len(self._spectra)).to(self.dtype)
         self._factor: Tensor | None = None
 
     # -- construction ---------------------------------------------------------------------------------------------
 
-    def _fit(self, positions: Nodes) -> Tensor:
+    def _fit(self, projector: Any, weights: Tensor, positions: Nodes) -> Tensor:
         """Kernels K_c, ``(terms, bands, nz, 2·ny − 1, 2·nx − 1)``."""
         ny, nx = self.grid.shape[-2:]
-        reach = slice_reach(self.projector.geometry, self.grid)
-        weights = self.weights.detach().cpu()
+        reach = slice_reach(projector.geometry, self.grid)
         at, found = [], []
         for y, x in positions:
             node = (round((ny - 1) / 2 * (1 + y)), round((nx - 1) / 2 * (1 + x)))
             at.append((2 * node[0] / max(ny - 1, 1) - 1, 2 * node[1] / max(nx - 1, 1) - 1))
-            found.append(kernel_at(self.projector, weights, node, reach))
+            found.append(kernel_at(projector, weights, node, reach))
         energy = torch.stack([(k.double() ** 2).sum(dim=(1, 2, 3)) for k in found]).sum(0)
         keep = int(torch.nonzero(energy > BAND_ENERGY * energy.sum()).abs().sub(reach).abs().max())
         stack = torch.stack(found)[:, reach - keep : reach + keep + 1]
@@ -96,13 +97,6 @@ class Gram:
             raise ValueError(f"factor must be finite and greater than 0, got {factor}")
         other = copy.copy(self)
         other.factor = self.factor * factor
-        other.weights = self.weights * factor
-        return other
-
-    def without_projector(self) -> Gram:
-        """The same operator without the projector and the weights (megabytes each); ``exact`` and ``error`` go too."""
-        other = copy.copy(self)
-        other.projector, other.weights = None, self.weights[:0]
         return other
 
     def to(self, device: torch.device | str) -> Gram:
@@ -154,20 +148,6 @@ class Gram:
         rows = torch.fft.ifft(spectrum, dim=-2)[..., :ny, :]
         return torch.fft.irfft(rows, n=self.padded[1], dim=-1)[..., :nx]
 
-    def exact(self, x: Tensor) -> Tensor:
-        """Aᵀ W A x with the exact operator (one projection pair)."""
-        if self.projector is None:
-            raise ValueError("this Gram operator was separated from its projector (without_projector): keep the first")
-        out: Tensor = self.projector.T(self.weights.to(x.dtype) * self.projector(x))
-        return out
-
-    def error(self, x: Tensor) -> Tensor:
-        """‖G x − AᵀWA x‖ / ‖AᵀWA x‖ of each volume, ``(...)`` float64."""
-        exact = self.exact(x)
-        axes = tuple(range(-self.grid.ndim, 0))
-        norm = torch.linalg.vector_norm(exact, dim=axes, dtype=torch.float64)
-        return torch.linalg.vector_norm(self.apply(x) - exact, dim=axes, dtype=torch.float64) / norm
-
     # -- what solvers, priors and training need -------------------------------------------------------------------
 
     def periodic_spectrum(self) -> Tensor:
@@ -213,7 +193,7 @@ class Gram:
         nz = 1 if self._flat else self.grid.shape[0]
         ny, nx = self.grid.shape[-2:]
         device = self._factor.device
-        white = torch.randn((*batch, nz, *self.padded), generator=generator, dtype=self.weights.dtype, device=device)
+        white = torch.randn((*batch, nz, *self.padded), generator=generator, dtype=self.dtype, device=device)
         spectrum = torch.fft.rfft2(white)
         lower = self._factor
         mixed = torch.zeros_like(spectrum)
@@ -251,12 +231,6 @@ def check_weights(weights: Any, shape: tuple[int, ...]) -> None:
         raise ValueError("all weights are 0: no reading carries information")
 
 
-def _fast(n: int) -> int:
-    from scipy.fft import next_fast_len
-
-    return int(next_fast_len(n, real=True))
-
-
 def _monomials(y: Tensor, x: Tensor, terms: int) -> Tensor:
     return torch.stack([torch.ones_like(y), y, x, y * y, y * x, x * x][:terms], dim=-1)
 
@@ -291,8 +265,6 @@ def _banded_add(kernel: Tensor, x: Tensor, scale: float, out: Tensor) -> None:
     """out += scale · K x, K Hermitian and banded along z: lower bands ``(reach + 1, nz, fy, fx)``."""
     nz = x.shape[-3]
     if x.device.type == "cpu":
-        from recon.gram.kernels import banded_add
-
         real = kernel.real.numpy().dtype.type
         shape = (-1, *x.shape[-3:])
         banded_add(kernel.numpy(), x.reshape(shape).numpy(), real(scale), out.view(shape).numpy())

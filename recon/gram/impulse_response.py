@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -53,27 +52,6 @@ def slice_reach(geometry: Geometry, grid: VolumeGrid) -> int:
     return min(max(math.ceil(lag) - 1, 0), nz - 1)
 
 
-def _window_of(projector: Any) -> DetectorWindow:
-    """The projector's window; the whole detector where it has none."""
-    g, w = projector.geometry, projector.window
-    if w is not None:
-        return w
-    rows = g.rows if isinstance(g, ConeBeam) else 1
-    return DetectorWindow(np.zeros(g.views, dtype=np.int64), g.columns, 0, rows)
-
-
-def _narrow(geometry: Geometry, window: DetectorWindow, grid: VolumeGrid) -> DetectorWindow:
-    """The part of ``window`` that sees ``grid``."""
-    part = shadow(geometry, grid, margin=1)
-    columns = min(part.columns, window.columns)
-    low, high = window.first_column, window.first_column + window.columns - columns
-    r0 = max(part.first_row, window.first_row)
-    r1 = min(part.first_row + part.rows, window.first_row + window.rows)
-    if r1 <= r0:
-        raise ValueError("no detector row of the window sees the grid: move the grid or widen the window")
-    return DetectorWindow(np.clip(part.first_column, low, high), columns, r0, r1 - r0)
-
-
 def kernel_at(projector: Any, weights: Tensor, node: tuple[int, int], reach: int) -> Tensor:
     """Impulse responses of AᵀWA for all slices of one voxel column.
 
@@ -100,8 +78,8 @@ def kernel_at(projector: Any, weights: Tensor, node: tuple[int, int], reach: int
         return VolumeGrid((nz, *shape), grid.spacing, (grid.center[0], *at))
 
     column = around((1, 1))
-    window = _window_of(projector)
-    part = _narrow(geometry, window, column)
+    window = projector.window or DetectorWindow.full(geometry)
+    part = shadow(geometry, column, margin=1).within(window)
     w = window.crop(weights.unsqueeze(1) if flat else weights, part)
     w = w.squeeze(1) if flat else w
     make = type(projector)

@@ -22,7 +22,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-__all__ = ["Steering"]
+from recon.linear_operator import gaussian_kernel, separable_filter
+
+__all__ = ["VesselSmoothing"]
 
 PILOT_SD_MM = 0.3
 """Standard deviation of the Gaussian that the pilot's gradient is taken with."""
@@ -37,7 +39,7 @@ _INDEX = ((0, 3, 4), (3, 1, 5), (4, 5, 2))
 
 
 @dataclass(frozen=True)
-class Steering:
+class VesselSmoothing:
     """The penalty S of a batch of volumes.
 
     Args:
@@ -49,7 +51,7 @@ class Steering:
     strength: Tensor
 
     @classmethod
-    def of(cls, pilot: Tensor, voxel_mm: float, strength: Tensor) -> Steering:
+    def of(cls, pilot: Tensor, voxel_mm: float, strength: Tensor) -> VesselSmoothing:
         """S with the directions of pilot volumes ``(batch, z, y, x)``, which are taken as fixed."""
         return cls(_directions(pilot.detach(), voxel_mm), strength)
 
@@ -131,13 +133,5 @@ def _transposed(h: Tensor, axis: int, shift: int) -> Tensor:
 
 def _gaussian(v: Tensor, sd: float) -> Tensor:
     """Gaussian filter of ``(batch, z, y, x)``, edges repeated; ``sd`` in voxels."""
-    reach = math.ceil(3 * sd)
-    at = torch.arange(-reach, reach + 1, dtype=v.dtype, device=v.device)
-    kernel = torch.exp(-0.5 * (at / sd) ** 2)
-    kernel = kernel / kernel.sum()
-    out = v[:, None]
-    for axis in _AXES:
-        shape = [1] * 5
-        shape[axis] = len(at)
-        out = F.conv3d(F.pad(out, _pad(axis, reach, reach), mode="replicate"), kernel.reshape(shape))
-    return out[:, 0]
+    kernel = gaussian_kernel(sd, math.ceil(3 * sd), v)
+    return separable_filter(v, kernel / kernel.sum(), "replicate")

@@ -19,14 +19,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recon.fbp.inset import to_hu
+from recon.mbir.minimise import minimise_passes, residual
 from recon.mbir.prior import PriorConfig
-from recon.mbir.unrolled import NormalProblem, Unrolled, minimise_passes, residual
+from recon.mbir.unrolled import NormalisedProblem, Unrolled
 from recon.mbir.weights_io import read_tensors
 from recon.pwls.inset_problem import InsetProblem
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
-from torchpcct.volume import Volume
+from torchpcct.volume import Volume, to_hu
 
 __all__ = ["Mbir", "average_onto", "reconstruct_mbir", "working_grid"]
 
@@ -83,7 +83,7 @@ class Mbir:
             ) from error
         return cls(model)
 
-    def problem(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> NormalProblem:
+    def problem(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> NormalisedProblem:
         """The normalised problem of ``b`` ``(batch, z, y, x)``, AᵀW y with the weights of the exposure."""
         spacing = problem.grid.spacing
         if max(abs(s / self.voxel_mm - 1.0) for s in spacing) > 0.01:
@@ -92,7 +92,7 @@ class Mbir:
                 "recon.mbir.mbir.working_grid and average the result onto the grid"
             )
         exposure = torch.full((b.shape[0],), float(exposure_s))
-        return NormalProblem.from_statistic(problem.gram, b, exposure, problem.mu_ref / 1000.0, self.voxel_mm)
+        return NormalisedProblem.from_statistic(problem.gram, b, exposure, problem.mu_ref / 1000.0, self.voxel_mm)
 
     @torch.no_grad()
     def __call__(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> Tensor:
@@ -106,7 +106,7 @@ class Mbir:
         normal = self.problem(problem, b, exposure_s)
         return self._hu(problem, self.model(normal), normal)
 
-    def _hu(self, problem: InsetProblem, u: Tensor, normal: NormalProblem) -> Tensor:
+    def _hu(self, problem: InsetProblem, u: Tensor, normal: NormalisedProblem) -> Tensor:
         scale = normal.scale_hu.reshape(-1, 1, 1, 1) * (problem.mu_ref / 1000.0)
         return to_hu(u * scale + problem.level, problem.mu_ref)
 
@@ -186,7 +186,7 @@ def reconstruct_mbir(
     grid: VolumeGrid,
     *,
     progress: Callable[[float], None] | None = None,
-    prior: Mbir | None = None,
+    network: Mbir | None = None,
     problem: InsetProblem | None = None,
     batch: int = 4,
     noise_map: bool = False,
@@ -198,13 +198,13 @@ def reconstruct_mbir(
         scans: realisations of one windowed scan.
         grid: the inset.
         progress: called with the finished fraction.
-        prior: loaded weights; None: those of the package.
+        network: with its weights; None: those of the package.
         problem: kept from an earlier call with the same scan and (working) grid; None: made here.
         batch: volumes at a time.
         noise_map: add an estimate of each voxel's standard deviation, ``report["noise_sd_hu"]``; that of the unrolled
             steps, also with ``converge``.
         converge: run every pass to the stationary point of its energy, about ten times the work
-            (:func:`recon.mbir.unrolled.minimise_passes`). ``report["residual"]`` of at most 1e-3 certifies it: within 1
+            (:func:`recon.mbir.minimise.minimise_passes`). ``report["residual"]`` of at most 1e-3 certifies it: within 1
             HU (root mean square) of the limit, on the paper's plaque. The unrolled steps end 10 HU from it at 0.35 s
             and 5 HU at 2 s.
 
@@ -220,8 +220,8 @@ def reconstruct_mbir(
         FileNotFoundError: the package has no weights.
     """
     start = time.perf_counter()
-    prior = prior or Mbir.load()
-    work = working_grid(grid, prior.voxel_mm)
+    network = network or Mbir.load()
+    work = working_grid(grid, network.voxel_mm)
     problem = problem or InsetProblem(scans[0], work)
     if problem.grid != work:
         raise ValueError(f"the problem was made for another grid: make it on {work} (recon.mbir.working_grid)")
@@ -231,28 +231,28 @@ def reconstruct_mbir(
         exposure = problem.exposure(part)
         statistics = [problem.statistic(s) for s in part]
         b = torch.stack([s.b for s in statistics])
-        normal = prior.problem(problem, b, exposure)
+        normal = network.problem(problem, b, exposure)
         with torch.no_grad():
-            report: dict[str, Any] = {"method": "mbir", "iterations": prior.model.iterations}
+            report: dict[str, Any] = {"method": "mbir", "iterations": network.model.iterations}
             if converge:
-                u, found = minimise_passes(prior.model, normal)
+                u, found = minimise_passes(network.model, normal)
                 residuals = found.pop("residual")
                 report.update(found)
             else:
-                u, last, steering = prior.model.passes(normal)
-                residuals = residual(prior.model, last, u, steering).tolist()
-            hu = prior._hu(problem, u, normal)
+                u, last, smoothing = network.model.passes(normal)
+                residuals = residual(network.model, last, u, smoothing).tolist()
+            hu = network._hu(problem, u, normal)
             misfit = (u * (normal.apply(u) - 2.0 * normal.beta)).sum(dim=(1, 2, 3))
         seconds = (time.perf_counter() - start) / len(part)
         for k, (volume, statistic) in enumerate(zip(hu, statistics, strict=True)):
             chi2 = (statistic.energy + float(misfit[k])) / statistic.readings
             info = {**report, "residual": residuals[k], "chi2": chi2, "seconds": round(seconds, 3)}
-            info["warnings"] = prior.check(float(normal.scale_hu[k]), chi2, float(volume.max()))
+            info["warnings"] = network.check(float(normal.scale_hu[k]), chi2, float(volume.max()))
             if not report.get("converged", True):
                 info["warnings"].append(f"the energy has not converged, its residual is {residuals[k]:.2g}")
                 _LOG.warning("%s", info["warnings"][-1])
             if noise_map:
-                sd = prior.noise_map(problem, statistic.b, exposure)
+                sd = network.noise_map(problem, statistic.b, exposure)
                 info["noise_sd_hu"] = sd if work is grid else average_onto(sd, work, grid)
             data = volume if work is grid else average_onto(volume, work, grid)
             volumes.append(Volume(data.to(torch.float32), grid, info))

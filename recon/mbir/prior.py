@@ -7,10 +7,9 @@ plus a quadratic term ½ Σ_f Q(f) |û(f)|² that holds down what the filters do
 
 The volume u is in units of its own noise (see :mod:`recon.mbir.unrolled`), so one set of weights serves every dose:
 what the noise level adds is only a slow change of the a_gj. The potentials are of the Lorentzian (Geman-McClure,
-Student-t)
-family: below τ_j they smooth, far above they let go, so a large contrast is not shrunk (Roth, Black 2009, Int. J.
-Comput. Vis. 82:205, fields of experts; Chen, Pock 2017, IEEE TPAMI 39:1256, as unrolled steps). Filters come in groups
-whose joint magnitude is penalised, as the three derivatives are in isotropic total variation.
+Student-t) family: below τ_j they smooth, far above they let go, so a large contrast is not shrunk (Roth, Black 2009,
+Int. J. Comput. Vis. 82:205, fields of experts; Chen, Pock 2017, IEEE TPAMI 39:1256, as unrolled steps). Filters come in
+groups whose joint magnitude is penalised, as the three derivatives are in isotropic total variation.
 
 Filters act on 2 × 2 × 2 blocks of voxels with a 3 × 3 × 3 neighbourhood of blocks, 6³ voxels in all; each level halves
 the resolution with the orthonormal Haar average. Outside the grid u is 0, the background.
@@ -19,17 +18,24 @@ the resolution with the orthonormal Haar average. Outside the grid u is 0, the b
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-__all__ = ["LearnedPrior", "PriorConfig", "squared_frequencies"]
+__all__ = [
+    "LearnedPrior",
+    "PriorConfig",
+    "filtered",
+    "from_frequencies",
+    "squared_frequencies",
+    "to_frequencies",
+]
 
 REFERENCE_SCALE_HU = 200.0
-"""Noise scale at which the conditioning variable is 0 (see :class:`recon.mbir.unrolled.NormalProblem`): about 1 s."""
+"""Noise scale (:class:`recon.mbir.unrolled.NormalisedProblem`) at which the conditioning variable is 0: about 1 s."""
 
 
 @dataclass(frozen=True)
@@ -66,10 +72,6 @@ class PriorConfig:
         if not self.thresholds or min(self.thresholds) <= 0:
             raise ValueError(f"thresholds must be positive, got {self.thresholds}")
 
-    def as_dict(self) -> dict[str, Any]:
-        """JSON values."""
-        return asdict(self)
-
 
 class LearnedPrior(nn.Module):
     """R(u) and ∇R(u) of volumes ``(batch, z, y, x)`` in noise units.
@@ -96,11 +98,6 @@ class LearnedPrior(nn.Module):
             mixtures[n, n % groups, 1, 1, 1] = 0.0
         self.mixtures = nn.ParameterList(nn.Parameter(mixtures.clone()) for _ in range(c.levels))
         self._squares = tuple(t * t for t in c.thresholds)
-
-    @property
-    def parameters_count(self) -> int:
-        """Number of trained values."""
-        return sum(p.numel() for p in self.parameters())
 
     def _kernels(self, level: int) -> Tensor:
         """Zero-mean filters of unit norm ``(filters, 8, 3, 3, 3)``: a constant costs nothing."""
@@ -132,7 +129,7 @@ class LearnedPrior(nn.Module):
         return first.reshape(-1, 1, 1, 1) * f2 + second.reshape(-1, 1, 1, 1) * f2 * f2
 
     def along_strength(self, scale_hu: Tensor) -> Tensor:
-        """Strength of the smoothing along vessels (:class:`recon.mbir.along_vessel.Steering`), ``(batch,)``."""
+        """Strength of the smoothing along vessels (:class:`recon.mbir.along_vessel.VesselSmoothing`), ``(batch,)``."""
         level = torch.log(scale_hu / REFERENCE_SCALE_HU).clamp(-3.0, 3.0)
         return torch.exp(self.along[0] + self.along[1] * level)
 
@@ -211,15 +208,30 @@ class LearnedPrior(nn.Module):
         return F.pad(u, (0, extra[2], 0, extra[1], 0, extra[0]))
 
 
-def squared_frequencies(shape: tuple[int, ...], voxel_mm: float) -> Tensor:
-    """f² in (line pairs per mm)² on the frequencies of ``rfftn`` of ``(z, y, x)`` volumes, float32."""
+def squared_frequencies(shape: tuple[int, ...], voxel_mm: float, along: float = 1.0) -> Tensor:
+    """f_xy² + ``along`` · f_z² in (line pairs per mm)² on the frequencies of ``rfftn`` of ``(z, y, x)`` volumes."""
     z, y, x = shape
     total: Tensor = (
-        torch.fft.fftfreq(z, voxel_mm)[:, None, None] ** 2
+        along * torch.fft.fftfreq(z, voxel_mm)[:, None, None] ** 2
         + torch.fft.fftfreq(y, voxel_mm)[:, None] ** 2
         + torch.fft.rfftfreq(x, voxel_mm) ** 2
     )
     return total
+
+
+def to_frequencies(v: Tensor) -> Tensor:
+    """``rfftn`` of volumes ``(..., z, y, x)``."""
+    return torch.fft.rfftn(v, dim=(-3, -2, -1))
+
+
+def from_frequencies(spectrum: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """Volumes ``(..., *shape)`` of :func:`to_frequencies`."""
+    return torch.fft.irfftn(spectrum, s=shape, dim=(-3, -2, -1))
+
+
+def filtered(v: Tensor, spectrum: Tensor) -> Tensor:
+    """Volumes ``(..., z, y, x)`` times ``spectrum`` on the frequencies of ``rfftn``."""
+    return from_frequencies(spectrum * to_frequencies(v), v.shape[-3:])
 
 
 def to_blocks(u: Tensor) -> Tensor:

@@ -8,10 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recon.fbp.channels import static_fbp
+from recon.fbp.inset import static_fbp
 from recon.gram.gram import Gram
-from recon.pwls.joint import Whitening, joint_pwls, mean_weights
+from recon.pwls.joint import joint_pwls, mean_weights
 from recon.pwls.qggmrf import QGGMRF
+from recon.pwls.whitening import Whitening
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import VolumeGrid
 from torchpcct.projector import Projector
@@ -99,7 +100,7 @@ class BasisProblem:
         if not (np.isfinite(dose) and dose > 0):
             raise ValueError(f"dose must be greater than 0, relative to the model's exposure, got {dose}")
         result = joint_pwls(
-            self.data(lines, window), self.information * dose, self.projector, prior or DEFAULT_JOINT_PRIOR,
+            self.projector, self.data(lines, window), self.information * dose, prior or DEFAULT_JOINT_PRIOR,
             gram=self.gram.scaled(dose), **options,
         )  # fmt: skip
         images = self.whitening.undo(result.x) + self.level.to(lines.dtype).reshape(2, 1, 1, 1)

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recon.fbp.inset import InsetFbp, to_hu
+from recon.fbp.inset import require_inside, static_fbp
 from recon.gram.gram import Gram
 from recon.pwls.pwls import pwls
 from recon.pwls.qggmrf import QGGMRF
@@ -20,7 +20,7 @@ from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import VolumeGrid
 from torchpcct.projector import Projector
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
-from torchpcct.volume import Volume
+from torchpcct.volume import Volume, to_hu
 
 __all__ = ["DEFAULT_PRIOR", "InsetProblem", "Statistic", "reconstruct_pwls"]
 
@@ -54,10 +54,9 @@ class InsetProblem:
         nodes: of the Gram operator. Linear in position (5) is enough for solvers: what the model lacks, the exact
             pairs repair, and each step costs half of that with 9.
         motion: displacement of the inset in every view, ``(views, 3)`` z, y, x mm
-        (:func:`recon.fbp.inset.view_motion`);
-            None: at rest. The background stands still; it is taken off before, so that only what moves is projected.
-            The Gram is that of a grid at rest with the weights that the moving one meets; exact pairs use the moving
-            projector.
+            (:func:`recon.fbp.inset.view_motion`); None: at rest. The background stands still; it is taken off before,
+            so that only what moves is projected. The Gram is that of a grid at rest with the weights that the moving
+            one meets; exact pairs use the moving projector.
 
     The weights are the inverse variances of the line integrals expected from the BACKGROUND: weights from the noisy
     readings themselves would bias the result, and a small inset changes the counts behind it by a few per cent only.
@@ -74,14 +73,11 @@ class InsetProblem:
         if scan.surround is None or scan.window is None:
             raise ValueError("PWLS of an inset needs a scan with a known surround: acquire it with region=")
         self.grid, self.geometry, self.outer = grid, scan.geometry, scan.window
-        fbp = InsetFbp(scan, [grid], ["standard"])
+        require_inside(shadow(scan.geometry, grid, margin=1), scan.window)
         self.mu_ref = scan.linearisation.mu_ref
         self.background = scan.surround_line_integrals()
         # The background's own value inside the inset, from the same data by FBP.
-        assert fbp.surround is not None
-        from recon.fbp.backproject import backproject
-
-        self.level = float(backproject(fbp.surround[0], scan.geometry, grid, fbp.shadow).mean())
+        self.level = float(static_fbp(self.background, scan.geometry, grid).mean())
         polychromatic = scan.air.log() - scan.surround.log()
         slope = scan.linearisation.slope(polychromatic)
         exposure = scan.exposure_s or NOISE_FREE_EXPOSURE_S
@@ -145,7 +141,7 @@ class InsetProblem:
         """PWLS of several realisations of one exposure: ``(scans, z, y, x)`` HU, and the solver's report."""
         exposure = self.exposure(scans)
         result = pwls(
-            torch.stack([self.data(s) for s in scans]), self._weights * exposure, self.projector, prior,
+            self.projector, torch.stack([self.data(s) for s in scans]), self._weights * exposure, prior,
             hu=self.mu_ref / 1000.0, gram=self.gram.scaled(exposure), **options,
         )  # fmt: skip
         return to_hu(result.x + self.level, self.mu_ref), dict(result.report)

@@ -4,12 +4,12 @@
 
 The line integrals of two basis materials, decomposed ray by ray, are strongly anticorrelated: reconstructing each by
 itself throws away what one says about the other. F is the information matrix of the decomposition
-(:class:`torchpcct.spectral.Decomposition`), R the vectorial q-GGMRF (:mod:`recon.pwls.joint_prior`).
+(:class:`torchpcct.spectral.Decomposition`), R the q-GGMRF of both channels (:mod:`recon.pwls.qggmrf`).
 
 The channels are mixed first so that the mean of F over the rays is a multiple of the identity
-(:class:`Whitening`). In these coordinates noise is isotropic, which is what R needs, and AᵀFA is nearly the same scalar
-operator in each channel: one FFT model (:class:`recon.gram.gram.Gram`) with the weights ½ tr F serves as the
-preconditioner of all. What it leaves out (F's change from ray to ray) the exact projections repair, as in
+(:mod:`recon.pwls.whitening`). In these coordinates noise is isotropic, which is what R needs, and AᵀFA is nearly the
+same scalar operator in each channel: one FFT model (:class:`recon.gram.gram.Gram`) with the weights ½ tr F serves as
+the preconditioner of all. What it leaves out (F's change from ray to ray) the exact projections repair, as in
 :mod:`recon.pwls.pwls`, whose iteration this is.
 """
 
@@ -17,101 +17,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from recon.gram.gram import Gram
-from recon.pwls.joint_prior import JointPrior
-from recon.pwls.pwls import PwlsResult, solve_normal
-from recon.pwls.qggmrf import QGGMRF
+from recon.pwls.pwls import PwlsResult, solve_normal, weighted_data
+from recon.pwls.qggmrf import QGGMRF, BoundPrior
 
-__all__ = ["Whitening", "joint_pwls"]
-
-Floats = NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class Whitening:
-    """Mixes two channels into two of equal, uncorrelated noise.
-
-    Attributes:
-        forward: ``(2, 2)``: whitened = forward @ channels. Its first row is the gain that was asked for.
-        backward: ``(2, 2)``, the inverse.
-    """
-
-    forward: Floats
-    backward: Floats
-
-    @classmethod
-    def of(cls, information: ArrayLike, gain: ArrayLike) -> Whitening:
-        """From the mean information of the channels.
-
-        Args:
-            information: ``(3,)`` F₁₁, F₁₂, F₂₂, positive definite.
-            gain: ``(2,)`` combination of the channels that becomes the first whitened channel and sets the unit of
-                both: e.g. HU per basis coefficient at one energy (:func:`torchpcct.spectral.vmi_weights`).
-
-        Raises:
-            ValueError: information that is not positive definite, a gain of 0, wrong shapes.
-        """
-        f, g = np.asarray(information, np.float64), np.asarray(gain, np.float64)
-        if f.shape != (3,) or g.shape != (2,) or not (np.isfinite(f).all() and np.isfinite(g).all()):
-            raise ValueError(f"information must hold 3, gain 2 finite numbers, got {information!r} and {gain!r}")
-        if not (f[0] > 0 and f[2] > 0 and f[0] * f[2] > f[1] ** 2):
-            raise ValueError(f"information must be positive definite, packed as F11, F12, F22, got {f}")
-        if not g.any():
-            raise ValueError("gain must not be 0")
-        covariance = np.linalg.inv([[f[0], f[1]], [f[1], f[2]]])
-        toward = covariance @ g
-        other = np.array([-toward[1], toward[0]])  # uncorrelated with the first
-        other *= np.sqrt((g @ toward) / (other @ covariance @ other))
-        forward = np.stack([g, other])
-        return cls(forward, np.linalg.inv(forward))
-
-    def apply(self, channels: Tensor) -> Tensor:
-        """Whitened channels, ``(..., 2, *shape)`` with 3 trailing axes."""
-        return _mix(self.forward, channels)
-
-    def undo(self, whitened: Tensor) -> Tensor:
-        """The channels, ``(..., 2, *shape)`` with 3 trailing axes."""
-        return _mix(self.backward, whitened)
-
-    def information(self, packed: Tensor) -> Tensor:
-        """Information ``(3, ...)`` of the channels → of the whitened channels."""
-        (a, b), (c, d) = self.backward
-        f11, f12, f22 = packed
-        return torch.stack([
-            a * a * f11 + 2 * a * c * f12 + c * c * f22,
-            a * b * f11 + (a * d + b * c) * f12 + c * d * f22,
-            b * b * f11 + 2 * b * d * f12 + d * d * f22,
-        ])  # fmt: skip
-
-
-def _mix(matrix: Floats, x: Tensor) -> Tensor:
-    if x.ndim < 4 or x.shape[-4] != 2:
-        raise ValueError(f"expected two channels (..., 2, n, n, n), got the shape {tuple(x.shape)}")
-    first, second = x.unbind(-4)
-    (a, b), (c, d) = matrix.tolist()
-    return torch.stack([a * first + b * second, c * first + d * second], dim=-4)
-
-
-class _ChannelGram:
-    """One scalar FFT model for every channel, as :func:`recon.pwls.pwls.solve_normal` takes it."""
-
-    def __init__(self, gram: Gram, channels: int) -> None:
-        self.gram, self.channels = gram, channels
-
-    def apply(self, x: Tensor) -> Tensor:
-        return self.gram.apply(x)
-
-    def periodic_spectrum(self) -> Tensor:
-        one = self.gram.periodic_spectrum()
-        return one.expand(self.channels, *one.shape)
+__all__ = ["joint_pwls", "mean_weights"]
 
 
 def weigh(information: Tensor, y: Tensor, axes: int) -> Tensor:
@@ -140,10 +55,10 @@ def check_information(information: Any, shape: tuple[int, ...]) -> None:
 
 
 def joint_pwls(
+    A: Any,
     y: Tensor,
     information: Tensor,
-    A: Any,
-    prior: QGGMRF | JointPrior,
+    prior: QGGMRF | BoundPrior,
     *,
     hu: float = 1.0,
     gram: Gram | None = None,
@@ -154,11 +69,12 @@ def joint_pwls(
     """Minimise ½ Σ (y − A x)ᵀ F (y − A x) + R(x) over two channels.
 
     Args:
+        A: the exact operator (:class:`torchpcct.projector.Projector`).
         y: whitened line integrals with the background taken off, ``(..., 2, *A.range_shape)`` float32 or float64; rays
             of information 0 may hold anything. Leading dimensions are independent realisations.
         information: F of the whitened channels, ``(3, *A.range_shape)`` (F₁₁, F₁₂, F₂₂), from smooth expected counts.
-            It should be near a multiple of the identity (:class:`Whitening`): that is for speed alone.
-        A: the exact operator (:class:`torchpcct.projector.Projector`).
+            It should be near a multiple of the identity (:class:`recon.pwls.whitening.Whitening`): that is for speed
+            alone.
         prior: in noise-normalised units, or bound already.
         hu: the value of the channels that counts as 1 HU.
         gram: FFT model of Aᵀ diag(½ tr F) A, kept from an earlier call; None: made here.
@@ -178,32 +94,19 @@ def joint_pwls(
     started = time.perf_counter()
     n = len(A.range_shape)
     check_information(information, tuple(A.range_shape))
-    if not isinstance(y, Tensor) or y.dtype not in (torch.float32, torch.float64):
-        raise TypeError(f"y must be a float32 or float64 tensor, got {getattr(y, 'dtype', type(y).__name__)}")
-    if tuple(y.shape[-n - 1 :]) != (2, *A.range_shape):
-        raise ValueError(f"y must have the shape (..., 2, {', '.join(map(str, A.range_shape))}), got {tuple(y.shape)}")
-    f = information.to(y.dtype)
-    known = f[0] + f[2] > 0
-    weighted = weigh(f, torch.where(known, y, torch.zeros((), dtype=y.dtype)), n)
-    if not torch.isfinite(weighted).all():
-        raise ValueError("y holds NaN or Inf on rays that carry information: give these rays the information 0")
-    model = gram if gram is not None else Gram(A, mean_weights(information))
-    spacing = A.grid.spacing
-    if isinstance(prior, QGGMRF):
-        bound, strength = JointPrior.bind(prior, model.information(hu), spacing, hu), prior.strength
-    else:
-        bound, strength = prior, None
+    known = information[0] + information[2] > 0
+    weighted = weighted_data(y, (2, *A.range_shape), known, lambda v: weigh(information.to(v.dtype), v, n))
+    f = information.to(weighted.dtype)
 
     def exact(x: Tensor) -> Tensor:
         out: Tensor = A.T(weigh(f, A(x), n))
         return out
 
     result = solve_normal(
-        A.T(weighted), exact, _ChannelGram(model, 2), bound, hu=hu, spacing=(1.0, *spacing), tolerance=tolerance,
-        max_exact=max_exact, callback=callback,
+        A.T(weighted), exact, gram if gram is not None else Gram(A, mean_weights(information)), prior, hu=hu,
+        spacing=A.grid.spacing, channels=True, tolerance=tolerance, max_exact=max_exact, callback=callback,
     )  # fmt: skip
-    report = {**result.report, "method": "joint-pwls", "strength": strength}
-    return PwlsResult(result.x, {**report, "seconds": time.perf_counter() - started})
+    return PwlsResult(result.x, {**result.report, "method": "joint-pwls", "seconds": time.perf_counter() - started})
 
 
 def mean_weights(information: Tensor) -> Tensor:

@@ -7,17 +7,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from recon.conjugate_gradient import dot, per_volume
 from recon.pwls.qggmrf import BoundPrior
 
-__all__ = ["ModelSolver", "dot"]
+__all__ = ["ModelSolver", "line_search"]
 
 # Steps below this many units of rounding of the first one are noise.
 ROUNDING = 30.0
-
-
-def dot(a: Tensor, b: Tensor, axes: int) -> Tensor:
-    """Inner products over the last ``axes`` axes, accumulated in float64."""
-    return (a * b).sum(dim=tuple(range(-axes, 0)), dtype=torch.float64)
 
 
 class ModelSolver:
@@ -26,37 +22,26 @@ class ModelSolver:
     Args:
         gram: ``apply(x)`` and ``periodic_spectrum()``.
         prior: R.
-        shape: of one volume.
-        dtype, device: of the volumes.
+        x: volumes ``(batch, *shape)``; only their shape, dtype and device matter.
         reduction: stop when the preconditioned gradient norm has fallen by this factor.
         most: largest number of iterations.
     """
 
-    def __init__(
-        self,
-        gram: Any,
-        prior: BoundPrior,
-        shape: tuple[int, ...] | torch.Size,
-        dtype: torch.dtype,
-        device: torch.device,
-        reduction: float = 3e-3,
-        most: int = 60,
-    ) -> None:
+    def __init__(self, gram: Any, prior: BoundPrior, x: Tensor, reduction: float = 3e-3, most: int = 60) -> None:
         self.gram, self.prior, self.reduction, self.most = gram, prior, reduction, most
         self._floor: Tensor | None = None
-        self.shape = tuple(shape)
-        self._data = gram.periodic_spectrum().to(device=device, dtype=dtype)
-        self._prior = prior.spectrum(self.shape).to(device=device, dtype=dtype)
+        self._grid = x.shape[-len(prior.spacing) :]
+        self._data = gram.periodic_spectrum().to(x)
+        self._prior = prior.spectrum(self._grid).to(x)
 
     def _precondition(self, q: Tensor, share: float) -> Tensor:
-        axes = tuple(range(-len(self.shape), 0))
+        axes = tuple(range(-len(self._grid), 0))
         spectrum = torch.fft.rfftn(q, dim=axes) / (self._data + share * self._prior)
-        return torch.fft.irfftn(spectrum, s=self.shape, dim=axes)
+        return torch.fft.irfftn(spectrum, s=self._grid, dim=axes)
 
     def step(self, x: Tensor, data_gradient: Tensor) -> tuple[Tensor, int]:
         """The minimising d, ``(batch, *shape)``, and the number of iterations (applications of G)."""
-        prior, axes = self.prior, len(self.shape)
-        one = [1] * axes
+        prior, axes = self.prior, self.prior.axes
         d = torch.zeros_like(x)
         model = data_gradient
         q = model + prior.gradient(x)
@@ -74,16 +59,7 @@ class ModelSolver:
         while count < self.most:
             curved = self.gram.apply(s)
             count += 1
-            slope, bend = dot(model, s, axes), dot(s, curved, axes)
-            alpha = torch.zeros_like(slope)
-            for _ in range(2):  # majorise and minimise along s
-                there = at + alpha.to(x.dtype).reshape(-1, *one) * s
-                pull, stiffness = prior.along(there, s, s)
-                total = bend + stiffness
-                # A slightly indefinite model must not reverse the step.
-                move = (slope + alpha * bend + pull) / total.clamp_min(1e-300)
-                alpha = torch.where(total > 0, alpha - move, alpha)
-            a = alpha.to(x.dtype).reshape(-1, *one)
+            a = per_volume(line_search(prior, at, s, curved, model, start=0.0, most=2), x)
             d = d + a * s
             model = model + a * curved
             at = x + d
@@ -95,7 +71,7 @@ class ModelSolver:
                 break
             beta = (new - dot(old, z, axes)) / qz.clamp_min(torch.finfo(torch.float64).tiny)
             qz = new
-            s = -z + beta.clamp_min(0).to(x.dtype).reshape(-1, *one) * s
+            s = -z + per_volume(beta.clamp_min(0), x) * s
         return d, count
 
     def _mean_share(self, x: Tensor) -> float:
@@ -106,3 +82,31 @@ class ModelSolver:
         ratio = [float(prior.curvature(t).mean()) for t in prior.gradients(x[:1]) if t.numel()]
         top = float(prior.curvature(torch.zeros(1, dtype=x.dtype, device=x.device)))
         return max(sum(ratio) / max(len(ratio), 1) / top, 1e-3)
+
+
+def line_search(
+    prior: BoundPrior, x: Tensor, step: Tensor, curved: Tensor, data_gradient: Tensor, *, start: float, most: int,
+    tolerance: float = 0.0,
+) -> Tensor:  # fmt: skip
+    """α of the minimum of α gᵀs + ½ α² sᵀH s + R(x + α s) for each volume, ``(batch,)`` float64: majorise, minimise.
+
+    Args:
+        prior: R.
+        x, step: x and s, ``(batch, *shape)``.
+        curved: H s.
+        data_gradient: g, the gradient of the data term at x.
+        start: first α.
+        most: largest number of iterations.
+        tolerance: stop when no α changes by more.
+    """
+    slope, bend = dot(data_gradient, step, prior.axes), dot(step, curved, prior.axes)
+    alpha = torch.full_like(slope, start)
+    for _ in range(most):
+        pull, stiffness = prior.along(x + per_volume(alpha, x) * step, step, step)
+        total = bend + stiffness
+        # A slightly indefinite model must not reverse the step.
+        move = torch.where(total > 0, (slope + alpha * bend + pull) / total.clamp_min(1e-300), torch.zeros_like(total))
+        alpha = alpha - move
+        if tolerance and float(move.abs().max()) < tolerance:
+            break
+    return alpha

@@ -19,11 +19,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from recon.conjugate_gradient import dot, per_volume
 from recon.gram.gram import Gram, check_weights
-from recon.pwls.model_solver import ModelSolver, dot
+from recon.pwls.model_solver import ModelSolver, line_search
 from recon.pwls.qggmrf import QGGMRF, BoundPrior
 
-__all__ = ["PwlsResult", "pwls", "solve_normal"]
+__all__ = ["PwlsResult", "pwls", "solve_normal", "weighted_data"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -47,9 +48,9 @@ class PwlsResult:
 
 
 def pwls(
+    A: Any,
     y: Tensor,
     weights: Tensor,
-    A: Any,
     prior: QGGMRF | BoundPrior,
     *,
     hu: float,
@@ -62,11 +63,11 @@ def pwls(
     """Minimise ½‖y − A x‖²_W + R(x).
 
     Args:
+        A: the exact operator (:class:`torchpcct.projector.Projector`).
         y: line integrals with the background taken off, ``(..., *A.range_shape)`` float32 or float64; readings of
             weight 0 may hold anything. Leading dimensions are independent noise realisations.
         weights: W, ``A.range_shape``: expected inverse variances of y (from smooth expected counts: weights taken
             from the noisy counts themselves bias the result).
-        A: the exact operator (:class:`torchpcct.projector.Projector`).
         prior: a prior in noise-normalised units, or one that is bound already.
         hu: 1 HU in mm⁻¹ (μ_ref / 1000).
         gram: model of AᵀWA with these weights (:class:`recon.gram.gram.Gram`, kept from an earlier call); default: made
@@ -89,15 +90,8 @@ def pwls(
     """
     started = time.perf_counter()
     check_weights(weights, A.range_shape)
-    n = len(A.range_shape)
-    if not isinstance(y, Tensor) or y.dtype not in (torch.float32, torch.float64):
-        raise TypeError(f"y must be a float32 or float64 tensor, got {getattr(y, 'dtype', type(y).__name__)}")
-    if tuple(y.shape[-n:]) != tuple(A.range_shape):
-        raise ValueError(f"y must have shape (..., {', '.join(map(str, A.range_shape))}), got {tuple(y.shape)}")
-    w = weights.to(y.dtype)
-    weighted = torch.where(w > 0, w * y, torch.zeros((), dtype=y.dtype, device=y.device))
-    if not torch.isfinite(weighted).all():
-        raise ValueError("y holds NaN or Inf in readings of positive weight: give these readings the weight 0")
+    weighted = weighted_data(y, tuple(A.range_shape), weights > 0, lambda v: weights.to(v.dtype) * v)
+    w = weights.to(weighted.dtype)
     model = Gram(A, weights) if gram is None else gram
 
     def exact(x: Tensor) -> Tensor:
@@ -111,6 +105,23 @@ def pwls(
     return PwlsResult(result.x, {**result.report, "seconds": time.perf_counter() - started})
 
 
+def weighted_data(y: Any, shape: tuple[int, ...], known: Tensor, weigh: Callable[[Tensor], Tensor]) -> Tensor:
+    """W y of data ``(..., *shape)``, where readings that are not ``known`` count as 0 and may hold anything.
+
+    Raises:
+        TypeError: no float tensor.
+        ValueError: another shape, or readings of positive weight that are not finite.
+    """
+    if not isinstance(y, Tensor) or y.dtype not in (torch.float32, torch.float64):
+        raise TypeError(f"y must be a float32 or float64 tensor, got {getattr(y, 'dtype', type(y).__name__)}")
+    if tuple(y.shape[-len(shape) :]) != shape:
+        raise ValueError(f"y must have shape (..., {', '.join(map(str, shape))}), got {tuple(y.shape)}")
+    weighted = weigh(torch.where(known, y, torch.zeros((), dtype=y.dtype, device=y.device)))
+    if not torch.isfinite(weighted).all():
+        raise ValueError("y holds NaN or Inf in readings of positive weight: give these readings the weight 0")
+    return weighted
+
+
 def solve_normal(
     b: Tensor,
     exact: Callable[[Tensor], Tensor],
@@ -119,6 +130,7 @@ def solve_normal(
     *,
     hu: float,
     spacing: tuple[float, ...],
+    channels: bool = False,
     start: Tensor | None = None,
     tolerance: float = 0.2,
     max_exact: int = 12,
@@ -127,14 +139,15 @@ def solve_normal(
     """The same from the sufficient statistic b = AᵀW y: minimise ½ xᵀHx − bᵀx + R(x).
 
     Args:
-        b: ``(..., *grid.shape)``.
+        b: ``(..., [channels,] *grid.shape)``.
         exact: x ↦ H x = AᵀWA x; ``gram.apply`` itself solves the model's problem.
         gram: the model of H: ``apply(x)``, ``periodic_spectrum()`` and, for a :class:`QGGMRF`, ``information(hu)``.
         spacing: voxel size per axis in mm.
+        channels: whether the volumes have an axis of channels, which the prior joins and ``gram`` treats alike.
         prior, hu, start, tolerance, max_exact, callback: see :func:`pwls`.
     """
     started = time.perf_counter()
-    axes = len(spacing)
+    axes = len(spacing) + channels
     shape = b.shape[-axes:]
     if not tolerance > 0:
         raise ValueError(f"tolerance must be greater than 0 HU, got {tolerance}")
@@ -142,10 +155,10 @@ def solve_normal(
         raise ValueError(f"max_exact must be at least 1, got {max_exact}")
     if start is not None and tuple(start.shape[-axes:]) != tuple(shape):
         raise ValueError(f"start must have shape (..., {', '.join(map(str, shape))}), got {tuple(start.shape)}")
-    bound = prior.bind(gram.information(hu), spacing, hu) if isinstance(prior, QGGMRF) else prior
+    bound = prior.bind(gram.information(hu), spacing, hu, channels) if isinstance(prior, QGGMRF) else prior
     lead = b.shape[:-axes]
     b = b.reshape(-1, *shape)
-    solver = ModelSolver(gram, bound, shape, b.dtype, b.device)
+    solver = ModelSolver(gram, bound, b)
     reference = dot(b, b, axes).sqrt().clamp_min(torch.finfo(b.dtype).tiny)
 
     pairs = 0
@@ -179,7 +192,8 @@ def solve_normal(
         pairs += 1
         if previous is not None:
             step, curved = _conjugate(x, step, curved, previous, bound)
-        alpha = _line_search(x, step, curved, data_gradient, bound)
+        # From the model's own α = 1.
+        alpha = per_volume(line_search(bound, x, step, curved, data_gradient, start=1.0, most=4, tolerance=1e-3), x)
         x = x + alpha * step
         data_gradient = data_gradient + alpha * curved
         previous = (step, curved)
@@ -210,29 +224,10 @@ def _conjugate(
     x: Tensor, step: Tensor, curved: Tensor, previous: tuple[Tensor, Tensor], bound: BoundPrior
 ) -> tuple[Tensor, Tensor]:
     """Make ``step`` conjugate to the previous one under the exact Hessian; costs no projection."""
-    axes = len(bound.spacing)
     old, old_curved = previous
     _, old_prior = bound.along(x, old, old)
     _, mixed_prior = bound.along(x, step, old)
-    down = dot(old, old_curved, axes) + old_prior
-    beta = -(dot(step, old_curved, axes) + mixed_prior) / down.clamp_min(torch.finfo(torch.float64).tiny)
-    beta = torch.where(down > 0, beta, torch.zeros_like(beta)).to(step.dtype)
-    beta = beta.reshape(-1, *[1] * axes)
+    down = dot(old, old_curved, bound.axes) + old_prior
+    beta = -(dot(step, old_curved, bound.axes) + mixed_prior) / down.clamp_min(torch.finfo(torch.float64).tiny)
+    beta = per_volume(torch.where(down > 0, beta, torch.zeros_like(beta)), step)
     return step + beta * old, curved + beta * old_curved
-
-
-def _line_search(x: Tensor, step: Tensor, curved: Tensor, data_gradient: Tensor, bound: BoundPrior) -> Tensor:
-    """α of the minimum of Φ along ``step``: majorise and minimise from the model's own α = 1. ``(batch, 1, …)``."""
-    axes = len(bound.spacing)
-    slope, bend = dot(data_gradient, step, axes), dot(step, curved, axes)
-    alpha = torch.ones_like(slope)
-    for _ in range(4):
-        at = x + alpha.to(x.dtype).reshape(-1, *[1] * axes) * step
-        pull, stiffness = bound.along(at, step, step)
-        total = bend + stiffness
-        move = (slope + alpha * bend + pull) / total.clamp_min(1e-300)
-        move = torch.where(total > 0, move, torch.zeros_like(move))
-        alpha = alpha - move
-        if float(move.abs().max()) < 1e-3:
-            break
-    return alpha.to(x.dtype).reshape(-1, *[1] * axes)

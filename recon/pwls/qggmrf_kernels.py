@@ -3,24 +3,33 @@
 The curvature formula is that of ``BoundPrior.curvature``, to which the tests compare these kernels. Rows of voxels are
 independent of each other in every pass, so results do not depend on the number of threads. Inner loops run over slices
 with unsigned indices and without branches (one loop for each kind of potential), so that they vectorise.
+
+Several channels have passes of their own, with the same formula: the curvature of the length of the channels'
+difference is written to a buffer first and serves them all. In one pass for any number of channels a single one took
+5 to 14 % longer.
 """
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numba import njit, prange
 
-__all__ = ["along", "majorize"]
+__all__ = ["along", "along_channels", "majorize", "majorize_channels"]
 
 _FLAGS = {"contract", "reassoc", "arcp", "nsz"}
 
 
 @njit(inline="always")
-def _general(t: Any, form: Any) -> Any:
-    """ρ'(t) / t for any 1 ≤ q ≤ p ≤ 2."""
-    r = abs(t) * form[0]
+def _simple(r, factor, form):
+    """factor · ρ'(t) / t at r = |t| / T for p = 2 and q = 1."""
+    one = form[0] / form[0]
+    d = one + r
+    return factor * (one + form[2] * r) / (d * d)
+
+
+@njit(inline="always")
+def _general(r, form):
+    """ρ'(t) / t at r = |t| / T for any 1 ≤ q ≤ p ≤ 2."""
     one = form[0] / form[0]
     if form[3] != 0:
         r = np.sqrt(r * r + form[4] * form[4])
@@ -34,22 +43,19 @@ def _general(t: Any, form: Any) -> Any:
 def _add_pull(x0, x1, v0, v1, scale, factor, kind, form, to):
     """to += factor · ρ'(t)/t · (v0 − v1), t = scale · (x0 − x1)."""
     n = x0.size
-    one = form[0] / form[0]
     if kind == 0:
         for j in range(n):
             i = np.uint64(j)
             to[i] += factor * (v0[i] - v1[i])
     elif kind == 1:
-        reach, ratio = scale * form[0], form[2]
+        reach = scale * form[0]
         for j in range(n):
             i = np.uint64(j)
-            r = abs(x0[i] - x1[i]) * reach
-            d = one + r
-            to[i] += factor * (one + ratio * r) / (d * d) * (v0[i] - v1[i])
+            to[i] += _simple(abs(x0[i] - x1[i]) * reach, factor, form) * (v0[i] - v1[i])
     else:
         for j in range(n):
             i = np.uint64(j)
-            to[i] += factor * _general((x0[i] - x1[i]) * scale, form) * (v0[i] - v1[i])
+            to[i] += factor * _general(abs((x0[i] - x1[i]) * scale) * form[0], form) * (v0[i] - v1[i])
 
 
 @njit(inline="always")
@@ -64,27 +70,25 @@ def _two_sums(x0, x1, u0, u1, v0, v1, scale, kind, form):
             a += (x0[i] - x1[i]) * (v0[i] - v1[i])
             b += (u0[i] - u1[i]) * (v0[i] - v1[i])
     elif kind == 1:
-        reach, ratio = scale * form[0], form[2]
+        reach = scale * form[0]
         for j in range(n):
             i = np.uint64(j)
             t = x0[i] - x1[i]
-            r = abs(t) * reach
-            d = one + r
-            c = (one + ratio * r) / (d * d) * (v0[i] - v1[i])
+            c = _simple(abs(t) * reach, one, form) * (v0[i] - v1[i])
             a += c * t
             b += c * (u0[i] - u1[i])
     else:
         for j in range(n):
             i = np.uint64(j)
             t = x0[i] - x1[i]
-            c = _general(t * scale, form) * (v0[i] - v1[i])
+            c = _general(abs(t * scale) * form[0], form) * (v0[i] - v1[i])
             a += c * t
             b += c * (u0[i] - u1[i])
     return a, b
 
 
 @njit(parallel=True, cache=True, fastmath=_FLAGS, error_model="numpy")
-def majorize(x: Any, v: Any, steps: Any, scales: Any, factors: Any, kind: int, form: Any, out: Any) -> None:
+def majorize(x, v, steps, scales, factors, kind, form, out):
     """out = Σ_neighbours factor · ρ'(t)/t · (v_j − v_k), t = scale · (x_j − x_k).
 
     Args:
@@ -115,7 +119,7 @@ def majorize(x: Any, v: Any, steps: Any, scales: Any, factors: Any, kind: int, f
 
 
 @njit(parallel=True, cache=True, fastmath=_FLAGS, error_model="numpy")
-def along(x: Any, u: Any, v: Any, steps: Any, scales: Any, factors: Any, kind: int, form: Any, out: Any) -> None:
+def along(x, u, v, steps, scales, factors, kind, form, out):
     """Row sums of the two inner products ⟨v, M(x) x⟩ and ⟨v, M(x) u⟩, M the matrix of :func:`majorize`.
 
     Args:
@@ -142,5 +146,92 @@ def along(x: Any, u: Any, v: Any, steps: Any, scales: Any, factors: Any, kind: i
             )  # fmt: skip
             first += factors[k] * a
             second += factors[k] * b
+        out[n, z, y, 0] = first
+        out[n, z, y, 1] = second
+
+
+@njit(inline="always")
+def _curvatures(x0, x1, scale, factor, kind, form, out):
+    """out = factor · ρ'(t)/t for every voxel of a row, t = scale · |x0 − x1|; x0, x1 ``(channels, n)``."""
+    n = out.size
+    if kind == 0:
+        out[:] = factor
+        return
+    out[:] = 0
+    for c in range(x0.shape[0]):
+        a, b = x0[c], x1[c]
+        for j in range(n):
+            i = np.uint64(j)
+            d = a[i] - b[i]
+            out[i] += d * d
+    if kind == 1:
+        reach = scale * form[0]
+        for j in range(n):
+            i = np.uint64(j)
+            out[i] = _simple(np.sqrt(out[i]) * reach, factor, form)
+    else:
+        for j in range(n):
+            i = np.uint64(j)
+            out[i] = factor * _general(np.sqrt(out[i]) * scale * form[0], form)
+
+
+@njit(parallel=True, cache=True, fastmath=_FLAGS, error_model="numpy")
+def majorize_channels(x, v, steps, scales, factors, kind, form, out):
+    """:func:`majorize` for x, v and out ``(batch, channels, nz, ny, nx)``, with |x_j − x_k| over the channels in t."""
+    batch, channels, nz, ny, nx = x.shape
+    for row in prange(batch * nz * ny):
+        n = row // (nz * ny)
+        z = (row // ny) % nz
+        y = row % ny
+        work = np.empty(nx, x.dtype)
+        for c in range(channels):
+            out[n, c, z, y, :] = 0
+        for k in range(steps.shape[0]):
+            z1, y1, dx = z + steps[k, 0], y + steps[k, 1], steps[k, 2]
+            if z1 < 0 or z1 >= nz or y1 < 0 or y1 >= ny:
+                continue
+            low, high = max(0, -dx), nx - max(0, dx)
+            w = work[low:high]
+            _curvatures(
+                x[n, :, z, y, low:high], x[n, :, z1, y1, low + dx : high + dx], scales[k], factors[k], kind, form, w
+            )
+            for c in range(channels):
+                v0, v1, to = v[n, c, z, y, low:high], v[n, c, z1, y1, low + dx : high + dx], out[n, c, z, y, low:high]
+                for j in range(high - low):
+                    i = np.uint64(j)
+                    to[i] += w[i] * (v0[i] - v1[i])
+
+
+@njit(parallel=True, cache=True, fastmath=_FLAGS, error_model="numpy")
+def along_channels(x, u, v, steps, scales, factors, kind, form, out):
+    """:func:`along` for x, u and v ``(batch, channels, nz, ny, nx)``, M the matrix of :func:`majorize_channels`."""
+    batch, channels, nz, ny, nx = x.shape
+    for row in prange(batch * nz * ny):
+        n = row // (nz * ny)
+        z = (row // ny) % nz
+        y = row % ny
+        work = np.empty(nx, x.dtype)
+        first = second = 0.0
+        for k in range(steps.shape[0]):
+            z1, y1, dx = z + steps[k, 0], y + steps[k, 1], steps[k, 2]
+            if z1 < 0 or z1 >= nz or y1 < 0 or y1 >= ny:
+                continue
+            low, high = max(0, -dx), nx - max(0, dx)
+            w = work[low:high]
+            _curvatures(
+                x[n, :, z, y, low:high], x[n, :, z1, y1, low + dx : high + dx], scales[k], factors[k], kind, form, w
+            )
+            for c in range(channels):
+                x0, x1 = x[n, c, z, y, low:high], x[n, c, z1, y1, low + dx : high + dx]
+                u0, u1 = u[n, c, z, y, low:high], u[n, c, z1, y1, low + dx : high + dx]
+                v0, v1 = v[n, c, z, y, low:high], v[n, c, z1, y1, low + dx : high + dx]
+                a = b = form[0] - form[0]
+                for j in range(high - low):
+                    i = np.uint64(j)
+                    pull = w[i] * (v0[i] - v1[i])
+                    a += pull * (x0[i] - x1[i])
+                    b += pull * (u0[i] - u1[i])
+                first += a
+                second += b
         out[n, z, y, 0] = first
         out[n, z, y, 1] = second

@@ -51,15 +51,9 @@ class Problem:
         self.gram_seconds = time.perf_counter() - start
         self.prior = DEFAULT_PRIOR.bind(self.gram.information(self.hu), grid.spacing, self.hu)
         self.reference = pwls(
-            self.y.double(),
-            self.w.double(),
-            self.A,
-            self.prior,
-            hu=self.hu,
-            gram=self.gram,
-            tolerance=1e-3,
+            self.A, self.y.double(), self.w.double(), self.prior, hu=self.hu, gram=self.gram, tolerance=1e-3,
             max_exact=60,
-        ).x
+        ).x  # fmt: skip
 
     def rmsd(self, x: Tensor) -> float:
         """Root mean square distance to the minimum, HU."""
@@ -75,7 +69,7 @@ def ours(p: Problem) -> Iterator[tuple[float, float, float]]:
     """(pairs, seconds, HU) of PWLS stopped after more and more pairs."""
     for most in (1, 2, 3, 4, 6):
         start = time.perf_counter()
-        result = pwls(p.y, p.w, p.A, p.prior, hu=p.hu, gram=p.gram, tolerance=1e-6, max_exact=most)
+        result = pwls(p.A, p.y, p.w, p.prior, hu=p.hu, gram=p.gram, tolerance=1e-6, max_exact=most)
         yield result.report["exact_pairs"], time.perf_counter() - start, p.rmsd(result.x)
 
 

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.fbp.fbp import fbp
-from recon.fbp.inset import to_hu
 from recon.study.bowtie.settings import DETECTORS
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.geometry import VolumeGrid
@@ -27,6 +26,7 @@ from torchpcct.scene.materials import MATERIALS
 from torchpcct.scene.phantoms.quality import ctdi, water_cylinder
 from torchpcct.scene.phantoms.thorax import thorax
 from torchpcct.validate import choice
+from torchpcct.volume import to_hu
 
 __all__ = [
     "BOWTIES",

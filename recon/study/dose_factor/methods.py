@@ -15,15 +15,15 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from recon.fbp.inset import to_hu
+from recon.conjugate_gradient import conjugate_gradient
 from recon.mbir.mbir import ADD_BACK, Mbir
-from recon.mbir.prior import squared_frequencies
-from recon.mbir.unrolled import NormalProblem
+from recon.mbir.prior import filtered, squared_frequencies
+from recon.mbir.unrolled import NormalisedProblem
 from recon.pwls.inset_problem import DEFAULT_PRIOR, InsetProblem
-from recon.pwls.model_solver import dot
 from recon.pwls.pwls import solve_normal
 from recon.pwls.qggmrf import QGGMRF, quadratic
 from recon.study.dose_factor.settings import METHODS
+from torchpcct.volume import to_hu
 
 __all__ = ["LinearFilter", "Method", "Misstated", "Penalised", "fingerprint", "load_methods"]
 
@@ -64,7 +64,7 @@ class LinearFilter:
 
     Args:
         name: of the method.
-        lam: λ in noise units (:class:`recon.mbir.unrolled.NormalProblem`), where G is about 1 at 0.5 lp/mm at every
+        lam: λ in noise units (:class:`recon.mbir.unrolled.NormalisedProblem`), where G is about 1 at 0.5 lp/mm at every
         dose.
         mu: μ in noise units, per (lp/mm)².
         along: κ, 1 for an isotropic filter.
@@ -80,26 +80,13 @@ class LinearFilter:
     def __call__(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> Tensor:
         voxel = problem.grid.spacing[-1]
         exposure = torch.full((b.shape[0],), float(exposure_s), dtype=b.dtype)
-        normal = NormalProblem.from_statistic(problem.gram, b, exposure, problem.mu_ref / 1000.0, voxel)
-        shape, axes = b.shape[-3:], (-3, -2, -1)
-        f2 = squared_frequencies(shape, voxel).to(b)
-        fz2 = torch.fft.fftfreq(shape[0], voxel).to(b)[:, None, None] ** 2
-        prior = self.lam + self.mu * (f2 + (self.along - 1.0) * fz2)
-
-        def filtered(v: Tensor, spectrum: Tensor) -> Tensor:
-            return torch.fft.irfftn(torch.fft.rfftn(v, dim=axes) * spectrum, s=shape, dim=axes)
-
+        normal = NormalisedProblem.from_statistic(problem.gram, b, exposure, problem.mu_ref / 1000.0, voxel)
+        prior = self.lam + self.mu * squared_frequencies(b.shape[-3:], voxel, self.along).to(b)
         inverse = 1.0 / (normal.spectrum() + prior)
-        u, left = torch.zeros_like(b), normal.beta
-        step = z_left = filtered(left, inverse)
-        energy = dot(left, z_left, 3)
-        for _ in range(self.steps):
-            curved = normal.apply(step) + filtered(step, prior)
-            alpha = (energy / dot(step, curved, 3).clamp_min(1e-300)).to(b.dtype).reshape(-1, 1, 1, 1)
-            u, left = u + alpha * step, left - alpha * curved
-            z_left = filtered(left, inverse)
-            before, energy = energy, dot(left, z_left, 3)
-            step = z_left + (energy / before.clamp_min(1e-300)).to(b.dtype).reshape(-1, 1, 1, 1) * step
+        u = conjugate_gradient(
+            lambda v: normal.apply(v) + filtered(v, prior), normal.beta, lambda v: filtered(v, inverse),
+            iterations=self.steps,
+        )  # fmt: skip
         return to_hu(
             u * normal.scale_hu.reshape(-1, 1, 1, 1) * (problem.mu_ref / 1000.0) + problem.level, problem.mu_ref
         )

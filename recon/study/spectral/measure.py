@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from recon.fbp.exact_noise import functional_covariance
 from recon.pwls.basis_problem import DEFAULT_JOINT_PRIOR, BasisProblem
 from recon.study.spectral.scan import SpectralScan, second_order_bound, starved_rays, water_hu
 from recon.study.spectral.settings import Settings
@@ -83,7 +84,7 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     scan = SpectralScan(s, lambda fraction: progress("simulate", fraction))
     data: dict[str, Any] = {"plan": scan.clean.info["plan"]}
     done("simulate")
-    clean = scan.fbp(scan.exact.line_integrals)
+    clean = scan.fbp.images(scan.exact.line_integrals)[0][0]
     data["second_order_bound"] = second_order_bound(scan, LOW_EXPOSURE_S)
     data["starved"] = starved_rays(scan, s.starved_rays, s.seed)
     data["water"] = {k: v.tolist() for k, v in water_hu(VMI_ENERGIES_KEV, s.views).items()}
@@ -92,7 +93,7 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     for k in range(s.realizations):
         noisy, statistics = scan.noisy(s.exposure_s, s.seed + k)
         data["rays"].append(statistics)
-        volumes.append(scan.fbp(noisy))
+        volumes.append(scan.fbp.images(noisy)[0][0])
         lines += [noisy] if k < s.mbir_realizations else []
         progress("decompose noisy scans", (k + 1) / (s.realizations + 1))
     data["rays"].append(scan.noisy(LOW_EXPOSURE_S, s.seed, _LOW_EXPOSURE_STEP)[1])
@@ -133,7 +134,7 @@ def _vmi(scan: SpectralScan, images: Images) -> dict[str, Any]:
     most = int(background.weights.argmax())  # the voxel that the background ROI weighs most
     voxel.view(-1)[most] = 1.0
     functionals = torch.stack([voxel, foreground.weights, background.weights]).to(torch.float32)
-    exact = scan.fbp.covariance(functionals, scan.covariance(scan.settings.exposure_s))
+    exact = functional_covariance(scan.fbp, functionals, scan.covariance(scan.settings.exposure_s))
     # The noise of the inset is nearly stationary in the plane: all voxels of the ROI's slice, far from rounding errors.
     z = most // (scan.grid.shape[1] * scan.grid.shape[2])
     noise = (images.noisy - images.clean)[:, :, z].transpose(0, 1).reshape(2, -1).double()

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.fbp.channels import ChannelFbp, static_fbp
+from recon.fbp.inset import InsetFbp, static_fbp
 from recon.study.paper.plaque_scan import inset_grid
 from recon.study.spectral.settings import Settings
 from torchpcct.acquisition.acquire import acquire
@@ -99,9 +99,9 @@ class SpectralScan:
         return decompose_surround(self.clean, self.model(NOISE_FREE_EXPOSURE_S))
 
     @cached_property
-    def fbp(self) -> ChannelFbp:
+    def fbp(self) -> InsetFbp:
         """FBP of the two basis images."""
-        return ChannelFbp(self.clean.geometry, self.window, self.surround, self.grid, self.settings.kernel)
+        return InsetFbp(self.clean, [self.grid], [self.settings.kernel], surround=self.surround)
 
     def covariance(self, exposure_s: float) -> Tensor:
         """Cramér–Rao covariance ``(3, views, rows, columns)`` in mm² of every ray."""
@@ -207,11 +207,11 @@ def water_hu(energies: Any, views: int) -> dict[str, NDArray[np.float64]]:
     lines = decompose_surround(cylinder, model)
     rod = Body("rod", EllipticCylinder(_ROD_MM, position=(x, y, z)), "water", "patient")
     scene = Scene([Body("patient", patient, "pericoronary_fat"), rod])
-    scan, window = _acquired(scene, scanner, VolumeGrid((2, 40, 40), spacing, (z, y, x)))
-    fbp = ChannelFbp(scan.geometry, window, decompose_surround(scan, model), there)
+    scan = _acquired(scene, scanner, VolumeGrid((2, 40, 40), spacing, (z, y, x)))[0]
+    fbp = InsetFbp(scan, [there], ["standard"], surround=decompose_surround(scan, model))
     images = {
         "cylinder, centre": static_fbp(lines, cylinder.geometry, middle),
         "cylinder, plaque's place": static_fbp(lines, cylinder.geometry, there),
-        "rod in fat, plaque's place": fbp(decompose_scan(scan, model).line_integrals),
+        "rod in fat, plaque's place": fbp.images(decompose_scan(scan, model).line_integrals)[0][0],
     }
     return {k: vmi(v.double().mean((-1, -2, -3)), model.basis, energies).numpy() for k, v in images.items()}

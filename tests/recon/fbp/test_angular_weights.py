@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recon.fbp.angular_weights import angular_weights, arc, parker_share, view_steps
+from recon.fbp.angular_weights import angular_weights, parker_share, view_steps
 from torchpcct.geometry import FanBeam, ParallelBeam, full_turn
 
 FAN = dict(sod=570.0, sdd=1040.0, columns=81, pitch=8.0)
@@ -79,7 +79,7 @@ def test_weights_of_a_scan_cover_every_line_once(degrees, detector):
     assert w[:, 40].sum() == pytest.approx(math.pi, rel=1e-5)
     # columns at ±γ together see every line of that distance twice in 2π
     np.testing.assert_allclose(w.sum(axis=0) + w.sum(axis=0)[::-1], 2 * math.pi, rtol=1e-4)
-    start, covered = arc(geometry)
+    _, start, covered = view_steps(geometry.angles)
     assert start == pytest.approx(1.0, abs=1e-9)
     assert covered == pytest.approx(span, rel=1e-9)
 
@@ -88,7 +88,7 @@ def test_full_circle_shares_are_one_half():
     w = angular_weights(FanBeam(full_turn(90, 0.3), **FAN))
     assert w.shape == (90, 1)
     np.testing.assert_allclose(w, math.pi / 90, rtol=1e-12)
-    assert arc(FanBeam(full_turn(90, 0.3), **FAN))[1] == 2 * math.pi
+    assert view_steps(full_turn(90, 0.3))[2] == 2 * math.pi
 
 
 @settings(max_examples=60, deadline=None)

@@ -12,7 +12,7 @@ from recon.fbp import filter_plan
 from recon.fbp.angular_weights import angular_weights
 from recon.fbp.backproject import BackprojectionPlan, backproject
 from recon.fbp.fbp import fbp, filter_sinogram, filter_windowed
-from recon.fbp.filter_plan import FilterPlan, full_window
+from recon.fbp.filter_plan import FilterPlan
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid, full_turn
 
@@ -118,7 +118,7 @@ def test_backprojector_in_float32(case):
 
 def test_transposes_are_exact(case):
     geometry, grid = case
-    plan = BackprojectionPlan(geometry, grid, full_window(geometry))
+    plan = BackprojectionPlan(geometry, grid, DetectorWindow.full(geometry))
     forward = dense(plan.forward, geometry.shape)
     transpose = dense(plan.transpose, grid.shape)
     torch.testing.assert_close(transpose, forward.T, rtol=0, atol=1e-12)
@@ -127,7 +127,7 @@ def test_transposes_are_exact(case):
 @pytest.mark.parametrize("name", ["parallel", "fan-curved-short", "cone-curved"])
 def test_filter_transpose_is_exact(name):
     geometry, _ = CASES[name]
-    window = full_window(geometry)
+    window = DetectorWindow.full(geometry)
     plan = FilterPlan(geometry, ("bone", "standard"), angular_weights(geometry), window, window)
     rng = torch.Generator().manual_seed(6)
     x = torch.randn((3, window.views, window.rows, window.columns), dtype=torch.float64, generator=rng)
@@ -231,7 +231,7 @@ def test_chunks_change_nothing(monkeypatch):
     monkeypatch.setattr(filter_plan, "CHUNK_BYTES", 1)
     torch.testing.assert_close(filter_sinogram(data, geometry), whole, rtol=0, atol=1e-12)
     gradient = torch.randn_like(whole)
-    window = full_window(geometry)
+    window = DetectorWindow.full(geometry)
     plan = FilterPlan(geometry, ("standard",), angular_weights(geometry), window, window)
     assert plan.chunk == 1
     mismatch = (whole * gradient).sum() - (data * plan.transpose(gradient.unsqueeze(1))).sum()

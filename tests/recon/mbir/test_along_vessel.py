@@ -5,13 +5,13 @@ import math
 import pytest
 import torch
 
-from recon.mbir.along_vessel import Steering
+from recon.mbir.along_vessel import VesselSmoothing
 
 VOXEL = 0.2
 
 
 def directions(pilot):
-    return Steering.of(pilot, VOXEL, torch.ones(len(pilot))).tensor
+    return VesselSmoothing.of(pilot, VOXEL, torch.ones(len(pilot))).tensor
 
 
 def tube(direction, shape=(28, 28, 28), radius=1.5):
@@ -41,17 +41,17 @@ def test_a_plane_and_noise_alone_are_not_smoothed():
         assert float(coherence.mean()) < 0.35
 
 
-def steering(shape=(4, 5, 6), seed=0):
+def smoothing(shape=(4, 5, 6), seed=0):
     generator = torch.Generator().manual_seed(seed)
     t = torch.randn(2, *shape, 3, generator=generator, dtype=torch.float64)
     t = t / t.norm(dim=-1, keepdim=True) * torch.rand(2, *shape, 1, generator=generator, dtype=torch.float64).sqrt()
     pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
     tensor = torch.stack([t[..., i] * t[..., j] for i, j in pairs], 1)
-    return Steering(tensor, torch.tensor([0.7, 2.0], dtype=torch.float64))
+    return VesselSmoothing(tensor, torch.tensor([0.7, 2.0], dtype=torch.float64))
 
 
 def test_gradient_is_a_symmetric_positive_operator_within_its_bound():
-    s, shape = steering(), (4, 5, 6)
+    s, shape = smoothing(), (4, 5, 6)
     n = math.prod(shape)
     columns = [s.gradient(e.reshape(shape).expand(2, *shape)).reshape(2, n) for e in torch.eye(n, dtype=torch.float64)]
     matrix = torch.stack(columns, -1)
@@ -63,7 +63,7 @@ def test_gradient_is_a_symmetric_positive_operator_within_its_bound():
 
 
 def test_gradient_is_that_of_the_energy():
-    s = steering()
+    s = smoothing()
     u = torch.randn(2, 4, 5, 6, dtype=torch.float64, requires_grad=True)
     (expected,) = torch.autograd.grad(s.energy(u).sum(), u)
     torch.testing.assert_close(s.gradient(u), expected)
@@ -73,7 +73,7 @@ def test_uniform_field_equals_its_spectrum_inside():
     """Along z everywhere: the operator is a convolution, whose eigenvalues the spectrum holds."""
     tensor = torch.zeros(1, 6, 32, 8, 8)
     tensor[:, 0] = 1.0
-    s = Steering(tensor, torch.tensor([1.5]))
+    s = VesselSmoothing(tensor, torch.tensor([1.5]))
     k = 5
     wave = torch.cos(2 * math.pi * k / 32 * torch.arange(32.0))[:, None, None].expand(1, 32, 8, 8)
     inside = (0, slice(8, 24), 4, 4)

@@ -8,8 +8,9 @@ from certificate import certificate, second
 from inset_operators import HU, problem, tissue
 
 from recon.gram.gram import Gram
+from recon.mbir.minimise import energy, minimise, minimise_passes, residual
 from recon.mbir.prior import PriorConfig
-from recon.mbir.unrolled import NormalProblem, Unrolled, energy, minimise, minimise_passes, residual
+from recon.mbir.unrolled import NormalisedProblem, Unrolled
 
 SMALL = PriorConfig(levels=2, filters=12, units=4)
 
@@ -34,7 +35,7 @@ def normal(scan, exposure=1.0, noise=0.0, seed=0, batch=1):
     if noise:
         generator = torch.Generator().manual_seed(seed)
         b = b + noise * math.sqrt(exposure) * gram.noise((batch,), generator=generator)
-    return NormalProblem.from_statistic(gram, b, torch.full((batch,), exposure), HU, 0.4)
+    return NormalisedProblem.from_statistic(gram, b, torch.full((batch,), exposure), HU, 0.4)
 
 
 def no_prior(net):
@@ -76,7 +77,7 @@ def test_quadratic_energy_against_a_dense_solve(scan):
 def test_gradient_of_the_energy_and_the_certificate(scan):
     net, p = model(), normal(scan, noise=1.0)
     net.double()
-    p = NormalProblem(p.gram, p.beta.double(), p.scale_hu.double(), p.factor.double(), p.voxel_mm)
+    p = NormalisedProblem(p.gram, p.beta.double(), p.scale_hu.double(), p.factor.double(), p.voxel_mm)
     u = torch.randn_like(p.beta).requires_grad_()
     (gradient,) = torch.autograd.grad(energy(net, p, u).sum(), u)
     direction = torch.randn_like(u)
@@ -112,7 +113,7 @@ def test_batch_equals_single(scan):
     generator = torch.Generator().manual_seed(0)
     noise = scan[0].noise((3,), generator=generator)
     for k in range(3):
-        p = NormalProblem.from_statistic(scan[0], (scan[2] + noise[k])[None], torch.ones(1), HU, 0.4)
+        p = NormalisedProblem.from_statistic(scan[0], (scan[2] + noise[k])[None], torch.ones(1), HU, 0.4)
         torch.testing.assert_close(net(p)[0], together[k], rtol=1e-4, atol=1e-4)
 
 
@@ -137,7 +138,7 @@ def test_fed_with_its_own_output(scan):
     p = normal(scan, noise=1.0)
     first = u = net(p)
     for _ in range(100):
-        u = net(NormalProblem(gram, p.apply(u), p.scale_hu, p.factor, p.voxel_mm))
+        u = net(NormalisedProblem(gram, p.apply(u), p.scale_hu, p.factor, p.voxel_mm))
     assert torch.isfinite(u).all()
     assert float(u.norm()) <= 2 * float(first.norm())
 
@@ -195,12 +196,12 @@ def two_passes():
 
 
 def test_residual_of_the_second_pass(scan, two_passes):
-    """Two volumes of one batch; neither the energy of the first pass nor another steering has this gradient."""
+    """Two volumes of one batch; neither the energy of the first pass nor another smoothing has this gradient."""
     net, p = two_passes, normal(scan, noise=1.0, batch=2)
-    u, last, steering = net.passes(p)
+    u, last, smoothing = net.passes(p)
     assert torch.equal(u, net(p))
-    expected = certificate(net, p, net.descend(p, net.steering(p)), u)
-    torch.testing.assert_close(residual(net, last, u, steering), expected, rtol=1e-3, atol=0)
+    expected = certificate(net, p, net.descend(p, net.vessel_smoothing(p)), u)
+    torch.testing.assert_close(residual(net, last, u, smoothing), expected, rtol=1e-3, atol=0)
     assert float((residual(net, p, u) / expected).min()) > 1.5
     assert float((residual(net, last, u) / expected - 1).abs().min()) > 0.1
 
@@ -208,9 +209,9 @@ def test_residual_of_the_second_pass(scan, two_passes):
 def test_every_pass_ends_at_its_stationary_point(scan, two_passes):
     """Pass after pass by hand, from zero, against the whole from its unrolled steps and from their end."""
     net, p = two_passes, normal(scan, noise=1.0)
-    zero, steering = torch.zeros_like(p.beta), net.steering(p)
+    zero, smoothing = torch.zeros_like(p.beta), net.vessel_smoothing(p)
     u1, _ = minimise(net, p, zero, tolerance=1e-5, most=800)
-    u2, _ = minimise(net, second(net, p, u1), zero, tolerance=1e-5, most=800, steering=steering)
+    u2, _ = minimise(net, second(net, p, u1), zero, tolerance=1e-5, most=800, smoothing=smoothing)
     for start, steps in ((None, 6), (net(p), 0)):
         found, report = minimise_passes(net, p, start, tolerance=1e-5, most=800)
         assert report["converged"]

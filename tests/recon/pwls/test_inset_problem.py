@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import pytest
-import torch
 from small_scan import GRID
 
 from recon import reconstruct
@@ -73,4 +72,3 @@ def test_progress_reaches_one(clean, problem):
         progress=seen.append,
     )  # fmt: skip
     assert seen == [pytest.approx(2 / 3), 1.0]
-    assert torch.is_tensor(problem.gram.weights)

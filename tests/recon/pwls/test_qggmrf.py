@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from recon.pwls.qggmrf import QGGMRF, BoundPrior, quadratic
 
 HU = 2e-5
+EDGE = QGGMRF(0.15, 100.0)
 FORMS = [(2.0, 1.0, 200.0), (2.0, 1.2, 200.0), (1.6, 1.1, 200.0), (2.0, 1.0, math.inf)]
 
 
@@ -112,6 +113,45 @@ def test_spectrum_is_that_of_the_periodic_matrix():
     assert torch.allclose(response, prior._plain_majorizer(wave, wave), atol=1e-9 * float(response.max()))
 
 
+# -- several channels -------------------------------------------------------------------------------------------------
+
+
+def both(prior, spacing):
+    return prior.bind(0.01, spacing, 1.0, channels=True)
+
+
+@pytest.mark.parametrize("prior", [quadratic(1.0), EDGE, QGGMRF(1.0, 50.0, 1.8, 1.1), QGGMRF(1.0, 50.0, 2.0, 1.3, 6)])
+@pytest.mark.parametrize("shape", [(3, 4, 5), (5, 6)])
+def test_kernels_of_channels_are_the_gradient_of_the_value(prior, shape):
+    joint = both(prior, (0.5, 0.4, 0.3)[-len(shape) :])
+    generator = torch.Generator().manual_seed(1)
+    x, v, u = (100 * torch.randn(2, 2, *shape, generator=generator, dtype=torch.float64) for _ in range(3))
+    at = x.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(joint.value(at).sum(), at)
+    torch.testing.assert_close(joint.gradient(x), gradient)
+    torch.testing.assert_close(joint.majorizer(x, v), joint._plain_majorizer(x, v))
+    pull, bend = joint.along(x, v, u)
+    axes = tuple(range(-len(shape) - 1, 0))
+    torch.testing.assert_close(pull, (v * gradient).sum(axes))
+    torch.testing.assert_close(bend, (v * joint._plain_majorizer(x, u)).sum(axes))
+
+
+def test_channels_may_be_turned():
+    """Only the length of the difference counts: a rotation of the channels changes nothing, and one is the scalar."""
+    joint, scalar = both(EDGE, (0.5,) * 3), EDGE.bind(0.01, (0.5,) * 3, 1.0)
+    x = 100 * torch.randn(2, 4, 5, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    c, s = math.cos(0.7), math.sin(0.7)
+    turned = torch.stack([c * x[0] - s * x[1], s * x[0] + c * x[1]])
+    torch.testing.assert_close(joint.value(turned), joint.value(x))
+    torch.testing.assert_close(joint.gradient(x[:1])[0], scalar.gradient(x[0]))
+    one = torch.stack([x[0], torch.zeros_like(x[0])])
+    torch.testing.assert_close(joint.value(one), scalar.value(x[0]))
+    torch.testing.assert_close(joint.gradient(one)[0], scalar.gradient(x[0]))
+    # Without edges the channels do not see each other: one spectrum preconditions all.
+    apart = both(quadratic(1.0), (0.5,) * 3).gradient(x)
+    torch.testing.assert_close(apart, quadratic(1.0).bind(0.01, (0.5,) * 3, 1.0).gradient(x))
+
+
 def test_binding_scales_with_the_noise():
     a = QGGMRF(0.5, 3.0, relative=True).bind(1e-3, (0.2,) * 3, HU)
     b = QGGMRF(0.5, 3.0, relative=True).bind(4e-3, (0.2,) * 3, HU)
@@ -145,3 +185,5 @@ def test_refusals_of_binding():
         QGGMRF(1.0, 1.0).bind(1.0, (0.2,) * 3, 0.0)
     with pytest.raises(ValueError, match="axes"):
         bound().value(torch.zeros(3, 3))
+    with pytest.raises(ValueError, match="4 axes"):
+        both(EDGE, (0.5,) * 3).gradient(torch.zeros(3, 3, 3))
