@@ -1,4 +1,4 @@
-"""Command line: ``torchpcct compare | dose-factor | study | simulate | reconstruct``."""
+"""Command line: ``torchpcct compare | dose-factor | study | simulate | reconstruct | verify``."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from typing import Any
 import torch
 
 from recon.api import reconstruct
-from recon.study import registry
+from recon.study import registry, verify
 from recon.study.study import ProgressBars
 from torchpcct import VolumeGrid, __version__
 from torchpcct.acquisition.acquire import acquire
@@ -115,6 +115,32 @@ def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         mean_hu=float(volume.data.mean()),
         **volume.report,
     )
+
+
+def _verify(arguments: argparse.Namespace, progress: ProgressBars) -> None:
+    results, readme = arguments.root / "notebooks", arguments.root / "README.md"
+    claims, text = verify.load_claims(results / "claims.yaml"), readme.read_text(encoding="utf-8")
+    if arguments.write:
+        text = verify.rewrite(text, claims, results)
+        with written_whole(readme) as part:
+            part.write_text(text, encoding="utf-8")
+    wrong = [v for v in verify.verify(text, claims, results) if not v.ok]
+    for v in wrong:
+        print(f"FAIL  the results say: {v.said}\n      README.md says:  {v.found or 'nothing like it'}")
+    bare = list(verify.uncovered(text, claims, verify.RESULTS))
+    for line in bare:
+        print(f"FAIL  no claim covers the figures of: {line}")
+    print(f"{len(claims) - len(wrong)} of {len(claims)} sentences with figures say what the results say")
+    changed = []
+    for name in arguments.again:
+        committed = json.loads((results / registry.folder(name) / "report.json").read_text(encoding="utf-8"))
+        settings = registry.settings_of(name, committed["settings"])
+        again = json.loads(registry.run(name, settings, progress).json)
+        changed += list(verify.differences(committed, again))
+        progress.close()
+        print("\n".join([f"{name}: {len(changed)} figures differ from the committed ones", *changed]))
+    if wrong or bare or changed:
+        raise ValueError("README.md and the committed results do not agree: see above (--write mends the README)")
 
 
 def _tell(file: Path, **summary: Any) -> None:
@@ -229,6 +255,18 @@ def _add_reconstruct(commands: _Commands) -> None:
     parser.add_argument("--extent", type=float, nargs=3, metavar=axes, help="edge lengths in mm (default: the inset)")
 
 
+def _add_verify(commands: _Commands) -> None:
+    text = "Compare every figure of the README with the key of the committed result that it comes from "
+    parser = commands.add_parser(
+        "verify", help="do the README's figures say what the committed results say?",
+        description=f"{text}(notebooks/claims.yaml), and compute studies again if asked.",
+    )  # fmt: skip
+    parser.set_defaults(run=_verify, device="cpu", no_progress=False, verbose=False)
+    parser.add_argument("--root", type=Path, default=Path(), help="folder of the repository (default: this one)")
+    parser.add_argument("--write", action="store_true", help="put the committed figures into the README")
+    parser.add_argument("--again", nargs="*", default=[], metavar="STUDY", help="compute these studies again, in full")
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="torchpcct",
@@ -236,7 +274,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"torchpcct {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for add in (_add_compare, _add_dose_factor, _add_study, _add_simulate, _add_reconstruct):
+    for add in (_add_compare, _add_dose_factor, _add_study, _add_simulate, _add_reconstruct, _add_verify):
         add(commands)
     return parser
 

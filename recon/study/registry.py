@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import ast
 import importlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from recon.study.report import Report
 from recon.study.study import Progress, silent
 from torchpcct.validate import choice
 
-__all__ = ["STUDIES", "build_settings", "part", "run"]
+__all__ = ["STUDIES", "build_settings", "folder", "part", "run", "settings_of"]
 
 STUDIES: dict[str, str] = {
     "compare": "the paper's CNR tables by FBP and PWLS, with intervals",
@@ -34,14 +34,33 @@ _FORMER = {"dose": "bowtie"}
 """The study "bowtie" was first published as "dose"; whoever calls it so still gets it."""
 
 
+def folder(name: str) -> str:
+    """Name of a study's package, and of the folder of its committed result.
+
+    Raises:
+        ValueError: an unknown study.
+    """
+    return choice("study", _FORMER.get(name, name), STUDIES).replace("-", "_")
+
+
 def part(name: str, module: str) -> Any:
     """One of the modules ``settings``, ``measure`` and ``report`` of a study.
 
     Raises:
         ValueError: an unknown study.
     """
-    folder = choice("study", _FORMER.get(name, name), STUDIES).replace("-", "_")
-    return importlib.import_module(f"recon.study.{folder}.{module}")
+    return importlib.import_module(f"recon.study.{folder(name)}.{module}")
+
+
+def settings_of(name: str, values: Mapping[str, Any]) -> Any:
+    """Settings from the JSON values of a report.
+
+    Raises:
+        ValueError, TypeError: an unknown study; values that its settings refuse.
+    """
+    kind = part(name, "settings").Settings
+    known = {f.name for f in fields(kind) if f.init}
+    return kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items() if k in known})
 
 
 def build_settings(name: str, *, quick: bool = False, seed: int | None = None, changes: Sequence[str] = ()) -> Any:
@@ -73,14 +92,14 @@ def build_settings(name: str, *, quick: bool = False, seed: int | None = None, c
     return kind.quick(**values) if quick else kind(**values)
 
 
-def run(name: str, settings: Any, progress: Progress | None = None, folder: str | Path | None = None) -> Report:
+def run(name: str, settings: Any, progress: Progress | None = None, pieces: str | Path | None = None) -> Report:
     """Measure a study and build its report, which is not saved.
 
     Args:
         name: of the study.
         settings: of that study.
         progress: called with the name of the step and its finished fraction.
-        folder: for finished pieces, which the next run of the same settings reuses; None: nothing is kept.
+        pieces: folder for finished pieces, which the next run of the same settings reuses; None: nothing is kept.
 
     Raises:
         ValueError: an unknown study; what the study itself refuses.
@@ -89,6 +108,6 @@ def run(name: str, settings: Any, progress: Progress | None = None, folder: str 
     kind = part(name, "settings").Settings
     if not isinstance(settings, kind):
         raise TypeError(f"settings must be {kind.__module__}.Settings, got {type(settings).__name__}")
-    measured = part(name, "measure").measure(settings, progress or silent, folder)
+    measured = part(name, "measure").measure(settings, progress or silent, pieces)
     report: Report = part(name, "report").build_report(measured)
     return report

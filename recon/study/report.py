@@ -71,6 +71,11 @@ class Report:
         self.data["command"] = command
         self.text += f" Command: `{command}`."
 
+    @property
+    def json(self) -> str:
+        """The values as JSON text."""
+        return json.dumps(self.data, indent=1, default=_plain)
+
     def save(self, folder: str | os.PathLike[str]) -> list[Path]:
         """Write ``report.json``, ``report.md`` and the figures into ``folder`` (made if need be).
 
@@ -81,7 +86,7 @@ class Report:
         out.mkdir(parents=True, exist_ok=True)
         files = []
         for name, content in (
-            ("report.json", json.dumps(self.data, indent=1, default=_plain)),
+            ("report.json", self.json),
             ("report.md", self.text),
         ):
             with written_whole(out / name) as part:

@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -20,10 +21,25 @@ from typing import Any
 
 import yaml
 
-__all__ = ["Claim", "Verdict", "load_claims", "lookup", "rewrite", "uncovered", "verify"]
+__all__ = ["Claim", "Verdict", "differences", "load_claims", "lookup", "rewrite", "uncovered", "verify"]
+
+RESULTS = ("The measured dose factor", "The studies")
+"""Sections of the README whose figures are results: a claim must cover each."""
+
+PASSING = (
+    "seconds",
+    "environment",
+    "machine",
+    "command",
+    "speed",
+    "rays_per_second",
+    "rays_per_core_second",
+    "threads",
+)
+"""Keys of results that tell of the run and not of what was found: they differ from run to run."""
 
 _FIELD = re.compile(r"\{(\w+)(?::([^}]*))?\}")
-_FIGURE = r"([-+−]?\d+(?:[.,]\d+)*|[A-Za-z]\w*)"
+_FIGURE = r"([-+−]?\d+(?:[.,]\d+)*%?|[A-Za-z]\w*)"
 _ROW = re.compile(r"^(\w*)\[(.+)\]$")
 
 
@@ -176,6 +192,31 @@ def uncovered(readme: str, claims: list[Claim], sections: tuple[str, ...]) -> It
             if re.search(r"\d", plain):
                 yield line.rstrip()
         place += len(line)
+
+
+def differences(committed: Any, again: Any, tolerance: float = 1e-3, place: str = "") -> Iterator[str]:
+    """Where a result that was computed again differs from the committed one.
+
+    Args:
+        committed, again: JSON values.
+        tolerance: relative, on every figure; other machines round sums otherwise. Figures below 1e-6 count as 0.
+        place: path so far, of the messages.
+
+    Yields:
+        A line for each difference: its path, then the committed value and the new one.
+    """
+    if isinstance(committed, dict) and isinstance(again, dict):
+        for key in sorted({*committed, *again}):
+            if not any(word in key for word in PASSING):
+                yield from differences(committed.get(key), again.get(key), tolerance, f"{place}/{key}")
+    elif isinstance(committed, list) and isinstance(again, list) and len(committed) == len(again):
+        for k, (a, b) in enumerate(zip(committed, again, strict=True)):
+            yield from differences(a, b, tolerance, f"{place}/{k}")
+    elif isinstance(committed, int | float) and isinstance(again, int | float):
+        if not math.isclose(committed, again, rel_tol=tolerance, abs_tol=1e-6):
+            yield f"{place}: {committed} → {again}"
+    elif committed != again:
+        yield f"{place}: {committed!r} → {again!r}"
 
 
 def _read(path: Path) -> Any:

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from recon.study.verify import Claim, load_claims, lookup, rewrite, uncovered, verify
+from recon.study.verify import Claim, differences, load_claims, lookup, rewrite, uncovered, verify
 
 DATA = {"rows": [{"m": "a", "s": 2.0, "v": 1.234}, {"m": "b", "s": 2.0, "v": [5.0, 6.6]}], "n": {"k": 200}}
 
@@ -58,3 +58,14 @@ def test_bad_claims_are_refused(folder):
     (folder / "c.yaml").write_text("- text: a\n", encoding="utf-8")
     with pytest.raises(ValueError, match="must hold text and values"):
         load_claims(folder / "c.yaml")
+
+
+def test_differences_are_named_and_runs_may_take_another_time():
+    again = json.loads(json.dumps(DATA))
+    assert not list(differences({**DATA, "seconds": 1}, {**again, "seconds": 2}))
+    again["rows"][0]["v"] *= 1.0005
+    assert not list(differences(DATA, again))
+    again["rows"][0]["v"] *= 1.01
+    again["rows"][1]["m"] = "c"
+    del again["n"]["k"]
+    assert [line.split(":")[0] for line in differences(DATA, again)] == ["/n/k", "/rows/0/v", "/rows/1/m"]
