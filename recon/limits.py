@@ -30,6 +30,7 @@ from torch import Tensor
 
 from recon.conjugate_gradient import conjugate_gradient
 from recon.linear_operator import gaussian_kernel, separable_filter
+from torchpcct.validate import number, whole
 
 __all__ = ["contrast_limit", "deformation_limit", "known_inside", "outline_maps"]
 
@@ -52,8 +53,7 @@ def known_inside(fractions: NDArray[np.float64], rings: int = 0) -> NDArray[np.b
     Returns:
         ``(tissues, z, y, x)`` masks.
     """
-    if rings < 0:
-        raise ValueError(f"rings must be at least 0, got {rings}")
+    whole("rings", rings, 0)
     pure = np.asarray(fractions) > 0.999
     if rings:
         pure = np.stack([ndimage.binary_erosion(p, iterations=rings, border_value=1) for p in pure])
@@ -176,11 +176,8 @@ def deformation_limit(
     Raises:
         ValueError: a displacement or correlation out of range.
     """
-    if not displacement_mm >= 0 or not correlation_mm > 0:
-        raise ValueError(
-            f"displacement_mm must be at least 0 and correlation_mm greater than 0, got {displacement_mm} and "
-            f"{correlation_mm}"
-        )
+    number("displacement_mm", displacement_mm, low=0.0)
+    number("correlation_mm", correlation_mm, positive=True)
     masks = torch.from_numpy(np.asarray(fractions, dtype=np.float32))
     change = torch.from_numpy(np.asarray(outlines, dtype=np.float32)) * displacement_mm
     # White noise through a kernel of unit norm and σ = ℓ/√2 has unit variance and the correlation exp(−r²/2ℓ²).

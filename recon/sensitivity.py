@@ -14,6 +14,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from torchpcct.validate import whole
+
 __all__ = ["worst_case_gain"]
 
 
@@ -43,8 +45,7 @@ def worst_case_gain(
     Raises:
         ValueError: fewer than one iteration, or a Jacobian that is zero or not finite at these data.
     """
-    if iterations < 1:
-        raise ValueError(f"iterations must be at least 1, got {iterations}")
+    whole("iterations", iterations)
     x = data.detach().clone().requires_grad_()
     out = reconstruct(x)
     v = torch.randn(out.shape, generator=torch.Generator().manual_seed(seed)).to(out)

@@ -11,7 +11,6 @@ from numpy.polynomial import Chebyshev, Polynomial
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.fbp import backproject_kernels as kernels
 from recon.linear_operator import apply_linear
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
@@ -179,6 +178,8 @@ class BackprojectionPlan:
 
     def forward(self, data: Tensor) -> Tensor:
         """``(..., views, [rows,] columns)`` to ``(..., [z,] y, x)``."""
+        from recon.fbp import backproject_kernels as kernels  # numba loads with its first use
+
         n = 3 if self.cone else 2
         lead, shape = data.shape[:-n], data.shape[-n:]
         out = data.new_empty((math.prod(lead), *self.grid.shape))
@@ -195,6 +196,8 @@ class BackprojectionPlan:
 
     def transpose(self, volume: Tensor) -> Tensor:
         """``(..., [z,] y, x)`` to ``(..., views, [rows,] columns)``: the exact transpose of :meth:`forward`."""
+        from recon.fbp import backproject_kernels as kernels  # numba loads with its first use
+
         n = self.grid.ndim
         lead = volume.shape[:-n]
         w = self.window

@@ -16,7 +16,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.fbp.filter_kernels import align, unalign
 from recon.fbp.ramp import fast_length, ramp_kernel
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam
@@ -131,6 +130,8 @@ class FilterPlan:
 
     def forward(self, data: Tensor) -> Tensor:
         """Weight and filter: ``(..., V, rows_in, width_in)`` to ``(..., K, V, rows_out, width_out)``."""
+        from recon.fbp.filter_kernels import align  # numba loads with its first use
+
         a, b = self.window_in, self.window_out
         lead = data.shape[:-3]
         data = data.reshape(math.prod(lead), *data.shape[-3:])
@@ -160,6 +161,8 @@ class FilterPlan:
 
     def transpose(self, gradient: Tensor) -> Tensor:
         """Transpose of :meth:`forward`: ``(..., K, V, rows_out, width_out)`` to ``(..., V, rows_in, width_in)``."""
+        from recon.fbp.filter_kernels import unalign  # numba loads with its first use
+
         a, b = self.window_in, self.window_out
         lead = gradient.shape[:-4]
         gradient = gradient.reshape(math.prod(lead), *gradient.shape[-4:])

@@ -23,6 +23,7 @@ from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import ConeBeam, Geometry, VolumeGrid
 from torchpcct.scan import Scan
 from torchpcct.scene.motion import SinusoidalMotion
+from torchpcct.validate import number
 from torchpcct.volume import to_hu
 
 __all__ = ["InsetFbp", "require_inside", "static_fbp", "view_motion"]
@@ -42,8 +43,7 @@ def view_motion(motion: SinusoidalMotion, geometry: Geometry, rotation_s: float)
     Raises:
         ValueError: ``rotation_s`` ≤ 0.
     """
-    if not rotation_s > 0:
-        raise ValueError(f"rotation_s must be greater than 0 s, got {rotation_s}")
+    number("rotation_s", rotation_s, positive=True, unit="s")
     times = (geometry.angles - geometry.angles[0]) / (2.0 * math.pi) * rotation_s
     return np.ascontiguousarray(motion.displacement(times)[:, ::-1])
 

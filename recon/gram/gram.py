@@ -23,8 +23,8 @@ from scipy.fft import next_fast_len
 from torch import Tensor
 
 from recon.gram.impulse_response import Nodes, kernel_at, node_positions, slice_reach
-from recon.gram.kernels import banded_add
 from recon.gram.positive_definite import cholesky, make_definite
+from torchpcct.validate import number
 
 __all__ = ["Gram", "check_weights"]
 
@@ -93,10 +93,8 @@ class Gram:
 
     def scaled(self, factor: float) -> Gram:
         """The Gram operator of ``factor`` · W (another exposure); shares the kernels."""
-        if not (math.isfinite(factor) and factor > 0):
-            raise ValueError(f"factor must be finite and greater than 0, got {factor}")
         other = copy.copy(self)
-        other.factor = self.factor * factor
+        other.factor = self.factor * number("factor", factor, positive=True)
         return other
 
     def to(self, device: torch.device | str) -> Gram:
@@ -265,6 +263,8 @@ def _banded_add(kernel: Tensor, x: Tensor, scale: float, out: Tensor) -> None:
     """out += scale · K x, K Hermitian and banded along z: lower bands ``(reach + 1, nz, fy, fx)``."""
     nz = x.shape[-3]
     if x.device.type == "cpu":
+        from recon.gram.kernels import banded_add  # numba loads with its first use
+
         real = kernel.real.numpy().dtype.type
         shape = (-1, *x.shape[-3:])
         banded_add(kernel.numpy(), x.reshape(shape).numpy(), real(scale), out.view(shape).numpy())

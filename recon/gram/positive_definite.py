@@ -13,8 +13,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.gram.kernels import banded_cholesky, stiffen
-
 __all__ = ["cholesky", "make_definite"]
 
 # Smallest pivot, as a share of the diagonal, that a definite spectrum must have.
@@ -34,6 +32,8 @@ def cholesky(kernel: Tensor) -> tuple[Tensor, NDArray[np.bool_]]:
 
 
 def _factor(flat: Any, least: float = LEAST_PIVOT) -> tuple[Any, NDArray[np.bool_]]:
+    from recon.gram.kernels import banded_cholesky  # numba loads with its first use
+
     lower = np.zeros_like(flat)
     definite = np.zeros(flat.shape[2], dtype=np.bool_)
     banded_cholesky(np.ascontiguousarray(flat), least, lower, definite)
@@ -53,6 +53,8 @@ def make_definite(spectra: Tensor) -> Tensor:
     terms, bands, nz = spectra.shape[:3]
     flat = spectra.reshape(terms, bands, nz, -1).to(torch.complex128).numpy().copy()
     level = np.abs(flat[0, 0].real).mean(axis=0)
+
+    from recon.gram.kernels import stiffen  # numba loads with its first use
 
     plain = flat.copy()
     definite = np.zeros(flat.shape[-1], dtype=np.bool_)

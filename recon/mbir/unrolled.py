@@ -33,6 +33,7 @@ from torch import Tensor, nn
 
 from recon.mbir.along_vessel import VesselSmoothing
 from recon.mbir.prior import REFERENCE_SCALE_HU, LearnedPrior, PriorConfig, from_frequencies, to_frequencies
+from torchpcct.validate import whole
 
 __all__ = ["FLOOR", "NormalisedProblem", "Unrolled"]
 
@@ -99,8 +100,7 @@ class Unrolled(nn.Module):
         self, config: PriorConfig | None = None, steps: int = 8, add_back: tuple[float, float] | None = None
     ) -> None:
         super().__init__()
-        if steps < 1:
-            raise ValueError(f"steps must be at least 1, got {steps}")
+        whole("steps", steps)
         self.add_back = add_back
         self.prior = LearnedPrior(config)
         self.steps = steps

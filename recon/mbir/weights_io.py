@@ -13,8 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
 from torchpcct.files import written_whole
@@ -47,6 +45,8 @@ def write_tensors(path: Path, kind: str, tensors: Mapping[str, Tensor], metadata
         tensors: any names and types; copied to the CPU.
         metadata: JSON values, floats exact; no NaN or infinity.
     """
+    from safetensors.torch import save_file  # loads with its first use
+
     # Copies, as safetensors refuses tensors that share memory.
     plain = {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}
     text = json.dumps(dict(metadata), ensure_ascii=False, allow_nan=False)
@@ -61,6 +61,8 @@ def read_tensors(path: Path, kind: str) -> tuple[dict[str, Tensor], dict[str, An
     Raises:
         TensorFileError: missing, cut short, altered, or not of this kind.
     """
+    from safetensors import SafetensorError, safe_open  # loads with its first use
+
     if not path.is_file():
         raise TensorFileError(f"{path} does not exist")
     try:

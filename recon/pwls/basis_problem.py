@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -18,6 +17,7 @@ from torchpcct.geometry import VolumeGrid
 from torchpcct.projector import Projector
 from torchpcct.scan import Scan
 from torchpcct.spectral import SpectralModel, cramer_rao, decompose_surround, inverse, vmi_weights
+from torchpcct.validate import number
 
 __all__ = ["DEFAULT_JOINT_PRIOR", "REFERENCE_KEV", "BasisProblem"]
 
@@ -97,8 +97,7 @@ class BasisProblem:
         Raises:
             ValueError: shapes that do not fit, ``dose`` ≤ 0.
         """
-        if not (np.isfinite(dose) and dose > 0):
-            raise ValueError(f"dose must be greater than 0, relative to the model's exposure, got {dose}")
+        number("dose", dose, positive=True, unit="of the model's exposure")
         result = joint_pwls(
             self.projector, self.data(lines, window), self.information * dose, prior or DEFAULT_JOINT_PRIOR,
             gram=self.gram.scaled(dose), **options,

@@ -23,6 +23,7 @@ from recon.conjugate_gradient import dot, per_volume
 from recon.gram.gram import Gram, check_weights
 from recon.pwls.model_solver import ModelSolver, line_search
 from recon.pwls.qggmrf import QGGMRF, BoundPrior
+from torchpcct.validate import number, whole
 
 __all__ = ["PwlsResult", "pwls", "solve_normal", "weighted_data"]
 
@@ -149,10 +150,8 @@ def solve_normal(
     started = time.perf_counter()
     axes = len(spacing) + channels
     shape = b.shape[-axes:]
-    if not tolerance > 0:
-        raise ValueError(f"tolerance must be greater than 0 HU, got {tolerance}")
-    if max_exact < 1:
-        raise ValueError(f"max_exact must be at least 1, got {max_exact}")
+    number("tolerance", tolerance, positive=True, unit="HU")
+    whole("max_exact", max_exact)
     if start is not None and tuple(start.shape[-axes:]) != tuple(shape):
         raise ValueError(f"start must have shape (..., {', '.join(map(str, shape))}), got {tuple(start.shape)}")
     bound = prior.bind(gram.information(hu), spacing, hu, channels) if isinstance(prior, QGGMRF) else prior

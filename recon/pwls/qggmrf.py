@@ -35,7 +35,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.pwls import qggmrf_kernels as kernels
+from torchpcct.validate import number
 
 __all__ = ["QGGMRF", "BoundPrior", "quadratic"]
 
@@ -69,14 +69,8 @@ class QGGMRF:
     relative: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("strength", "threshold", "p", "q"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int | float):
-                raise TypeError(f"{name} must be a number, got {value!r}")
-        if not (math.isfinite(self.strength) and self.strength >= 0):
-            raise ValueError(f"strength must be finite and at least 0, got {self.strength}")
-        if not self.threshold > 0:
-            raise ValueError(f"threshold must be greater than 0 (inf: quadratic), got {self.threshold}")
+        number("strength", self.strength, low=0.0)
+        number("threshold", self.threshold, positive=True, finite=False)
         if not 1.0 <= self.q <= self.p <= 2.0:
             raise ValueError(f"the exponents need 1 ≤ q ≤ p ≤ 2 for a convex prior, got p = {self.p}, q = {self.q}")
         if self.neighbors not in (6, 26):
@@ -92,8 +86,7 @@ class QGGMRF:
             hu: 1 HU in mm⁻¹ (μ_ref / 1000); the value of the channels that counts as 1 HU.
             channels: for volumes with an axis of channels.
         """
-        if not (math.isfinite(information) and information > 0):
-            raise ValueError(f"information must be finite and greater than 0, got {information}")
+        number("information", information, positive=True)
         lam = self.strength * information / math.pi**2  # (2π · 0.5 lp/mm)² = π² mm⁻²
         threshold = self.threshold
         if self.relative and lam > 0:
@@ -131,10 +124,8 @@ class BoundPrior:
     def __post_init__(self) -> None:
         if len(self.spacing) not in (2, 3) or min(self.spacing) <= 0:
             raise ValueError(f"spacing must be 2 or 3 lengths in mm, got {self.spacing}")
-        if not (math.isfinite(self.hu) and self.hu > 0):
-            raise ValueError(f"hu must be the mm⁻¹ of 1 HU (μ_ref / 1000), greater than 0, got {self.hu}")
-        if not (math.isfinite(self.lam) and self.lam >= 0):
-            raise ValueError(f"lam must be finite and at least 0, got {self.lam}")
+        number("hu (μ_ref / 1000)", self.hu, positive=True, unit="mm⁻¹")
+        number("lam", self.lam, low=0.0)
 
     # -- the potential: the only place where its formula stands ---------------------------------------------------
 
@@ -257,6 +248,8 @@ class BoundPrior:
         return out
 
     def _fused_majorizer(self, x: Tensor, direction: Tensor) -> Tensor:
+        from recon.pwls import qggmrf_kernels as kernels  # numba loads with its first use
+
         a, b = self._volumes(x), self._volumes(direction)
         out = np.empty_like(a)
         majorize: Any = kernels.majorize_channels if self.channels else kernels.majorize
@@ -264,6 +257,8 @@ class BoundPrior:
         return torch.from_numpy(out).reshape(x.shape)
 
     def _fused_along(self, x: Tensor, direction: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
+        from recon.pwls import qggmrf_kernels as kernels  # numba loads with its first use
+
         a, v, u = self._volumes(x), self._volumes(direction), self._volumes(other)
         rows = np.empty((a.shape[0], *a.shape[-3:-1], 2))
         along: Any = kernels.along_channels if self.channels else kernels.along
