@@ -2,7 +2,8 @@
 
 ``settings`` say what is measured. A scene is a ``variant`` (where things are), then a ``scene`` (its scan) with facts
 that hold exactly: ``tissue_values``, ``exact_fbp``. ``realisations`` draws its noise, ``methods`` reconstruct it,
-``measures`` reads every volume, ``shape_limit`` and ``stability`` bound what can be had; ``measure`` runs all of that in
-resumable pieces (``store``). From samples to figures: ``estimates``, ``exact``, ``main_scenes``, ``other_rois``,
-``further_scenes``, together ``analysis``. ``tables`` and ``figures`` make the ``report`` of them.
+``measures`` reads every volume, ``shape_limit`` and ``stability`` bound what can be had; ``vessels`` (of
+``vessel_shapes``) run in any direction; ``measure`` does all of that in resumable pieces (``store``). From samples to
+figures: ``estimates``, ``exact``, ``main_scenes``, ``other_rois``, ``further_scenes``, ``vessel_rows``, together
+``analysis``. ``tables`` and ``figures`` make the ``report`` of them.
 """

@@ -10,6 +10,7 @@ from recon.study.dose_factor.further_scenes import scene_rows
 from recon.study.dose_factor.main_scenes import method_entry
 from recon.study.dose_factor.measure import Measured
 from recon.study.dose_factor.other_rois import other_voxels, wide_entry
+from recon.study.dose_factor.vessel_rows import vessel_rows
 
 __all__ = ["analyse"]
 
@@ -31,4 +32,5 @@ def analyse(measured: Measured) -> dict[str, Any]:
         "worst_case_gains": [{"exposure_s": dose, **gains} for dose, gains in measured.gains.items()],
         "scenes": scene_rows(exact),
         "scenes_left_out": measured.left_out,
+        "vessels": vessel_rows(measured.vessels, exact.paper.contrast_hu),
     }
