@@ -58,7 +58,7 @@ class Measured:
             :func:`recon.study.dose_factor.measures.segmentation`); empty with fast noise.
         samples: (method, scene, dose) → the same of each method, ``shape`` of all of its realisations.
         extra: (method, scene, dose) → ``roi`` and, with the core replaced by fibrous tissue, ``absent`` ``(n, 2)``.
-        vessels: (method, vessel, dose) → ``roi`` and ``absent`` ``(n, 2)``, ``fat (n, voxels)``.
+        vessels: (method, vessel, dose) → what :class:`recon.study.dose_factor.vessels.VesselScans` reads.
         volumes: (method or "fbp", scene, dose) → first realisation, HU.
         wide: FBP variant → covariance of the means in the wider ROIs at 1 s.
         gains: dose → method or FBP variant → worst-case response, HU mm^1.5.

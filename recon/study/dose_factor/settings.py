@@ -21,6 +21,7 @@ __all__ = [
     "NOISY_SCENES",
     "SLOW_METHODS",
     "VESSELS",
+    "VESSEL_ROIS",
     "WIDE_ROIS",
     "Settings",
     "fbp_label",
@@ -48,6 +49,9 @@ EXTRA_SCENES = (
 VESSELS = ("straight", "tilted", "in_plane_x", "in_plane_y", "curved_8mm", "curved_5mm", "bifurcating")
 """Vessels of any direction, :data:`recon.study.dose_factor.vessel_shapes.SHAPES`; the first is what gains are compared
 with."""
+
+VESSEL_ROIS = ("section", "tissue")
+"""What is read of a vessel: the paper's ROIs in the section across it, and all of core and fibrous tissue."""
 
 METHOD_NAMES = {
     "linear": "linear 3-D filter",
@@ -175,7 +179,7 @@ class Settings(StudySettings):
         """Rough time in s of each part on two idle cores, nothing finished yet."""
         share = self.views / paper.FULL_VIEWS["PCCT"]
         further = sum(len(with_twin(name)) for name in self.scenes)
-        extra = (further + 2 * len(self.vessels)) * self.scene_n * len(self.scene_doses)
+        extra = (further + len(self.vessels)) * self.scene_n * len(self.scene_doses)
         drawn = 0 if self.fast_noise else len(NOISY_SCENES) * self.n * len(self.doses)
         on_images = bool(set(self.methods) & set(IMAGE_METHODS))
         image_scenes = len(NOISY_SCENES) if on_images else int(not self.fast_noise)

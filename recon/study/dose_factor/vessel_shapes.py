@@ -39,6 +39,9 @@ _SLAB = 8
 _ROI_MM, _ROI_STEP_MM = 4.4, 0.05
 """Edge and voxel size of the cube about the core in which the ROIs are placed."""
 
+_SECTION_MM = 0.1
+"""Thickness of the section across the vessel."""
+
 _ROI_ACROSS_MM = 1.6
 """The fibrous ROI ends this far from the core's centre across the vessel, as that of the wide ROI "tissue"."""
 
@@ -162,28 +165,41 @@ class Vessel:
             result[first : first + count] = blocks.mean((1, 3, 5))
         return result
 
-    def rois(self, margin: float = 0.10, lumen_margin: float = 0.30) -> RoiPair:
-        """All of the core, and the fibrous tissue beside it within the core's slab, but for a margin at the edges.
+    def rois(self, name: str) -> RoiPair:
+        """Core and fibrous tissue beside it, but for a margin at their edges; they follow the vessel.
 
-        As :func:`torchpcct.metrics.placement.whole_rois` with distances in space, along any vessel.
+        Args:
+            name: ``"tissue"``: all of the core, and the fibrous tissue in its slab, as
+                :func:`torchpcct.metrics.placement.whole_rois` takes them; ``"section"``: the paper's ROIs in the
+                section across the vessel, as :func:`torchpcct.metrics.placement.place_rois` does. Distances in space.
         """
         center = self.plaque.core_center
         x, y, z = self.line.point(center) + np.array(self.center[::-1])
         count = round(_ROI_MM / _ROI_STEP_MM)
         image = VolumeGrid((count, count, count), _ROI_STEP_MM, (float(z), float(y), float(x)))
         points = grid_points(image)
-        labels, off = self.labels(points), np.abs(self.local(points) - np.array(center))
-        near = (off[..., :2] <= _ROI_ACROSS_MM).all(-1) & (off[..., 2] <= self.plaque.core.semi_axes[2])
+        labels, local = self.labels(points), self.local(points) - np.array(center)
+        off = np.abs(local)
 
         def depth(mask: Any) -> Any:
             return ndimage.distance_transform_edt(mask, sampling=image.spacing)
 
         index = self.straight.index
-        foreground = depth(labels == index("core")) > margin
+        in_core, in_tissue = labels == index("core"), labels == index("fibrous")
+        section = name == "section"
+        rule = RoiRule() if section else RoiRule(0.10, 0.10, math.inf, 0.30)
+        slab = off[..., 2] <= (_SECTION_MM / 2 if section else self.plaque.core.semi_axes[2])
+        foreground = (depth(in_core) > rule.core_margin) & slab
         background = (
-            near & (depth(labels == index("fibrous")) > margin) & (depth(labels != index("lumen")) > lumen_margin)
+            (off[..., :2] <= _ROI_ACROSS_MM).all(-1)
+            & slab
+            & (depth(in_tissue) > rule.background_margin)
+            & (depth(labels != index("lumen")) > rule.lumen_margin)
         )
-        return RoiPair(foreground, background, image, RoiRule(margin, margin, math.inf, lumen_margin))
+        if section:
+            # Of the two alike regions beside the core the paper's; in a bend it lies outside.
+            background &= (depth(~in_core) < rule.background_reach) & (local[..., 1] < 0)
+        return RoiPair(foreground, background, image, rule)
 
     def plain_fat(self, grid: VolumeGrid, distance: float = 1.5, edge: float = 0.8) -> Any:
         """Mask ``grid.shape`` of the voxels farther than ``distance`` mm from the vessel and ``edge`` mm from the

@@ -150,7 +150,9 @@ def _counting(piece, calls):
 
 def test_vessels(measured, analysed, scene, clean_b):
     rows = analysed["vessels"]
-    assert [(r["method"], r["vessel"]) for r in rows] == [("linear", "straight"), ("linear", "curved_5mm")]
+    assert [(r["roi"], r["vessel"]) for r in rows] == [
+        (roi, name) for roi in ("section", "tissue") for name in ("straight", "curved_5mm")
+    ]
     assert {len(v["roi"]) for v in measured.vessels.values()} == {TINY.scene_n}
     for row in rows:
         # 0.4 mm voxels and 3 realisations: enough to see that there is a core, and none without.

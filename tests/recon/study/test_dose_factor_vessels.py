@@ -14,6 +14,8 @@ from recon.study.dose_factor.vessel_rows import vessel_rows
 from recon.study.dose_factor.vessel_shapes import LENGTH_MM, SHAPES, Centreline, Vessel, vessel
 from recon.study.dose_factor.vessels import FINE_MM, fine_grid, projected
 from torchpcct import VolumeGrid
+from torchpcct.metrics.placement import place_rois
+from torchpcct.metrics.roi import axial_grid
 from torchpcct.scene import Scene
 from torchpcct.scene.plaque import Plaque, plaque_scene
 from torchpcct.scene.raster import grid_points
@@ -82,6 +84,17 @@ def test_the_straight_vessel_is_the_analytic_scene():
     np.testing.assert_array_equal(vessel("straight", CENTER).labels(points), scene.labels(points))
 
 
+def test_the_section_of_the_straight_vessel_has_the_papers_rois():
+    paper = place_rois(plaque_scene(Plaque(position=CENTER[::-1]))[0], axial_grid(CENTER))
+    ours = vessel("straight", CENTER).rois("section")
+    for theirs, mask in ((paper.foreground, ours.foreground), (paper.background, ours.background)):
+        middle = [np.mean(a[i]) for a, i in zip(paper.image.axes, np.nonzero(theirs), strict=True)]
+        own = [np.mean(a[i]) for a, i in zip(ours.image.axes, np.nonzero(mask), strict=True)]
+        np.testing.assert_allclose(own, middle, atol=0.05)
+        # Two slices of the section.
+        assert mask.sum() * 0.05**2 / 2 == pytest.approx(theirs.sum() * 0.035**2, rel=0.05)
+
+
 def test_a_vessel_turned_in_plane_has_turned_labels():
     along_x, along_y = (vessel(name, CENTER).labels(grid_points(GRID)) for name in ("in_plane_x", "in_plane_y"))
     # By −90° about z: what lies at (x, y) comes to (y, −x).
@@ -92,13 +105,16 @@ def test_a_vessel_turned_in_plane_has_turned_labels():
 @pytest.mark.parametrize("name", VESSELS)
 def test_rois_lie_in_their_tissue_and_fat_is_plain(name):
     shape = vessel(name, CENTER)
-    pair, index = shape.rois(), shape.straight.index
-    labels = shape.labels(grid_points(pair.image))
-    assert (labels[pair.foreground] == index("core")).all()
-    assert (labels[pair.background] == index("fibrous")).all()
-    # The same tissue is read in every vessel, whatever its direction.
-    for mask, expected in ((pair.foreground, 1.71), (pair.background, 2.33)):
-        assert mask.sum() * np.prod(pair.image.spacing) == pytest.approx(expected, rel=0.05)
+    index = shape.straight.index
+    # The same tissue is read in every vessel, whatever its direction; mm³ in all, mm² of the section.
+    for roi, sizes, rel in (("tissue", (1.71, 2.33), 0.05), ("section", (1.02, 0.225), 0.2)):
+        pair = shape.rois(roi)
+        labels = shape.labels(grid_points(pair.image))
+        assert (labels[pair.foreground] == index("core")).all()
+        assert (labels[pair.background] == index("fibrous")).all()
+        cell = np.prod(pair.image.spacing) / (0.1 if roi == "section" else 1.0)
+        for mask, expected in zip((pair.foreground, pair.background), sizes, strict=True):
+            assert mask.sum() * cell == pytest.approx(expected, rel=rel)
     fat = shape.plain_fat(GRID)
     assert fat.sum() > 1000
     inside = np.argwhere(shape.labels(grid_points(GRID)) != index("patient"))[::20]
@@ -133,39 +149,57 @@ def test_the_statistic_of_a_vessel_on_the_methods_grid_is_the_grams():
     assert 1e-4 < float((finer - b).norm() / b.norm()) < 0.1
 
 
-def _samples(rng, gains, n=400):
-    """Readings of a linear filter of 10 HU, and of a method with ``gains`` and 0.8 of the contrast."""
+TWINS = 8
+
+
+def _samples(gains, n=400):
+    """Readings of a linear filter of 10 HU, and of a method with ``gains``, 0.8 of the contrast and 5 HU too little."""
     found = {}
-    for name, gain in gains.items():
-        noise = rng.standard_normal((n, 2)) @ np.diag([6.0, 8.0])
+    for seed, (name, gain) in enumerate(gains.items()):
+        rng = np.random.default_rng(seed)
+        noise = rng.standard_normal((n, 1, 2)) @ np.diag([6.0, 8.0])
         fat = 20.0 * rng.standard_normal((n, 50))
-        for method, slope, scale in (("linear", 1.0, 1.0), ("mbir", 0.8, 0.8 / math.sqrt(gain))):
-            roi = np.array([40.0, 40.0 + 60.0 * slope]) + scale * noise
-            absent = np.array([100.0, 100.0]) + scale * noise
-            found[method, name, 2.0] = {"roi": roi, "absent": absent, "fat": scale * fat}
+        for method, slope, scale, off in (("linear", 1.0, 1.0, 0.0), ("mbir", 0.8, 0.8 / math.sqrt(gain), -5.0)):
+            # The second pair of ROIs reads twice the contrast of the first.
+            clean = np.array([[40.0, 40.0 + off + 60.0 * slope], [40.0, 40.0 + 2 * (off + 60.0 * slope)]])
+            twin = np.array([[100.0, 100.0 + off], [100.0, 100.0 + 2 * off]])
+            found[method, name, 2.0] = {
+                "roi": clean + scale * noise, "absent": (twin + scale * noise)[:TWINS], "fat": scale * fat,
+            }  # fmt: skip
+            if method == "linear":
+                found[method, name, 2.0]["expected"] = np.stack([clean, twin])[None]
     return found
 
 
 def test_rows_say_what_is_gained_and_kept():
-    rows = vessel_rows(_samples(np.random.default_rng(1), {"straight": 3.0, "curved_5mm": 1.5}), 60.0)
-    by = {(r["vessel"], r["method"]): r for r in rows}
+    rows = vessel_rows(_samples({"straight": 3.0, "curved_5mm": 1.5}), 60.0)
+    by = {(r["vessel"], r["method"]): r for r in rows if r["roi"] == "section"}
+    assert len(rows) == 2 * len(by) == 8
     assert by["straight", "mbir"]["to_linear"]["value"] == pytest.approx(3.0)
     bent = by["curved_5mm", "mbir"]
     assert bent["to_linear"]["value"] == pytest.approx(1.5)
+    # The two methods' draws are the same but for a factor: pairing leaves no sampling error.
+    assert bent["to_linear"]["low"] == pytest.approx(1.5, rel=0.01)
     assert bent["kept"]["value"] == pytest.approx(0.5)
     assert bent["slope"]["value"] == pytest.approx(0.8)
-    assert bent["false_contrast_hu"]["low"] <= 0 <= bent["false_contrast_hu"]["high"]
-    assert bent["contrast_hu"]["value"] == pytest.approx(48.0, abs=2.0)
+    # The control makes the means exact, with the core and without.
+    assert bent["contrast_hu"]["value"] == pytest.approx(43.0)
+    assert bent["false_contrast_hu"]["value"] == pytest.approx(-5.0)
     assert by["curved_5mm", "linear"]["fat_sd_hu"]["value"] == pytest.approx(20.0, rel=0.05)
+    assert by["curved_5mm", "linear"]["contrast_sd_raw_hu"] == pytest.approx(10.0, rel=0.15)
+    assert by["straight", "linear"]["contrast_hu"] == {"value": 60.0, "low": None, "high": None}
     assert by["straight", "linear"]["to_linear"]["value"] is None
     assert by["straight", "mbir"]["kept"]["value"] is None
+    wide = next(r for r in rows if (r["roi"], r["vessel"], r["method"]) == ("tissue", "curved_5mm", "mbir"))
+    assert wide["slope"]["value"] == pytest.approx(1.6)
     assert not vessel_rows({}, 60.0)
 
 
 def test_rows_without_the_linear_filter_or_the_straight_vessel():
-    samples = _samples(np.random.default_rng(2), {"straight": 3.0, "tilted": 2.0})
+    samples = _samples({"straight": 3.0, "tilted": 2.0})
     alone = vessel_rows({k: v for k, v in samples.items() if k[0] == "mbir"}, 60.0)
-    assert [r["to_linear"]["value"] for r in alone] == [None, None]
+    assert {r["to_linear"]["value"] for r in alone} == {None}
+    assert alone[0]["contrast_hu"]["low"] < 43.0 < alone[0]["contrast_hu"]["high"]
     tilted = vessel_rows({k: v for k, v in samples.items() if k[1] == "tilted"}, 60.0)
     assert tilted[1]["to_linear"]["value"] == pytest.approx(2.0)
     assert tilted[1]["kept"]["value"] is None
