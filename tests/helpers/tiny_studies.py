@@ -16,7 +16,7 @@ TINY: dict[str, dict[str, Any]] = {
     "dose-factor": {
         "n": 6, "slow_n": 3, "scene_n": 3, "doses": (2.0,), "scene_doses": (2.0,), "methods": ("linear",),
         "scenes": ("half_size_core",), "scene_methods": ("linear",), "views": 48, "voxel_mm": 0.4, "kernels": ("soft",),
-        "voxels_mm": (0.25,), "blurs_mm": (0.4,), "block": 3,
+        "voxels_mm": (0.25,), "blurs_mm": (0.4,), "block": 3, "vessels": ("straight", "curved_5mm"),
     },
     "detector": {"photons": 4000, "dead_times_ns": (50.0,), "charge_sharing": (0.1,)},
     "bowtie": {

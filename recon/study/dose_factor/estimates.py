@@ -28,6 +28,7 @@ __all__ = [
     "controlled",
     "estimate",
     "factor",
+    "kept",
     "mean_of",
     "none",
     "observer_factor",
@@ -151,13 +152,12 @@ def _squared_cnr(roi: Floats, slope: Any) -> Floats:
 _PAIRED = {"contrast_variance": _slope_corrected, "paper_cnr": _squared_cnr}
 
 
-def paired_ratio(figure: str, first: tuple[Floats, ContrastSlope], second: tuple[Floats, ContrastSlope]) -> Any:
-    """Dose factor of one method against another, both resampled together.
+Sample = tuple[Floats, ContrastSlope]
+"""ROI means ``(n, 2)`` of a method, and its contrast slope on the same noise."""
 
-    Args:
-        figure: ``"contrast_variance"`` or ``"paper_cnr"``.
-        first, second: ROI means ``(n, 2)`` on the same noise, and contrast slope.
-    """
+
+def _resampled_ratio(figure: str, first: Sample, second: Sample) -> tuple[float, Floats, Floats]:
+    """The ratio of two methods' figures, of bootstrap samples, and its logarithm with one realisation left out."""
     of, (a, slope_a), (b, slope_b) = _PAIRED[figure], first, second
     n = len(a)
 
@@ -168,5 +168,26 @@ def paired_ratio(figure: str, first: tuple[Floats, ContrastSlope], second: tuple
     value = float(ratio(np.arange(n)[None], (slope_a.value, slope_b.value))[0])
     with np.errstate(divide="ignore"):
         jackknife = np.log(ratio(leave_one_out(n), (slope_a.jackknife, slope_b.jackknife)))
-    draws = ratio(resampling(n, DRAWS, 0), (slope_a.draws, slope_b.draws))
+    return value, ratio(resampling(n, DRAWS, 0), (slope_a.draws, slope_b.draws)), jackknife
+
+
+def paired_ratio(figure: str, first: Sample, second: Sample) -> Any:
+    """Dose factor of one method against another, both resampled together.
+
+    Args:
+        figure: ``"contrast_variance"`` or ``"paper_cnr"``.
+        first, second: of the two methods, on the same noise.
+    """
+    value, draws, jackknife = _resampled_ratio(figure, first, second)
     return estimate((value, *bca_interval(value, draws, jackknife)))
+
+
+def kept(figure: str, here: tuple[Sample, Sample], there: tuple[Sample, Sample]) -> Any:
+    """Share of a dose factor (:func:`paired_ratio`) in one place that is left in another, all resampled together.
+
+    Args:
+        figure: as there.
+        here, there: the two methods in the place asked for and in the place compared with.
+    """
+    (a, drawn_a, left_a), (b, drawn_b, left_b) = (_resampled_ratio(figure, *pair) for pair in (here, there))
+    return estimate((a / b, *bca_interval(a / b, drawn_a / drawn_b, left_a - left_b)))

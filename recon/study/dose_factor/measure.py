@@ -36,6 +36,7 @@ from recon.study.dose_factor.settings import IMAGE_METHODS, MAIN_SCENES, NOISY_S
 from recon.study.dose_factor.shape_limit import shape_limits
 from recon.study.dose_factor.stability import worst_case_gains
 from recon.study.dose_factor.store import Store
+from recon.study.dose_factor.vessels import VesselScans
 from recon.study.study import Clock, Progress, silent
 
 __all__ = ["Measured", "measure"]
@@ -57,6 +58,7 @@ class Measured:
             :func:`recon.study.dose_factor.measures.segmentation`); empty with fast noise.
         samples: (method, scene, dose) → the same of each method, ``shape`` of all of its realisations.
         extra: (method, scene, dose) → ``roi`` and, with the core replaced by fibrous tissue, ``absent`` ``(n, 2)``.
+        vessels: (method, vessel, dose) → what :class:`recon.study.dose_factor.vessels.VesselScans` reads.
         volumes: (method or "fbp", scene, dose) → first realisation, HU.
         wide: FBP variant → covariance of the means in the wider ROIs at 1 s.
         gains: dose → method or FBP variant → worst-case response, HU mm^1.5.
@@ -72,6 +74,7 @@ class Measured:
     fbp: dict[tuple[str, float], dict[str, Any]] = field(default_factory=dict)
     samples: dict[tuple[str, str, float], dict[str, Any]] = field(default_factory=dict)
     extra: dict[tuple[str, str, float], dict[str, Any]] = field(default_factory=dict)
+    vessels: dict[tuple[str, str, float], dict[str, Any]] = field(default_factory=dict)
     volumes: dict[tuple[str, str, float], Any] = field(default_factory=dict)
     wide: dict[str, Any] = field(default_factory=dict)
     gains: dict[float, dict[str, float]] = field(default_factory=dict)
@@ -131,6 +134,7 @@ class _Study:
         for method in self.methods:
             self._main(method)
         self._extra()
+        self._vessels()
         m.wide = self.scene("paper").wide_covariance() if s.rois else {}
         m.gains = self._bounds(worst_case_gains, self.methods)
         m.shape_limits = self._bounds(shape_limits)
@@ -216,9 +220,15 @@ class _Study:
         place = f"methods/{method.name}/{name}_{dose:g}s_{block.start}-{block.stop}"
         return self.store.piece(place, f"{self.noise.key} {fingerprint(method)} 2", compute)
 
+    def _scene_methods(self) -> list[Method]:
+        return [m for m in self.methods if m.name in self.settings.scene_methods and m.name not in IMAGE_METHODS]
+
+    def _vessels(self) -> None:
+        jobs = VesselScans(self.noise).jobs(self.settings.vessels, self._scene_methods())
+        self.m.vessels = {key: joined(pieces) for key, pieces in self._collected("vessels", jobs).items()}
+
     def _extra(self) -> None:
-        s = self.settings
-        methods = [m for m in self.methods if m.name in s.scene_methods and m.name not in IMAGE_METHODS]
+        s, methods = self.settings, self._scene_methods()
         jobs = [
             ((method.name, name, dose), partial(self._extra_piece, method, name, dose, block))
             for name in self.m.scenes for dose in s.scene_doses for block in s.blocks(s.scene_n) for method in methods

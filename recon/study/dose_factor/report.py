@@ -13,6 +13,7 @@ from recon.study.dose_factor.measure import Measured
 from recon.study.dose_factor.other_rois import other_voxels, wide_entry
 from recon.study.dose_factor.settings import FBP_BASE, METHOD_NAMES, fbp_label
 from recon.study.dose_factor.tables import at_dose, headline_method, of_method, tables, text
+from recon.study.dose_factor.vessel_rows import vessel_rows
 from recon.study.paper.facts import ASSUMED_FACTOR
 from recon.study.report import Report
 from recon.study.study import environment
@@ -52,6 +53,7 @@ def _analyse(measured: Measured) -> dict[str, Any]:
         "worst_case_gains": [{"exposure_s": dose, **gains} for dose, gains in measured.gains.items()],
         "scenes": scene_rows(exact),
         "scenes_left_out": measured.left_out,
+        "vessels": vessel_rows(measured.vessels, exact.paper.contrast_hu),
     }
 
 

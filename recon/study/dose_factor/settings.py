@@ -20,6 +20,8 @@ __all__ = [
     "METHOD_NAMES",
     "NOISY_SCENES",
     "SLOW_METHODS",
+    "VESSELS",
+    "VESSEL_ROIS",
     "WIDE_ROIS",
     "Settings",
     "fbp_label",
@@ -44,6 +46,13 @@ EXTRA_SCENES = (
 )  # fmt: skip
 """Scenes that can expose an invention."""
 
+VESSELS = ("straight", "tilted", "in_plane_x", "in_plane_y", "curved_8mm", "curved_5mm", "bifurcating")
+"""Vessels of any direction, :data:`recon.study.dose_factor.vessel_shapes.SHAPES`; the first is what gains are compared
+with."""
+
+VESSEL_ROIS = ("section", "tissue")
+"""What is read of a vessel: the paper's ROIs in the section across it, and all of core and fibrous tissue."""
+
 METHOD_NAMES = {
     "linear": "linear 3-D filter",
     "linear_z": "linear filter along z",
@@ -67,10 +76,10 @@ IMAGE_METHODS = ("fbp_cnn",)
 SLOW_METHODS = ("quadratic", "qggmrf", "tv", "fbp_cnn", "mbir_noise_half", "mbir_noise_double")
 """Few realisations place them well enough: iterated to convergence, drawn anew as images, or a test of robustness."""
 
-_SECONDS = {"scene": 45.0, "fbp": 90.0, "data": 3.0, "images": 3.0, "linear": 0.3, "linear_z": 0.3, "quadratic": 1.5,
-            "qggmrf": 5.0, "tv": 10.0, "fbp_cnn": 1.0, "mbir_one_pass": 0.5, "mbir": 1.0, "mbir_noise_half": 1.0,
-            "mbir_noise_double": 1.0}  # fmt: skip
-"""Rough cost at all views on two cores: one scene, exact FBP noise, one realisation, one volume of each method."""
+_SECONDS = {"scene": 45.0, "vessel": 8.0, "fbp": 90.0, "data": 3.0, "images": 3.0, "linear": 0.3, "linear_z": 0.3,
+            "quadratic": 1.5, "qggmrf": 5.0, "tv": 10.0, "fbp_cnn": 1.0, "mbir_one_pass": 0.5, "mbir": 1.0,
+            "mbir_noise_half": 1.0, "mbir_noise_double": 1.0}  # fmt: skip
+"""Rough cost at all views on two cores: a scene, a vessel, exact FBP noise, one realisation, one volume of a method."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +95,8 @@ class Settings(StudySettings):
         seed: first seed.
         methods: names of :data:`METHODS`.
         scenes: further scenes, of :data:`EXTRA_SCENES`.
-        scene_methods: methods that reconstruct the further scenes.
+        scene_methods: methods that reconstruct the further scenes and the vessels.
+        vessels: vessels of other directions, of :data:`VESSELS`, at ``scene_doses`` with ``scene_n`` realisations.
         views: per rotation; fewer than the paper's keep the tube load of the whole scan.
         voxel_mm: of the methods' grid.
         kernels, voxels_mm: FBP that is analysed exactly.
@@ -111,6 +121,7 @@ class Settings(StudySettings):
     methods: tuple[str, ...] = METHODS
     scenes: tuple[str, ...] = EXTRA_SCENES
     scene_methods: tuple[str, ...] = ("linear", "mbir")
+    vessels: tuple[str, ...] = VESSELS
     views: int = paper.FULL_VIEWS["PCCT"]
     voxel_mm: float = 0.2
     kernels: tuple[str, ...] = paper.KERNELS
@@ -126,6 +137,7 @@ class Settings(StudySettings):
         "n": 8, "scene_n": 4, "doses": (2.0,), "scene_doses": (2.0,), "views": 246, "fast_noise": True,
         "methods": ("linear", "mbir_one_pass", "mbir"), "scenes": ("half_size_core",),
         "kernels": ("soft", "standard"), "voxels_mm": (0.25,), "blurs_mm": (0.25,), "bounds": False, "rois": (),
+        "vessels": (),
     }  # fmt: skip
 
     def __post_init__(self) -> None:
@@ -142,6 +154,7 @@ class Settings(StudySettings):
             ("methods", METHODS),
             ("scene_methods", METHODS),
             ("rois", WIDE_ROIS),
+            ("vessels", VESSELS),
         ):
             values = tuple(getattr(self, name))
             object.__setattr__(self, name, values)
@@ -166,7 +179,7 @@ class Settings(StudySettings):
         """Rough time in s of each part on two idle cores, nothing finished yet."""
         share = self.views / paper.FULL_VIEWS["PCCT"]
         further = sum(len(with_twin(name)) for name in self.scenes)
-        extra = further * self.scene_n * len(self.scene_doses)
+        extra = (further + len(self.vessels)) * self.scene_n * len(self.scene_doses)
         drawn = 0 if self.fast_noise else len(NOISY_SCENES) * self.n * len(self.doses)
         on_images = bool(set(self.methods) & set(IMAGE_METHODS))
         image_scenes = len(NOISY_SCENES) if on_images else int(not self.fast_noise)
@@ -175,6 +188,7 @@ class Settings(StudySettings):
             "scenes": share * ((len(MAIN_SCENES) + further) * _SECONDS["scene"] + _SECONDS["fbp"]),
             "data": share * drawn * _SECONDS["data"],
             "images": share * images * _SECONDS["images"],
+            "vessels": share * len(self.vessels) * _SECONDS["vessel"],
         }
         for name in self.methods:
             volumes = len(MAIN_SCENES) * self.realizations(name) * len(self.doses)

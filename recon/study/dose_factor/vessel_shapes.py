@@ -1,0 +1,239 @@
+"""The paper's plaque on a vessel of any direction: tilted, in plane, curved, bifurcating.
+
+The analytic scenes know vessels along z only. Here a point of space is taken to the vessel's own coordinates (across
+towards the plaque, across, along the centreline) and there asked which tissue of the straight plaque it lies in. So all
+vessels have the same sections. The plaque sits across the plane of a bend, where bending neither stretches nor squeezes
+it on average: every tissue keeps its volume exactly (Pappus), as its sections are symmetric about that plane.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
+
+from torchpcct.geometry import VolumeGrid
+from torchpcct.metrics.placement import RoiPair, RoiRule
+from torchpcct.scene import Scene
+from torchpcct.scene.plaque import Plaque, plaque_scene
+from torchpcct.scene.raster import grid_points
+
+__all__ = ["LENGTH_MM", "SHAPES", "Branch", "Centreline", "Vessel", "vessel"]
+
+Floats = NDArray[np.float64]
+
+LENGTH_MM = 8.0
+"""Of every vessel, along its centreline: in any direction it ends inside of the inset, 9 mm wide."""
+
+_PLAQUE = Plaque(position=(0.0, 0.0, 0.0), vessel_length=LENGTH_MM)
+
+_SLAB = 8
+"""Slices painted at a time."""
+
+_ROI_MM, _ROI_STEP_MM = 4.4, 0.05
+"""Edge and voxel size of the cube about the core in which the ROIs are placed."""
+
+_SECTION_MM = 0.1
+"""Thickness of the section across the vessel."""
+
+_ROI_ACROSS_MM = 1.6
+"""The fibrous ROI ends this far from the core's centre across the vessel, as that of the wide ROI "tissue"."""
+
+
+@dataclass(frozen=True)
+class Centreline:
+    """A straight line or a circle's arc through the origin.
+
+    Args:
+        tangent: ``(x, y, z)`` unit vector along the vessel at the origin.
+        side: unit vector across, towards the plaque.
+        radius: of the arc in mm, which bends towards ``tangent × side``; ``inf`` for a line.
+
+    Raises:
+        ValueError: vectors that are not of unit length and perpendicular, a radius that is not positive.
+    """
+
+    tangent: tuple[float, float, float]
+    side: tuple[float, float, float]
+    radius: float = math.inf
+
+    def __post_init__(self) -> None:
+        frame = np.stack([self.side, self.tangent])
+        if not np.allclose(frame @ frame.T, np.eye(2)):
+            raise ValueError(f"tangent and side must be perpendicular unit vectors, got {self.tangent}, {self.side}")
+        if not self.radius > 0:
+            raise ValueError(f"radius must be positive, got {self.radius} mm")
+
+    def local(self, points: ArrayLike) -> Floats:
+        """``(..., 3)`` x, y, z in mm → towards the plaque, across, along the centreline, mm."""
+        p = np.asarray(points, dtype=np.float64)
+        towards, across, along = (p @ np.asarray(v, np.float64) for v in self.axes)
+        if math.isinf(self.radius):
+            return np.stack([towards, across, along], axis=-1)
+        left = self.radius - across
+        return np.stack([towards, self.radius - np.hypot(along, left), self.radius * np.arctan2(along, left)], axis=-1)
+
+    def point(self, local: ArrayLike) -> Floats:
+        """The inverse of :meth:`local`."""
+        towards, across, along = np.moveaxis(np.asarray(local, dtype=np.float64), -1, 0)
+        if not math.isinf(self.radius):
+            angle, distance = along / self.radius, self.radius - across
+            across, along = self.radius - distance * np.cos(angle), distance * np.sin(angle)
+        result: Floats = np.stack([towards, across, along], axis=-1) @ np.asarray(self.axes, np.float64)
+        return result
+
+    @property
+    def axes(self) -> tuple[Any, Any, Any]:
+        """Unit vectors at the origin: towards the plaque, across, along."""
+        return self.side, np.cross(self.tangent, self.side), self.tangent
+
+
+@dataclass(frozen=True)
+class Branch:
+    """A healthy side branch, away from the plaque; lengths in mm.
+
+    Args:
+        angle: to the vessel, rad.
+        diameter: outer; its wall is as thick as the vessel's.
+        length: from the vessel's lumen to its flat end.
+    """
+
+    angle: float = math.pi / 4
+    diameter: float = 2.24
+    length: float = 4.5
+
+
+@dataclass(frozen=True)
+class Vessel:
+    """The plaque on a centreline.
+
+    Args:
+        line: the vessel's, in a frame about ``center``.
+        center: ``(z, y, x)`` mm of the vessel's axis in the middle of the plaque.
+        branch: None for none.
+        plaque: its geometry, in the vessel's own coordinates.
+    """
+
+    line: Centreline
+    center: tuple[float, float, float]
+    branch: Branch | None = None
+    plaque: Plaque = _PLAQUE
+
+    @cached_property
+    def straight(self) -> Scene:
+        """The plaque in the vessel's own coordinates."""
+        return plaque_scene(self.plaque)[0]
+
+    def local(self, points: Floats) -> Floats:
+        """Points ``(..., 3)`` of the scanner's frame in the vessel's coordinates, mm."""
+        return self.line.local(points - np.array(self.center[::-1]))
+
+    def labels(self, points: Floats) -> NDArray[np.int64]:
+        """Index of the tissue in :attr:`straight` at points ``(..., 3)`` x, y, z in mm."""
+        local = self.local(points)
+        labels = self.straight.labels(local)
+        if self.branch is not None:
+            index, b = self.straight.index, self.branch
+            along = np.array([-math.sin(b.angle), 0.0, math.cos(b.angle)])
+            start = np.array([float(self.plaque.section("lumen", 0.0)[0]), 0.0, 0.0])
+            depth = (local - start) @ along
+            off = np.linalg.norm(local - start - depth[..., None] * along, axis=-1)
+            within = (depth >= 0) & (depth <= b.length)
+            labels[within & (off <= b.diameter / 2) & (labels == index("patient"))] = index("wall")
+            blood = within & (off <= b.diameter / 2 - self.plaque.wall_thickness)
+            labels[blood & (labels != index("core"))] = index("lumen")
+        return labels
+
+    def painted(self, grid: VolumeGrid, values: Mapping[str, float], samples: int = 2) -> Floats:
+        """``grid.shape``: mean over each voxel of ``values`` of the tissues, from ``samples``³ points; others 0."""
+        table = np.array([values.get(name, 0.0) for name in self.straight.names])
+        result = np.empty(grid.shape)
+        for first in range(0, grid.shape[0], _SLAB):
+            count = min(_SLAB, grid.shape[0] - first)
+            shape = (count, *grid.shape[1:])
+            middle = grid.center[0] + (first + (count - grid.shape[0]) / 2) * grid.spacing[0]
+            fine = VolumeGrid(
+                tuple(samples * n for n in shape), tuple(s / samples for s in grid.spacing), (middle, *grid.center[1:])
+            )
+            blocks = table[self.labels(grid_points(fine))].reshape(count, samples, shape[1], samples, shape[2], samples)
+            result[first : first + count] = blocks.mean((1, 3, 5))
+        return result
+
+    def rois(self, name: str) -> RoiPair:
+        """Core and fibrous tissue beside it, but for a margin at their edges; they follow the vessel.
+
+        Args:
+            name: ``"tissue"``: all of the core, and the fibrous tissue in its slab, as
+                :func:`torchpcct.metrics.placement.whole_rois` takes them; ``"section"``: the paper's ROIs in the
+                section across the vessel, as :func:`torchpcct.metrics.placement.place_rois` does. Distances in space.
+        """
+        center = self.plaque.core_center
+        x, y, z = self.line.point(center) + np.array(self.center[::-1])
+        count = round(_ROI_MM / _ROI_STEP_MM)
+        image = VolumeGrid((count, count, count), _ROI_STEP_MM, (float(z), float(y), float(x)))
+        points = grid_points(image)
+        labels, local = self.labels(points), self.local(points) - np.array(center)
+        off = np.abs(local)
+
+        def depth(mask: Any) -> Any:
+            return ndimage.distance_transform_edt(mask, sampling=image.spacing)
+
+        index = self.straight.index
+        in_core, in_tissue = labels == index("core"), labels == index("fibrous")
+        section = name == "section"
+        rule = RoiRule() if section else RoiRule(0.10, 0.10, math.inf, 0.30)
+        slab = off[..., 2] <= (_SECTION_MM / 2 if section else self.plaque.core.semi_axes[2])
+        foreground = (depth(in_core) > rule.core_margin) & slab
+        background = (
+            (off[..., :2] <= _ROI_ACROSS_MM).all(-1)
+            & slab
+            & (depth(in_tissue) > rule.background_margin)
+            & (depth(labels != index("lumen")) > rule.lumen_margin)
+        )
+        if section:
+            # Of the two alike regions beside the core the paper's; in a bend it lies outside.
+            background &= (depth(~in_core) < rule.background_reach) & (local[..., 1] < 0)
+        return RoiPair(foreground, background, image, rule)
+
+    def plain_fat(self, grid: VolumeGrid, distance: float = 1.5, edge: float = 0.8) -> Any:
+        """Mask ``grid.shape`` of the voxels farther than ``distance`` mm from the vessel and ``edge`` mm from the
+        grid's faces."""
+        outside = self.labels(grid_points(grid)) == self.straight.index("patient")
+        mask = ndimage.distance_transform_edt(outside, sampling=grid.spacing) > distance
+        for axis, step in enumerate(grid.spacing):
+            kept = np.moveaxis(mask, axis, 0)
+            width = math.ceil(edge / step - 1e-9)
+            kept[:width] = kept[len(kept) - width :] = False
+        return mask
+
+
+_X, _Y, _Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+_HALF = math.sqrt(0.5)
+
+SHAPES: dict[str, tuple[Centreline, Branch | None]] = {
+    "straight": (Centreline(_Z, _X), None),
+    "tilted": (Centreline((0.0, _HALF, _HALF), _X), None),
+    "in_plane_x": (Centreline(_X, (0.0, -1.0, 0.0)), None),
+    "in_plane_y": (Centreline(_Y, _X), None),
+    "curved_8mm": (Centreline(_Z, _X, 8.0), None),
+    "curved_5mm": (Centreline(_Z, _X, 5.0), None),
+    "bifurcating": (Centreline(_Z, _X), Branch()),
+}
+"""Centreline and side branch of every vessel; ``in_plane_x`` is ``in_plane_y`` turned by a right angle about z."""
+
+
+def vessel(name: str, center: tuple[float, float, float]) -> Vessel:
+    """A vessel of :data:`SHAPES`.
+
+    Args:
+        name: of the vessel.
+        center: ``(z, y, x)`` mm.
+    """
+    line, branch = SHAPES[name]
+    return Vessel(line, center, branch)
