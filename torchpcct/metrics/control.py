@@ -215,7 +215,7 @@ def variance_factor(
     """
     known = not isinstance(reference, Jackknifed)
     for name, v in (("reference", reference if known else 1.0), ("slope", slope), ("reference_slope", reference_slope)):
-        if not np.min(v.left_out if isinstance(v, Jackknifed) else v) > 0:  # type: ignore[operator]
+        if not np.min(v.left_out if isinstance(v, Jackknifed) else v) > 0:
             raise ValueError(f"{name} must be positive: contrast of the wrong sign cannot be corrected")
     log_reference = reference if isinstance(reference, Jackknifed) else math.log(reference)
     ratio = combined(

@@ -5,7 +5,7 @@ and on the scanner's water correction. A least-squares fit of all tissues to one
 layers apart and moves by tens of HU with what it takes the fat for. A rod of the tissue alone, at the same place in
 the same patient, is large enough for the plateau of its FBP image to be read directly: no fit, no edges, no noise.
 
-Measured with the paper's scanner, standard kernel: core 41.1, wall 63.5, fibrous tissue 103.2, blood 480.0, fat −92.7 HU.
+Measured with the paper's scanner, standard kernel: core 41.1, wall 63.5, fibrous 103.2, blood 480.0, fat −92.7 HU.
 246 views differ from 1968 by 0.01 HU at most, voxels of 0.1 mm from those of 0.25 mm too. Rods of 3, 4 and 6 mm agree
 within 0.03 HU but for blood with iodine, which hardens its own beam and reads 1.2 HU less per mm of diameter: rods
 should be about as thick as the vessel. All read 3–6 HU more than :meth:`Material.hu` of the spectrum behind the patient

@@ -16,11 +16,11 @@ def setup():
 
 @pytest.fixture(scope="module")
 def found(setup):
-    return rod_values(*setup, views=120)
+    return rod_values(*setup, views=60)
 
 
 def test_ct_numbers_behind_the_patient(setup, found):
-    """Material.hu of the spectrum behind the cylinder is against water behind fat, FBP's against water alone: a shift."""
+    """Material.hu behind the cylinder refers to water behind fat, FBP to water alone: a shift of a few HU."""
     scene, scanner, _ = setup
     energies, weights = scanner.weights()
     column = weights.shape[1] // 2
@@ -36,9 +36,9 @@ def test_ct_numbers_behind_the_patient(setup, found):
 
 
 def test_neither_diameter_nor_views_matter(setup, found):
-    tissues = {name: setup[0][name].material for name in ("core", "fibrous", "wall")}
-    thick = rod_values(*setup, tissues=tissues, diameter_mm=6.0, views=120)
-    more = rod_values(*setup, tissues=tissues, views=246)
+    tissues = {name: setup[0][name].material for name in ("core", "fibrous")}
+    thick = rod_values(*setup, tissues=tissues, diameter_mm=6.0, views=60)
+    more = rod_values(*setup, tissues=tissues, views=120)
     for name in tissues:
         assert thick.hu[name] == pytest.approx(found.hu[name], abs=0.1)
         assert more.hu[name] == pytest.approx(found.hu[name], abs=0.05)
@@ -46,14 +46,14 @@ def test_neither_diameter_nor_views_matter(setup, found):
 
 def test_blood_hardens_its_own_beam(setup, found):
     blood = {"lumen": setup[0]["lumen"].material}
-    thick = rod_values(*setup, tissues=blood, diameter_mm=6.0, views=120)
+    thick = rod_values(*setup, tissues=blood, diameter_mm=6.0, views=60)
     assert -4.0 < thick.hu["lumen"] - found.hu["lumen"] < -1.5
 
 
 def test_another_material_and_kernel(setup, found):
     progress = []
     own = rod_values(
-        *setup, tissues={"own": MATERIALS["fibrous_tissue"], "core": "necrotic_core"}, views=60, kernel="soft",
+        *setup, tissues={"own": MATERIALS["fibrous_tissue"], "core": "necrotic_core"}, views=30, kernel="soft",
         progress=progress.append,
     )  # fmt: skip
     assert own.hu["own"] == pytest.approx(found.hu["fibrous"], abs=3.0)
