@@ -11,7 +11,7 @@ from recon.study.report import Report
 TINY: dict[str, dict[str, Any]] = {
     "compare": {
         "realizations": 3, "views": 48, "kernels": ("soft",), "voxels_mm": (0.4,), "doses": {"1x": 0.35, "5.7x": 2.0},
-        "pwls": False,
+        "pwls": False, "mbir": False, "placements": False,
     },
     "dose-factor": {
         "n": 6, "slow_n": 3, "scene_n": 3, "doses": (2.0,), "scene_doses": (2.0,), "methods": ("linear",),

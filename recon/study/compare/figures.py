@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from recon.study.compare.measure import PWLS, Measured
+from recon.study.compare.measure import MBIR, PWLS, PWLS_VOXEL_MM, Measured
 from recon.study.figures import extent, roi_outlines
 from recon.study.paper import facts as paper
 from recon.study.paper.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM
@@ -21,7 +21,12 @@ def sections_figure(m: Measured) -> Any:
     voxel = 0.25 if 0.25 in s.voxels_mm else s.voxels_mm[0]
     columns = [("noise free\nstandard 0.10 mm", ("noise free", REFERENCE_KERNEL, REFERENCE_VOXEL_MM))]
     columns += [(f"FBP {kernel}\n{voxel:.2f} mm", ("fbp", kernel, voxel)) for kernel in s.kernels]
-    columns.append((f"PWLS {PWLS[1]}\n{voxel:.2f} mm", (*PWLS, voxel)))
+    columns.append((f"PWLS {PWLS[1]}\n{PWLS_VOXEL_MM:.2f} mm", (*PWLS, PWLS_VOXEL_MM)))
+    for key in m.images:
+        if key[0] == MBIR[0]:
+            columns.append((f"MBIR\n{key[2]:.2f} mm", key))
+        elif key[0] == "mbir absent":
+            columns.append(("MBIR, no core,\nthe same noise", key))
     z, y, x = image.center
     pixel = image.spacing[1]
     section = VolumeGrid((int(8.75 / pixel), 1, image.shape[2]), pixel, (z, y, x))

@@ -1,11 +1,12 @@
-"""Simulate the plaque's scan, reconstruct every noise realisation by FBP and PWLS, take the ROI means."""
+"""Simulate the plaque's scan, reconstruct every noise realisation by FBP, PWLS and MBIR, take the ROI means."""
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,23 +17,43 @@ from numpy.typing import NDArray
 from recon import reconstruct
 from recon.fbp.exact_noise import roi_covariance
 from recon.fbp.inset import InsetFbp
+from recon.mbir.mbir import Mbir
 from recon.pwls.inset_problem import InsetProblem
+from recon.study.compare.draws import Draws, linear_control, reconstruct_draws
+from recon.study.compare.placements import Placements, vary_placement
+from recon.study.compare.reference import Reference, exact_reference
+from recon.study.compare.regions import Regions
 from recon.study.compare.settings import Settings
 from recon.study.paper import facts as paper
-from recon.study.paper.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM, PlaqueScan, prepare, roi_entry
+from recon.study.paper.plaque_scan import (
+    REFERENCE_KERNEL,
+    REFERENCE_VOXEL_MM,
+    PlaqueScan,
+    duty,
+    enclosing,
+    inset_grid,
+    prepare,
+    roi_entry,
+)
+from recon.study.paper.rods import RodValues, rod_values
+from recon.study.paper.tables import table_checks
 from recon.study.study import Clock, Progress, silent
+from torchpcct.acquisition.acquire import acquire
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.placement import RoiPair
+from torchpcct.scan import Scan
 from torchpcct.scanner import presets
-from torchpcct.scene.plaque import plaque_scene
+from torchpcct.scene.plaque import plaque_scene, plaque_variant
 
-__all__ = ["PWLS", "Key", "Measured", "measure"]
+__all__ = ["MBIR", "PWLS", "Key", "Measured", "measure"]
 
 PWLS = ("pwls", "q-GGMRF")
 """Method and "kernel" of PWLS in the tables."""
+MBIR = ("mbir", "learned")
+"""Method and "kernel" of MBIR in the tables."""
 
 PWLS_VOXEL_MM = 0.25
-"""Voxel size at which PWLS is run at every dose (the paper's best for FBP); at the tables' dose it is run at all."""
+"""Voxel size of PWLS: the paper's best for FBP."""
 
 Key = tuple[str, str, float, float]
 """Method, kernel, voxel size in mm, exposure in s."""
@@ -49,7 +70,11 @@ class Measured:
         voxel_noise: setting of FBP → SD over the realisations, rms over the inset, HU.
         images: (method, kernel, voxel size) → first realisation at the tables' dose, and the noise-free reference.
         grids: voxel size → grid.
-        pwls: how PWLS converged, for every voxel size and dose.
+        pwls: how PWLS converged, for every dose.
+        draws: exposure → MBIR with and without the core, beside its control.
+        reference: exact figures of the FBP that dose factors refer to; rods: true values of core and fibrous tissue;
+            both None without MBIR.
+        placements: of the FBPs that have a figure outside its tolerance.
         seconds: per step.
     """
 
@@ -62,14 +87,19 @@ class Measured:
     images: dict[tuple[str, str, float], Any]
     grids: dict[float, VolumeGrid]
     pwls: list[dict[str, Any]]
+    draws: dict[float, Draws]
+    reference: Reference | None
+    rods: RodValues | None
+    placements: list[Placements]
     seconds: dict[str, float]
 
 
 def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
     """Simulate, reconstruct, measure; see :mod:`recon.study.study`."""
     clock = Clock()
+    scene = plaque_scene()
     scanned = prepare(
-        settings.kernels, settings.voxels_mm, plaque_scene(), presets.pcct(views=settings.views),
+        settings.kernels, settings.voxels_mm, scene, presets.pcct(views=settings.views),
         paper.FULL_VIEWS["PCCT"], lambda f: progress("simulate", f),
     )  # fmt: skip
     clean, fine, fbp = scanned.clean, scanned.fine, scanned.fbp
@@ -85,6 +115,10 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
         images={("noise free", REFERENCE_KERNEL, REFERENCE_VOXEL_MM): reference},
         grids={g.spacing[0]: g for g in [fine, *scanned.grids]},
         pwls=[],
+        draws={},
+        reference=None,
+        rods=None,
+        placements=[],
         seconds=clock.seconds,
     )
     expected = fbp(clean)
@@ -97,21 +131,52 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     for entry, matrix in zip(m.noise_free[1:], itertools.chain.from_iterable(covariances), strict=True):
         entry["covariance_hu2_s"] = matrix.tolist()
     clock.lap("exact noise of FBP")
-    _realisations(m, scanned, expected, clock, progress)
-    if settings.pwls:
-        _run_pwls(m, scanned, progress)
-        clock.lap("PWLS")
+    if settings.placements:
+        _vary_placements(m, scanned, progress)
+        clock.lap("ROIs and grids elsewhere")
+    mbir = _MbirRun(m, scanned, Regions(*scene, scanned.rois), clock, progress) if settings.mbir else None
+    pwls = InsetProblem(clean, inset_grid(scene[1], PWLS_VOXEL_MM)) if settings.pwls else None
+    clock.lap("PWLS")
+    for exposure in settings.doses.values():
+        scans = _realisations(m, scanned, exposure, expected, mbir, clock, progress)
+        if pwls is not None and exposure in settings.pwls_s:
+            _run_pwls(m, scanned, pwls, exposure, scans, progress)
+            clock.lap("PWLS")
+        if mbir is not None and exposure in settings.mbir_s:
+            mbir(exposure)
     return m
 
 
-def _realisations(m: Measured, scanned: PlaqueScan, expected: Any, clock: Clock, progress: Progress) -> None:
-    """FBP of every noise realisation."""
+def _vary_placements(m: Measured, scanned: PlaqueScan, progress: Progress) -> None:
+    """Move ROIs and grid for every FBP that has a figure of the paper's tables outside its tolerance."""
+    outside: dict[float, list[str]] = {}
+    for e in m.noise_free[1:]:
+        covariance = np.array(e["covariance_hu2_s"]) / paper.TABLE_EXPOSURE_S
+        means = (e["foreground_hu"], e["background_hu"])
+        if not all(c.ok for c in table_checks(e["kernel"], e["voxel_mm"], means, covariance)):
+            outside.setdefault(e["voxel_mm"], []).append(e["kernel"])
+    for done, (voxel, kernels) in enumerate(outside.items()):
+        progress("ROIs and grids elsewhere", done / len(outside))
+        m.placements += vary_placement(scanned.clean, m.grids[voxel], scanned.rois, kernels)
+
+
+def _realisations(
+    m: Measured,
+    scanned: PlaqueScan,
+    exposure: float,
+    expected: Any,
+    mbir: _MbirRun | None,
+    clock: Clock,
+    progress: Progress,
+) -> list[Scan]:
+    """FBP of every noise realisation of an exposure, and its b for MBIR; the scans, where PWLS needs them."""
     s = m.settings
     means: dict[Key, list[tuple[float, float]]] = {}
     squares: dict[Key, float] = {}
-    total = len(s.doses) * s.realizations
-    for done, (exposure, seed) in enumerate(_runs(s)):
-        scan = scanned.clean.with_noise(exposure, seed)
+    kept = []
+    before = list(s.doses.values()).index(exposure) * s.realizations
+    for k in range(s.realizations):
+        scan = scanned.clean.with_noise(exposure, s.seed + k)
         clock.lap("noise")
         for grid, pair, volumes, truth in zip(scanned.grids, scanned.pairs, scanned.fbp(scan), expected, strict=True):
             voxel = grid.spacing[0]
@@ -120,48 +185,98 @@ def _realisations(m: Measured, scanned: PlaqueScan, expected: Any, clock: Clock,
                 # FBP is linear: its expectation is known, and every voxel of every run adds to the variance.
                 squares[key] = squares.get(key, 0.0) + float(torch.mean((volume - mean) ** 2)) / s.realizations
                 means.setdefault(key, []).append((float(pair[0](volume)), float(pair[1](volume))))
-                if seed == s.seed and exposure == paper.table_exposure(s.doses):
+                if k == 0 and exposure == paper.table_exposure(s.doses):
                     m.images["fbp", kernel, voxel] = volume
         clock.lap("FBP")
-        progress("noise realisations, FBP", (done + 1) / total)
+        if mbir is not None and exposure in s.mbir_s:
+            mbir.take(scan)
+            clock.lap("MBIR")
+        if s.pwls and exposure in s.pwls_s:
+            kept.append(scan)
+        progress("noise realisations, FBP", (before + k + 1) / (len(s.doses) * s.realizations))
     m.means.update({key: np.array(values) for key, values in means.items()})
     m.voxel_noise.update({key: math.sqrt(value) for key, value in squares.items()})
+    return kept
 
 
-def _run_pwls(m: Measured, scanned: PlaqueScan, progress: Progress) -> None:
-    s = m.settings
-    shown = paper.table_exposure(s.doses)
-    problems: dict[float, InsetProblem] = {}
-    jobs = [
-        (exposure, grid, pair)
-        for exposure in s.doses.values()
-        for grid, pair in zip(scanned.grids, scanned.pairs, strict=True)
-        if (exposure == shown) + (grid.spacing[0] == PWLS_VOXEL_MM) >= (1 if s.pwls_everywhere else 2)
-    ]
-    for done, (exposure, grid, pair) in enumerate(jobs):
-        voxel = grid.spacing[0]
-        scans = [scanned.clean.with_noise(exposure, seed) for e, seed in _runs(s) if e == exposure]
-        if voxel not in problems:
-            problems[voxel] = InsetProblem(scanned.clean, grid)
-
-        def inner(fraction: float, done: int = done) -> None:
-            progress("PWLS", (done + fraction) / len(jobs))
-
-        volumes = reconstruct(scans, grid, "pwls", problem=problems[voxel], progress=inner)
-        m.means[*PWLS, voxel, exposure] = np.array([[float(roi(v.data)) for roi in pair] for v in volumes])
-        m.pwls.append(
-            {
-                "voxel_mm": voxel,
-                "exposure_s": exposure,
-                "largest_rmsd_hu": max(v.report["rmsd_hu"][-1] for v in volumes),
-                "seconds_per_volume": float(np.mean([v.report["seconds"] for v in volumes])),
-                **volumes[0].report,
-            }
-        )
-        if exposure == shown:
-            m.images[*PWLS, voxel] = volumes[0].data
+def _run_pwls(
+    m: Measured, scanned: PlaqueScan, problem: InsetProblem, exposure: float, scans: Sequence[Scan], progress: Progress
+) -> None:
+    grid = problem.grid
+    pair = scanned.rois.on(grid)
+    volumes = reconstruct(scans, grid, "pwls", problem=problem, progress=lambda f: progress("PWLS", f))
+    m.means[*PWLS, PWLS_VOXEL_MM, exposure] = np.array([[float(roi(v.data)) for roi in pair] for v in volumes])
+    m.pwls.append(
+        {
+            "voxel_mm": PWLS_VOXEL_MM,
+            "exposure_s": exposure,
+            "largest_rmsd_hu": max(v.report["rmsd_hu"][-1] for v in volumes),
+            "seconds_per_volume": float(np.mean([v.report["seconds"] for v in volumes])),
+            **volumes[0].report,
+        }
+    )
+    if exposure == paper.table_exposure(m.settings.doses):
+        m.grids[PWLS_VOXEL_MM] = grid
+        m.images[*PWLS, PWLS_VOXEL_MM] = volumes[0].data
 
 
-def _runs(settings: Settings) -> Iterator[tuple[float, int]]:
-    """Exposure and seed of every realisation."""
-    return itertools.product(settings.doses.values(), range(settings.seed, settings.seed + settings.realizations))
+class _MbirRun:
+    """MBIR of every realisation with and without the core, on the voxels of its network.
+
+    Args:
+        m: where results go; the exact figures of FBP and the true values are found here.
+        scanned: the plaque's scan.
+        regions: what is read.
+        clock, progress: of the study.
+    """
+
+    def __init__(self, m: Measured, scanned: PlaqueScan, regions: Regions, clock: Clock, progress: Progress) -> None:
+        self.m, self.clean, self.regions, self.clock, self.progress = m, scanned.clean, regions, clock, progress
+        scanner = presets.pcct(views=m.settings.views)
+        absent = acquire(
+            plaque_variant("paper", core_contrast=0.0)[0], scanner, region=enclosing([*scanned.grids, scanned.fine]),
+            duty=duty(scanner, paper.FULL_VIEWS["PCCT"]), progress=lambda f: progress("simulate without core", f),
+        )  # fmt: skip
+        clock.lap("simulate")
+        progress("exact noise of FBP", 0.0)
+        m.reference = exact_reference(self.clean, absent, regions)
+        clock.lap("exact noise of FBP")
+        tissues = {b.name: b.material for b in regions.scene.bodies if b.name in ("core", "fibrous")}
+        m.rods = rod_values(regions.scene, scanner, regions.plaque.position, tissues=tissues)
+        clock.lap("true values")
+        self.network = Mbir.load()
+        self.grid = inset_grid(regions.plaque, self.network.voxel_mm)
+        self.problem = InsetProblem(self.clean, self.grid)
+        self.rois, self.fat = regions.on(self.grid), regions.fat(self.grid)
+        self.statistic = self.problem.statistic(self.clean).b
+        self.change = self.problem.statistic(absent).b - self.statistic
+        self.noisy: list[torch.Tensor] = []
+        clock.lap("MBIR")
+
+    def take(self, scan: Scan) -> None:
+        """Keep the b of a realisation."""
+        self.noisy.append(self.problem.statistic(scan).b)
+
+    def __call__(self, exposure: float) -> None:
+        """Reconstruct what was taken."""
+        m, clean = self.m, self.statistic * exposure
+        control = None
+        if m.settings.control:
+            self.progress("control of MBIR", 0.0)
+            # Without torch.no_grad, for the backward pass.
+            through = partial(Mbir.__call__.__wrapped__, self.network)  # type: ignore[attr-defined]
+            control = linear_control(through, self.problem, self.rois, self.clean, clean, exposure)
+            self.clock.lap("control of MBIR")
+        draws = reconstruct_draws(
+            self.network, self.problem, self.rois, self.fat, torch.stack(self.noisy), self.change * exposure, exposure,
+            control, lambda f: self.progress("MBIR", f),
+        )  # fmt: skip
+        self.noisy.clear()
+        self.clock.lap("MBIR")
+        m.draws[exposure] = draws
+        voxel = self.grid.spacing[0]
+        m.means[*MBIR, voxel, exposure] = draws.means[:, :2]
+        if exposure == paper.table_exposure(m.settings.doses):
+            m.grids[voxel] = self.grid
+            m.images[*MBIR, voxel] = draws.images[0]
+            m.images["mbir absent", MBIR[1], voxel] = draws.images[1]

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import resource
 import sys
-from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 
 from recon.study.checks import Check, around, checks_section
+from recon.study.compare.answer import answer, claim, dose_section
+from recon.study.compare.factors import dose_factors, reference_entry
 from recon.study.compare.figures import sections_figure
-from recon.study.compare.measure import PWLS, Key, Measured
+from recon.study.compare.measure import MBIR, PWLS, PWLS_VOXEL_MM, Key, Measured
+from recon.study.compare.placements import SHIFT_MM
+from recon.study.compare.tables import is_reference, noise_free_table, tables
 from recon.study.paper import facts as paper
-from recon.study.paper.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM
-from recon.study.paper.tables import published, table_checks
+from recon.study.paper.tables import table_checks
 from recon.study.report import Report, markdown_table
 from recon.study.study import environment, time_line
 from torchpcct.metrics.cnr import cnr, cnr_interval, mean_interval, sd_interval
@@ -30,29 +32,64 @@ def build_report(m: Measured) -> Report:
         "settings": asdict(m.settings),
         "plan": m.plan,
         "rois": m.rois.as_dict(),
+        **_answered(m),
         "noise_free": m.noise_free,
         "statistics": [_statistics(key, means) for key, means in m.means.items()],
         "noise_against_dose": _noise_against_dose(m),
         "pwls": m.pwls,
+        "placements": [p.as_dict() for p in m.placements],
         "seconds": {k: round(v, 2) for k, v in m.seconds.items()},
     }
-    checks = _checks(data)
+    data["answer"] = answer(data)
+    checks = _checks(data, m)
     data["checks"] = [c.as_dict() for c in checks]
     data["environment"] = environment()
     sections = [
-        "# Plaque CNR by FBP and PWLS, beside the paper",
+        "# Plaque CNR by FBP, PWLS and MBIR, beside the paper",
+        data["answer"],
+        dose_section(data),
         _intro(data),
-        _noise_free_table(data),
-        *(_tables(data, name, exposure) for name, exposure in m.settings.doses.items()),
+        noise_free_table(data),
+        *(tables(data, name, exposure) for name, exposure in m.settings.doses.items()),
         _noise_table(data),
         _pwls_table(data),
         checks_section(checks, every=False),
+        _causes(data),
+        _FITTED,
         time_line(m.seconds, f"peak memory {_peak_memory_gib():.1f} GiB"),
     ]
     return Report("compare", data, "\n\n".join(s for s in sections if s), {"compare.png": sections_figure(m)})
 
 
+_FITTED = (
+    "## What was fitted to the paper's tables, and what was not\n\n"
+    "Fitted, or inferred from the very figures that are compared: the rule that places the two ROIs "
+    "(torchpcct/metrics/placement.py: from their noise-free means and the ratio of their SDs), the exposure of the "
+    "tables (from the size of their SDs), and in the bowtie study the width of the ROI bowtie's ramp (from the dose in "
+    "the peripheral bores). Inferred from other statements of the paper: the detector's pitch. Not fitted to these "
+    "tables: vessel, wall, cap and core (torchpcct/scene/plaque says what the paper leaves open), materials, spectrum, "
+    "tube output (from the public CatSim spectrum), detector, kernels (public CatSim points; “detail” is assumed "
+    "midway between standard and bone), PWLS and MBIR."
+)
+
+
 # --- figures ------------------------------------------------------------------------------------------------------
+
+
+def _answered(m: Measured) -> dict[str, Any]:
+    """The dose factors, what they refer to, and the paper's claim."""
+    if m.reference is None or m.rods is None:
+        return {"dose_factors": [], "reference": [], "claim": None}
+    truth = m.rods.contrast()
+    factors = [{"method": MBIR[0], **dose_factors(draws, m.reference, truth)} for _, draws in sorted(m.draws.items())]
+    references = [reference_entry(m.reference, exposure, truth) for exposure in m.settings.doses.values()]
+    return {
+        "true_values": {**m.rods.as_dict(), "contrast_hu": truth},
+        "mbir_voxel_mm": next(voxel for method, _, voxel, _ in m.means if method == MBIR[0]),
+        "dose_factors": factors,
+        "reference": references,
+        "claim": claim(factors, references),
+    }
 
 
 def _statistics(key: Key, means: Any) -> dict[str, Any]:
@@ -98,20 +135,17 @@ def _noise_against_dose(m: Measured) -> list[dict[str, Any]]:
     return slopes
 
 
-def _is_reference(entry: dict[str, Any]) -> bool:
-    return (entry["kernel"], entry["voxel_mm"]) == (REFERENCE_KERNEL, REFERENCE_VOXEL_MM)
-
-
-def _checks(data: dict[str, Any]) -> list[Check]:
+def _checks(data: dict[str, Any], m: Measured) -> list[Check]:
     """Every row of the paper that this study covers, with its tolerance."""
     checks: list[Check] = []
     for e in data["noise_free"]:
-        if _is_reference(e):
+        if is_reference(e):
             for roi, published_hu in paper.NOISE_FREE_ROI_HU.items():
                 checks.append(around(f"noise-free {roi} mean, standard 0.10 mm, HU", e[f"{roi}_hu"], published_hu, 8))
         if "covariance_hu2_s" in e:
             covariance = np.array(e["covariance_hu2_s"]) / paper.TABLE_EXPOSURE_S
-            checks += table_checks(e["kernel"], e["voxel_mm"], (e["foreground_hu"], e["background_hu"]), covariance)
+            found = table_checks(e["kernel"], e["voxel_mm"], (e["foreground_hu"], e["background_hu"]), covariance)
+            checks += [_with_range(c, e, m) for c in found]
     for e in data["noise_against_dose"]:
         if e["method"] == "fbp" and "pixel" in e:
             name = f"slope of voxel noise against dose, {e['kernel']} {e['voxel_mm']:.2f} mm"
@@ -119,101 +153,60 @@ def _checks(data: dict[str, Any]) -> list[Check]:
     return checks
 
 
+def _with_range(check: Check, entry: dict[str, Any], m: Measured) -> Check:
+    """A mean or SD outside its tolerance, with the range that it takes where ROIs and grid lie elsewhere."""
+    roi, _, rest = check.name.partition(" ")
+    varied = [p for p in m.placements if (p.kernel, p.voxel_mm) == (entry["kernel"], entry["voxel_mm"])]
+    if check.ok or roi not in ("core", "fibrous") or not varied or isinstance(check.paper, str):
+        return check
+    low, high = varied[0].range_of(roi, rest.split(" ")[0].rstrip(","), paper.TABLE_EXPOSURE_S)
+    inside = "inside" if low <= check.paper <= high else "outside"
+    return replace(check, note=f"{low:.1f} … {high:.1f}: {inside}")
+
+
 # --- text ---------------------------------------------------------------------------------------------------------
 
 
 def _intro(data: dict[str, Any]) -> str:
     s, r = data["settings"], data["rois"]
+    iterative = []
+    if s["pwls"]:
+        at = ", ".join(f"{e:.2f}" for e in s["doses"].values() if e in s["pwls_s"])
+        iterative.append(f"PWLS ({PWLS[1]}) is run at {at} s on {PWLS_VOXEL_MM:.2f} mm")
+    if s["mbir"]:
+        at = ", ".join(f"{e:.2f}" for e in s["doses"].values() if e in s["mbir_s"])
+        iterative.append(f"MBIR at {at} s on {data['mbir_voxel_mm']:.2f} mm, the voxels of its network")
+    n = s["realizations"]
+    low, high = sd_interval(1.0, n)
+    half = float(mean_interval(np.linspace(-1.0, 1.0, n))[1] / np.std(np.linspace(-1.0, 1.0, n), ddof=1))
     return (
-        f"{s['realizations']} noise realisations per dose (seeds {s['seed']}…{s['seed'] + s['realizations'] - 1}, the "
+        f"## The paper's tables\n\n{n} noise realisations per dose (seeds {s['seed']}…{s['seed'] + n - 1}, the "
         f"same for every method), {s['views']} views. Foreground ROI (necrotic core): {r['foreground_pixels']} pixels "
         f"of {r['pixel_mm']} mm, {r['foreground_mm2']:.2f} mm²; background ROI (fibrous tissue): "
         f"{r['background_pixels']} pixels, {r['background_mm2']:.2f} mm². "
         "CNR = (mean_bg − mean_fg) / sqrt(var_bg + var_fg) of the ROI means across "
-        "realisations. Square brackets: 95 % interval. “exact”: expectation and SD of FBP without sampling error (one "
-        "adjoint pass per ROI). The paper's number follows after “paper”; its tables are for "
-        f"{paper.TABLE_EXPOSURE_S:g} s (our inference)."
+        "realisations. “exact”: expectation and SD of FBP without sampling error (one adjoint pass per ROI). "
+        f"“{n} runs”: as the paper measures; the 95 % interval of such a mean is ± {half:.2f} SD, of an SD "
+        f"×{low:.2f}…{high:.2f} (all intervals, those of the CNR too, are in report.json). “paper”: its tables, which "
+        f"are for {paper.TABLE_EXPOSURE_S:g} s (our inference). {'; '.join(iterative)}{'.' if iterative else ''}"
     )
 
 
-def _label(method: str, kernel: str) -> str:
-    return f"{method.upper()} {kernel}"
-
-
-def _noise_free_table(data: dict[str, Any]) -> str:
-    s = data["settings"]
-    voxels = [REFERENCE_VOXEL_MM, *s["voxels_mm"]]
-    entries = {(e["kernel"], e["voxel_mm"]): e for e in data["noise_free"]}
-
-    def cell(kernel: str, voxel: float) -> str:
-        e = entries.get((kernel, voxel))
-        if e is None:
-            return "–"
-        text = f"{e['foreground_hu']:.1f} / {e['background_hu']:.1f}"
-        if _is_reference(e):
-            p = paper.NOISE_FREE_ROI_HU
-            text += f" (paper {p['foreground']:.1f} / {p['background']:.1f})"
-        return text
-
-    kernels = list(dict.fromkeys([*s["kernels"], REFERENCE_KERNEL]))
-    rows = [[f"FBP {k}", *(cell(k, v) for v in voxels)] for k in kernels]
-    table = markdown_table(["core / fibrous, HU", *(f"{v:.2f} mm" for v in voxels)], rows)
-    return f"## Noise-free ROI means\n\n{table}"
-
-
-def _tables(data: dict[str, Any], dose: str, exposure: float) -> str:
-    """Measured and exact moments of both ROIs and the CNR at an exposure."""
-    s = data["settings"]
-    measured = {(e["method"], e["kernel"], e["voxel_mm"]): e for e in data["statistics"] if e["exposure_s"] == exposure}
-    exact = {(e["kernel"], e["voxel_mm"]): e for e in data["noise_free"] if "covariance_hu2_s" in e}
-    methods = [("fbp", kernel) for kernel in s["kernels"]] + ([PWLS] if s["pwls"] else [])
-    parts = [f"## {dose} dose: {exposure:.2f} s"]
-
-    def add(
-        title: str, table: Any, found: Callable[[Any], str], of_paper: str, known: Callable[[Any, Any], str]
-    ) -> None:
-        def cell(method: str, kernel: str, voxel: float) -> str:
-            if (method, kernel, voxel) not in measured:
-                return "–"
-            text = found(measured[method, kernel, voxel])
-            entry = published(table, kernel, voxel, exposure) if method == "fbp" else None
-            return text if entry is None else f"{text} paper {of_paper.format(*np.atleast_1d(entry))}"
-
-        def exact_cell(kernel: str, voxel: float) -> str:
-            e = exact.get((kernel, voxel))
-            if e is None:
-                return "–"
-            return known((e["foreground_hu"], e["background_hu"]), np.diag(e["covariance_hu2_s"]) / exposure)
-
-        rows = [[_label(m, k), *(cell(m, k, v) for v in s["voxels_mm"])] for m, k in methods]
-        rows += [[f"FBP {k}, exact", *(exact_cell(k, v) for v in s["voxels_mm"])] for k in s["kernels"]]
-        parts.append(markdown_table([title, *(f"{v:.2f} mm" for v in s["voxels_mm"])], rows))
-
-    for i, (roi, title, table) in enumerate(
-        (
-            ("foreground", "Core ROI mean (SD), HU", paper.FOREGROUND),
-            ("background", "Fibrous ROI mean (SD), HU", paper.BACKGROUND),
-        )
-    ):
-
-        def moments(e: Any, roi: str = roi) -> str:
-            low, high = e[roi]["mean_interval"]
-            return f"{e[roi]['mean_hu']:.1f} [{low:.0f}, {high:.0f}] ({e[roi]['sd_hu']:.1f})"
-
-        def exact_moments(means: Any, variances: Any, i: int = i) -> str:
-            return f"{means[i]:.1f} ({np.sqrt(variances[i]):.1f})"
-
-        add(title, table, moments, "{:.1f} ({:.1f})", exact_moments)
-
-    def ratio(e: Any) -> str:
-        low, high = e["cnr_interval"]
-        return f"{e['cnr']:.2f} [{low:.1f}, {high:.1f}]"
-
-    def exact_ratio(means: Any, variances: Any) -> str:
-        return f"{(means[1] - means[0]) / np.sqrt(variances.sum()):.2f}"
-
-    add("CNR", paper.CNR, ratio, "{:.2f}", exact_ratio)
-    return "\n\n".join(parts)
+def _causes(data: dict[str, Any]) -> str:
+    """What the ranges beside the checks are."""
+    varied = data["placements"]
+    if not varied:
+        return ""
+    noted = [c["note"] for c in data["checks"] if c["note"]]
+    inside = sum(note.endswith("inside") for note in noted)
+    return (
+        "Notes: range of the exact figure over "
+        f"{varied[0]['placements']} placements, the two ROIs moved together by ± {SHIFT_MM:g} mm in x and y, and the "
+        "grid by half a voxel along each axis; and whether the paper's value lies inside it. "
+        f"{inside} of {len(noted)} do: those are a matter of where ROIs and voxels lie. The SDs of the paper that lie "
+        f"outside come from {paper.REALIZATIONS} realisations, whose own 95 % interval is "
+        "×{:.2f}…{:.2f}.".format(*sd_interval(1.0, paper.REALIZATIONS))
+    )
 
 
 def _noise_table(data: dict[str, Any]) -> str:
@@ -221,7 +214,9 @@ def _noise_table(data: dict[str, Any]) -> str:
     if not slopes:
         return ""
     rows = [
-        [_label(e["method"], e["kernel"]), f"{e['voxel_mm']:.2f}", f"{e['pixel']:.3f}"] for e in slopes if "pixel" in e
+        [f"{e['method'].upper()} {e['kernel']}", f"{e['voxel_mm']:.2f}", f"{e['pixel']:.3f}"]
+        for e in slopes
+        if "pixel" in e
     ]
     text = (
         "## Noise against dose\n\n"

@@ -17,15 +17,18 @@ class Settings(StudySettings):
     """Settings of the comparison.
 
     Args:
-        realizations: noise realisations per dose (paper: 10), at least 3 for an interval.
+        realizations: noise realisations per dose (paper: 10), at least 3 for an interval, 5 for MBIR.
         seed: first seed.
         views: views per rotation. Fewer than the paper's keep the tube load of the whole scan.
         kernels, voxels_mm, doses: the axes of the tables.
-        pwls: whether to run PWLS.
-        pwls_everywhere: PWLS at the tables' dose for all voxel sizes and at every dose for one; False: one of each.
+        pwls: whether to run PWLS; pwls_s: exposures at which it is run, those of ``doses``.
+        mbir: whether to run MBIR, and with it the dose factors; mbir_s: exposures, those of ``doses``.
+        control: whether MBIR's figures are controlled by a linear functional of the same noise, which is worth its time
+            from 8 realisations.
+        placements: whether the checks outside their tolerance are computed again with ROIs and grid moved.
 
     Raises:
-        ValueError, TypeError: a count out of range, or none.
+        ValueError, TypeError: a count out of range, or none; too few realisations for MBIR.
     """
 
     realizations: int = paper.REALIZATIONS
@@ -35,17 +38,33 @@ class Settings(StudySettings):
     voxels_mm: tuple[float, ...] = paper.VOXELS_MM
     doses: dict[str, float] = field(default_factory=lambda: dict(paper.DOSES))
     pwls: bool = True
-    pwls_everywhere: bool = True
+    pwls_s: tuple[float, ...] = (0.35, 2.00)
+    mbir: bool = True
+    mbir_s: tuple[float, ...] = (0.35, 0.70, 2.00)
+    control: bool = True
+    placements: bool = True
 
-    # An eighth of the views, two kernels, two voxel sizes, two doses: under a minute.
+    # An eighth of the views, two kernels, two voxel sizes, two doses, 8 realisations: ≤ 45 s.
     QUICK: ClassVar[Mapping[str, Any]] = {
-        "realizations": 5,
+        "realizations": 8,
         "views": 246,
         "kernels": ("soft", "standard"),
         "voxels_mm": (0.25, 0.40),
         "doses": {"1x": 0.35, "5.7x": 2.00},
-        "pwls_everywhere": False,
+        "pwls_s": (2.00,),
+        "mbir_s": (0.35, 2.00),
+        "placements": False,
     }
 
     def __post_init__(self) -> None:
         self.check_whole(realizations=3, seed=0, views=8)
+        least = (8 if self.control else 5) if self.mbir else 3
+        if self.realizations < least:
+            raise ValueError(
+                f"realizations must be at least {least} for MBIR{' with control' if self.control else ''}, got "
+                f"{self.realizations}: set mbir=False{', or control=False from 5' if self.control else ''}"
+            )
+
+    def exposures(self, wanted: tuple[float, ...]) -> tuple[float, ...]:
+        """Those of ``wanted`` that are among the doses."""
+        return tuple(e for e in self.doses.values() if e in wanted)
