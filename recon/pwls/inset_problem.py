@@ -61,6 +61,9 @@ class InsetProblem:
     The weights are the inverse variances of the line integrals expected from the BACKGROUND: weights from the noisy
     readings themselves would bias the result, and a small inset changes the counts behind it by a few per cent only.
 
+    Attributes:
+        weights: on ``window``, at 1 s, of line integrals in mm⁻¹ · mm.
+
     Raises:
         ValueError: a grid outside the field of view or the scan's region; a spectral or energy-integrating scan.
     """
@@ -89,10 +92,10 @@ class InsetProblem:
     def _place(self, motion: Any) -> None:
         geometry, grid = self.geometry, self.grid
         self.window = shadow(geometry, grid, margin=1, motion=motion)
-        self._weights = self.window.take(self._cell_weights).contiguous()
+        self.weights = self.window.take(self._cell_weights).contiguous()
         self.projector = Projector(geometry, grid, self.window, motion)
         if motion is None:
-            self.gram = Gram(self.projector, self._weights, nodes=self._nodes)
+            self.gram = Gram(self.projector, self.weights, nodes=self._nodes)
             return
         # A displaced grid sees its voxels as the grid at rest does, a magnification of 0.3 % apart, but through the
         # weights of where it is.
@@ -121,7 +124,7 @@ class InsetProblem:
     def statistic(self, scan: Scan) -> Statistic:
         """What the solvers need of a scan, with the weights of its exposure (noise free: of 1 s)."""
         y = self.data(scan)
-        weighted = self._weights * (scan.exposure_s or NOISE_FREE_EXPOSURE_S) * y
+        weighted = self.weights * (scan.exposure_s or NOISE_FREE_EXPOSURE_S) * y
         energy = float((weighted * y).sum((-1, -2), dtype=torch.float64).sum())
         return Statistic(self.projector.T(weighted), energy, y.numel())
 
@@ -141,7 +144,7 @@ class InsetProblem:
         """PWLS of several realisations of one exposure: ``(scans, z, y, x)`` HU, and the solver's report."""
         exposure = self.exposure(scans)
         result = pwls(
-            self.projector, torch.stack([self.data(s) for s in scans]), self._weights * exposure, prior,
+            self.projector, torch.stack([self.data(s) for s in scans]), self.weights * exposure, prior,
             hu=self.mu_ref / 1000.0, gram=self.gram.scaled(exposure), **options,
         )  # fmt: skip
         return to_hu(result.x + self.level, self.mu_ref), dict(result.report)

@@ -43,7 +43,7 @@ class Problem:
         clean = acquire(scene, presets.pcct(views=views), region=grid, duty=min(1.0, views / 1968))
         inset = InsetProblem(clean, grid)
         self.hu = inset.mu_ref / 1000.0
-        self.A, self.w = inset.projector, inset._weights * EXPOSURE_S
+        self.A, self.w = inset.projector, inset.weights * EXPOSURE_S
         self.y = inset.data(clean.with_noise(EXPOSURE_S, 0))
         self.grid = grid
         start = time.perf_counter()

@@ -24,7 +24,7 @@ from torchpcct.scene.materials import Material
 from torchpcct.scene.materials import material as material_of
 from torchpcct.scene.motion import SinusoidalMotion
 
-__all__ = ["Body", "Scene"]
+__all__ = ["Body", "Scene", "voxel_centres"]
 
 Floats = NDArray[np.float64]
 
@@ -292,7 +292,7 @@ class Scene:
         Returns:
             ``(...)`` or ``grid.shape``, int64.
         """
-        points = _voxel_centres(where) if isinstance(where, VolumeGrid) else np.asarray(where, dtype=np.float64)
+        points = voxel_centres(where) if isinstance(where, VolumeGrid) else np.asarray(where, dtype=np.float64)
         labels = np.full(points.shape[:-1], -1, dtype=np.int64)
         for k, (body, parent) in enumerate(zip(self.bodies, self.parents, strict=True)):
             labels[(labels == parent) & body.shape.contains(points)] = k
@@ -337,7 +337,7 @@ class Scene:
         return self.render(grid, dict(zip(self.names, mu, strict=True)), oversample=oversample)
 
 
-def _voxel_centres(grid: VolumeGrid) -> Floats:
+def voxel_centres(grid: VolumeGrid) -> Floats:
     """``(*grid.shape, 3)`` as x, y, z in mm; a 2-D grid lies in the plane z = 0."""
     axes = grid.axes if grid.ndim == 3 else (np.zeros(1), *grid.axes)
     z, y, x = np.meshgrid(*axes, indexing="ij")

@@ -108,7 +108,7 @@ def statistic_covariance(problem: Any, vectors: Tensor, exposure_s: float, clean
     if clean.window != problem.outer or clean.geometry != problem.geometry:
         raise ValueError("this scan has another geometry or window than the one the problem was made for")
     variance = line_integral_variance(clean.crop(problem.window), exposure)
-    root = problem._weights * (exposure / NOISE_FREE_EXPOSURE_S) * variance.sqrt()
+    root = problem.weights * (exposure / NOISE_FREE_EXPOSURE_S) * variance.sqrt()
     rows = torch.stack([(problem.projector(v.to(root.dtype)) * root).flatten(1) for v in g])
     total = torch.zeros((len(g), len(g)), dtype=torch.float64)
     for view in range(rows.shape[1]):  # one view in float64 at a time
@@ -236,7 +236,7 @@ class DataSteps:
         directions = normal
         if self.statistic is not None:
             directions = self.network.problem(problem, self.statistic.to(b)[None], exposure_s)
-        smoothing = model.steering(directions)
+        smoothing = model.vessel_smoothing(directions)
         u = model.descend(normal, smoothing)
         if model.add_back is not None:
             u = model.descend(model.added_back(normal, u), smoothing)

@@ -22,7 +22,7 @@ from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.placement import RoiPair, RoiRule
 from torchpcct.scene import Scene
 from torchpcct.scene.plaque import Plaque, plaque_scene
-from torchpcct.scene.raster import grid_points
+from torchpcct.scene.scene import voxel_centres
 
 __all__ = ["LENGTH_MM", "SHAPES", "Branch", "Centreline", "Vessel", "vessel"]
 
@@ -161,7 +161,9 @@ class Vessel:
             fine = VolumeGrid(
                 tuple(samples * n for n in shape), tuple(s / samples for s in grid.spacing), (middle, *grid.center[1:])
             )
-            blocks = table[self.labels(grid_points(fine))].reshape(count, samples, shape[1], samples, shape[2], samples)
+            blocks = table[self.labels(voxel_centres(fine))].reshape(
+                count, samples, shape[1], samples, shape[2], samples
+            )
             result[first : first + count] = blocks.mean((1, 3, 5))
         return result
 
@@ -177,7 +179,7 @@ class Vessel:
         x, y, z = self.line.point(center) + np.array(self.center[::-1])
         count = round(_ROI_MM / _ROI_STEP_MM)
         image = VolumeGrid((count, count, count), _ROI_STEP_MM, (float(z), float(y), float(x)))
-        points = grid_points(image)
+        points = voxel_centres(image)
         labels, local = self.labels(points), self.local(points) - np.array(center)
         off = np.abs(local)
 
@@ -204,7 +206,7 @@ class Vessel:
     def plain_fat(self, grid: VolumeGrid, distance: float = 1.5, edge: float = 0.8) -> Any:
         """Mask ``grid.shape`` of the voxels farther than ``distance`` mm from the vessel and ``edge`` mm from the
         grid's faces."""
-        outside = self.labels(grid_points(grid)) == self.straight.index("patient")
+        outside = self.labels(voxel_centres(grid)) == self.straight.index("patient")
         mask = ndimage.distance_transform_edt(outside, sampling=grid.spacing) > distance
         for axis, step in enumerate(grid.spacing):
             kept = np.moveaxis(mask, axis, 0)

@@ -53,9 +53,9 @@ def projected(problem: InsetProblem, x: Any, grid: VolumeGrid) -> Tensor:
         x: ``(..., *grid.shape)`` attenuation above the background, mm⁻¹.
         grid: of ``x``, over the problem's extent.
     """
-    volume = torch.as_tensor(x, dtype=problem.gram.weights.dtype)
+    volume = torch.as_tensor(x, dtype=problem.weights.dtype)
     readings = Projector(problem.geometry, grid, problem.window)(volume)
-    b: Tensor = problem.projector.T(problem.gram.weights * readings)
+    b: Tensor = problem.projector.T(problem.weights * readings)
     return b
 
 

@@ -183,7 +183,7 @@ def test_compensated_pwls_shows_the_inset_at_rest(scans, path):
     x = rest[0] - rest.min()
     errors = []
     for gram, p in ((problem.gram, problem), (moved.gram, moved), (problem.gram, moved)):
-        exact = p.projector.T(p._weights * p.projector(x))
+        exact = p.projector.T(p.weights * p.projector(x))
         errors.append(float((gram(x) - exact).norm() / exact.norm()))
     assert errors[0] < 0.005
     assert errors[1] < 0.007

@@ -18,7 +18,7 @@ from torchpcct.metrics.placement import place_rois
 from torchpcct.metrics.roi import axial_grid
 from torchpcct.scene import Scene
 from torchpcct.scene.plaque import Plaque, plaque_scene
-from torchpcct.scene.raster import grid_points
+from torchpcct.scene.scene import voxel_centres
 
 CENTER = (0.0, -30.38, -29.63)
 GRID = VolumeGrid((50, 44, 44), 0.2, CENTER)
@@ -64,7 +64,7 @@ def test_tissues_have_the_volumes_of_the_analytic_plaque(name):
     shape, plaque = vessel(name, CENTER), Plaque(vessel_length=LENGTH_MM)
     # The outer side of the sharpest bend reaches 4.8 mm along z.
     fine = VolumeGrid((124, 110, 110), 0.08, CENTER)
-    labels = shape.labels(grid_points(fine))
+    labels = shape.labels(voxel_centres(fine))
     volume = {k: float((labels == shape.straight.index(k)).sum() * 0.08**3) for k in ("core", "lumen", "wall")}
     assert volume["core"] == pytest.approx(plaque.core.volume, rel=0.01)
     if name == "bifurcating":
@@ -80,7 +80,7 @@ def test_tissues_have_the_volumes_of_the_analytic_plaque(name):
 def test_the_straight_vessel_is_the_analytic_scene():
     plaque = Plaque(position=CENTER[::-1], vessel_length=LENGTH_MM)
     scene: Scene = plaque_scene(plaque)[0]
-    points = grid_points(GRID)
+    points = voxel_centres(GRID)
     np.testing.assert_array_equal(vessel("straight", CENTER).labels(points), scene.labels(points))
 
 
@@ -96,7 +96,7 @@ def test_the_section_of_the_straight_vessel_has_the_papers_rois():
 
 
 def test_a_vessel_turned_in_plane_has_turned_labels():
-    along_x, along_y = (vessel(name, CENTER).labels(grid_points(GRID)) for name in ("in_plane_x", "in_plane_y"))
+    along_x, along_y = (vessel(name, CENTER).labels(voxel_centres(GRID)) for name in ("in_plane_x", "in_plane_y"))
     # By −90° about z: what lies at (x, y) comes to (y, −x).
     np.testing.assert_array_equal(along_x, along_y.transpose(0, 2, 1)[:, ::-1])
     assert (along_x != along_y).any()
@@ -109,7 +109,7 @@ def test_rois_lie_in_their_tissue_and_fat_is_plain(name):
     # The same tissue is read in every vessel, whatever its direction; mm³ in all, mm² of the section.
     for roi, sizes, rel in (("tissue", (1.71, 2.33), 0.05), ("section", (1.02, 0.225), 0.2)):
         pair = shape.rois(roi)
-        labels = shape.labels(grid_points(pair.image))
+        labels = shape.labels(voxel_centres(pair.image))
         assert (labels[pair.foreground] == index("core")).all()
         assert (labels[pair.background] == index("fibrous")).all()
         cell = np.prod(pair.image.spacing) / (0.1 if roi == "section" else 1.0)
@@ -117,7 +117,7 @@ def test_rois_lie_in_their_tissue_and_fat_is_plain(name):
             assert mask.sum() * cell == pytest.approx(expected, rel=rel)
     fat = shape.plain_fat(GRID)
     assert fat.sum() > 1000
-    inside = np.argwhere(shape.labels(grid_points(GRID)) != index("patient"))[::20]
+    inside = np.argwhere(shape.labels(voxel_centres(GRID)) != index("patient"))[::20]
     for voxel in np.argwhere(fat)[::200]:
         assert np.linalg.norm((inside - voxel) * 0.2, axis=-1).min() > 1.5
 

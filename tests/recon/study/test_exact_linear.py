@@ -123,7 +123,7 @@ def test_noise_of_the_readings(clean, problem):
     g[0, 3:5, 8:10, 8:10], g[1, 4, 3, 3] = 1.0, 1.0
     found = statistic_covariance(problem, g, 2.0, clean)
     V = line_integral_variance(clean.crop(problem.window), 2.0).double()
-    W = 2.0 * problem._weights.double()
+    W = 2.0 * problem.weights.double()
     expected = [[float((W * problem.projector(a.float()) * V * W * problem.projector(c.float())).sum()) for c in g]
                 for a in g]  # fmt: skip
     np.testing.assert_allclose(found, expected, rtol=1e-4)
