@@ -33,8 +33,8 @@ FAT_VOXELS = 2000
 """Of plain fat, kept of every volume for its noise."""
 
 TWIN_REALIZATIONS = 8
-"""Reconstructed without the core too, in whole blocks: what the core adds hardly changes from draw to draw (its SD is
-below 1 % for MBIR), so few say what the slope is."""
+"""Reconstructed without the core too, in whole blocks. What the core adds hardly changes from draw to draw (at 2 s by
+below 1 % with MBIR), so few say what the slope is."""
 
 Key = tuple[str, str, float]
 
