@@ -174,13 +174,14 @@ def _command(
 def _add_compare(commands: _Commands) -> None:
     parser = _command(
         commands, "compare", _own_study, registry.STUDIES["compare"],
-        "Simulate the paper's plaque scan at full size, reconstruct it by FBP (kernels × voxel sizes) and "
-        "PWLS at 1×, 2×, 5.7× and 8× dose, and print the paper's tables with 95 %% intervals beside its numbers.",
+        "Simulate the paper's plaque scan at full size, reconstruct it by FBP (kernels × voxel sizes), PWLS and MBIR "
+        "at 1×, 2×, 5.7× and 8× dose, and print what dose MBIR saves and the paper's tables beside its numbers.",
         "folder for report.json, report.md and compare.png (default out/compare)",
     )  # fmt: skip
     parser.add_argument("--realizations", type=int, metavar="N", help="per dose (default 10)")
-    parser.add_argument("--quick", action="store_true", help="reduced views and settings: a first look, < 60 s")
-    parser.add_argument("--no-pwls", dest="pwls", action="store_const", const=False, help="FBP only")
+    parser.add_argument("--quick", action="store_true", help="reduced views and settings: a first look, < 45 s")
+    parser.add_argument("--no-pwls", dest="pwls", action="store_const", const=False, help="leave PWLS out")
+    parser.add_argument("--no-mbir", dest="mbir", action="store_const", const=False, help="no MBIR, no dose factors")
 
 
 def _add_dose_factor(commands: _Commands) -> None:

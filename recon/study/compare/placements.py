@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from recon.fbp.inset import InsetFbp
 from recon.study.compare.reference import exact_variances
@@ -43,11 +44,21 @@ class Placements:
     means: Floats
     variances: Floats
 
-    def range_of(self, roi: str, quantity: str, exposure_s: float) -> tuple[float, float]:
-        """Smallest and largest ``"mean"`` or ``"SD"`` of the ``"core"`` or ``"fibrous"`` ROI over all placements."""
+    def range_of(self, roi: str, quantity: str, exposure_s: float, runs: int | None = None) -> tuple[float, float]:
+        """Smallest and largest ``"mean"`` or ``"SD"`` of the ``"core"`` or ``"fibrous"`` ROI over all placements.
+
+        Args:
+            roi, quantity: which.
+            exposure_s: in s.
+            runs: widened to what 95 of 100 experiments of so many noise realisations would show; None: exact figures.
+        """
         column = ("core", "fibrous").index(roi)
-        found = self.means if quantity == "mean" else np.sqrt(self.variances / exposure_s)
-        return float(found[:, column].min()), float(found[:, column].max())
+        means, sds = self.means[:, column], np.sqrt(self.variances[:, column] / exposure_s)
+        if quantity == "mean":
+            half = 0.0 if runs is None else stats.norm.ppf(0.975) * sds / np.sqrt(runs)
+            return float((means - half).min()), float((means + half).max())
+        low, high = (1.0, 1.0) if runs is None else np.sqrt(stats.chi2.ppf((0.025, 0.975), runs - 1) / (runs - 1))
+        return float(sds.min() * low), float(sds.max() * high)
 
     def as_dict(self) -> dict[str, Any]:
         """JSON values."""

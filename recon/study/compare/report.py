@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from recon.study.checks import Check, around, checks_section
+from recon.study.checks import Check, around
 from recon.study.compare.answer import answer, claim, dose_section
 from recon.study.compare.factors import dose_factors, reference_entry
 from recon.study.compare.figures import sections_figure
@@ -41,8 +41,10 @@ def build_report(m: Measured) -> Report:
         "seconds": {k: round(v, 2) for k, v in m.seconds.items()},
     }
     data["answer"] = answer(data)
-    checks = _checks(data, m)
-    data["checks"] = [c.as_dict() for c in checks]
+    checks = _checks(data)
+    causes = [_cause(c, m) for c in checks]
+    data["checks"] = [_noted(c, cause).as_dict() for c, cause in zip(checks, causes, strict=True)]
+    data["causes"] = [cause for cause in causes if cause is not None]
     data["environment"] = environment()
     sections = [
         "# Plaque CNR by FBP, PWLS and MBIR, beside the paper",
@@ -53,8 +55,7 @@ def build_report(m: Measured) -> Report:
         *(tables(data, name, exposure) for name, exposure in m.settings.doses.items()),
         _noise_table(data),
         _pwls_table(data),
-        checks_section(checks, every=False),
-        _causes(data),
+        _agreement(checks, data),
         _FITTED,
         time_line(m.seconds, f"peak memory {_peak_memory_gib():.1f} GiB"),
     ]
@@ -135,7 +136,7 @@ def _noise_against_dose(m: Measured) -> list[dict[str, Any]]:
     return slopes
 
 
-def _checks(data: dict[str, Any], m: Measured) -> list[Check]:
+def _checks(data: dict[str, Any]) -> list[Check]:
     """Every row of the paper that this study covers, with its tolerance."""
     checks: list[Check] = []
     for e in data["noise_free"]:
@@ -145,7 +146,7 @@ def _checks(data: dict[str, Any], m: Measured) -> list[Check]:
         if "covariance_hu2_s" in e:
             covariance = np.array(e["covariance_hu2_s"]) / paper.TABLE_EXPOSURE_S
             found = table_checks(e["kernel"], e["voxel_mm"], (e["foreground_hu"], e["background_hu"]), covariance)
-            checks += [_with_range(c, e, m) for c in found]
+            checks += found
     for e in data["noise_against_dose"]:
         if e["method"] == "fbp" and "pixel" in e:
             name = f"slope of voxel noise against dose, {e['kernel']} {e['voxel_mm']:.2f} mm"
@@ -153,15 +154,33 @@ def _checks(data: dict[str, Any], m: Measured) -> list[Check]:
     return checks
 
 
-def _with_range(check: Check, entry: dict[str, Any], m: Measured) -> Check:
-    """A mean or SD outside its tolerance, with the range that it takes where ROIs and grid lie elsewhere."""
-    roi, _, rest = check.name.partition(" ")
-    varied = [p for p in m.placements if (p.kernel, p.voxel_mm) == (entry["kernel"], entry["voxel_mm"])]
+def _cause(check: Check, m: Measured) -> dict[str, Any] | None:
+    """The ranges that a mean or SD outside its tolerance takes where ROIs and grid lie elsewhere; None: no such check.
+
+    ``"placements"`` of the exact figure; ``"runs"`` of as many realisations as the paper has; ``"inside"`` the first of
+    them that holds the paper's value, or ``"none"``."""
+    what, _, setting = check.name.partition(", ")
+    roi, _, quantity = what.partition(" ")
+    varied = [p for p in m.placements if setting.startswith(f"{p.kernel} {p.voxel_mm:.2f} mm")]
     if check.ok or roi not in ("core", "fibrous") or not varied or isinstance(check.paper, str):
+        return None
+    ranges = {
+        name: varied[0].range_of(roi, quantity, paper.TABLE_EXPOSURE_S, runs)
+        for name, runs in (("placements", None), ("runs", paper.REALIZATIONS))
+    }
+    inside = next((name for name, (low, high) in ranges.items() if low <= check.paper <= high), "none")
+    return {"check": check.name, **ranges, "inside": inside}
+
+
+def _noted(check: Check, cause: dict[str, Any] | None) -> Check:
+    """The check with its cause in words."""
+    if cause is None:
         return check
-    low, high = varied[0].range_of(roi, rest.split(" ")[0].rstrip(","), paper.TABLE_EXPOSURE_S)
-    inside = "inside" if low <= check.paper <= high else "outside"
-    return replace(check, note=f"{low:.1f} … {high:.1f}: {inside}")
+    first, second = (f"{cause[name][0]:.1f} … {cause[name][1]:.1f}" for name in ("placements", "runs"))
+    where = {"placements": "in both ranges", "runs": "in the second range only", "none": "in neither"}[cause["inside"]]
+    return replace(
+        check, note=f"{first} over placements, {second} in {paper.REALIZATIONS} runs; the paper's value lies {where}"
+    )
 
 
 # --- text ---------------------------------------------------------------------------------------------------------
@@ -192,20 +211,36 @@ def _intro(data: dict[str, Any]) -> str:
     )
 
 
-def _causes(data: dict[str, Any]) -> str:
-    """What the ranges beside the checks are."""
-    varied = data["placements"]
-    if not varied:
-        return ""
-    noted = [c["note"] for c in data["checks"] if c["note"]]
-    inside = sum(note.endswith("inside") for note in noted)
+def _agreement(checks: list[Check], data: dict[str, Any]) -> str:
+    """The checks outside their tolerance, with the causes that were computed."""
+    outside = [c for c in checks if not c.ok]
+    text = (
+        f"## Agreement with the paper\n\n{len(checks) - len(outside)} of {len(checks)} checks inside their tolerance "
+        "(means ± 10 HU, SDs within a factor of 1.5, the paper's CNR where 95 of 100 ten-run experiments of ours lie)."
+    )
+    if not outside:
+        return text
+    causes = {cause["check"]: cause for cause in data["causes"]}
+    words = {"placements": "in both", "runs": "in runs", "none": "in none"}
+    rows = []
+    for c in outside:
+        row = [c.name, f"{c.ours:.4g}", c.paper if isinstance(c.paper, str) else f"{c.paper:.4g}"]
+        cause = causes.get(c.name)
+        if cause is None:
+            rows.append([*row, "", "", ""])
+        else:
+            ranges = [f"{low:.1f} … {high:.1f}" for low, high in (cause["placements"], cause["runs"])]
+            rows.append([*row, *ranges, words[cause["inside"]]])
+    header = ["check", "ours", "paper", "placements", f"{paper.REALIZATIONS} runs", "paper"]
+    text += f" Outside:\n\n{markdown_table(header, rows)}"
+    if not causes:
+        return text
     return (
-        "Notes: range of the exact figure over "
-        f"{varied[0]['placements']} placements, the two ROIs moved together by ± {SHIFT_MM:g} mm in x and y, and the "
-        "grid by half a voxel along each axis; and whether the paper's value lies inside it. "
-        f"{inside} of {len(noted)} do: those are a matter of where ROIs and voxels lie. The SDs of the paper that lie "
-        f"outside come from {paper.REALIZATIONS} realisations, whose own 95 % interval is "
-        "×{:.2f}…{:.2f}.".format(*sd_interval(1.0, paper.REALIZATIONS))
+        f"{text}\n\n“placements”: range of the exact figure over {data['placements'][0]['placements']} placements, the "
+        f"two ROIs moved together by ± {SHIFT_MM:g} mm in x and y, and the grid by half a voxel along each axis. "
+        f"“{paper.REALIZATIONS} runs”: the range that 95 of 100 experiments of {paper.REALIZATIONS} realisations show "
+        "at each of these placements, put together. Last column: where the paper's value lies. In both: a matter of "
+        "where ROIs and voxels are. In runs: one of chance as well. In none: we know no cause."
     )
 
 
