@@ -18,10 +18,11 @@ TINY: dict[str, dict[str, Any]] = {
         "scenes": ("half_size_core",), "scene_methods": ("linear",), "views": 48, "voxel_mm": 0.4, "kernels": ("soft",),
         "voxels_mm": (0.25,), "blurs_mm": (0.4,), "block": 3, "vessels": ("straight", "curved_5mm"),
     },
+    "phantom": {"voxel_mm": 0.05, "sections": 2, "energies_kev": (55.0, 64.0)},
     "detector": {"photons": 4000, "dead_times_ns": (50.0,), "charge_sharing": (0.1,)},
     "bowtie": {
-        "views": 96, "realizations": 2, "map_mm": 12.0, "histories": 20_000, "plaque_views": 40, "plaque_doses": (2.0,),
-        "plaque_realizations": 4,
+        "views": 96, "realizations": 2, "map_mm": 12.0, "cause_views": 24, "histories": 20_000, "plaque_views": 40,
+        "plaque_doses": (2.0,), "plaque_realizations": 4,
     },
     "motion": {
         "thinning": 24, "fractions": (0.2, 1.0), "eid_fractions": (0.2,), "errors": (0.2,), "voxel_mm": 0.4,
@@ -34,7 +35,7 @@ TINY: dict[str, dict[str, Any]] = {
     "resolution": {"thinning": 32, "sigmas_px": (0.0, 3.75, 10.0), "bulges_mm": ()},
     "spectral": {
         "views": 60, "voxel_mm": 0.4, "realizations": 2, "mbir_realizations": 1, "noise_levels": (0.0, 1.0),
-        "starved_rays": 300,
+        "starved_rays": 300, "calibration_views": 60, "transport_photons": 50_000,
     },
 }  # fmt: skip
 """Study → settings."""

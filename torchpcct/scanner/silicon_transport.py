@@ -4,7 +4,7 @@ A Compton-scattered photon may interact again, in another strip or depth segment
 stop it. Counting some photons twice adds noise: with k counts per incident photon, the zero-frequency detective quantum
 efficiency of the counts is E[k]² / E[k²] (Rabbani, Shaw and Van Metter, J. Opt. Soc. Am. A 4, 895, 1987), not the share
 of photons that count. This module follows photons one by one to find out. It is a reference for
-:class:`~torchpcct.scanner.detector.SiliconDetector`, not part of a scan.
+:class:`~torchpcct.scanner.detector.SiliconDetector`; :mod:`torchpcct.scanner.transported` brings it into scans.
 """
 
 from __future__ import annotations

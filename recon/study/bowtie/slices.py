@@ -21,7 +21,7 @@ from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
 from torchpcct.scanner import Scanner, Scintillator, presets
 from torchpcct.scanner.linearisation import WaterLinearisation
-from torchpcct.scene import Scene
+from torchpcct.scene import Body, EllipticCylinder, Scene
 from torchpcct.scene.materials import MATERIALS
 from torchpcct.scene.phantoms.quality import ctdi, water_cylinder
 from torchpcct.scene.phantoms.thorax import thorax
@@ -32,7 +32,9 @@ __all__ = [
     "BOWTIES",
     "Images",
     "cupping",
+    "enlarged",
     "noise",
+    "noise_regions",
     "phantom_grid",
     "phantoms",
     "polynomial_linearisation",
@@ -64,11 +66,12 @@ HEART_DISC_MM = 8.0
 _THORAX_CENTER = (-34.0, -14.0)
 
 
-def wide_scanners(views: int, detector: str = "eid") -> dict[str, Scanner]:
+def wide_scanners(views: int, detector: str = "eid", half_fan_rad: float = HALF_FAN_RAD) -> dict[str, Scanner]:
     """The paper's scanner of the dose study, one detector row, with each of :data:`BOWTIES`.
 
     Args:
         views: per rotation.
+        half_fan_rad: half-angle of the fan.
         detector: ``"eid"``: energy-integrating cells of 1.02 × 1.10 mm without electronic noise; ``"silicon"``: the
             PCCT's counting cells of 0.35 × 0.5 mm.
 
@@ -80,7 +83,7 @@ def wide_scanners(views: int, detector: str = "eid") -> dict[str, Scanner]:
     scanners = {b: presets.pcct(views=views, bowtie=b, rows=1) for b in BOWTIES}
     pitch = presets.EID_PITCH_MM if integrating else presets.PCCT_PITCH_MM
     geometry = scanners["large"].geometry
-    columns = 2 * math.ceil(HALF_FAN_RAD * geometry.sdd / pitch[1])
+    columns = 2 * math.ceil(half_fan_rad * geometry.sdd / pitch[1])
     changes: dict[str, Any] = {"geometry": replace(geometry, columns=columns, pitch=pitch)}
     if integrating:
         changes["detector"] = Scintillator(electronic_noise_kev=0.0)
@@ -156,10 +159,30 @@ def phantoms() -> dict[str, Scene]:
     return {"ctdi": ctdi(), "thorax": thorax()}
 
 
+def enlarged(scene: Scene, factor: float) -> Scene:
+    """A scene of elliptic cylinders with all lengths across the axis, and places, times ``factor``."""
+
+    def larger(body: Body) -> Body:
+        assert isinstance(body.shape, EllipticCylinder)
+        x, y, z = body.shape.position
+        axes = tuple(factor * a for a in body.shape.semi_axes)
+        return replace(body, shape=replace(body.shape, semi_axes=axes, position=(factor * x, factor * y, z)))
+
+    return Scene([larger(scene[name]) for name in scene.names])
+
+
 def phantom_grid(name: str, spacing: float) -> VolumeGrid:
     """Square voxels that hold the phantom with a rim of air."""
     extent, center = ((340.0, 340.0), (0.0, 0.0)) if name == "ctdi" else ((252.0, 356.0), _THORAX_CENTER)
     return VolumeGrid(tuple(math.ceil(e / spacing) for e in extent), spacing, center)
+
+
+def noise_regions(name: str, grid: VolumeGrid) -> dict[str, Any]:
+    """Where the noise of a phantom of :func:`phantoms` is measured: region → mask."""
+    r = _radius(grid)
+    if name == "ctdi":
+        return {region: (r >= low) & (r < high) for region, (low, high) in CTDI_REGIONS_MM.items()}
+    return {"heart": r < HEART_DISC_MM}
 
 
 @dataclass(frozen=True)
@@ -189,10 +212,7 @@ def noise(
     """
     scans, grid = slice_scans(scene, scanners), phantom_grid(name, PIXEL_MM)
     clean = np.stack([slice_image(scan, grid, kernel) for scan in scans.values()])
-    r = _radius(grid)
-    regions = {"heart": r < HEART_DISC_MM}
-    if name == "ctdi":
-        regions = {region: (r >= low) & (r < high) for region, (low, high) in CTDI_REGIONS_MM.items()}
+    regions = noise_regions(name, grid)
     first, rings = clean, []
     squares: list[list[list[float]]] = []
     for seed in seeds:

@@ -23,7 +23,10 @@ __all__ = [
     "FOREGROUND",
     "FULL_VIEWS",
     "KERNELS",
+    "MATERIALS",
     "NOISE_FREE_ROI_HU",
+    "PHANTOM_MM",
+    "PHANTOM_VOXEL_MM",
     "REALIZATIONS",
     "ROTATION_S",
     "SPECTRAL",
@@ -131,3 +134,35 @@ MOTION: dict[str, Any] = {
 }
 """Motion study: residual motions shown for PCCT and EID-CT, of 2 mm; the largest that is tolerated; and the one below
 which the lumen's area does not suffer much."""
+
+MATERIALS: Mapping[str, tuple[float, float, Mapping[str, float]]] = {
+    "vessel_wall": (1.074, 60.0, {"H": 0.1040, "C": 0.1818, "N": 0.0368, "O": 0.6739, "P": 0.0011, "Ca": 0.0024}),
+    "fibrous_tissue": (1.113, 100.0, {"H": 0.1089, "C": 0.1378, "N": 0.0178, "O": 0.7355}),
+    "necrotic_core": (1.055, 40.0, {"H": 0.1083, "C": 0.1737, "N": 0.0217, "O": 0.6963}),
+    "blood_iodine": (
+        1.060,
+        500.0,
+        {"H": 0.1010, "C": 0.1089, "N": 0.0327, "O": 0.7376, "Na": 0.0010, "P": 0.0010, "S": 0.0020, "Cl": 0.0030,
+         "K": 0.0020, "Fe": 0.0010, "I": 0.0100},
+    ),
+    "pericoronary_fat": (
+        0.950,
+        -100.0,
+        {"H": 0.1140, "C": 0.5980, "N": 0.0070, "O": 0.2780, "Na": 0.0010, "S": 0.0010, "Cl": 0.0010},
+    ),
+}  # fmt: skip
+"""Phantom: tissue → density in g/cm³, CT number in HU at 100 kVp, mass fractions. The spectrum of the CT numbers is not
+stated. The fractions of blood sum to 1.0002."""
+
+PHANTOM_MM: Mapping[str, float] = {
+    "core, major axis": 1.97,
+    "core, minor axis": 1.20,
+    "fibrous cap": 0.17,
+    "wall": 0.19,
+    "vessel diameter": 3.36,
+    "distance from the isocentre": 42.4,
+    "patient diameter": 240.0,
+}
+"""Phantom: lengths in mm. The paper draws it on binary voxels of 0.021 mm."""
+
+PHANTOM_VOXEL_MM = 0.021

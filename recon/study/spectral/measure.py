@@ -24,6 +24,7 @@ from torch import Tensor
 
 from recon.fbp.exact_noise import functional_covariance
 from recon.pwls.basis_problem import DEFAULT_JOINT_PRIOR, BasisProblem
+from recon.study.spectral.calibration import calibration_costs
 from recon.study.spectral.scan import SpectralScan, second_order_bound, starved_rays, water_hu
 from recon.study.spectral.settings import Settings
 from recon.study.spectral.tissues import RULES, Tissues
@@ -112,6 +113,9 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     if lines:
         data["mbir"], data["dice"]["joint MBIR"] = _mbir(scan, tissues, lines, images, data["vmi"], progress)
         done("joint MBIR")
+    if s.calibration_views:
+        data["calibration"] = calibration_costs(s, tissues, lambda fraction: progress("wrong calibrations", fraction))
+        clock.lap("wrong calibrations")
     return Measured(s, data, scan, tissues, images, clock.seconds, time.process_time() - spent)
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.fbp.inset import InsetFbp, static_fbp
-from recon.study.paper.plaque_scan import inset_grid
+from recon.study.paper.plaque_scan import duty, inset_grid
 from recon.study.spectral.settings import Settings
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.detector_window import DetectorWindow, shadow
@@ -23,7 +23,7 @@ from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.placement import place_rois
 from torchpcct.metrics.roi import axial_grid
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
-from torchpcct.scanner import Scanner, presets
+from torchpcct.scanner import Scanner, SiliconDetector, presets
 from torchpcct.scene.bodies import EllipticCylinder
 from torchpcct.scene.plaque import PAPER_POSITION, PATIENT_DIAMETER, plaque_scene
 from torchpcct.scene.scene import Body, Scene
@@ -51,10 +51,11 @@ _WATER_ROWS, _WATER_VIEWS = 8, 246
 
 
 def _acquired(
-    scene: Scene, scanner: Scanner, grid: VolumeGrid, progress: Callable[[float], None] | None = None
-) -> tuple[Scan, DetectorWindow]:
+    scene: Scene, scanner: Scanner, grid: VolumeGrid, progress: Callable[[float], None] | None = None,
+    on: float = 1.0,
+) -> tuple[Scan, DetectorWindow]:  # fmt: skip
     """The noise-free readings that the FBP of ``grid`` needs, and their window."""
-    scan = acquire(scene, scanner, region=grid, progress=progress)
+    scan = acquire(scene, scanner, region=grid, duty=on, progress=progress)
     assert scan.window is not None
     window = shadow(scan.geometry, grid).widened(NOISE_COLUMNS, scan.window)
     return scan.crop(window), window
@@ -66,6 +67,9 @@ class SpectralScan:
     Args:
         settings: of the study.
         progress: called with the finished fraction of the simulation.
+        detector: another one than the preset's.
+        full_views: of the complete scan that ``settings.views`` stand for, each with its turn of the gantry; None: the
+            scan has no more.
 
     Attributes:
         scene, plaque, scanner: what is scanned.
@@ -74,12 +78,16 @@ class SpectralScan:
         basis: PE and PVC.
     """
 
-    def __init__(self, settings: Settings, progress: Callable[[float], None] | None = None) -> None:
+    def __init__(
+        self, settings: Settings, progress: Callable[[float], None] | None = None,
+        detector: SiliconDetector | None = None, full_views: int | None = None,
+    ) -> None:  # fmt: skip
         self.settings = settings
         self.scene, self.plaque = plaque_scene()
-        self.scanner = presets.pcct(views=settings.views, mode="spectral")
+        self.scanner = presets.pcct(views=settings.views, mode="spectral", detector=detector)
+        on = 1.0 if full_views is None else duty(self.scanner, full_views)
         self.grid = inset_grid(self.plaque, settings.voxel_mm)
-        self.clean, self.window = _acquired(self.scene, self.scanner, self.grid, progress)
+        self.clean, self.window = _acquired(self.scene, self.scanner, self.grid, progress, on)
         self.basis = SpectralModel.of(self.scanner, NOISE_FREE_EXPOSURE_S).basis
         self.rois = place_rois(self.scene, axial_grid(self.grid.center))
 

@@ -15,7 +15,7 @@ __all__ = ["Settings"]
 
 @dataclass(frozen=True)
 class Settings(StudySettings):
-    """Settings of the study; the quick ones take an eighth of the views and one realisation.
+    """Settings of the study; the quick ones take an eighth of the views, one realisation, no wrong calibrations.
 
     Args:
         exposure_s: of the standard noise (the paper does not state it; 2.0 s is the exposure of its tables).
@@ -26,6 +26,11 @@ class Settings(StudySettings):
         voxel_mm: [paper: 0.2].
         kernel: of FBP (the paper names none for its spectral images).
         starved_rays: number of rays from no counts to air that the decomposition is tried on.
+        calibration_views: of the noise-free scans with a wrong calibration; 0: no wrong calibrations.
+        threshold_error_kev: by which every threshold lies lower than the decomposition assumes.
+        voltage_error_kv: by which the tube's voltage lies lower than the decomposition assumes.
+        gain_error: relative error of the counts since the air scan, in all energy bins or in one.
+        transport_photons: followed through the silicon for a scan with all their interactions; 0: no such scan.
         seed: first seed of the noise.
 
     Raises:
@@ -40,14 +45,28 @@ class Settings(StudySettings):
     voxel_mm: float = 0.2
     kernel: str = "standard"
     starved_rays: int = 20_000
+    calibration_views: int = 246
+    threshold_error_kev: float = 2.0
+    voltage_error_kv: float = 2.0
+    gain_error: float = 0.01
+    transport_photons: int = 1_000_000
     seed: int = 0
 
-    QUICK: ClassVar = {"views": 246, "realizations": 1, "mbir_realizations": 1, "starved_rays": 5000}
+    QUICK: ClassVar = {
+        "views": 246, "realizations": 1, "mbir_realizations": 1, "starved_rays": 5000, "calibration_views": 0,
+    }  # fmt: skip
 
     def __post_init__(self) -> None:
         number("exposure_s", self.exposure_s, positive=True, unit="s")
         number("voxel_mm", self.voxel_mm, positive=True, unit="mm")
         self.check_whole(realizations=1, mbir_realizations=0, views=60, starved_rays=100, seed=0)
+        self.check_whole(calibration_views=0, transport_photons=0)
+        number("threshold_error_kev", self.threshold_error_kev, low=-4.0, high=4.0, unit="keV")
+        number("voltage_error_kv", self.voltage_error_kv, low=-20.0, high=20.0, unit="kV")
+        number("gain_error", self.gain_error, low=-0.5, high=0.5)
+        for name, low in (("calibration_views", 60), ("transport_photons", 1000)):
+            if 0 < getattr(self, name) < low:
+                raise ValueError(f"{name} must be 0 or at least {low}, got {getattr(self, name)}")
         if self.mbir_realizations > self.realizations:
             raise ValueError(
                 f"mbir_realizations must lie in 0…{self.realizations} (realizations), got {self.mbir_realizations}"

@@ -71,6 +71,7 @@ def test_report(tiny, tmp_path):
     study = tiny("motion")
     sections = ("one view in 24", "wrong by 20 %", "## Agreement with the paper", "## What was modelled")
     data = assert_report_is_whole(study, tmp_path, {"motion.png", "motion_images.png"}, sections)
+    assert "segmentation finds it" in study.report.text
     assert {"range [0, A]", "EID-CT less sensitive"} <= {c["paper"] for c in data["checks"]}
     assert len(data["residual"]) == 3
     assert len(data["compensated"]) == 10

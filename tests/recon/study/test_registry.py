@@ -41,7 +41,7 @@ def test_effects_say_what_is_modelled():
 
 COUNTS = {
     "compare": "views", "dose-factor": "views", "detector": "photons", "bowtie": "views", "motion": "thinning",
-    "noise": "views", "resolution": "thinning", "spectral": "views",
+    "noise": "views", "phantom": "sections", "resolution": "thinning", "spectral": "views",
 }  # fmt: skip
 """Study → a field that counts something."""
 

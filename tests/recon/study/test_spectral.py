@@ -2,12 +2,14 @@
 
 import copy
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from tiny_studies import assert_report_is_whole
 
+from recon.study.spectral.calibration import SHOWN_KEV, CalibrationError, calibration_costs, cases, decomposed
 from recon.study.spectral.report import checks_of
 from recon.study.spectral.settings import Settings
 from recon.study.spectral.tissues import BODIES, truth_labels
@@ -67,6 +69,54 @@ def test_checks_name_what_fails(tiny):
         assert any(part in name for name in failed)
 
 
+def test_no_error_costs_nothing(tiny):
+    """Wrong calibrations of zero size, through the whole chain: every cost is 0 in HU and in Dice."""
+    settings = replace(
+        tiny("spectral").measured.settings, threshold_error_kev=0.0, voltage_error_kv=0.0, gain_error=0.0,
+        transport_photons=0,
+    )  # fmt: skip
+    costs = calibration_costs(settings, tiny("spectral").measured.tissues, lambda fraction: None)
+    assert len(costs["cases"]) == 6 + 8
+    for case in costs["cases"]:
+        assert case["failed"] == 0.0
+        for hu in case["cost_hu"].values():
+            assert hu == pytest.approx(dict.fromkeys(hu, 0.0), abs=1e-3)
+        assert set(case["cost_dice"].values()) == {0.0}
+
+
+def test_wrong_calibrations_cost(tiny):
+    """Signs and sizes that follow without the study's own code."""
+    found = {c["name"]: c for c in tiny("spectral").measured.data["calibration"]["cases"]}
+    assert found["none"]["failed"] == 0.0
+    # 1 % more counts: the line integrals fall by 0.01, evenly; of the patient's 240 mm of fat that is 2.3 per mille.
+    for energy in SHOWN_KEV:
+        more = found["1 % more counts in all bins"]["cost_hu"][f"{energy:g}"]
+        assert more["fat"] < 0
+        assert more["fat"] == pytest.approx(more["core"], abs=0.3)
+    # One bin in eight costs less than all of them, and the air scan takes most of an error of the spectrum.
+    level = {name: abs(c["cost_hu"]["70"]["fat"]) for name, c in found.items()}
+    assert max(level[f"1 % more counts in bin {k}"] for k in range(1, 9)) < level["1 % more counts in all bins"]
+    assert level["tube voltage 2 kV lower"] < 0.5 * level["tube voltage 2 kV lower, no air scan"]
+    assert level["thresholds 2 keV lower"] > 2.0
+    # What repeated interactions cost is gone once the decomposition knows their response.
+    unknown = found["photons interact repeatedly"]["cost_hu"]["52"]["core"]
+    known = found["photons interact repeatedly, known from other photons"]["cost_hu"]["52"]["core"]
+    assert abs(known) < 0.3 * abs(unknown)
+    assert found["none"]["hu"]["52"]["contrast"] > 20.0
+
+
+def test_twice_the_error_costs_more(tiny):
+    """Small errors cost in proportion."""
+    scan = tiny("spectral").measured.scan
+    lines = [decomposed(scan, CalibrationError("x", gain=g), scan.scanner)[0] for g in (0.0, 0.005, 0.01)]
+    small, large = (vmi(images - lines[0], scan.basis, [70.0]) for images in lines[1:])
+    zero = vmi(torch.zeros_like(lines[0]), scan.basis, [70.0])
+    ratio = float((large - zero).mean() / (small - zero).mean())
+    assert ratio == pytest.approx(2.0, abs=0.05)
+    names = [e.name for e in cases(Settings(), 8)]
+    assert len(set(names)) == len(names) == 17
+
+
 def test_truth_is_the_tissue_that_fills_the_voxel():
     scene, plaque = plaque_scene()
     x, y, z = plaque.position
@@ -96,6 +146,9 @@ def test_vmi_of_the_corners_is_the_tissue():
         ({"noise_levels": (0.0, 1.0, 0.5)}, "ascend from 0"),
         ({"views": 10}, "views"),
         ({"starved_rays": 1}, "starved_rays"),
+        ({"calibration_views": 8}, "calibration_views"),
+        ({"transport_photons": 10}, "transport_photons"),
+        ({"threshold_error_kev": 9.0}, "threshold_error_kev"),
     ],
 )
 def test_bad_settings(change, match):

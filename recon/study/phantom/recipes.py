@@ -8,6 +8,8 @@ import xraydb
 
 from torchpcct.scene.materials import Material, formula_mass_fractions, mixture
 
+__all__ = ["BASIS_FORMULAS", "PLAQUE_RECIPES", "elastin_formula", "plaque_tissue"]
+
 # Amino acids of intimal elastin: abundance in per cent and formula (C, H, N, O) of the free acid.
 _ELASTIN_RESIDUES: Mapping[str, tuple[float, Mapping[str, int]]] = {
     "glycine": (29.8, {"C": 2, "H": 5, "N": 1, "O": 2}),

@@ -1,0 +1,189 @@
+"""What a wrong calibration of the decomposition costs: noise-free scans decomposed with a model that is not theirs.
+
+A decomposition knows tube, filters and detector only by calibration. Three errors are tried:
+
+* thresholds: every comparator stands lower than assumed. This is the energy axis of a counting detector: pulse heights
+  drift with the electronics' gain and offset, and no air scan shows by how much;
+* tube voltage: the spectrum is softer than assumed;
+* gain: a relative error of the counts since the air scan, in all bins (tube output) or in one.
+
+The first two are seen by the air scan of every calibration, which sets the assumed counts in air to the measured ones
+bin by bin; what is left is the wrong *shape* of the spectra. Without that scan the error is larger: both are given.
+
+The scan is always the true one and the model is wrong, never the other way round. A detector of another kind needs its
+own scan: that with :class:`~torchpcct.scanner.transported.TransportedSilicon`, whose photons interact more than once,
+decomposed with the response of one interaction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import copy
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from recon.fbp.inset import InsetFbp
+from recon.study.paper import facts as paper
+from recon.study.spectral.scan import SpectralScan
+from recon.study.spectral.settings import Settings
+from recon.study.spectral.tissues import BODIES, Tissues
+from torchpcct.scan import NOISE_FREE_EXPOSURE_S
+from torchpcct.scanner import Scanner, SiliconDetector, TransportedSilicon
+from torchpcct.spectral import MMD_TISSUES, SpectralModel, decompose_scan, decompose_surround, vmi
+
+__all__ = ["SHOWN_KEV", "CalibrationError", "calibration_costs", "cases", "decomposed"]
+
+SHOWN_KEV = (52.0, 70.0)
+"""Energies of the monochromatic images that are compared: the paper's best, and one where contrasts are usual."""
+
+_PURE = 0.999
+_FAT_MM = 3.2  # from the vessel's axis on there is only fat
+
+
+@dataclass(frozen=True)
+class CalibrationError:
+    """How a calibration is wrong.
+
+    Args:
+        name: in tables.
+        threshold_kev: assumed less true thresholds.
+        voltage_kv: assumed less true tube voltage.
+        gain: relative error of the counts since the air scan.
+        bin: the energy bin that has it; None: all.
+        air_scan: whether the assumed counts in air are those that the true scanner measures.
+        transported: whether the scan's photons interact more than once: 1, and the decomposition does not know: 2, and
+            it does, from other photons; 0: they do not.
+    """
+
+    name: str
+    threshold_kev: float = 0.0
+    voltage_kv: float = 0.0
+    gain: float = 0.0
+    bin: int | None = None
+    air_scan: bool = True
+    transported: int = 0
+
+    def assumed(self, scanner: Scanner) -> Scanner:
+        """The scanner that the decomposition believes in, if ``scanner`` is the calibrated one."""
+        detector = scanner.detector
+        assert isinstance(detector, SiliconDetector)
+        thresholds = tuple(t + self.threshold_kev for t in detector.thresholds_kev)
+        source = replace(scanner.source, kvp=scanner.source.kvp + self.voltage_kv)
+        return scanner.replace(detector=replace(detector, thresholds_kev=thresholds), source=source)
+
+
+def cases(s: Settings, bins: int) -> list[CalibrationError]:
+    """The errors of a study's settings, none first."""
+    kev, kv, gain = s.threshold_error_kev, s.voltage_error_kv, s.gain_error
+    errors = [
+        CalibrationError("none"),
+        CalibrationError(f"thresholds {kev:g} keV lower", threshold_kev=kev),
+        CalibrationError(f"thresholds {kev:g} keV lower, no air scan", threshold_kev=kev, air_scan=False),
+        CalibrationError(f"tube voltage {kv:g} kV lower", voltage_kv=kv),
+        CalibrationError(f"tube voltage {kv:g} kV lower, no air scan", voltage_kv=kv, air_scan=False),
+        CalibrationError(f"{100 * gain:g} % more counts in all bins", gain=gain),
+    ]
+    errors += [CalibrationError(f"{100 * gain:g} % more counts in bin {k + 1}", gain=gain, bin=k) for k in range(bins)]
+    if s.transport_photons:
+        errors += [
+            CalibrationError("photons interact repeatedly", transported=1),
+            CalibrationError("photons interact repeatedly, no air scan", transported=1, air_scan=False),
+            CalibrationError("photons interact repeatedly, known from other photons", transported=2),
+        ]
+    return errors
+
+
+def decomposed(scan: SpectralScan, error: CalibrationError, calibrated: Scanner) -> tuple[Tensor, float]:
+    """Noise-free basis images of a scan, ``(2, z, y, x)``, and the share of its rays that found no solution.
+
+    Args:
+        scan: the true one.
+        error: of the calibration.
+        calibrated: the scanner that the decomposition knew before the error.
+    """
+    model = SpectralModel.of(error.assumed(calibrated), NOISE_FREE_EXPOSURE_S)
+    air = torch.from_numpy(model.air).to(scan.clean.air)
+    factor = air / scan.clean.air if error.air_scan else torch.ones_like(air)
+    factor[slice(None) if error.bin is None else error.bin] *= 1.0 + error.gain
+    clean = scan.clean
+    assert clean.surround is not None
+    counts = clean.counts * scan.window.take(factor).to(clean.counts)
+    # The model's own counts in air, so that it takes the scan for its own.
+    believed = replace(clean, counts=counts, surround=clean.surround * factor.to(clean.surround), air=air)
+    found = decompose_scan(believed, model, tolerance=1e-3)
+    fbp = InsetFbp(clean, [scan.grid], [scan.settings.kernel], surround=decompose_surround(believed, model))
+    return fbp.images(found.line_integrals)[0][0], float((~found.converged).double().mean())
+
+
+def calibration_costs(s: Settings, tissues: Tissues, progress: Callable[[float], None]) -> dict[str, Any]:
+    """HU of the tissues, contrast and tissue maps with every wrong calibration.
+
+    Args:
+        s: of the study; its calibration's fields.
+        tissues: of the study's own scan, whose noise is the unit of the maps' distances.
+        progress: called with the finished fraction.
+
+    Returns:
+        JSON values: ``cases``, one row per error (the first is none) with HU by energy and tissue, contrast, Dice, and
+        their costs, the difference to the first; ``half_views``: largest difference of a cost in HU if every other view
+        is left out.
+    """
+    few = replace(s, views=s.calibration_views)
+    # Fewer views stand for the paper's scan, thinned out: each sees as much of the gantry's turn.
+    full = max(paper.FULL_VIEWS["PCCT"], s.calibration_views)
+    scans = {0: SpectralScan(few, lambda f: progress(0.3 * f), full_views=full)}
+    if s.transport_photons:
+        silicon = TransportedSilicon("spectral", photons=s.transport_photons, transport_seed=s.seed)
+        scans[1] = SpectralScan(few, lambda f: progress(0.3 + 0.3 * f), silicon, full)
+    plain = scans[0].scanner
+    other = plain.replace(detector=replace(silicon, transport_seed=s.seed + 1)) if s.transport_photons else plain
+    errors, rows, half = cases(s, plain.detector.bins), [], []
+    for k, error in enumerate(errors):
+        scan, calibrated = scans[min(error.transported, 1)], other if error.transported == 2 else plain
+        images, failed = decomposed(scan, error, calibrated)
+        rows.append({**asdict(error), "failed": failed, **_measured(scan, tissues, images)})
+        if (error.threshold_kev and error.air_scan) or k == 0:
+            thin = _thinned(scan)
+            half.append(_measured(thin, tissues, decomposed(thin, error, calibrated)[0])["hu"])
+        progress(0.6 + 0.4 * (k + 1) / len(errors))
+    base = rows[0]
+    for row in rows:
+        row["cost_hu"] = {e: {t: v - base["hu"][e][t] for t, v in hu.items()} for e, hu in row["hu"].items()}
+        row["cost_dice"] = {t: v - base["dice"][t] for t, v in row["dice"].items()}
+    result = {"views": s.calibration_views, "energies_kev": list(SHOWN_KEV), "cases": rows}
+    if len(half) == 2:
+        shifted = next(r for r in rows if r["threshold_kev"] and r["air_scan"])["cost_hu"]
+        change = [half[1][e][t] - half[0][e][t] - v for e, hu in shifted.items() for t, v in hu.items()]
+        result["half_views_hu"] = float(np.abs(change).max())
+    return result
+
+
+def _thinned(scan: SpectralScan) -> SpectralScan:
+    """The scan with every other view."""
+    thin, views = copy(scan), slice(None, None, 2)
+    geometry, counts = scan.clean.geometry.select(views), scan.clean.counts[:, views].contiguous()
+    thin.window = scan.window.select(views)
+    thin.clean = replace(scan.clean, counts=counts, geometry=geometry, window=thin.window)
+    return thin
+
+
+def _measured(scan: SpectralScan, tissues: Tissues, images: Tensor) -> dict[str, Any]:
+    """HU of the tissues and of the contrast by energy, and Dice coefficients of the tissue map."""
+    _, y, x = (a - c for a, c in zip(scan.grid.axes, scan.grid.center, strict=True))
+    middle = scan.grid.shape[0] // 2
+    lumen = torch.from_numpy(scan.scene.volume_fractions(scan.grid)[scan.scene.index(BODIES["blood_iodine"])] > _PURE)
+    fat = torch.zeros(scan.grid.shape, dtype=torch.bool)
+    fat[middle - 4 : middle + 4] = torch.from_numpy(np.hypot(y[:, None], x) > _FAT_MM)
+    hu = {}
+    for energy in SHOWN_KEV:
+        volume = vmi(images, scan.basis, [energy])[0].double()
+        core, fibrous = (float(roi(volume)) for roi in scan.rois.on(scan.grid))
+        hu[f"{energy:g}"] = {
+            "blood": float(volume[lumen].mean()), "core": core, "fibrous": fibrous, "fat": float(volume[fat].mean()),
+            "contrast": fibrous - core,
+        }  # fmt: skip
+    return {"hu": hu, "dice": dict(zip(MMD_TISSUES, tissues.dice(images), strict=True))}

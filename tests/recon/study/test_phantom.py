@@ -1,0 +1,84 @@
+"""Study ``phantom``: materials and lengths beside the paper's, and that wrong ones are seen."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+from tiny_studies import assert_report_is_whole
+
+from recon.study.paper import facts as paper
+from recon.study.phantom.geometry import analytic_lengths, raster_lengths
+from recon.study.phantom.report import TRANSMITTED, checks_of
+from recon.study.phantom.settings import Settings
+from torchpcct.scene.materials import MATERIALS
+from torchpcct.scene.plaque import plaque_scene
+
+
+def test_report(tiny, tmp_path):
+    study = tiny("phantom")
+    sections = ("## Agreement with the paper", "## Materials", "## CT numbers", "## Geometry", "elastin")
+    data = assert_report_is_whole(study, tmp_path, {"phantom.png"}, sections)
+    assert {m["material"] for m in data["materials"]} == set(paper.MATERIALS) == set(data["hu"][TRANSMITTED])
+    assert len(data["checks"]) == 5 + 5 + 3 + 10 + 14
+
+
+def test_lengths_of_the_bodies_are_the_paper_s(tiny):
+    lengths = tiny("phantom").measured.parts["lengths_mm"]
+    for name, value in paper.PHANTOM_MM.items():
+        assert lengths["bodies"][name] == pytest.approx(value, abs=0.05 if "isocentre" in name else 1e-3)
+        assert lengths["raster"][name] == pytest.approx(value, abs=0.07)  # of voxels of 0.05 mm
+
+
+def test_the_raster_sees_other_lengths():
+    """Each length follows its own parameter, measured on the raster as in the bodies."""
+    scene, plaque = plaque_scene(
+        vessel_diameter=3.0, wall_thickness=0.3, cap_thickness=0.3, core_semi_axes=(0.4, 0.7, 0.5), bulge=0.4,
+        position=(10.0, 20.0, 0.0), patient_diameter=100.0,
+    )  # fmt: skip
+    voxel = 0.03
+    bodies, raster = analytic_lengths(scene, plaque), raster_lengths(scene, plaque, voxel, 2)
+    assert (bodies["core, minor axis"], bodies["core, major axis"]) == pytest.approx((0.8, 1.4))
+    assert bodies["fibrous cap"] == pytest.approx(0.3, abs=1e-6)
+    assert bodies["patient diameter"] == 100.0
+    assert raster.keys() == bodies.keys()
+    for name, value in bodies.items():
+        assert raster[name] == pytest.approx(value, abs=1.7 * voxel), name
+
+
+def test_known_ct_numbers(tiny):
+    """Soft tissue reads the paper's HU at 64 keV; iodine and fat do not (fat loses contrast with energy)."""
+    hu = tiny("phantom").measured.parts["hu"]
+    for name in ("vessel_wall", "fibrous_tissue", "necrotic_core"):
+        assert hu["64 keV"][name] == pytest.approx(paper.MATERIALS[name][1], abs=0.5)
+    assert hu["55 keV"]["blood_iodine"] == pytest.approx(522, abs=3)
+    assert hu["55 keV"]["pericoronary_fat"] == pytest.approx(-98.6, abs=0.5)
+    assert 440 < hu[TRANSMITTED]["blood_iodine"] < 480
+    assert hu["100 kVp, filtered, in air"]["blood_iodine"] > hu[TRANSMITTED]["blood_iodine"]
+
+
+def test_checks_see_what_is_wrong(tiny):
+    parts = copy.deepcopy(tiny("phantom").measured.parts)
+    failed = {c.name for c in checks_of(parts) if not c.ok and "raster" not in c.name}
+    assert failed == {"blood iodine, HU, 64 keV", "pericoronary fat, HU, 64 keV"}
+    parts["materials"][0]["density_g_cm3"] += 0.01
+    parts["materials"][1]["from_molecules"] = 0.002
+    parts["hu"][TRANSMITTED]["necrotic_core"] = 50.0
+    parts["lengths_mm"]["bodies"]["fibrous cap"] = 0.2
+    more = {c.name for c in checks_of(parts) if not c.ok and "raster" not in c.name} - failed
+    assert len(more) == 4
+
+
+def test_the_library_s_table_is_the_published_one():
+    for name, (density, _, fractions) in paper.MATERIALS.items():
+        total = sum(fractions.values())
+        assert MATERIALS[name].density_g_cm3 == density
+        assert dict(MATERIALS[name].mass_fractions) == pytest.approx({k: v / total for k, v in fractions.items()})
+
+
+@pytest.mark.parametrize(
+    ("change", "match"), [({"voxel_mm": 0.5}, "voxel_mm"), ({"energies_kev": (10.0,)}, "energies_kev")]
+)
+def test_bad_settings(change, match):
+    with pytest.raises(ValueError, match=match):
+        Settings(**change)
