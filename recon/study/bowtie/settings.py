@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+from recon.study.paper import facts as paper
 from recon.study.study import StudySettings
 from torchpcct.validate import choice, number, numbers
 
@@ -25,7 +26,7 @@ class Settings(StudySettings):
         detector: ``"eid"`` as the paper, or ``"silicon"``; see :func:`recon.study.bowtie.slices.wide_scanners`.
         map_mm: voxels of the thorax's dose map; that of the phantom has half of them, at least 1 mm.
         histories: photons of each Monte Carlo run; 0: no scatter.
-        plaque_views: of the plaque's scans; fewer than 1968 keep the tube load.
+        plaque_views: of the plaque's scans; fewer than the paper's keep the tube load.
         plaque_doses: exposures of the plaque's scans in s.
         plaque_realizations: paired realisations for MBIR.
         seed: of the first realisation and of the Monte Carlo.
@@ -35,13 +36,13 @@ class Settings(StudySettings):
     """
 
     exposure_s: float = 0.35
-    views: int = 1968
+    views: int = paper.FULL_VIEWS["PCCT"]
     kernel: str = "standard"
     realizations: int = 4
     detector: str = "eid"
     map_mm: float = 2.0
     histories: int = 2_000_000
-    plaque_views: int = 984
+    plaque_views: int = paper.FULL_VIEWS["PCCT"] // 2
     plaque_doses: tuple[float, ...] = (0.35, 2.0)
     plaque_realizations: int = 40
     seed: int = 0

@@ -10,6 +10,7 @@ from recon.study.detector.efficiency import PUBLISHED_DQE
 from recon.study.detector.figures import draw
 from recon.study.detector.measure import Measured
 from recon.study.detector.rate import EXPOSURE_S
+from recon.study.paper.facts import FULL_VIEWS
 from recon.study.report import Report, markdown_table, records_table
 from recon.study.study import environment, time_line
 from torchpcct.acquisition.plan import Effect
@@ -56,8 +57,8 @@ def _counts(rates: list[dict[str, Any]]) -> str:
         "incident, 10⁶ / (s mm²)": "{incident_mcps_mm2:.1f}",
     }
     return (
-        f"## Counts\n\nCentral cell, 100 kVp, 1000 mA, {EXPOSURE_S} s, 1968 views, flat filter and large bowtie, "
-        f"lowest threshold 5 keV.\n\n{records_table(rates, columns)}"
+        f"## Counts\n\nCentral cell, 100 kVp, 1000 mA, {EXPOSURE_S} s, {FULL_VIEWS['PCCT']} views, flat filter and "
+        f"large bowtie, lowest threshold 5 keV.\n\n{records_table(rates, columns)}"
     )
 
 

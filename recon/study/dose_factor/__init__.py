@@ -4,5 +4,5 @@
 that hold exactly: ``tissue_values``, ``exact_fbp``. ``realisations`` draws its noise, ``methods`` reconstruct it,
 ``measures`` reads every volume, ``shape_limit`` and ``stability`` bound what can be had; ``measure`` runs it all in
 resumable pieces (``store``). From samples to figures: ``estimates``, ``exact``, ``main_scenes``, ``other_rois``,
-``further_scenes``, together ``analysis``. ``tables`` and ``figures`` make the ``report`` of them.
+``further_scenes``; with ``tables`` and ``figures`` they make the ``report``.
 """

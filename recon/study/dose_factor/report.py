@@ -2,26 +2,30 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
-from recon.study.dose_factor.analysis import analyse
+from recon.study.dose_factor.exact import Exact
 from recon.study.dose_factor.figures import curves_figure, images_figure
+from recon.study.dose_factor.further_scenes import scene_rows
+from recon.study.dose_factor.main_scenes import method_entry
 from recon.study.dose_factor.measure import Measured
+from recon.study.dose_factor.other_rois import other_voxels, wide_entry
 from recon.study.dose_factor.settings import FBP_BASE, METHOD_NAMES, fbp_label
 from recon.study.dose_factor.tables import at_dose, headline_method, of_method, tables, text
 from recon.study.paper.facts import ASSUMED_FACTOR
 from recon.study.report import Report
 from recon.study.study import environment
 
-__all__ = ["build_report", "headline"]
+__all__ = ["build_report"]
 
 
 def build_report(measured: Measured) -> Report:
     """``report.json``, ``report.md``, ``dose_factor.png`` and ``dose_factor_images.png``."""
-    data = {"study": "dose-factor", **analyse(measured), "environment": environment()}
+    data = {"study": "dose-factor", **_analyse(measured), "environment": environment()}
     data["command"], data["seconds"] = "", measured.total_seconds
     sections = [
-        headline(data),
+        _headline(data),
         "# Measured dose factors",
         _intro(data),
         *tables(data),
@@ -31,7 +35,27 @@ def build_report(measured: Measured) -> Report:
     return Report("dose-factor", data, "\n\n".join(s for s in sections if s), figures)
 
 
-def headline(data: dict[str, Any]) -> str:
+def _analyse(measured: Measured) -> dict[str, Any]:
+    """All figures of the study, each with a 95 % interval where it is not exact."""
+    exact, s = Exact(measured), measured.settings
+    return {
+        "settings": asdict(s),
+        "methods_run": measured.methods,
+        "rois": exact.variant.rois.as_dict(),
+        "truth": exact.true_values(),
+        "ceiling": [exact.limit_entry(dose) for dose in s.doses],
+        "fbp": list(exact.fbp.values()),
+        "methods": [method_entry(exact, name, dose) for dose in s.doses for name in measured.methods],
+        "wide_rois": [wide_entry(exact, name) for name in s.rois],
+        "other_voxels": other_voxels(exact),
+        "shape_limits": exact.shape_limit_entries(),
+        "worst_case_gains": [{"exposure_s": dose, **gains} for dose, gains in measured.gains.items()],
+        "scenes": scene_rows(exact),
+        "scenes_left_out": measured.left_out,
+    }
+
+
+def _headline(data: dict[str, Any]) -> str:
     """The study's sentence."""
     method = headline_method(data["methods_run"])
     base = fbp_label(*FBP_BASE)

@@ -18,7 +18,7 @@ class Settings(StudySettings):
     Args:
         realizations: paired noise realisations per dose, at least 10 (the paper's number).
         seed: first seed; realisation i uses ``seed + i`` at every dose.
-        views: views per rotation (paper: 1968). Fewer views keep the tube load of the whole scan.
+        views: views per rotation. Fewer than the paper's keep the tube load of the whole scan.
         kernels, voxels_mm: of FBP.
         doses: name → exposure in s.
         reconstructed: realisations at the tables' dose that are reconstructed in full, at least 1.

@@ -6,6 +6,7 @@ import itertools
 from dataclasses import dataclass
 from typing import ClassVar
 
+from recon.study.paper import facts as paper
 from recon.study.study import StudySettings
 from torchpcct.validate import number
 
@@ -21,7 +22,7 @@ class Settings(StudySettings):
         realizations: of the noise, for tissue maps by FBP.
         mbir_realizations: of these, how many are reconstructed by joint MBIR at every noise level; 0: none.
         noise_levels: shares of the standard noise, ascending, 0 first.
-        views: per rotation (paper: 1968).
+        views: per rotation.
         voxel_mm: [paper: 0.2].
         kernel: of FBP (the paper names none for its spectral images).
         starved_rays: number of rays from no counts to air that the decomposition is tried on.
@@ -35,7 +36,7 @@ class Settings(StudySettings):
     realizations: int = 4
     mbir_realizations: int = 2
     noise_levels: tuple[float, ...] = (0.0, 0.25, 0.5, 1.0)
-    views: int = 1968
+    views: int = paper.FULL_VIEWS["PCCT"]
     voxel_mm: float = 0.2
     kernel: str = "standard"
     starved_rays: int = 20_000
