@@ -10,9 +10,28 @@ asks whether the core is seen, ``resolution`` and ``noise_power`` how sharp and 
 from torchpcct.metrics.bootstrap import Estimate
 from torchpcct.metrics.cnr import Interval, cnr, cnr_from_moments, cnr_interval, cnr_range, mean_interval, sd_interval
 from torchpcct.metrics.contrast_slope import ContrastSlope, contrast_slope, roi_bias
+from torchpcct.metrics.control import (
+    controlled_cnr,
+    controlled_log_variance,
+    controlled_mean,
+    controlled_slope,
+    expected_half_width,
+    variance_factor,
+)
 from torchpcct.metrics.data_limit import Ceiling, ceiling, information_matrix, paper_cnr_ceiling
 from torchpcct.metrics.dose_curve import DoseCurve, MeasuredDoseCurve
 from torchpcct.metrics.dose_factor import DoseFactor, dose_factor, efficiency
+from torchpcct.metrics.image_noise import RegionNoise, central_frequency_ratio, noise_magnitude_ratio
+from torchpcct.metrics.jackknife import Jackknifed, combined
+from torchpcct.metrics.matched_resolution import (
+    LinearReference,
+    MatchedNoise,
+    edge_mask,
+    gaussian_to_reach,
+    jackknifed_f50,
+    matched_noise_ratio,
+)
+from torchpcct.metrics.noise_covariance import NoiseCovariance
 from torchpcct.metrics.noise_power import NoisePower, noise_power_spectrum
 from torchpcct.metrics.observer import (
     ObserverResult,
@@ -44,34 +63,51 @@ __all__ = [
     "DoseFactor",
     "Estimate",
     "Interval",
+    "Jackknifed",
+    "LinearReference",
+    "MatchedNoise",
     "MeasuredDoseCurve",
+    "NoiseCovariance",
     "NoisePower",
     "ObserverResult",
+    "RegionNoise",
     "TransferFunction",
     "auc",
     "auc_from_d_prime",
     "cap_thickness",
     "ceiling",
+    "central_frequency_ratio",
     "channel_responses",
     "cnr",
     "cnr_from_moments",
     "cnr_interval",
     "cnr_range",
+    "combined",
     "contrast_slope",
+    "controlled_cnr",
+    "controlled_log_variance",
+    "controlled_mean",
+    "controlled_slope",
     "d_prime",
     "dog_channels",
     "dose_factor",
+    "edge_mask",
     "edge_profile",
     "edge_width",
     "efficiency",
     "ellipsoid_distance",
+    "expected_half_width",
     "false_positive_difference",
     "false_positive_rate",
+    "gaussian_to_reach",
     "hotelling_scores",
     "information_matrix",
+    "jackknifed_f50",
     "lumen_area",
     "match_edge_width",
+    "matched_noise_ratio",
     "mean_interval",
+    "noise_magnitude_ratio",
     "noise_power_spectrum",
     "observe",
     "paper_cnr_ceiling",
@@ -80,4 +116,5 @@ __all__ = [
     "task_transfer",
     "template_channel",
     "threshold_contour",
+    "variance_factor",
 ]

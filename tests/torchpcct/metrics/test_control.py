@@ -1,0 +1,184 @@
+"""Control variates: least squares by another way, the coverage of the intervals, and what is refused."""
+
+import math
+
+import numpy as np
+import pytest
+
+from torchpcct.metrics import (
+    Jackknifed,
+    combined,
+    contrast_slope,
+    controlled_cnr,
+    controlled_log_variance,
+    controlled_mean,
+    controlled_slope,
+    expected_half_width,
+    variance_factor,
+)
+from torchpcct.metrics.cnr import cnr
+from torchpcct.metrics.jackknife import log_of_sum
+
+SIGMA = np.array([[1.0, 0.3], [0.3, 2.0]])
+MU = np.array([3.0, -1.0])
+
+
+def draws(n, correlation=0.97, kind="normal", seed=0, beta=(0.8, 0.2)):
+    """y, x and the true variance of y."""
+    rng = np.random.default_rng(seed)
+    x = rng.standard_normal((n, 2)) @ np.linalg.cholesky(SIGMA).T
+    explained = np.array(beta) @ SIGMA @ beta
+    rest = explained * (1 / correlation**2 - 1)
+    e = rng.standard_t(6, n) / math.sqrt(1.5) if kind == "tails" else rng.standard_normal(n)
+    bent = 0.05 * (x[:, 0] ** 2 - 1) if kind == "bent" else 0.0
+    y = 5.0 + x @ beta + math.sqrt(rest) * e + bent
+    return y, x + MU, explained + rest + (2 * 0.05**2 if kind == "bent" else 0.0)
+
+
+def refitted(y, x, k):
+    """Both figures of ordinary least squares by numpy, realisation k left out (None: none)."""
+    keep = np.arange(len(y)) != (-1 if k is None else k)
+    y, x = y[keep], x[keep]
+    n, m = x.shape
+    design = np.c_[np.ones(n), x - MU]
+    coefficients, residual, *_ = np.linalg.lstsq(design, y, rcond=None)
+    rest = residual[0] / (n - m - 1)
+    slopes = coefficients[1:]
+    return coefficients[0], slopes @ SIGMA @ slopes + rest * (1 - m / (n - m - 2))
+
+
+def test_closed_forms_are_refits():
+    y, x, _ = draws(15)
+    mean, variance = controlled_mean(y, x, MU), controlled_log_variance(y, x, SIGMA)
+    own = refitted(y, x, None)
+    assert (mean.value, math.exp(variance.value)) == pytest.approx(own, rel=1e-12)
+    for k in range(15):
+        a, v = refitted(y, x, k)
+        assert mean.left_out[k] == pytest.approx(a, rel=1e-11)
+        assert math.exp(variance.left_out[k]) == pytest.approx(v, rel=1e-11)
+
+
+def test_variance_is_unbiased():
+    """Mean over 4000 experiments of 12 draws, where the correction for the error of β is 20 % of the residual."""
+    found = [math.exp(controlled_log_variance(*draws(12, 0.8, seed=s)[:2], SIGMA).value) for s in range(4000)]
+    true = draws(12, 0.8)[2]
+    assert np.mean(found) == pytest.approx(true, abs=3.5 * np.std(found) / math.sqrt(4000))
+    assert np.std(found) / math.sqrt(4000) < 0.01 * true
+
+
+def test_without_controls():
+    y, _, _ = draws(30)
+    assert controlled_mean(y, None, None).value == pytest.approx(y.mean())
+    assert controlled_log_variance(y, None).value == pytest.approx(math.log(y.var(ddof=1)))
+    error = controlled_mean(y, None, None).standard_error
+    assert error == pytest.approx(y.std(ddof=1) / math.sqrt(30))  # the jackknife of a mean is exact
+
+
+def test_a_linear_method_is_exact():
+    """Nothing is left of the sampling error of a method that the controls explain wholly."""
+    _, x, _ = draws(20)
+    y = 7.0 + (x - MU) @ [0.5, -2.0]
+    mean, log_variance = controlled_mean(y, x, MU), controlled_log_variance(y, x, SIGMA)
+    assert mean.estimate() == pytest.approx((7.0, 7.0, 7.0), abs=1e-10)
+    true = np.array([0.5, -2.0]) @ SIGMA @ [0.5, -2.0]
+    assert log_variance.exponential() == pytest.approx((true, true, true), rel=1e-9)
+
+
+@pytest.mark.parametrize(("correlation", "width"), [(0.0, 1.217), (0.97, 1.069), (0.999, 1.0125)])
+def test_half_width_of_a_factor(correlation, width):
+    """×1.22, ×1.07, ×1.01 at n = 200; the intervals of simulated experiments have it."""
+    assert expected_half_width(200, correlation) == pytest.approx(width, abs=1e-3)
+    found = []
+    for s in range(60):
+        y, x, _ = draws(200, correlation or 0.97, seed=s)
+        f = variance_factor(controlled_log_variance(y, *((x, SIGMA) if correlation else (None,))), 1.0)
+        found.append(math.log(f.high / f.low) / 2)
+    assert math.exp(np.mean(found)) - 1 == pytest.approx(width - 1, rel=0.08)
+
+
+@pytest.mark.parametrize("kind", ["normal", "tails", "bent"])
+def test_coverage(kind):
+    """1000 experiments of 200 draws: factor, mean and CNR within 93–97 % (binomial error 0.7 %)."""
+    hits = np.zeros(3)
+    for s in range(1000):
+        y, x, true = draws(200, 0.97, kind, seed=s)
+        z = 9.0 + (x - MU) @ [0.1, 0.7] + np.random.default_rng(10_000 + s).standard_normal(200) * 0.2
+        true_z = np.array([0.1, 0.7]) @ SIGMA @ [0.1, 0.7] + 0.04
+        figures = (
+            (variance_factor(controlled_log_variance(y, x, SIGMA), 2.0), 2.0 / true),
+            (controlled_mean(y, x, MU).estimate(), 5.0),
+            (controlled_cnr(y, z, x, MU, SIGMA).estimate(), 4.0 / math.sqrt(true + true_z)),
+        )
+        hits += [f.low <= t <= f.high for f, t in figures]
+    assert (hits >= 930).all(), hits
+    assert (hits <= 970).all(), hits
+
+
+def test_pairs_of_methods():
+    """A factor of two methods of the same draws: what they share cancels, and the interval says so."""
+    y, x, _ = draws(200, 0.9)
+    first, second = controlled_log_variance(y, None), controlled_log_variance(2.0 * y + 1.0, None)
+    assert variance_factor(first, second) == pytest.approx((4.0, 4.0, 4.0))
+    alone = variance_factor(first, math.exp(second.value))
+    assert alone.high / alone.low > 1.4
+    slope = controlled_mean(y, x, MU)
+    corrected = variance_factor(first, second, slope, slope)
+    assert corrected == pytest.approx((4.0, 4.0, 4.0))
+
+
+def test_cnr_without_controls_is_the_papers():
+    y, x, _ = draws(40)
+    assert controlled_cnr(y, y + x[:, 0] + 3, None, None, None).value == pytest.approx(cnr(y, y + x[:, 0] + 3))
+
+
+def test_slope_is_that_of_contrast_slope():
+    rng = np.random.default_rng(3)
+    truth = np.array([62.0, 0.0, 31.0, -62.0])
+    control = rng.standard_normal(50)
+    measured = 0.8 * truth[:, None] + 4.0 + np.array([9.0, 5.0, 7.0, 1.0])[:, None] * control + rng.normal(size=(4, 50))
+    plain = controlled_slope(truth, measured, None, None)
+    reference = contrast_slope(truth, measured)
+    assert plain.value == pytest.approx(reference.value)
+    np.testing.assert_allclose(plain.left_out, reference.jackknife)
+    held = controlled_slope(truth, measured, control, 0.0)
+    assert held.standard_error < 0.6 * plain.standard_error
+    assert held.value == pytest.approx(0.8, abs=4 * held.standard_error)
+
+
+def test_combined_and_sums():
+    y, _, _ = draws(20)
+    parts = np.square(y - y.mean())
+    log = log_of_sum(parts, lost=1)
+    assert log.value == pytest.approx(math.log(y.var(ddof=1)))
+    np.testing.assert_allclose(log.left_out, [math.log(np.delete(y, k).var(ddof=1)) for k in range(20)])
+    mean = log_of_sum(np.square(y))
+    np.testing.assert_allclose(mean.left_out, [math.log(np.square(np.delete(y, k)).mean()) for k in range(20)])
+    assert combined(np.subtract, log, log).estimate() == pytest.approx((0, 0, 0))
+    half = log.exponential(scale=-0.5)
+    assert half.low < half.value < half.high
+
+
+def test_refusals():
+    y, x, _ = draws(20)
+    with pytest.raises(ValueError, match="controls must be"):
+        controlled_mean(y, x[:10], MU)
+    with pytest.raises(ValueError, match="at least 7 realisations"):
+        controlled_mean(y[:6], x[:6], MU)
+    with pytest.raises(ValueError, match="one per control"):
+        controlled_mean(y, x, [1.0])
+    with pytest.raises(ValueError, match="linearly dependent"):
+        controlled_mean(y, np.c_[x, x[:, 0]], [3, -1, 3])
+    with pytest.raises(ValueError, match="NaN"):
+        controlled_mean(np.full(20, np.nan), x, MU)
+    with pytest.raises(ValueError, match=r"\(2, 2\)"):
+        controlled_log_variance(y, x, 1.0)
+    with pytest.raises(ValueError, match="no covariance"):
+        controlled_log_variance(y, x, [[1.0, 2.0], [2.0, 1.0]])
+    with pytest.raises(ValueError, match="do not vary"):
+        controlled_log_variance(np.ones(20), None)
+    with pytest.raises(ValueError, match="wrong sign"):
+        variance_factor(controlled_log_variance(y, None), 1.0, slope=-0.2)
+    with pytest.raises(ValueError, match="same realisations"):
+        combined(np.subtract, Jackknifed(1.0, y), Jackknifed(1.0, y[:5]))
+    with pytest.raises(ValueError, match="2 different"):
+        controlled_slope([1.0, 1.0], np.stack([y, y]), None, None)

@@ -1,0 +1,237 @@
+"""Control variates on paired draws: figures of a nonlinear method beside a linear one whose moments are exactly known.
+
+A linear reconstruction of the same noise (FBP, a linear filter) has ROI means x of exactly known expectation μ and
+covariance Σ. The regression y = α + β·(x − μ) + e of a method's ROI mean y on them says what is luck of the draws:
+
+* mean: α, where the draws' own mean of x no longer counts;
+* variance: σ_y² = βᵀΣβ + σ_e². For normal (x, y) this is the maximum-likelihood estimate with known Σ, because the
+  likelihood factors into that of x (which Σ fixes) and that of y given x (ordinary least squares; Anderson 1957, J. Am.
+  Stat. Assoc. 52:200). It is consistent for any distribution and any nonlinear relation: βᵀΣβ is the variance of the
+  best linear prediction, σ_e² that of what is left.
+
+With R² = βᵀΣβ / σ_y² the logarithm of that variance has the variance 2 (1 − R⁴) / n, against 2 / n unpaired. The 95 %
+half-width of a factor of σ_y² and an exact variance (FBP's) at n = 200 is ×1.22 unpaired, ×1.07 at the correlation
+R = 0.97 and ×1.01 at 0.999.
+
+Intervals are jackknife intervals, each realisation left out once in closed form: they do not ask for normal values, and
+figures of the same draws combine (:mod:`torchpcct.metrics.jackknife`). Simulated coverage of nominal 95 % (2000
+experiments each, R = 0.97 and 0.999): 94–96 % at n = 200 and at 40 for normal values and for residuals of Student's t
+with 6 degrees of freedom; 94–95 % at n = 200 for a relation whose quadratic part has 2 % of the variance, but 91–94 %
+at n = 40. The half-widths are wider there than the correlation promises (×1.10 in place of ×1.01).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from torchpcct.metrics.bootstrap import Estimate
+from torchpcct.metrics.jackknife import Jackknifed, combined
+
+__all__ = [
+    "controlled_cnr",
+    "controlled_log_variance",
+    "controlled_mean",
+    "controlled_slope",
+    "expected_half_width",
+    "variance_factor",
+]
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class _Regression:
+    """Least squares of ``values`` on 1 and the deviations of the controls, each with all and with one left out."""
+
+    coefficients: Floats  # (1 + m,): at the controls' expectation, slopes
+    left_out: Floats  # (n, 1 + m)
+    residual: float  # sum of squares
+    residual_left_out: Floats  # (n,)
+
+    @classmethod
+    def of(cls, values: Any, controls: Any, control_mean: Any) -> _Regression:
+        y = np.asarray(values, dtype=np.float64)
+        if y.ndim != 1:
+            raise ValueError(f"values must be (realisations,), got the shape {y.shape}")
+        x = np.zeros((y.size, 0)) if controls is None else np.asarray(controls, dtype=np.float64)
+        x = x[:, None] if x.ndim == 1 else x
+        if x.ndim != 2 or len(x) != y.size:
+            raise ValueError(f"controls must be ({y.size},) or ({y.size}, controls) like values, got {x.shape}")
+        if y.size < x.shape[1] + 5:
+            raise ValueError(f"{x.shape[1]} controls need at least {x.shape[1] + 5} realisations, got {y.size}")
+        mean = np.zeros(x.shape[1]) if control_mean is None else np.atleast_1d(np.asarray(control_mean, np.float64))
+        if mean.shape != x.shape[1:]:
+            raise ValueError(f"control_mean must have {x.shape[1]} numbers, one per control, got {mean.shape}")
+        if not (np.isfinite(y).all() and np.isfinite(x).all() and np.isfinite(mean).all()):
+            raise ValueError("values or controls hold NaN or Inf: check the reconstructions before measuring them")
+        design = np.concatenate([np.ones((y.size, 1)), x - mean], axis=1)
+        # Singular vectors keep the digits where controls are nearly alike.
+        left, size, right = np.linalg.svd(design, full_matrices=False)
+        if size[-1] <= 1e-10 * size[0]:
+            raise ValueError("the controls are linearly dependent, or do not vary: leave some out")
+        pseudo = (right.T / size) @ left.T
+        coefficients = pseudo @ y
+        error = y - design @ coefficients
+        weight = error / (1.0 - np.square(left).sum(1))
+        return cls(
+            coefficients,
+            coefficients - pseudo.T * weight[:, None],
+            float(error @ error),
+            error @ error - error * weight,
+        )
+
+    def variance(self, covariance: Floats) -> tuple[float, Floats]:
+        """βᵀΣβ + σ_e², of all and with each left out."""
+        n, m = self.left_out.shape[0], self.left_out.shape[1] - 1
+
+        def total(slopes: Floats, residual: Any, count: int) -> Any:
+            # The error of β adds σ_e² m / (n − m − 2) to βᵀΣβ on average: taken off.
+            share = (1.0 - m / (count - m - 2)) / (count - m - 1)
+            return np.einsum("...i,ij,...j->...", slopes, covariance, slopes) + residual * share
+
+        return (
+            float(total(self.coefficients[1:], self.residual, n)),
+            total(self.left_out[:, 1:], self.residual_left_out, n - 1),
+        )
+
+
+def _known_covariance(value: Any, count: int) -> Floats:
+    c = np.asarray(value, dtype=np.float64)
+    c = c.reshape(1, 1) if c.ndim == 0 and count == 1 else c
+    if c.shape != (count, count) or not np.isfinite(c).all() or not np.allclose(c, c.T, rtol=1e-6):
+        raise ValueError(f"control_covariance must be a finite symmetric ({count}, {count}) matrix, got {value!r}")
+    if count and np.linalg.eigvalsh(c)[0] < -1e-9 * np.trace(c):
+        raise ValueError("control_covariance has a negative eigenvalue: it is no covariance")
+    return c
+
+
+def _count(controls: Any) -> int:
+    return 0 if controls is None else 1 if np.ndim(controls) == 1 else np.shape(controls)[-1]
+
+
+def controlled_mean(values: Any, controls: Any, control_mean: Any) -> Jackknifed:
+    """Expectation of a method's figure, by regression on controls of known expectation.
+
+    Args:
+        values: ``(n,)``, e.g. ROI means in HU.
+        controls: ``(n,)`` or ``(n, m)`` of linear methods on the same noise; None: none, the plain mean.
+        control_mean: their exact expectation, a number or ``(m,)``.
+
+    Raises:
+        ValueError: wrong shapes, fewer than m + 5 realisations, NaN or Inf, controls that do not vary or depend on
+            each other linearly.
+    """
+    fit = _Regression.of(values, controls, control_mean)
+    return Jackknifed(float(fit.coefficients[0]), fit.left_out[:, 0])
+
+
+def controlled_log_variance(values: Any, controls: Any, control_covariance: Any = None) -> Jackknifed:
+    """Logarithm of a method's variance, ln(βᵀΣβ + σ_e²), by regression on controls of known covariance Σ.
+
+    ``.exponential()`` gives the variance, ``.exponential(scale=0.5)`` the SD, with interval.
+
+    Args:
+        values: ``(n,)``, e.g. contrasts in HU.
+        controls: ``(n,)`` or ``(n, m)`` of linear methods on the same noise; None: none, the plain variance.
+        control_covariance: their exact covariance Σ, a number or ``(m, m)``, in the square of their unit.
+
+    Raises:
+        ValueError: as in :func:`controlled_mean`; a matrix that is no covariance; values that do not vary.
+    """
+    covariance = _known_covariance(np.zeros((0, 0)) if controls is None else control_covariance, _count(controls))
+    value, left_out = _Regression.of(values, controls, None).variance(covariance)
+    if not (value > 0 and (left_out > 0).all()):
+        raise ValueError("the values do not vary over the realisations: they must be noisy")
+    return Jackknifed(math.log(value), np.log(left_out))
+
+
+def controlled_slope(true_contrasts: Any, measured: Any, controls: Any, control_mean: Any) -> Jackknifed:
+    """Slope of the measured against the true contrast over scenes, as :func:`contrast_slope`, but with controls.
+
+    Args:
+        true_contrasts: ``(scenes,)`` HU, at least 2 different values.
+        measured: ``(scenes, n)`` HU; realisation k has the noise seed k in every scene.
+        controls, control_mean: as in :func:`controlled_mean`; columns of every scene whose noise differs.
+
+    Raises:
+        ValueError: as in :func:`controlled_mean`; equal true contrasts.
+    """
+    t, y = np.asarray(true_contrasts, dtype=np.float64), np.asarray(measured, dtype=np.float64)
+    if t.ndim != 1 or y.ndim != 2 or len(y) != t.size or not np.isfinite(y).all():
+        raise ValueError(f"true_contrasts must be (scenes,), measured finite (scenes, n), got {t.shape} and {y.shape}")
+    weight = 1.0 / np.maximum(y.var(1, ddof=1), np.finfo(np.float64).tiny)
+    weight /= weight.sum()
+    centered = t - weight @ t
+    spread = float(weight @ centered**2)
+    if not spread > 0:
+        raise ValueError("true_contrasts must hold at least 2 different values")
+    # Linear in the contrasts: the slope is the mean of what each realisation alone would give.
+    return controlled_mean((weight * centered / spread) @ y, controls, control_mean)
+
+
+def controlled_cnr(
+    foreground: Any, background: Any, controls: Any, control_mean: Any, control_covariance: Any
+) -> Jackknifed:
+    """The paper's CNR, (μ_bg − μ_fg) / √(σ²_bg + σ²_fg), with means and variances controlled.
+
+    Args:
+        foreground, background: ``(n,)`` ROI means in HU of the same realisations.
+        controls, control_mean, control_covariance: as in :func:`controlled_mean` and :func:`controlled_log_variance`;
+            best both ROI means of a linear method.
+
+    Raises:
+        ValueError: as there.
+    """
+    means = [controlled_mean(v, controls, control_mean) for v in (foreground, background)]
+    logs = [controlled_log_variance(v, controls, control_covariance) for v in (foreground, background)]
+    return combined(lambda f, b, vf, vb: (b - f) / np.sqrt(np.exp(vf) + np.exp(vb)), *means, *logs)
+
+
+def variance_factor(
+    log_variance: Jackknifed,
+    reference: Jackknifed | float,
+    slope: Jackknifed | float = 1.0,
+    reference_slope: Jackknifed | float = 1.0,
+    level: float = 0.95,
+) -> Estimate:
+    """How many times the method's slope-corrected variance is contained in the reference's.
+
+    FBP's variance falls as 1 / dose, so against FBP this is the dose factor by variance.
+
+    Args:
+        log_variance: of the method (:func:`controlled_log_variance`).
+        reference: exact variance of the reference, or :func:`controlled_log_variance` of it on the same draws.
+        slope, reference_slope: contrast slopes, positive: exact numbers or :func:`controlled_slope`.
+        level: coverage.
+
+    Raises:
+        ValueError: a variance or slope that is not positive, figures of different numbers of realisations.
+    """
+    known = not isinstance(reference, Jackknifed)
+    for name, v in (("reference", reference if known else 1.0), ("slope", slope), ("reference_slope", reference_slope)):
+        if not np.min(v.left_out if isinstance(v, Jackknifed) else v) > 0:
+            raise ValueError(f"{name} must be positive: contrast of the wrong sign cannot be corrected")
+    log_reference = reference if isinstance(reference, Jackknifed) else math.log(reference)
+    ratio = combined(
+        lambda v, r, s, t: r - v + 2.0 * (np.log(s) - np.log(t)), log_variance, log_reference, slope, reference_slope
+    )
+    return ratio.exponential(level)
+
+
+def expected_half_width(realizations: int, correlation: float, level: float = 0.95) -> float:
+    """Half-width (as a factor) of a variance factor's interval for normal values: exp(z √(2 (1 − R⁴) / n)).
+
+    Args:
+        realizations: n.
+        correlation: R, multiple correlation of the values with the controls; 0 unpaired.
+        level: coverage.
+    """
+    if realizations < 2 or not 0 <= correlation <= 1:
+        raise ValueError(f"need realizations ≥ 2 and 0 ≤ correlation ≤ 1, got {realizations} and {correlation}")
+    return math.exp(float(stats.norm.ppf(0.5 + level / 2)) * math.sqrt(2.0 * (1.0 - correlation**4) / realizations))
