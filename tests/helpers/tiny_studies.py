@@ -14,9 +14,9 @@ TINY: dict[str, dict[str, Any]] = {
         "pwls": False, "mbir": False, "placements": False,
     },
     "dose-factor": {
-        "n": 6, "slow_n": 3, "scene_n": 3, "doses": (2.0,), "scene_doses": (2.0,), "methods": ("linear",),
+        "n": 14, "slow_n": 12, "scene_n": 3, "doses": (2.0,), "scene_doses": (2.0,), "methods": ("linear", "qggmrf"),
         "scenes": ("half_size_core",), "scene_methods": ("linear",), "views": 48, "voxel_mm": 0.4, "kernels": ("soft",),
-        "voxels_mm": (0.25,), "blurs_mm": (0.4,), "block": 3, "vessels": ("straight", "curved_5mm"),
+        "voxels_mm": (0.25,), "blurs_mm": (), "block": 7, "vessels": ("straight", "curved_5mm"),
     },
     "phantom": {"voxel_mm": 0.05, "sections": 2, "energies_kev": (55.0, 64.0)},
     "detector": {"photons": 4000, "dead_times_ns": (50.0,), "charge_sharing": (0.1,)},

@@ -1,35 +1,25 @@
-"""What is known without sampling error: the true tissues, the limit of the data, FBP at every dose."""
+"""What the report starts from: true values, the limit of the data, FBP and its figures at every exposure."""
 
 from __future__ import annotations
 
 import math
-from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.study.dose_factor.estimates import attempt
+from recon.study.dose_factor.figures_found import drawn_figures, exact_figures
 from recon.study.dose_factor.measure import Measured
-from recon.study.dose_factor.measures import DOG_CHANNELS, OBSERVERS, crop_window, observer_channels
-from recon.study.dose_factor.settings import FBP_BASE, MAIN_SCENES, fbp_label
+from recon.study.dose_factor.measures import OBSERVERS
+from recon.study.dose_factor.merit import Figures, entry_of, factors_of, json_of
+from recon.study.dose_factor.readings import BIN_MM, REACH_MM
+from recon.study.dose_factor.settings import FBP_BASE, LINEAR_METHODS, MAIN_SCENES, ROIS, fbp_label
 from recon.study.dose_factor.variant import Variant
-from recon.study.paper.facts import ASSUMED_FACTOR
-from torchpcct.metrics import (
-    auc_from_d_prime,
-    ceiling,
-    channel_responses,
-    ellipsoid_distance,
-    paper_cnr_ceiling,
-    task_transfer,
-)
+from torchpcct.metrics import LinearReference, NoiseCovariance, ceiling, paper_cnr_ceiling, task_transfer
 
 __all__ = ["Exact", "contrast_sd"]
 
 Floats = NDArray[np.float64]
-
-_REACH_MM = (0.5, 1.0)
-_BIN_MM = 0.05
 
 
 def contrast_sd(covariance: Floats, dose: float = 1.0) -> float:
@@ -38,7 +28,7 @@ def contrast_sd(covariance: Floats, dose: float = 1.0) -> float:
 
 
 class Exact:
-    """Exact figures of the main scenes.
+    """Entries of the report.
 
     Args:
         measured: of the study.
@@ -46,29 +36,29 @@ class Exact:
     Attributes:
         m, s, facts: of the study; paper: facts of the paper's scene.
         variant: where things are in it.
-        truth: contrasts of the main scenes, HU.
-        base: label of the reference FBP; variants: kernel, voxel size and blur of FBP without filters.
-        fbp: label → entry of the report.
+        truth: main scene → true values of core and fibrous tissue, HU.
+        base: label of the reference FBP.
     """
 
     def __init__(self, measured: Measured) -> None:
         self.m, self.s, self.facts = measured, measured.settings, measured.facts
         self.paper = self.facts["paper"]
         self.variant = Variant("paper", self.s)
-        self.truth = np.array([self.facts[name].contrast_hu for name in MAIN_SCENES])
+        self.truth = {name: self.facts[name].truth_hu for name in MAIN_SCENES}
         self.base = fbp_label(*FBP_BASE)
-        self.variants = [(k, v, 0.0) for v in self.s.voxels_mm for k in self.s.kernels]
-        self.fbp: dict[str, dict[str, Any]] = {}
-        for each in [*self.variants, *((*FBP_BASE, b) for b in self.s.blurs_mm)]:
-            self._add_fbp(*each)
+
+    @property
+    def difference(self) -> float:
+        """True contrast with the core less that without, HU."""
+        return self.paper.contrast_hu - self.facts["absent_core"].contrast_hu
 
     def true_values(self) -> dict[str, Any]:
         """Tissues, contrasts and shapes as they are."""
         plaque = self.variant.plaque
         return {
-            "tissues_hu": dict(zip(self.paper.tissues, self.paper.amplitudes_hu.tolist(), strict=True)),
+            "tissues_hu": self.paper.tissue_hu,
             "reference_hu": self.paper.reference_hu.tolist(),
-            "contrasts_hu": dict(zip(MAIN_SCENES, self.truth.tolist(), strict=True)),
+            "contrasts_hu": {name: self.facts[name].contrast_hu for name in MAIN_SCENES},
             "lumen_mm2": float(plaque.area("lumen", 0.0)),
             "cap_mm": float(plaque.cap_thickness),
         }
@@ -79,8 +69,8 @@ class Exact:
         """Figures of the best unbiased estimate at an exposure, the surrounding fat known from the rest of the scan."""
         keep = [k for k, t in enumerate(self.paper.tissues) if t != "patient"]
         information = self.paper.information[np.ix_(keep, keep)]
-        amplitudes = self.paper.amplitudes_hu[keep]
         names = [self.paper.tissues[k] for k in keep]
+        values = np.array([self.paper.tissue_hu[name] for name in names])
         core, fibrous = names.index("core"), names.index("fibrous")
         h = np.zeros(len(keep))
         h[core], h[fibrous] = -1.0, 1.0
@@ -89,32 +79,31 @@ class Exact:
         return {
             "contrast_sd_hu": ceiling(information, h, dose).contrast_sd,
             "contrast_sd_fat_unknown_hu": ceiling(self.paper.information, full, dose).contrast_sd,
-            "paper_cnr": paper_cnr_ceiling(information, amplitudes, core, fibrous, dose),
+            "paper_cnr": paper_cnr_ceiling(information, values, core, fibrous, dose),
             # The ideal observer knows everything but whether the core is there.
-            "d_prime": abs(self.paper.contrast_hu) * math.sqrt(information[core, core] * dose),
+            "d_prime": abs(self.difference) * math.sqrt(information[core, core] * dose),
         }
 
     def limit_entry(self, dose: float) -> dict[str, Any]:
-        """The limit, and the largest dose factors that it allows against every FBP variant."""
-        limits = self.limits(dose)
-        factors = {}
-        for each in self.variants:
-            f = self.at(fbp_label(*each), dose)
-            entry = {
-                "paper_cnr": (limits["paper_cnr"] / f["paper_cnr"]) ** 2,
-                "contrast_variance": (f["contrast_sd_hu"] / limits["contrast_sd_hu"]) ** 2,
-                **{f"d_prime_{o}": (limits["d_prime"] / f[f"d_prime_{o}"]) ** 2 for o in OBSERVERS},
-            }
-            below = {k: bool(v >= ASSUMED_FACTOR) for k, v in entry.items()}
-            factors[fbp_label(*each)] = {**entry, "assumed_below": below}
+        """The limit, and the largest dose factors that it allows against the reference FBP."""
+        limits, fbp = self.limits(dose), self._fbp(self.base, dose)
+        factors: dict[str, float] = {
+            f"d_prime_{o}": limits["d_prime"] ** 2 / math.exp(_number(fbp.log_detectability[o])) for o in OBSERVERS
+        }
+        for k, name in enumerate(ROIS):
+            variance = math.exp(_number(fbp.log_corrected(k, self.difference)))
+            factors[f"contrast_{name}"] = variance / limits["contrast_sd_hu"] ** 2
+        factors["paper_cnr"] = limits["paper_cnr"] ** 2 / math.exp(_number(fbp.log_cnr))
         return {"exposure_s": dose, **limits, "factors": factors}
 
     def shape_limit_entries(self) -> list[dict[str, float]]:
         """The limit with outlines that are only roughly known: its share of the one with known shapes, and the largest
-        factor against the reference FBP."""
+        factor against the reference FBP by the contrast of all tissue."""
         rows = []
         for dose, sds in self.m.shape_limits.items():
-            ideal, base = self.limits(dose)["contrast_sd_hu"], self.at(self.base, dose)["contrast_sd_hu"]
+            ideal = self.limits(dose)["contrast_sd_hu"]
+            fbp = self._fbp(self.base, dose)
+            base = math.exp(0.5 * _number(fbp.log_corrected(ROIS.index("tissue"), self.difference)))
             for displacement, sd in sds.items():
                 rows.append({
                     "exposure_s": dose, "displacement_mm": displacement, "contrast_sd_hu": sd,
@@ -122,65 +111,66 @@ class Exact:
                 })  # fmt: skip
         return rows
 
-    # -- FBP ------------------------------------------------------------------------------------------------------
+    # -- methods --------------------------------------------------------------------------------------------------
 
-    def _add_fbp(self, kernel: str, voxel: float, blur: float) -> None:
-        label = fbp_label(kernel, voxel, blur)
-        contrasts = [self.facts[name].fbp_contrast(label) for name in MAIN_SCENES]
-        slope, intercept = np.polyfit(self.truth, contrasts, 1)
-        self.fbp[label] = {
-            "label": label, "kernel": kernel, "voxel_mm": voxel, "blur_mm": blur,
-            "roi_hu": self.paper.fbp_hu[label].tolist(),
-            "slope": float(slope), "false_contrast_hu": contrasts[1], "intercept_hu": float(intercept),
-            "resolution": self.resolution(self._fbp_difference(label), voxel),
-        }  # fmt: skip
-        self.fbp[label]["doses"] = [{"exposure_s": d, **self.at(label, d)} for d in self.s.doses]
+    def _fbp(self, label: str, dose: float) -> Figures:
+        return exact_figures(self.m.fbp[label], self.m, "fbp", self.truth, dose)
 
-    def at(self, label: str, dose: float) -> dict[str, Any]:
-        """Figures of an FBP variant at an exposure."""
-        c = self.paper.fbp_covariance[label] / dose
-        fg, bg = self.paper.fbp_hu[label]
-        sd = contrast_sd(c)
-        result = {
-            "paper_cnr": float((bg - fg) / math.sqrt(c[0, 0] + c[1, 1])),
-            "contrast_sd_raw_hu": sd,
-            "contrast_sd_hu": sd / self.fbp[label]["slope"],
-        }
-        if len(c) > 2:
-            count = self.channel_count(self.s.n)
-            difference = self._fbp_difference(label)[None]
-            for k, observer in enumerate(OBSERVERS):
-                first = 2 + k * (1 + DOG_CHANNELS)
-                use = slice(first, first + count)
-                channels = self.channels(self.fbp[label]["voxel_mm"], observer)[:count]
-                delta = channel_responses(difference, channels)[0]
-                value = float(math.sqrt(delta @ np.linalg.solve(c[use, use], delta)))
-                result[f"d_prime_{observer}"], result[f"auc_{observer}"] = value, auc_from_d_prime(value)
+    def figures(self, name: str, dose: float) -> Figures:
+        """Of a method at an exposure."""
+        if name in LINEAR_METHODS:
+            return exact_figures(self.m.linear[name, dose], self.m, "method", self.truth)
+        return drawn_figures(self.m, name, dose, self.truth)
+
+    def _sharper(self, dose: float) -> dict[str, LinearReference]:
+        """FBP variants to match resolution with."""
+        found = {}
+        for label, f in self.m.fbp.items():
+            plane, z = (task_transfer(f[d], self.m.distances["fbp", d], REACH_MM, BIN_MM) for d in ("plane", "z"))
+            found[label] = LinearReference(plane, z, NoiseCovariance.exact(f["row"] / dose, FBP_BASE[1]))
+        return found
+
+    def entries(self, dose: float) -> list[dict[str, Any]]:
+        """FBP, then every method, at an exposure."""
+        base = self._fbp(self.base, dose)
+        try:
+            sharper = self._sharper(dose)
+        except ValueError:
+            sharper = {}  # too few views or voxels too large to tell the edge of the core
+        found = [(f"FBP {label}", True, self._fbp(label, dose)) for label in self.m.fbp]
+        found += [(name, False, self.figures(name, dose)) for name in self.m.methods]
+        ideal, bias2 = self.limits(dose)["contrast_sd_hu"], self.m.fbp[self.base]["square"]
+        rows = []
+        for name, is_fbp, figures in found:
+            entry = {"method": name, "exposure_s": dose, "is_fbp": is_fbp, **entry_of(figures, base, self.truth)}
+            sd = entry["rois"]["tissue"]["corrected_sd_hu"]
+            # Only where the estimator pools the same tissue as the limit.
+            entry["efficiency_tissue"] = {
+                k: None if sd.get(j) is None else (ideal / sd[j]) ** 2
+                for k, j in (("value", "value"), ("low", "high"), ("high", "low"))
+            }
+            entry["factors"] = factors_of(figures, base, self.difference, sharper, bias2)
+            if name in self.m.seconds:
+                entry["seconds_per_volume"] = round(self.m.seconds[name], 3)
+            samples = self.m.samples.get((name, "paper", dose))
+            if samples is not None:
+                entry["shape"] = self._shape(samples["shape"])
+            rows.append(entry)
+        return rows
+
+    def _shape(self, shape: Floats) -> dict[str, Any]:
+        """Error of lumen area and cap thickness of single realisations."""
+        truth, result = self.true_values(), {}
+        for name, values in zip(("lumen_mm2", "cap_mm", "lumen_half_mm2"), shape.T, strict=True):
+            true = truth[name.replace("_half", "")]
+            v = values[np.isfinite(values)]
+            result[name] = {
+                "true": true, "mean": float(v.mean()) if v.size else None,
+                "absolute_error": json_of(float(np.abs(v - true).mean())) if v.size else None,
+                "lost": float(1 - v.size / len(values)),
+            }  # fmt: skip
         return result
 
-    def _fbp_difference(self, label: str) -> Any:
-        """Core present minus absent, noise free."""
-        return self.paper.fbp_crop[label].astype(np.float64) - self.facts["absent_core"].fbp_crop[label]
 
-    @cache  # noqa: B019 - lives for one report
-    def channels(self, voxel: float, observer: str) -> Floats:
-        """The observer's channels on crops of a voxel size."""
-        return observer_channels(self.variant, self.variant.grid_of(voxel), observer)
-
-    def channel_count(self, n: int) -> int:
-        """As many channels as the realisations can train, 8 for each: the core's shape first."""
-        return max(1, min(1 + DOG_CHANNELS, n // 8))
-
-    def resolution(self, difference: Any, voxel: float) -> dict[str, Any]:
-        """Edge width and transfer function of the core's own edge, on present minus absent."""
-        grid = crop_window(self.variant.grid_of(voxel), self.variant.core_center)[1]
-        core = self.variant.plaque.core
-        distance = ellipsoid_distance(grid, self.variant.core_center, tuple(core.semi_axes[::-1]))
-
-        def compute() -> Any:
-            t = task_transfer(difference, distance, _REACH_MM, _BIN_MM)
-            found = {"edge_width_mm": t.edge_width, "f50_lp_mm": t.f50, "f10_lp_mm": t.f10, "contrast_hu": t.contrast}
-            return {k: v if math.isfinite(v) else None for k, v in found.items()}
-
-        found = attempt(compute)
-        return found if "edge_width_mm" in found else {"edge_width_mm": None, **found}
+def _number(figure: Any) -> float:
+    return float(figure)

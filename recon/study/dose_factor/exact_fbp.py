@@ -20,7 +20,7 @@ from recon.study.paper.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM, 
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
 
-__all__ = ["exact_fbp", "wide_covariance"]
+__all__ = ["exact_fbp"]
 
 Floats = NDArray[np.float64]
 
@@ -46,14 +46,6 @@ def exact_fbp(variant: Variant, clean: Scan) -> dict[str, Any]:
     if full and s.blurs_mm:
         result |= _blurred_covariances(variant, clean)
     return result
-
-
-def wide_covariance(variant: Variant, clean: Scan) -> dict[str, Floats]:
-    """FBP variant → covariance at 1 s of the means in all wider ROIs of the settings, two each."""
-    s = variant.settings
-    fbp = InsetFbp(clean, [variant.grid_of(v) for v in s.voxels_mm], s.kernels)
-    rows = [[r for name in s.rois for r in variant.wide_rois(name).on(grid)] for grid in fbp.grids]
-    return {k.removeprefix("covariance "): matrix for k, matrix in _covariances(clean, fbp, rows).items()}
 
 
 def _images(variant: Variant, fbp: InsetFbp, clean: Scan) -> dict[str, Any]:

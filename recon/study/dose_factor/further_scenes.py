@@ -24,7 +24,9 @@ def scene_rows(exact: Exact) -> list[dict[str, Any]]:
     for name in exact.m.scenes:
         for dose in exact.s.scene_doses:
             rows.append(_fbp_row(exact, name, dose))
-            rows += [_method_row(exact, k, name, dose) for k in exact.m.methods if (k, name, dose) in exact.m.extra]
+            rows += [
+                _method_row(exact, k, name, dose) for k in exact.s.scene_methods if (k, name, dose) in exact.m.extra
+            ]
     return rows
 
 

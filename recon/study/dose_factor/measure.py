@@ -2,14 +2,14 @@
 
 Stages, each of them a set of files that are written whole and reused:
 
-1. scenes: noise-free scans, what FBP makes of them exactly (means, covariances, images without noise), the limit of
-   the data by generalised least squares on exact path lengths;
-2. data: b = AᵀW y of every noise realisation, and FBP of the same readings
-(:mod:`recon.study.dose_factor.realisations`);
-3. methods: ROI means, a crop about the core and segmentation figures of every reconstruction.
+1. scenes: noise-free scans, true values by rods, the limit of the data by generalised least squares;
+2. exact: FBP and the linear methods without sampling error (:mod:`recon.study.dose_factor.exact_figures`);
+3. data: b = AᵀW y of every noise realisation, and FBP of the same readings
+   (:mod:`recon.study.dose_factor.realisations`); the linear controls' readings of every b, by inner products;
+4. methods: what is read off every reconstruction of the others (:mod:`recon.study.dose_factor.readings`).
 
-The scenes with half and with flipped contrast carry the noise of the paper's scene (the counts behind the core
-differ by less than 1 %).
+All main scenes carry the noise of the paper's scene, seed by seed (the counts behind the core differ by less than 1 %).
+So the difference between two of them is free of what noise they have in common.
 """
 
 from __future__ import annotations
@@ -28,11 +28,22 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.study.dose_factor.measures import crop_window, segmentation
+from recon.study.dose_factor.exact_figures import fbp_figures, linear_figures
+from recon.study.dose_factor.exact_linear import statistic_covariance
+from recon.study.dose_factor.measures import segmentation
 from recon.study.dose_factor.methods import Method, fingerprint, load_methods
-from recon.study.dose_factor.realisations import Realisations, joined
+from recon.study.dose_factor.readings import Readings
+from recon.study.dose_factor.realisations import NOISY_SCENE, Realisations, joined
 from recon.study.dose_factor.scene import SceneFacts, StudyScene
-from recon.study.dose_factor.settings import IMAGE_METHODS, MAIN_SCENES, NOISY_SCENES, Settings, with_twin
+from recon.study.dose_factor.settings import (
+    FBP_BASE,
+    IMAGE_METHODS,
+    LINEAR_METHODS,
+    MAIN_SCENES,
+    Settings,
+    fbp_label,
+    with_twin,
+)
 from recon.study.dose_factor.shape_limit import shape_limits
 from recon.study.dose_factor.stability import worst_case_gains
 from recon.study.dose_factor.store import Store
@@ -54,13 +65,17 @@ class Measured:
         settings: of the study; ``methods``: names of the methods that ran, with their fingerprints.
         facts: scene → what holds without sampling error.
         scenes: further scenes; left_out: those that could not be simulated, with the reason.
-        fbp: (scene, dose) → FBP realisations (``roi (n, 2)``, ``crop``; of the paper's scene ``shape (slow_n, 3)``, see
-            :func:`recon.study.dose_factor.measures.segmentation`); empty with fast noise.
-        samples: (method, scene, dose) → the same of each method, ``shape`` of all of its realisations.
+        distances: direction → distance from the core's surface of the bins of an edge profile, on each of FBP's and the
+            methods' grids (keys ``("fbp" or "method", direction)``); fat_shape: ``(y, x)`` voxels of a slice of fat.
+        fbp: FBP variant → :func:`recon.study.dose_factor.exact_figures.fbp_figures` at 1 s.
+        linear: (method, dose) → :func:`recon.study.dose_factor.exact_figures.linear_figures`, without its adjoints.
+        controls: dose → ``readings (n, 2 · rows)`` of the linear controls in the paper's scene, their exact
+            ``mean (scenes, 2 · rows)`` and ``covariance``; ``fbp (n, channels)`` of FBP of the same readings.
+        samples: (method, scene, dose) → ``readings (n, rows)``, with and without the core ``plane`` and ``z``
+            ``(n, bins)``; of the paper's scene also ``fat``, ``square`` and ``shape``.
         extra: (method, scene, dose) → ``roi`` and, with the core replaced by fibrous tissue, ``absent`` ``(n, 2)``.
         vessels: (method, vessel, dose) → what :class:`recon.study.dose_factor.vessels.VesselScans` reads.
         volumes: (method or "fbp", scene, dose) → first realisation, HU.
-        wide: FBP variant → covariance of the means in the wider ROIs at 1 s.
         gains: dose → method or FBP variant → worst-case response, HU mm^1.5.
         shape_limits: dose → displacement of the outlines in mm → smallest contrast SD, HU.
         seconds: (method) → s per volume; total_seconds: of this run, with the pieces that it found finished.
@@ -71,12 +86,15 @@ class Measured:
     facts: dict[str, SceneFacts] = field(default_factory=dict)
     scenes: tuple[str, ...] = ()
     left_out: dict[str, str] = field(default_factory=dict)
-    fbp: dict[tuple[str, float], dict[str, Any]] = field(default_factory=dict)
+    distances: dict[tuple[str, str], Any] = field(default_factory=dict)
+    fat_shape: dict[str, tuple[int, int]] = field(default_factory=dict)
+    fbp: dict[str, dict[str, Any]] = field(default_factory=dict)
+    linear: dict[tuple[str, float], dict[str, Any]] = field(default_factory=dict)
+    controls: dict[float, dict[str, Any]] = field(default_factory=dict)
     samples: dict[tuple[str, str, float], dict[str, Any]] = field(default_factory=dict)
     extra: dict[tuple[str, str, float], dict[str, Any]] = field(default_factory=dict)
     vessels: dict[tuple[str, str, float], dict[str, Any]] = field(default_factory=dict)
     volumes: dict[tuple[str, str, float], Any] = field(default_factory=dict)
-    wide: dict[str, Any] = field(default_factory=dict)
     gains: dict[float, dict[str, float]] = field(default_factory=dict)
     shape_limits: dict[float, dict[float, float]] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
@@ -114,6 +132,7 @@ class _Study:
         self.methods = load_methods(settings.methods)
         self.m = Measured(settings, {m.name: fingerprint(m) for m in self.methods})
         self._scenes: dict[str, StudyScene] = {}
+        self._of_grid: dict[str, Readings] = {}
         self.noise = Realisations(settings, store, self.scene)
 
     def scene(self, name: str) -> StudyScene:
@@ -126,16 +145,16 @@ class _Study:
         """All stages."""
         s, m = self.settings, self.m
         self._facts()
-        if s.fast_noise:
-            for name in NOISY_SCENES:
-                m.volumes["fbp", name, s.doses[-1]] = self.noise.picture(name, s.doses[-1])
-        else:
+        if not s.fast_noise:
             self._data()
+        self._exact()
+        for name in MAIN_SCENES[:2]:
+            m.volumes["fbp", name, s.doses[-1]] = self.noise.picture(name, s.doses[-1])
         for method in self.methods:
-            self._main(method)
+            if method.name not in LINEAR_METHODS:
+                self._main(method)
         self._extra()
         self._vessels()
-        m.wide = self.scene("paper").wide_covariance() if s.rois else {}
         m.gains = self._bounds(worst_case_gains, self.methods)
         m.shape_limits = self._bounds(shape_limits)
 
@@ -151,7 +170,7 @@ class _Study:
                     raise
                 log.warning("the scene %s is left out: %s", name, error)
                 self.m.left_out[name.partition(":")[0]] = str(error)
-            if name not in NOISY_SCENES:
+            if name not in MAIN_SCENES:
                 self.scene(name).release()
         self.report("scenes", 1.0)
         self.m.scenes = tuple(n for n in self.settings.scenes if n not in self.m.left_out)
@@ -166,38 +185,105 @@ class _Study:
             self.report(step, 1.0)
         return found
 
-    def _data(self) -> None:
+    def _readings(self, kind: str) -> Readings:
+        """On FBP's or the methods' grid."""
+        if kind not in self._of_grid:
+            scene = self.scene("paper")
+            grid = scene.grid_of(FBP_BASE[1]) if kind == "fbp" else scene.grid
+            self._of_grid[kind] = found = Readings(scene, grid, scene.facts.tissue_hu)
+            self.m.distances |= {(kind, direction): r for direction, r in found.distances.items()}
+            self.m.fat_shape[kind] = found.fat_shape
+        return self._of_grid[kind]
+
+    def _exact(self) -> None:
+        """FBP and linear methods, and the controls."""
         s, m = self.settings, self.m
-
-        def without_b(name: str, dose: float, block: range) -> dict[str, Any]:
-            return {k: v for k, v in self.noise.data(name, dose, block).items() if k != "b"}
-
-        jobs = [
-            ((name, dose), partial(without_b, name, dose, block))
-            for name in NOISY_SCENES for dose in s.doses for block in s.blocks(s.n)
-        ]  # fmt: skip
-        for (name, dose), pieces in self._collected("noise realisations, FBP", jobs).items():
-            m.fbp[name, dose] = joined(pieces)
-            m.volumes["fbp", name, dose] = m.fbp[name, dose].pop("first")
+        scenes = [self.scene(name) for name in MAIN_SCENES]
+        run = {method.name: method for method in self.methods if method.name in LINEAR_METHODS}
+        names = [*run, *(c for c in s.controls if c not in run)]
+        steps, done = len(s.kernels) + len(s.doses) * len(names), 0
+        for kernel in s.kernels:
+            self.report("exact: FBP, linear methods", done / steps)
+            done += 1
+            m.fbp[fbp_label(kernel, FBP_BASE[1])] = self.store.piece(
+                f"exact/fbp_{kernel}", self.noise.key,
+                partial(fbp_figures, scenes, self._readings("fbp"), kernel),
+            )  # fmt: skip
+        for method in load_methods(names):
+            for dose in s.doses:
+                self.report("exact: FBP, linear methods", done / steps)
+                done += 1
+                found = self.store.piece(
+                    f"exact/{method.name}_{dose:g}s", f"{self.noise.key} {fingerprint(method)}",
+                    partial(linear_figures, method, scenes, self._readings("method"), dose, not s.fast_noise),
+                )  # fmt: skip
+                m.linear[method.name, dose] = found
         for dose in s.doses:
-            pieces = [self.noise.images("paper", dose, block) for block in s.blocks(min(s.n, s.slow_n))]
-            m.fbp["paper", dose]["shape"] = np.concatenate([p["shape"] for p in pieces])
+            m.controls[dose] = self._controls(dose)
+        for found in m.linear.values():
+            found.pop("adjoints")
+        self._readings("fbp")
+        self._readings("method")
+        self.report("exact: FBP, linear methods", 1.0)
+
+    def _controls(self, dose: float) -> dict[str, Any]:
+        s, scene = self.settings, self.scene("paper")
+        of = [self.m.linear[name, dose] for name in s.controls]
+        g = torch.from_numpy(np.concatenate([c["adjoints"] for c in of])).double()
+        offset = np.concatenate([c["offset"] for c in of])
+        key = f"{self.noise.key} {[fingerprint(m) for m in load_methods(s.controls)]}"
+
+        def joint() -> dict[str, Any]:
+            clean = None if s.fast_noise else scene.clean
+            return {"covariance": statistic_covariance(scene.problem, g, dose, clean)}
+
+        def block_of(block: range) -> dict[str, Any]:
+            b = self.noise.statistic("paper", dose, block).double()
+            found = {"readings": torch.einsum("nzyx,rzyx->nr", b, g).numpy() + offset}
+            if not s.fast_noise:
+                crops = self.noise.data(NOISY_SCENE, dose, block)["crop"]
+                found["fbp"] = self._readings("fbp").channels_of_crops(crops)
+            return found
+
+        any_drawn = any(m.name not in LINEAR_METHODS for m in self.methods)
+        pieces = [
+            self.store.piece(f"controls/{dose:g}s_{k.start}-{k.stop}", key, partial(block_of, k))
+            for k in (s.blocks(s.n) if any_drawn else ())
+        ]
+        return {
+            "covariance": self.store.piece(f"exact/controls_{dose:g}s", key, joint)["covariance"],
+            "mean": np.concatenate([c["readings"] for c in of], axis=1),
+            **(joined(pieces) if pieces else {}),
+        }
+
+    def _data(self) -> None:
+        """The realisations, if a method needs them."""
+        s = self.settings
+        if all(m.name in LINEAR_METHODS for m in self.methods):
+            return
+        jobs = [(dose, block) for dose in s.doses for block in s.blocks(s.n)]
+        for done, job in enumerate(jobs):
+            self.report("noise realisations, FBP", done / len(jobs))
+            self.noise.data(NOISY_SCENE, *job)
+        self.report("noise realisations, FBP", 1.0)
 
     # -- methods --------------------------------------------------------------------------------------------------
 
     def _main(self, method: Method) -> None:
         s, m = self.settings, self.m
         n = s.realizations(method.name)
+        count = {name: n if name in MAIN_SCENES[:2] else min(n, s.slow_n) for name in MAIN_SCENES}
         jobs = [
             ((method.name, name, dose), partial(self._method_piece, method, name, dose, block))
-            for dose in s.doses for block in s.blocks(n) for name in MAIN_SCENES
+            for name in MAIN_SCENES for dose in s.doses for block in s.blocks(count[name])
         ]  # fmt: skip
         spent = 0.0
         for key, pieces in self._collected(method.name, jobs).items():
             m.samples[key] = joined(pieces)
-            m.volumes[key] = m.samples[key].pop("first")
+            if "first" in m.samples[key]:
+                m.volumes[key] = m.samples[key].pop("first")
             spent += sum(float(p["seconds"]) for p in pieces)
-        m.seconds[method.name] = spent / (len(MAIN_SCENES) * n * len(s.doses))
+        m.seconds[method.name] = spent / (sum(count.values()) * len(s.doses))
 
     def _method_piece(self, method: Method, name: str, dose: float, block: range) -> dict[str, Any]:
         scene = self.scene(name)
@@ -205,23 +291,24 @@ class _Study:
         def compute() -> dict[str, Any]:
             of = self.noise.image_statistic if method.name in IMAGE_METHODS else self.noise.statistic
             volume, seconds = _timed(method, scene, of(name, dose, block), dose)
-            rois = scene.rois.on(scene.grid)
-            crop = crop_window(scene.grid, scene.core_center)[0]
-            result = {
-                "roi": torch.stack([r(volume) for r in rois], dim=-1).numpy(),
-                "crop": volume[(slice(None), *crop)].numpy().astype(np.float16),
-                "shape": np.array([segmentation(scene, scene.grid, v) for v in volume]),
-                "seconds": np.array(seconds),
-            }
-            if block.start == 0:
-                result["first"] = volume[0].numpy().astype(np.float16)
+            readings = self._readings("method")
+            result = {"readings": readings.linear(volume), "seconds": np.array(seconds)}
+            if name in MAIN_SCENES[:2]:
+                result |= readings.profiles(volume)
+                if block.start == 0:
+                    result["first"] = volume[0].numpy().astype(np.float16)
+            if name == "paper":
+                result |= {"fat": readings.fat(volume), "square": readings.squares(volume)}
+                result["shape"] = np.array([segmentation(scene, scene.grid, v) for v in volume])
             return result
 
         place = f"methods/{method.name}/{name}_{dose:g}s_{block.start}-{block.stop}"
-        return self.store.piece(place, f"{self.noise.key} {fingerprint(method)} 2", compute)
+        return self.store.piece(place, f"{self.noise.key} {fingerprint(method)} 3", compute)
 
     def _scene_methods(self) -> list[Method]:
-        return [m for m in self.methods if m.name in self.settings.scene_methods and m.name not in IMAGE_METHODS]
+        s = self.settings
+        wanted = bool(self.m.scenes or s.vessels)
+        return [m for m in load_methods(s.scene_methods) if m.name not in IMAGE_METHODS] if wanted else []
 
     def _vessels(self) -> None:
         jobs = VesselScans(self.noise).jobs(self.settings.vessels, self._scene_methods())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -15,13 +16,14 @@ from torch import Tensor
 
 from recon.fbp.exact_noise import FILTER_MARGIN_COLUMNS
 from recon.pwls.inset_problem import InsetProblem
-from recon.study.dose_factor.exact_fbp import exact_fbp, wide_covariance
+from recon.study.dose_factor.exact_fbp import exact_fbp
 from recon.study.dose_factor.settings import Settings
 from recon.study.dose_factor.store import Store
 from recon.study.dose_factor.tissue_values import least_squares
 from recon.study.dose_factor.variant import Variant
 from recon.study.paper.facts import FULL_VIEWS
 from recon.study.paper.plaque_scan import duty, enclosing
+from recon.study.paper.rods import rod_values
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.scan import Scan
@@ -32,6 +34,8 @@ log = logging.getLogger(__name__)
 
 Floats = NDArray[np.float64]
 
+_ROD_VIEWS = 246
+
 
 @dataclass(frozen=True)
 class SceneFacts:
@@ -39,8 +43,9 @@ class SceneFacts:
 
     Attributes:
         statistic: ``(z, y, x)`` AᵀW y of the noise-free scan.
-        tissues: names; amplitudes_hu: their values as the scanner sees them (generalised least squares on exact path
-            lengths of the noise-free scan), ``(tissues,)``; information: ``(tissues, tissues)`` HU⁻².
+        tissues: names; information: ``(tissues, tissues)`` HU⁻², of generalised least squares on exact path lengths.
+        tissue_hu: true values, by rods of each tissue at the plaque's place (:mod:`recon.study.paper.rods`): of all
+            tissues of the paper's scene, of core and fibrous tissue in the others.
         reference_hu: ROI means of noise-free standard FBP on 0.1 mm, ``(2,)``.
         fbp_hu: FBP variant → its ROI means ``(2,)``; fbp_crop: image of the core; fbp_covariance: ``(F, F)`` HU² of the
             ROI means and, where they were asked for, of the observer's channels.
@@ -48,7 +53,7 @@ class SceneFacts:
 
     statistic: NDArray[np.float32]
     tissues: list[str]
-    amplitudes_hu: Floats
+    tissue_hu: dict[str, float]
     information: Floats
     reference_hu: Floats
     fbp_hu: dict[str, Floats]
@@ -62,7 +67,7 @@ class SceneFacts:
     @property
     def truth_hu(self) -> Floats:
         """``(foreground, background)``."""
-        return self.amplitudes_hu[[self.tissue("core"), self.tissue("fibrous")]]
+        return np.array([self.tissue_hu["core"], self.tissue_hu["fibrous"]])
 
     @property
     def contrast_hu(self) -> float:
@@ -76,8 +81,8 @@ class SceneFacts:
         return float(bg - fg)
 
     @classmethod
-    def of(cls, arrays: dict[str, Any]) -> SceneFacts:
-        """From the arrays of a piece."""
+    def of(cls, arrays: dict[str, Any], tissue_hu: Mapping[str, float]) -> SceneFacts:
+        """From the arrays of a piece and the true values."""
 
         def all_of(prefix: str) -> dict[str, Any]:
             return {k[len(prefix) :]: v for k, v in arrays.items() if k.startswith(prefix)}
@@ -85,7 +90,7 @@ class SceneFacts:
         return cls(
             statistic=arrays["statistic"],
             tissues=[str(t) for t in arrays["tissues"]],
-            amplitudes_hu=arrays["amplitudes_hu"],
+            tissue_hu=dict(tissue_hu),
             information=arrays["information"],
             reference_hu=arrays["reference_hu"],
             fbp_hu=dict(zip(map(str, arrays["labels"]), arrays["fbp_hu"], strict=True)),
@@ -109,6 +114,7 @@ class StudyScene(Variant):
         self.peers = {} if peers is None else peers
         self._clean: Scan | None = None
         self._problem: InsetProblem | None = None
+        self._known_hu: dict[str, float] = {}
 
     @property
     def _file(self) -> str:
@@ -183,10 +189,26 @@ class StudyScene(Variant):
             }  # fmt: skip
 
         key = f"views={s.views} voxel={s.voxel_mm:g} {s.kernels} {s.voxels_mm} {s.blurs_mm} 2"
-        return SceneFacts.of(self.store.piece(f"scenes/{self._file}", key, compute))
+        return SceneFacts.of(self.store.piece(f"scenes/{self._file}", key, compute), self._rods())
 
-    def wide_covariance(self) -> dict[str, Floats]:
-        """Exact covariance at 1 s of the means in all wider ROIs of the settings, two each, of every FBP variant."""
-        s = self.settings
-        key = f"views={s.views} {s.kernels} {s.voxels_mm} {s.rois}"
-        return self.store.piece(f"scenes/{self._file}_rois", key, lambda: wide_covariance(self, self.clean))
+    def _rods(self) -> dict[str, float]:
+        """True value of every tissue, HU; a material that a scene of the same patient and scanner has is known."""
+        wanted = [b.name for b in self.scene.bodies] if self.name == "paper" else ["core", "fibrous"]
+        materials = {b.name: b.material for b in self.scene.bodies if b.name in wanted}
+        alike = [
+            p for p in self.peers.values() if p.scene.bodies[0] == self.scene.bodies[0] and p.scanner == self.scanner
+        ]
+        known = {str(m): hu for p in alike for m, hu in p._known_hu.items()}
+
+        def compute() -> dict[str, Any]:
+            new = {k: m for k, m in materials.items() if str(m) not in known}
+            # Few views would leave streaks in the rods: what is true does not hinge on the study's.
+            scanner = self.scanner.with_views(max(self.settings.views, _ROD_VIEWS))
+            hu = rod_values(self.scene, scanner, tuple(self.plaque.position), tissues=new).hu if new else {}
+            hu |= {k: known[str(m)] for k, m in materials.items() if k not in new}
+            return {"tissues": np.array(list(hu)), "hu": np.array(list(hu.values()))}
+
+        found = self.store.piece(f"scenes/{self._file}_rods", "246 views", compute)
+        values = dict(zip(map(str, found["tissues"]), found["hu"].tolist(), strict=True))
+        self._known_hu = {str(m): values[k] for k, m in materials.items()}
+        return values

@@ -15,14 +15,15 @@ __all__ = [
     "EXTRA_SCENES",
     "FBP_BASE",
     "IMAGE_METHODS",
+    "LINEAR_METHODS",
     "MAIN_SCENES",
     "METHODS",
     "METHOD_NAMES",
-    "NOISY_SCENES",
+    "PURPOSES",
+    "ROIS",
     "SLOW_METHODS",
     "VESSELS",
     "VESSEL_ROIS",
-    "WIDE_ROIS",
     "Settings",
     "fbp_label",
     "with_twin",
@@ -34,11 +35,8 @@ MAIN_SCENES = ("paper", "absent_core", "half_contrast", "flipped_contrast")
 FBP_BASE = ("soft", 0.25)
 """Kernel and voxel size (mm) that factors are quoted against, and of the FBP realisations."""
 
-WIDE_ROIS = ("section", "tissue")
-"""ROIs beyond the paper's: all of core and fibrous tissue in the axial image, and in all slices of the core."""
-
-NOISY_SCENES = ("paper", "absent_core")
-"""Scenes with readings drawn in the sinogram; half and flipped contrast carry the paper scene's noise."""
+ROIS = ("paper", "section", "tissue")
+"""The paper's ROIs; all of core and fibrous tissue in the axial image; the same in all slices of the core."""
 
 EXTRA_SCENES = (
     "moved_core", "mirrored", "turned", "half_size_core", "core_for_fibrous", "calcification", "stent", "textured",
@@ -54,32 +52,60 @@ VESSEL_ROIS = ("section", "tissue")
 """What is read of a vessel: the paper's ROIs in the section across it, and all of core and fibrous tissue."""
 
 METHOD_NAMES = {
-    "linear": "linear 3-D filter",
-    "linear_z": "linear filter along z",
+    "linear": "linear 3-D",
+    "linear_z": "linear along z",
+    "linear_z_added": "linear z + add-back",
     "quadratic": "quadratic PWLS",
     "qggmrf": "q-GGMRF PWLS",
     "tv": "smoothed TV",
-    "fbp_cnn": "FBP + MBIR's prior",
+    "fbp_cnn": "FBP + CNN",
     "mbir_one_pass": "MBIR, one pass",
-    "mbir": "MBIR, two passes",
-    "mbir_noise_half": "MBIR, noise taken for ½",
-    "mbir_noise_double": "MBIR, noise taken for 2×",
+    "mbir": "MBIR",
+    "mbir_no_cnn": "MBIR, no CNN",
+    "mbir_no_vessel": "MBIR, no vessel sm.",
+    "mbir_noise_half": "MBIR told noise ½×",
+    "mbir_noise_double": "MBIR told noise 2×",
 }
-"""Methods in the order of the tables, as reports call them. ``fbp_cnn`` is MBIR's prior on FBP images, ``mbir_noise_*``
-MBIR that takes the noise for half or twice of what it is."""
+"""Methods in the order of the tables, as reports call them. ``linear_z_added`` adds 1.3 times the residual back, as
+MBIR's second pass does; ``fbp_cnn`` is MBIR's prior on FBP images; ``mbir_no_cnn`` is MBIR with its learned energy
+silent, ``mbir_no_vessel`` without the smoothing along vessels, ``mbir_one_pass`` without the second pass;
+``mbir_noise_*`` takes the noise for half or twice of what it is."""
+
+PURPOSES = {
+    "linear": "the best post-filter of FBP that treats all directions alike",
+    "linear_z": "quiet images and whole-plaque means where thin slices do not matter",
+    "linear_z_added": "ROI means at full contrast by a filter that anybody can write",
+    "quadratic": "penalised least squares without edges",
+    "qggmrf": "quiet images with edges kept; reference for iterative reconstruction",
+    "tv": "quiet, piecewise constant images",
+    "fbp_cnn": "the network without the data term",
+    "mbir_one_pass": "quiet images, contrast of small structures shrunk",
+    "mbir": "contrast between small ROIs at slope about 1, not for quiet images",
+    "mbir_no_cnn": "what the network adds (ablation)",
+    "mbir_no_vessel": "what the smoothing along vessels adds (ablation)",
+    "mbir_noise_half": "robustness",
+    "mbir_noise_double": "robustness",
+}
+"""What a method is for."""
 
 METHODS = tuple(METHOD_NAMES)
+
+LINEAR_METHODS = ("linear", "linear_z", "linear_z_added", "quadratic")
+"""Exact, without realisations. MBIR without CNN is not among them: the directions of its smoothing along vessels come
+from the noisy data."""
 
 IMAGE_METHODS = ("fbp_cnn",)
 """Methods of an image domain: in place of b = AᵀW y they are given G x of an FBP volume x."""
 
-SLOW_METHODS = ("quadratic", "qggmrf", "tv", "fbp_cnn", "mbir_noise_half", "mbir_noise_double")
-"""Few realisations place them well enough: iterated to convergence, drawn anew as images, or a test of robustness."""
+SLOW_METHODS = ("qggmrf", "tv", "fbp_cnn", "mbir_noise_half", "mbir_noise_double")
+"""Fewer realisations: iterated to convergence, drawn anew as images, or a test of robustness."""
 
-_SECONDS = {"scene": 45.0, "vessel": 8.0, "fbp": 90.0, "data": 3.0, "images": 3.0, "linear": 0.3, "linear_z": 0.3,
-            "quadratic": 1.5, "qggmrf": 5.0, "tv": 10.0, "fbp_cnn": 1.0, "mbir_one_pass": 0.5, "mbir": 1.0,
-            "mbir_noise_half": 1.0, "mbir_noise_double": 1.0}  # fmt: skip
-"""Rough cost at all views on two cores: a scene, a vessel, exact FBP noise, one realisation, one volume of a method."""
+_SECONDS = {"scene": 45.0, "vessel": 8.0, "fbp": 90.0, "data": 3.0, "images": 3.0, "linear": 20.0, "linear_z": 25.0,
+            "linear_z_added": 30.0, "quadratic": 90.0, "qggmrf": 5.0, "tv": 10.0, "fbp_cnn": 1.0, "mbir_one_pass": 0.5,
+            "mbir": 1.0, "mbir_no_cnn": 0.7, "mbir_no_vessel": 1.0, "mbir_noise_half": 1.0,
+            "mbir_noise_double": 1.0}  # fmt: skip
+"""Rough cost at all views on two cores: one scene, one vessel, exact FBP noise, one realisation, a linear method at one
+exposure, one volume of each other method."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +114,7 @@ class Settings(StudySettings):
 
     Args:
         n: paired realisations of each main scene and dose; claims need ≥ 200.
-        slow_n: realisations for :data:`SLOW_METHODS` and for FBP's lumen and cap, at most ``n``.
+        slow_n: realisations for :data:`SLOW_METHODS`, and of half and flipped contrast; at most ``n``.
         scene_n: realisations of each further scene and dose.
         doses: exposures in s.
         scene_doses: exposures of the further scenes.
@@ -103,7 +129,8 @@ class Settings(StudySettings):
         blurs_mm: σ of Gaussian filters after soft FBP, for FBP of the same resolution as a method.
         bounds: measure the worst-case response of FBP and of the learned methods, and the limit of the data with
             outlines that are only roughly known.
-        rois: wider ROIs than the paper's, of :data:`WIDE_ROIS`.
+        controls: linear methods of the same draws that the figures of all nonlinear methods are controlled by, of
+            :data:`LINEAR_METHODS`.
         fast_noise: draw b = AᵀW y from the Gram's covariance instead of drawing the readings. The further scenes
             always do. There are no FBP realisations then; FBP's exact figures stay.
         block: realisations in one piece.
@@ -113,7 +140,7 @@ class Settings(StudySettings):
     """
 
     n: int = 200
-    slow_n: int = 64
+    slow_n: int = 48
     scene_n: int = 40
     doses: tuple[float, ...] = (0.35, 0.70, 2.00)
     scene_doses: tuple[float, ...] = (0.35, 2.00)
@@ -128,20 +155,19 @@ class Settings(StudySettings):
     voxels_mm: tuple[float, ...] = (0.25, 0.20)
     blurs_mm: tuple[float, ...] = (0.15, 0.25, 0.40, 0.60)
     bounds: bool = True
-    rois: tuple[str, ...] = WIDE_ROIS
+    controls: tuple[str, ...] = ("linear", "linear_z_added")
     fast_noise: bool = False
     block: int = 8
 
-    # About 90 s: an eighth of the views, 8 realisations, fast noise.
+    # A twelfth of the views, 12 realisations, fast noise, one control.
     QUICK: ClassVar[Mapping[str, Any]] = {
-        "n": 8, "scene_n": 4, "doses": (2.0,), "scene_doses": (2.0,), "views": 246, "fast_noise": True,
-        "methods": ("linear", "mbir_one_pass", "mbir"), "scenes": ("half_size_core",),
-        "kernels": ("soft", "standard"), "voxels_mm": (0.25,), "blurs_mm": (0.25,), "bounds": False, "rois": (),
-        "vessels": (),
+        "n": 12, "slow_n": 5, "scene_n": 4, "doses": (2.0,), "scene_doses": (2.0,), "views": 164, "fast_noise": True,
+        "methods": ("linear", "mbir"), "scenes": (), "controls": ("linear",),
+        "kernels": ("soft",), "voxels_mm": (0.25,), "blurs_mm": (), "bounds": False, "block": 12, "vessels": (),
     }  # fmt: skip
 
     def __post_init__(self) -> None:
-        self.check_whole(n=3, slow_n=3, scene_n=3, seed=0, views=8, block=1)
+        self.check_whole(n=8, slow_n=5, scene_n=3, seed=0, views=8, block=1)
         for name in ("doses", "scene_doses"):
             values = tuple(float(v) for v in getattr(self, name))
             object.__setattr__(self, name, values)
@@ -153,8 +179,8 @@ class Settings(StudySettings):
             ("scenes", (*MAIN_SCENES, *EXTRA_SCENES)),
             ("methods", METHODS),
             ("scene_methods", METHODS),
-            ("rois", WIDE_ROIS),
             ("vessels", VESSELS),
+            ("controls", LINEAR_METHODS),
         ):
             values = tuple(getattr(self, name))
             object.__setattr__(self, name, values)
@@ -162,14 +188,16 @@ class Settings(StudySettings):
                 if value not in known:
                     raise ValueError(f"unknown entry {value!r} of {name}: choose from {', '.join(known)}")
         object.__setattr__(self, "scenes", tuple(s for s in self.scenes if s not in MAIN_SCENES))
+        if not self.controls:
+            raise ValueError(f"controls is empty: choose from {', '.join(LINEAR_METHODS)}")
         if not self.methods:
             raise ValueError(f"methods is empty: choose from {', '.join(METHODS)}")
         if FBP_BASE[0] not in self.kernels or FBP_BASE[1] not in self.voxels_mm:
             raise ValueError(f"kernels and voxels_mm must hold FBP {FBP_BASE[0]} at {FBP_BASE[1]} mm, the reference")
 
     def realizations(self, method: str) -> int:
-        """Realisations of each main scene and dose for a method."""
-        return min(self.n, self.slow_n) if method in SLOW_METHODS else self.n
+        """Realisations with and without the core at each dose for a method that is not linear."""
+        return min(self.n, max(self.slow_n, 8)) if method in SLOW_METHODS else self.n
 
     def blocks(self, n: int) -> list[range]:
         """Realisations of every piece."""
@@ -180,10 +208,9 @@ class Settings(StudySettings):
         share = self.views / paper.FULL_VIEWS["PCCT"]
         further = sum(len(with_twin(name)) for name in self.scenes)
         extra = (further + len(self.vessels)) * self.scene_n * len(self.scene_doses)
-        drawn = 0 if self.fast_noise else len(NOISY_SCENES) * self.n * len(self.doses)
+        drawn = 0 if self.fast_noise else self.n * len(self.doses)
         on_images = bool(set(self.methods) & set(IMAGE_METHODS))
-        image_scenes = len(NOISY_SCENES) if on_images else int(not self.fast_noise)
-        images = image_scenes * min(self.n, self.slow_n) * len(self.doses)
+        images = min(self.n, self.slow_n) * len(self.doses) if on_images else 0
         parts = {
             "scenes": share * ((len(MAIN_SCENES) + further) * _SECONDS["scene"] + _SECONDS["fbp"]),
             "data": share * drawn * _SECONDS["data"],
@@ -191,8 +218,11 @@ class Settings(StudySettings):
             "vessels": share * len(self.vessels) * _SECONDS["vessel"],
         }
         for name in self.methods:
-            volumes = len(MAIN_SCENES) * self.realizations(name) * len(self.doses)
-            parts[name] = (volumes + (extra if name in self.scene_methods else 0)) * _SECONDS[name]
+            scenes = 2 * self.realizations(name) + 2 * min(self.n, self.slow_n)
+            volumes = len(self.doses) * (share if name in LINEAR_METHODS else scenes)
+            parts[name] = (
+                volumes + (extra if name in self.scene_methods and name not in LINEAR_METHODS else 0)
+            ) * _SECONDS[name]
         return parts
 
 

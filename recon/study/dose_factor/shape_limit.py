@@ -40,7 +40,7 @@ def shape_limits(noise: Realisations, dose: float) -> dict[float, float]:
         tissues = np.full(labels.max() + 1, facts.tissues.index("patient"))
         tissues[order] = np.arange(len(order))
         labels = tissues[labels]
-        maps = outline_maps(labels, facts.amplitudes_hu.tolist(), _FACTOR, fine.spacing[-1])
+        maps = outline_maps(labels, [facts.tissue_hu[t] for t in facts.tissues], _FACTOR, fine.spacing[-1])
         parts = [v for n in grid.shape for v in (n, _FACTOR)]
         keep = [k for k, t in enumerate(facts.tissues) if t != "patient"]
         fractions = np.stack([(labels == k).reshape(parts).mean(axis=(1, 3, 5)) for k in keep])
@@ -55,6 +55,6 @@ def shape_limits(noise: Realisations, dose: float) -> dict[float, float]:
         ]  # fmt: skip
         return {"displacement_mm": np.array(DISPLACEMENTS_MM), "contrast_sd_hu": np.array(sds)}
 
-    key = f"{noise.key} {DISPLACEMENTS_MM} {CORRELATION_MM} {_FACTOR}"
+    key = f"{noise.key} rods {DISPLACEMENTS_MM} {CORRELATION_MM} {_FACTOR}"
     piece = noise.store.piece(f"limits/{dose:g}s", key, compute)
     return dict(zip(piece["displacement_mm"].tolist(), piece["contrast_sd_hu"].tolist(), strict=True))

@@ -7,7 +7,7 @@ import re
 from dataclasses import replace
 from functools import cached_property
 
-from recon.study.dose_factor.settings import WIDE_ROIS, Settings
+from recon.study.dose_factor.settings import ROIS, Settings
 from recon.study.paper.plaque_scan import inset_grid
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.placement import RoiPair, place_rois, whole_rois
@@ -93,8 +93,12 @@ class Variant:
         scene = self.scene if "calcification" in self.name else self.plain
         return place_rois(scene, axial_grid(self.grid.center))
 
+    def pair_of(self, name: str) -> RoiPair:
+        """The ROIs of a name."""
+        return self.rois if name == "paper" else self.wide_rois(name)
+
     def wide_rois(self, name: str) -> RoiPair:
-        """The ROIs of :data:`recon.study.dose_factor.settings.WIDE_ROIS`, inside of the crop."""
+        """The ROIs of :data:`recon.study.dose_factor.settings.ROIS` beyond the paper's, inside of the crop."""
         z, y, x = self.core_center
         if name == "section":
             image = VolumeGrid((1, 80, 80), 0.04, (self.grid.center[0], y, x))
@@ -102,5 +106,5 @@ class Variant:
             half = float(self.plaque.core.semi_axes[2])
             image = VolumeGrid((max(1, math.floor(2 * half / 0.05)), 64, 64), 0.05, (z, y, x))
         else:
-            raise ValueError(f"rois must be of {', '.join(WIDE_ROIS)}, got {name!r}")
+            raise ValueError(f"rois must be of {', '.join(ROIS[1:])}, got {name!r}")
         return whole_rois(self.plain, image)

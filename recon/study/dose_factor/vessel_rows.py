@@ -9,17 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.study.dose_factor.estimates import (
-    Sample,
-    attempt,
-    controlled,
-    estimate,
-    kept,
-    mean_of,
-    none,
-    paired_ratio,
-    slope_of,
-)
+from recon.study.dose_factor.estimates import attempt, estimate, mean_of, none
+from recon.study.dose_factor.paired import Sample, controlled, kept, paired_ratio, slope_of
 from recon.study.dose_factor.settings import VESSEL_ROIS, VESSELS
 
 __all__ = ["REFERENCE", "vessel_rows"]

@@ -106,10 +106,9 @@ class VesselScans:
         return f"{self.noise.key} fine={FINE_MM} {values}"
 
     def tissues_hu(self) -> dict[str, float]:
-        """Tissue → HU above the fat, as the scanner sees them in the paper's scene."""
-        facts = self.noise.scene("paper").facts
-        fat = facts.amplitudes_hu[facts.tissue("patient")]
-        return {k: float(v - fat) for k, v in zip(facts.tissues, facts.amplitudes_hu, strict=True)}
+        """Tissue → true HU above the fat, by rods in the paper's scene."""
+        values = self.noise.scene("paper").facts.tissue_hu
+        return {k: v - values["patient"] for k, v in values.items()}
 
     def clean(self, name: str) -> dict[str, Any]:
         """``b`` at 1 s ``(2, z, y, x)`` of a vessel with its core, and with fibrous tissue in its place."""

@@ -1,6 +1,5 @@
 """Parts of the dose-factor study that need no run of it: settings, methods, pieces on disk, grids, estimates."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -8,20 +7,16 @@ import pytest
 import torch
 from tiny_studies import TINY as SMALLEST
 
-from recon.mbir.mbir import average_onto
-from recon.study.dose_factor.estimates import controlled
 from recon.study.dose_factor.measures import crop_window
 from recon.study.dose_factor.methods import (
     LinearFilter,
     fingerprint,
     load_methods,
 )
-from recon.study.dose_factor.other_rois import averaged_rois
 from recon.study.dose_factor.settings import METHODS, Settings
 from recon.study.dose_factor.store import Store
 from recon.study.dose_factor.tissue_values import tissue_groups
 from recon.study.dose_factor.variant import Variant
-from recon.study.paper.plaque_scan import inset_grid
 from torchpcct import VolumeGrid
 
 TINY = Settings(**SMALLEST["dose-factor"])
@@ -47,16 +42,21 @@ def test_method_registry(caplog):
         load_methods(["magic"])
 
 
-def test_control_variates():
-    rng = np.random.default_rng(3)
-    noise = rng.standard_normal((200, 2))
-    values = np.array([5.0, -2.0]) + noise @ np.array([[2.0, 0.3], [0.1, 1.0]]) + 0.1 * rng.standard_normal((200, 2))
-    found = controlled(values, 7.0 + 3.0 * noise, [7.0, 7.0])
-    np.testing.assert_allclose(found.mean(0), [5.0, -2.0], atol=4 * 0.1 / math.sqrt(200))
-    assert found.std(0).max() < 0.15 < 5 * 0.15 < values.std(0).min()
-    # Noise that has nothing to do with the control stays.
-    free = rng.standard_normal((200, 2))
-    np.testing.assert_allclose(controlled(free, noise, [0.0, 0.0]).mean(0), free.mean(0), atol=0.03)
+def test_add_back_is_linear_and_restores_contrast():
+    plain, added = load_methods(["linear_z", "linear_z_added"])
+    assert fingerprint(plain) != fingerprint(added)
+    assert replace(added, name="linear_z", add_back=0.0) == plain
+
+
+def test_ablations_are_told_apart():
+    found = load_methods(["mbir", "mbir_no_cnn", "mbir_no_vessel", "mbir_one_pass"])
+    assert [m.name for m in found] == ["mbir", "mbir_no_cnn", "mbir_no_vessel", "mbir_one_pass"]
+    prints = [fingerprint(m) for m in found]
+    assert len(set(prints)) == 4
+    assert prints == [fingerprint(m) for m in load_methods([m.name for m in found])]
+    scale = torch.tensor([200.0])
+    own, without = (m.model.prior.along_strength(scale) for m in (found[0], found[2]))
+    assert own > 1e6 * without
 
 
 def test_missing_weights_leave_mbir_out(monkeypatch, caplog):
@@ -70,15 +70,6 @@ def test_missing_weights_leave_mbir_out(monkeypatch, caplog):
     assert "mbir is left out" in caplog.text
     with pytest.raises(ValueError, match="no method to run"):
         load_methods(["mbir"])
-
-
-def test_rois_on_larger_voxels_are_those_of_the_averaged_volume():
-    variant = Variant("paper", replace(TINY, voxel_mm=0.2))
-    coarse = inset_grid(variant.plaque, 0.35)
-    volume = torch.randn(variant.grid.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    place = crop_window(variant.grid, variant.core_center)[0]
-    expected = [float(r(average_onto(volume, variant.grid, coarse))) for r in variant.rois.on(coarse)]
-    np.testing.assert_allclose(averaged_rois(variant, 0.35).means(volume[place].numpy(), 0.2), expected, rtol=1e-9)
 
 
 def test_pitch_of_the_scene():
@@ -106,13 +97,12 @@ def test_tissue_groups_and_crop():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"n": 2}, "n must be at least 3"),
+        ({"n": 2}, "n must be at least 8"),
         ({"doses": ()}, "doses is empty"),
         ({"doses": (0.0,)}, "doses must be different exposures"),
         ({"methods": ("magic",)}, "'magic' of methods"),
         ({"scenes": ("nowhere",)}, "'nowhere' of scenes"),
         ({"kernels": ("bone",)}, "FBP soft"),
-        ({"rois": ("vessel",)}, "'vessel' of rois"),
     ],
 )
 def test_bad_settings(changes, message):
