@@ -115,7 +115,8 @@ def noise_causes(views: int, exposure_s: float, kernel: str, seeds: range, progr
         JSON values: ``rows``, each with ``sd_hu`` by region, ``over_paper`` (ours over the paper's) and ``fits``; the
         paper's ``needed`` factors on ours; ``thorax_scale``, see there.
     """
-    scenes, rows, asked = phantoms(), [], changes(kernel)
+    scenes, asked = phantoms(), changes(kernel)
+    rows: list[dict[str, Any]] = []
     for k, change in enumerate(asked):
         sd: dict[str, float] = {}
         for name, scene in scenes.items():

@@ -115,7 +115,8 @@ def with_arms(chest: Scene) -> Scene:
 def muscle_causes(map_mm: float, exposure_s: float, progress: Callable[[float], None]) -> list[dict[str, Any]]:
     """Reductions in % by every change: ``readings`` of the muscle, and of ``side ribs``, ``skin`` and the CTDI
     phantom's ``periphery`` by their means."""
-    rows, asked, periphery = [], changes(), math.nan
+    asked, periphery = changes(), math.nan
+    rows: list[dict[str, Any]] = []
     for k, change in enumerate(asked):
         scanners, scene = change.scanners(), change.scene()
         low, high = scene.bounding_box("skin")[:, 1::-1]  # (y, x)
