@@ -82,7 +82,7 @@ def _further(detector: TransportedSilicon) -> Floats:
     node = np.searchsorted(_NODES_KEV, d.incident_kev)
     keys = np.stack([d.photon, d.sheet, d.strip, d.segment], axis=1)
     pulses, index = np.unique(keys, axis=0, return_inverse=True)
-    heights = np.bincount(index.reshape(-1), d.energy_kev)
+    heights: Floats = np.bincount(index.reshape(-1), d.energy_kev).astype(np.float64)
     first = d.order == 0
     shape = (_NODES_KEV.size, _HEIGHTS.size)
 

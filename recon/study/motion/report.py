@@ -122,14 +122,16 @@ def _borne(m: Measured) -> str:
 
     def limit(good: Sequence[bool]) -> str:
         kept = _up_to(list(series), good)
-        return f"up to {100 * kept:.0f} %" if kept is not None else f"not even at {100 * min(series):.0f} %"
+        if kept is None:
+            return f"not even up to {100 * min(series):.0f} % ({min(series) * m.settings.amplitude_mm:.2g} mm)"
+        return f"up to {100 * kept:.0f} % ({kept * m.settings.amplitude_mm:.2g} mm)"
 
     contrast = limit([_contrast_kept(o, rest) for o in series.values()])
     found = limit([_core_right(o) for o in series.values()])
     at_rest = "" if _core_right(rest) else " (nor at rest)"
     return (
-        "Residual motion of the whole that the core bears uncompensated: its contrast, read where it is at rest, "
-        f"stays within {_TOLERANCE:.0f} % {contrast}; segmentation finds it {found}{at_rest}."
+        "How much of the motion the core bears uncompensated depends on the measure: its contrast, read where it is at "
+        f"rest, stays within {_TOLERANCE:.0f} % of that at rest {contrast}; segmentation finds it {found}{at_rest}."
     )
 
 

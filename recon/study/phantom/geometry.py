@@ -19,7 +19,7 @@ from torchpcct.scene.plaque import Plaque
 
 __all__ = ["analytic_lengths", "assumptions", "raster_lengths"]
 
-_MARGIN_MM = 0.25
+_MARGIN_MM = 0.1
 
 
 def analytic_lengths(scene: Scene, plaque: Plaque) -> dict[str, float]:
@@ -63,7 +63,7 @@ def raster_lengths(scene: Scene, plaque: Plaque, voxel_mm: float, sections: int)
         scene,
         plaque,
         plaque.core_center,
-        tuple(np.array(plaque.core.semi_axes) + plaque.minimum_cap + _MARGIN_MM),
+        tuple(a + plaque.minimum_cap + _MARGIN_MM for a in plaque.core.semi_axes),
         voxel_mm,
     )
     inside = core[0] == scene.index("core")
