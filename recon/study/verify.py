@@ -40,7 +40,7 @@ PASSING = (
 
 _FIELD = re.compile(r"\{(\w+)(?::([^}]*))?\}")
 _FIGURE = r"([-+−]?\d+(?:[.,]\d+)*%?|[A-Za-z]\w*)"
-_ROW = re.compile(r"^(\w*)\[(.+)\]$")
+_ROW = re.compile(r"^([^[]*)\[(.+)\]$")
 
 
 @dataclass(frozen=True)
