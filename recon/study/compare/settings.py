@@ -44,14 +44,14 @@ class Settings(StudySettings):
     control: bool = True
     placements: bool = True
 
-    # An eighth of the views, two kernels, two voxel sizes, two doses, 8 realisations: ≤ 45 s.
+    # An eighth of the views, two kernels, two voxel sizes, two doses, 8 realisations, no PWLS: ≤ 45 s.
     QUICK: ClassVar[Mapping[str, Any]] = {
         "realizations": 8,
         "views": 246,
         "kernels": ("soft", "standard"),
         "voxels_mm": (0.25, 0.40),
         "doses": {"1x": 0.35, "5.7x": 2.00},
-        "pwls_s": (2.00,),
+        "pwls": False,
         "mbir_s": (0.35, 2.00),
         "placements": False,
     }
