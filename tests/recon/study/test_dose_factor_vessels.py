@@ -137,7 +137,7 @@ def test_the_truth_is_finer_than_the_methods_grid():
 def test_the_statistic_of_a_vessel_on_the_methods_grid_is_the_grams():
     A, weights = problem(views=120, shape=(12, 23, 23), voxel=0.4)
     gram = Gram(A, weights)
-    of = SimpleNamespace(geometry=A.geometry, window=A.window, projector=A, gram=gram)
+    of = SimpleNamespace(geometry=A.geometry, window=A.window, projector=A, weights=weights)
     shape = Vessel(Centreline(X, (0.0, -1.0, 0.0)), A.grid.center)
     values = {"wall": 160.0, "fibrous": 199.0, "core": 136.0, "lumen": 575.0}
     x = torch.from_numpy(shape.painted(A.grid, values) * 2e-5).float()
