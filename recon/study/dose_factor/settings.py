@@ -219,7 +219,7 @@ class Settings(StudySettings):
         }
         for name in self.methods:
             scenes = 2 * self.realizations(name) + 2 * min(self.n, self.slow_n)
-            volumes = len(self.doses) * (share if name in LINEAR_METHODS else scenes)
+            volumes = len(self.doses) * (1 if name in LINEAR_METHODS else scenes)
             parts[name] = (
                 volumes + (extra if name in self.scene_methods and name not in LINEAR_METHODS else 0)
             ) * _SECONDS[name]
