@@ -233,7 +233,8 @@ def _vessel_table(data: dict[str, Any]) -> str:
         "## Vessels of any direction\n\nThe plaque on a vessel along z, tilted by 45°, in plane, curved and with a "
         f"side branch at 45°: painted on voxels of {FINE_MM:g} mm, which are projected exactly; {e['realizations']} "
         "realisations with noise of the paper scene's covariance, the same in all vessels. ROIs follow the tissues in "
-        f"space. In HU; true contrast {e['true_contrast_hu']:.1f}. No core: contrast without it. Slope: what the core adds to the contrast, over the "
+        f"space. In HU; true contrast {e['true_contrast_hu']:.1f}. No core: contrast without it. Slope: what the core "
+        "adds to the contrast, over the "
         f"true one, from the first {TWIN_REALIZATIONS} realisations with and without it. To linear: slope-corrected "
         "contrast variance of the isotropic linear filter over the method's, on the same noise. Kept: that "
         "factor over the straight vessel's.\n\n" + "\n\n".join(parts)
