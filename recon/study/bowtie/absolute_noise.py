@@ -123,7 +123,8 @@ def noise_causes(views: int, exposure_s: float, kernel: str, seeds: range, progr
             if rows and _of_thorax(change, asked[0]) and name != "thorax":  # the other phantom does not change
                 sd |= {r: v for r, v in rows[0]["sd_hu"].items() if REGIONS[r] == name}
             else:
-                sd |= _sds(name, enlarged(scene, change.thorax), change, views, exposure_s, kernel, seeds)
+                body = enlarged(scene, change.thorax) if name == "thorax" else scene
+                sd |= _sds(name, body, change, views, exposure_s, kernel, seeds)
         over = {r: v / paper.BOWTIE[f"{r}_sd_hu"][0] for r, v in sd.items()}
         rows.append({"change": change.name, "sd_hu": sd, "over_paper": over, "fits": fits(over)})
         progress((k + 1) / len(asked))

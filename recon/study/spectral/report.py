@@ -13,6 +13,7 @@ from recon.study.report import Report, markdown_table, records_table
 from recon.study.spectral.calibration_text import calibration_section, contrast_cost
 from recon.study.spectral.figures import curves_figure, tissue_figure
 from recon.study.spectral.measure import Measured
+from recon.study.spectral.tissues import RULES
 from recon.study.study import environment, time_line
 from torchpcct.acquisition.plan import Effect
 from torchpcct.spectral import MMD_TISSUES, pe_pvc
@@ -189,8 +190,9 @@ def _core_kept(data: dict[str, Any]) -> str:
         found.append(f"{method}: {upto}" + ("" if np.isnan(here) else f" (Dice {here:.2f} at {100 * limit:.0f} %)"))
     return (
         f"Noise up to which the core's Dice reaches {VISIBLE_DICE:g}: {'; '.join(found)}. The paper calls the core "
-        f"visible up to {100 * limit:.0f} %. Here that holds where the centres of the tissues are held fixed at their "
-        "known values; of the paper's own step, k-means with free centres, see the second line."
+        f"visible up to {100 * limit:.0f} % and used k-means. With the centres of the tissues held fixed at their "
+        f"known values its Dice there is {_at(data['dice']['FBP'], limit, 'necrotic_core'):.2f}, with the free centres "
+        f"of k-means {_at(data['dice'][RULES['k-means']], limit, 'necrotic_core'):.2f}."
     )
 
 

@@ -217,6 +217,9 @@ def test_report(tiny, tmp_path):
         assert noise["kernel soft"][region] < sd < noise["kernel bone"][region]
     assert noise["thorax 10 % larger"]["inside"] == plain["inside"]
     assert noise["thorax 10 % larger"]["heart"] > plain["heart"]
+    detail = noise["both: kernel detail, thorax 10 % larger"]
+    assert detail["inside"] == noise["kernel detail"]["inside"]
+    assert detail["heart"] > noise["kernel detail"]["heart"]
     muscle = {r["change"]: r for r in data["muscle_causes"]}
     ramps = [muscle[f"ramp of {w:g} mm"] for w in (1.0, 7.5, 22.5, 30.0)]
     assert (np.diff([r["readings"]["means"] for r in ramps]) < 0).all()
