@@ -32,7 +32,7 @@ def test_command_line_simulate_and_reconstruct(tmp_path, capsys):
         (["reconstruct", "{tmp}/none.h5", "--out", "{tmp}/a.png"], "unknown volume format"),
         (["reconstruct", "{tmp}/none.h5", "--voxel", "0", "--out", "{tmp}/a.h5"], "--voxel must be greater than 0 mm"),
         (["compare", "--realizations", "2", "--out", "{tmp}/o"], "realizations must be at least 3"),
-        (["dose-factor", "--n", "2", "--out", "{tmp}/o"], "n must be at least 3"),
+        (["dose-factor", "--n", "2", "--out", "{tmp}/o"], "n must be at least 8"),
         (["study", "magic", "--out", "{tmp}/o"], "unknown study 'magic'"),
         (["study", "noise", "--set", "views", "--out", "{tmp}/o"], "give field=value"),
     ],
@@ -43,7 +43,7 @@ def test_command_line_refuses_bad_input_and_writes_nothing(tmp_path, capsys, arg
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("command", ["compare", "dose-factor", "study", "simulate", "reconstruct"])
+@pytest.mark.parametrize("command", ["compare", "dose-factor", "study", "simulate", "reconstruct", "verify"])
 def test_help(command, capsys):
     with pytest.raises(SystemExit) as stop:
         main([command, "--help"])
