@@ -43,7 +43,7 @@ def test_command_line_refuses_bad_input_and_writes_nothing(tmp_path, capsys, arg
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("command", ["compare", "dose-factor", "study", "simulate", "reconstruct", "verify"])
+@pytest.mark.parametrize("command", ["compare", "dose-factor", "study", "simulate", "reconstruct"])
 def test_help(command, capsys):
     with pytest.raises(SystemExit) as stop:
         main([command, "--help"])
@@ -51,3 +51,20 @@ def test_help(command, capsys):
     text = capsys.readouterr().out
     for flag in ("--seed", "--device", "--out"):
         assert flag in text
+
+
+def test_verify_finds_a_stale_readme_and_mends_it(tmp_path, capsys):
+    (tmp_path / "notebooks").mkdir()
+    (tmp_path / "notebooks" / "r.json").write_text('{"a": 1.26}', encoding="utf-8")
+    (tmp_path / "notebooks" / "claims.yaml").write_text(
+        '- {text: "it is {a:.1f}×", values: {a: "r.json: a"}}\n', encoding="utf-8"
+    )
+    readme = tmp_path / "README.md"
+    readme.write_text("# T\n\n## The studies\n\nSo it is 1.2× now.\n", encoding="utf-8")
+    assert main(["verify", "--root", str(tmp_path)]) == 2
+    assert "the results say: it is 1.3×" in capsys.readouterr().out
+    assert main(["verify", "--root", str(tmp_path), "--write"]) == 0
+    assert "So it is 1.3× now." in readme.read_text(encoding="utf-8")
+    readme.write_text("# T\n\n## The studies\n\nSo it is 1.3× now, of 7.\n", encoding="utf-8")
+    assert main(["verify", "--root", str(tmp_path)]) == 2
+    assert "no claim covers the figures of: So it is" in capsys.readouterr().out
