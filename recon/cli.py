@@ -136,9 +136,10 @@ def _verify(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         committed = json.loads((results / registry.folder(name) / "report.json").read_text(encoding="utf-8"))
         settings = registry.settings_of(name, committed["settings"])
         again = json.loads(registry.run(name, settings, progress).json)
-        changed += list(verify.differences(committed, again))
+        found = list(verify.differences(committed, again))
         progress.close()
-        print("\n".join([f"{name}: {len(changed)} figures differ from the committed ones", *changed]))
+        print("\n".join([f"{name}: {len(found)} figures differ from the committed ones", *found]))
+        changed += found
     if wrong or bare or changed:
         raise ValueError("README.md and the committed results do not agree: see above (--write mends the README)")
 

@@ -16,6 +16,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -213,7 +214,8 @@ def differences(committed: Any, again: Any, tolerance: float = 1e-3, place: str 
         for k, (a, b) in enumerate(zip(committed, again, strict=True)):
             yield from differences(a, b, tolerance, f"{place}/{k}")
     elif isinstance(committed, int | float) and isinstance(again, int | float):
-        if not math.isclose(committed, again, rel_tol=tolerance, abs_tol=1e-6):
+        both_undetermined = math.isnan(committed) and math.isnan(again)
+        if not both_undetermined and not math.isclose(committed, again, rel_tol=tolerance, abs_tol=1e-6):
             yield f"{place}: {committed} → {again}"
     elif committed != again:
         yield f"{place}: {committed!r} → {again!r}"
@@ -221,9 +223,15 @@ def differences(committed: Any, again: Any, tolerance: float = 1e-3, place: str 
 
 def _read(path: Path) -> Any:
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return _parsed(path, path.stat().st_mtime_ns)
     except OSError as error:
         raise ValueError(f"cannot read {path}: {error.strerror}") from None
+
+
+@lru_cache(maxsize=16)
+def _parsed(path: Path, changed_ns: int) -> Any:
+    """A report, parsed once for all claims that it answers; ``changed_ns`` tells a new one from the old."""
+    return json.loads(path.read_text(encoding="utf-8"))
 
 
 def _same(value: Any, text: str) -> bool:

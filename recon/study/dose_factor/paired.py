@@ -45,26 +45,19 @@ def _slope_corrected(roi: Floats, slope: Any) -> Floats:
     return np.square(slope) / (roi[..., 1] - roi[..., 0]).var(-1, ddof=1)
 
 
-def _squared_cnr(roi: Floats, slope: Any) -> Floats:
-    mean, variance = roi.mean(-2), roi.var(-2, ddof=1)
-    return np.square(mean[..., 1] - mean[..., 0]) / variance.sum(-1)
-
-
-_PAIRED = {"contrast_variance": _slope_corrected, "paper_cnr": _squared_cnr}
-
-
 Sample = tuple[Floats, ContrastSlope]
 """ROI means ``(n, 2)`` of a method, and its contrast slope on the same noise."""
 
 
-def _resampled_ratio(figure: str, first: Sample, second: Sample) -> tuple[float, Floats, Floats]:
-    """The ratio of two methods' figures, of bootstrap samples, and its logarithm with one realisation left out."""
-    of, (a, slope_a), (b, slope_b) = _PAIRED[figure], first, second
+def _resampled_ratio(first: Sample, second: Sample) -> tuple[float, Floats, Floats]:
+    """The second's slope-corrected contrast variance over the first's, that of bootstrap samples, and its logarithm
+    with one realisation left out."""
+    (a, slope_a), (b, slope_b) = first, second
     n = len(a)
 
     def ratio(index: Any, slopes: tuple[Any, Any]) -> Floats:
         with np.errstate(divide="ignore", invalid="ignore"):
-            return of(a[index], slopes[0]) / of(b[index], slopes[1])
+            return _slope_corrected(a[index], slopes[0]) / _slope_corrected(b[index], slopes[1])
 
     value = float(ratio(np.arange(n)[None], (slope_a.value, slope_b.value))[0])
     with np.errstate(divide="ignore"):
@@ -72,23 +65,21 @@ def _resampled_ratio(figure: str, first: Sample, second: Sample) -> tuple[float,
     return value, ratio(resampling(n, DRAWS, 0), (slope_a.draws, slope_b.draws)), jackknife
 
 
-def paired_ratio(figure: str, first: Sample, second: Sample) -> Any:
-    """Dose factor of one method against another, both resampled together.
+def paired_ratio(first: Sample, second: Sample) -> Any:
+    """Dose factor by contrast variance of one method against another, both resampled together.
 
     Args:
-        figure: ``"contrast_variance"`` or ``"paper_cnr"``.
         first, second: of the two methods, on the same noise.
     """
-    value, draws, jackknife = _resampled_ratio(figure, first, second)
+    value, draws, jackknife = _resampled_ratio(first, second)
     return estimate((value, *bca_interval(value, draws, jackknife)))
 
 
-def kept(figure: str, here: tuple[Sample, Sample], there: tuple[Sample, Sample]) -> Any:
+def kept(here: tuple[Sample, Sample], there: tuple[Sample, Sample]) -> Any:
     """Share of a dose factor (:func:`paired_ratio`) in one place that is left in another, all resampled together.
 
     Args:
-        figure: as there.
         here, there: the two methods in the place asked for and in the place compared with.
     """
-    (a, drawn_a, left_a), (b, drawn_b, left_b) = (_resampled_ratio(figure, *pair) for pair in (here, there))
+    (a, drawn_a, left_a), (b, drawn_b, left_b) = (_resampled_ratio(*pair) for pair in (here, there))
     return estimate((a / b, *bca_interval(a / b, drawn_a / drawn_b, left_a - left_b)))

@@ -21,8 +21,6 @@ Pieces = Mapping[tuple[str, str, float], dict[str, Any]]
 REFERENCE = "linear"
 """The method that gains are quoted against, and whose noise-free readings are the control of all means."""
 
-_FIGURE = "contrast_variance"
-
 
 def vessel_rows(samples: Pieces, true_contrast_hu: float) -> list[dict[str, Any]]:
     """Every vessel at every dose with every method, for both pairs of ROIs.
@@ -63,10 +61,10 @@ def _row(samples: Pieces, key: tuple[str, str, float], roi: int, true_contrast_h
         "fat_sd_hu": _noise(entry["fat"]),
         "to_linear": none("nothing to compare with")
         if here is None
-        else attempt(lambda: paired_ratio(_FIGURE, *here)),
+        else attempt(lambda: paired_ratio(*here)),
         "kept": none("nothing to compare with")
         if here is None or straight is None or name == VESSELS[0]
-        else attempt(lambda: kept(_FIGURE, here, straight)),
+        else attempt(lambda: kept(here, straight)),
     }  # fmt: skip
 
 

@@ -1,6 +1,7 @@
 """Figures of the README against committed results."""
 
 import json
+import math
 
 import pytest
 
@@ -63,6 +64,8 @@ def test_bad_claims_are_refused(folder):
 def test_differences_are_named_and_runs_may_take_another_time():
     again = json.loads(json.dumps(DATA))
     assert not list(differences({**DATA, "seconds": 1}, {**again, "seconds": 2}))
+    assert not list(differences({"core_mm2": math.nan}, {"core_mm2": math.nan}))
+    assert list(differences({"core_mm2": math.nan}, {"core_mm2": 1.0}))
     again["rows"][0]["v"] *= 1.0005
     assert not list(differences(DATA, again))
     again["rows"][0]["v"] *= 1.01
