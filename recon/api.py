@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -9,16 +10,21 @@ from typing import Any, overload
 
 import torch
 
+from recon.fbp.coverage import sampling_warnings
 from recon.fbp.inset import InsetFbp
 from recon.mbir.mbir import reconstruct_mbir
 from recon.pwls.inset_problem import reconstruct_pwls
-from torchpcct.geometry import VolumeGrid
+from torchpcct.defects import mended
+from torchpcct.geometry import ConeBeam, VolumeGrid
 from torchpcct.scan import Scan
-from torchpcct.volume import Volume
+from torchpcct.validate import choice
+from torchpcct.volume import Volume, from_hu
 
 __all__ = ["METHODS", "reconstruct"]
 
 METHODS: tuple[str, ...] = ("fbp", "pwls", "mbir")
+
+_LOG = logging.getLogger(__name__)
 
 Progress = Callable[[float], None]
 
@@ -45,18 +51,24 @@ def reconstruct(
 
     Args:
         scan: one scan, or several realisations of one scan (same geometry, window and exposure).
-        grid: ``(z, y, x)`` grid inside the field of view.
+        grid: ``(z, y, x)`` grid inside the field of view; of a parallel or fan-beam scan ``(y, x)`` or, of several
+            slices, ``(slices, y, x)``.
         method: ``"fbp"`` (FDK; option ``kernel``) or ``"pwls"`` (penalised weighted least squares with a q-GGMRF
-            prior, to convergence; options of :func:`recon.pwls.inset_problem.reconstruct_pwls`) or ``"mbir"`` (unrolled
+            prior, of an inset or a whole field; options of :func:`recon.pwls.inset_problem.reconstruct_pwls`; a volume
+            that did not converge carries ``warnings`` in its report) or ``"mbir"`` (unrolled
             steps with the learned prior that ships with the package; options of
             :func:`recon.mbir.mbir.reconstruct_mbir`).
         progress: called with the finished fraction, 0…1.
         device: where the returned volumes lie.
         options: of the method.
 
+    Readings that no object can cause (dead or hot cells, dead views, lost readings: :mod:`torchpcct.defects`) are
+    interpolated before; the report's ``warnings`` say so.
+
     Returns:
         A :class:`torchpcct.Volume` (a list of them for a sequence of scans), float32 HU; its ``report`` says how it was
-        made: method, options, seconds, and for iterative methods iterations and residual.
+        made: method, options, seconds, ``warnings``, and for iterative methods iterations and residual. In mm⁻¹ if
+        ``scan.unit`` says so.
 
     Raises:
         ValueError: an unknown method, kernel or option value, a grid outside the field of view, a starved scan.
@@ -65,7 +77,7 @@ def reconstruct(
     scans = [scan] if isinstance(scan, Scan) else list(scan)
     if not scans or not all(isinstance(s, Scan) for s in scans):
         raise TypeError(f"scan must be a Scan or a non-empty sequence of scans, got {type(scan).__name__}")
-    if not isinstance(grid, VolumeGrid) or grid.ndim != 3:
+    if not isinstance(grid, VolumeGrid) or (grid.ndim != 3 and isinstance(scans[0].geometry, ConeBeam)):
         raise ValueError(f"grid must be a (z, y, x) VolumeGrid, got {grid!r}")
     for s in scans:
         if s.zero_fraction > _STARVED:
@@ -73,15 +85,24 @@ def reconstruct(
                 f"{100 * s.zero_fraction:.0f} % of the readings are zero: too few photons for a line-integral method; "
                 "raise the exposure or bin the readings"
             )
+    choice("method", method, METHODS)
+    whole = [mended(s) for s in scans]
+    scans = [s for s, _ in whole]
+    for text in {text for _, texts in whole for text in texts}:
+        _LOG.warning("%s", text)
     if method == "fbp":
         volumes = _fbp(scans, grid, progress, **options)
     elif method == "mbir":
         volumes = reconstruct_mbir(scans, grid, progress=progress, **options)
-    elif method == "pwls":
-        volumes = reconstruct_pwls(scans, grid, progress=progress, **options)
     else:
-        raise ValueError(f"unknown method {method!r}: use one of {', '.join(METHODS)}")
-    volumes = [replace(v, data=v.data.to(device)) for v in volumes]
+        volumes = reconstruct_pwls(scans, grid, progress=progress, **options)
+    if scans[0].unit != "HU":
+        mu = scans[0].linearisation.mu_ref
+        volumes = [replace(v, data=from_hu(v.data, mu), unit=scans[0].unit) for v in volumes]
+    volumes = [
+        replace(v, data=v.data.to(device), report={**v.report, "warnings": [*texts, *v.report.get("warnings", [])]})
+        for v, (_, texts) in zip(volumes, whole, strict=True)
+    ]
     return volumes[0] if isinstance(scan, Scan) else volumes
 
 
@@ -90,11 +111,15 @@ def _fbp(scans: Sequence[Scan], grid: VolumeGrid, progress: Progress | None, ker
         raise TypeError(f"kernel must be one name, got {kernel!r}; recon.fbp.inset.InsetFbp takes several at once")
     start = time.perf_counter()
     run = InsetFbp(scans[0], [grid], [kernel])
+    warnings = [*run.warnings, *sampling_warnings(run.geometry)]
+    for text in warnings:
+        _LOG.warning("%s", text)
     volumes = []
     for i, s in enumerate(scans):
         data = run(s)[0][0].to(torch.float32)
         seconds = time.perf_counter() - start
-        volumes.append(Volume(data, grid, {"method": "fbp", "kernel": kernel, "seconds": round(seconds, 3)}))
+        report = {"method": "fbp", "kernel": kernel, "seconds": round(seconds, 3), "warnings": list(warnings)}
+        volumes.append(Volume(data, grid, report))
         start = time.perf_counter()
         if progress is not None:
             progress((i + 1) / len(scans))

@@ -38,6 +38,30 @@ _LAZY = {
 }
 
 
+def _check_cache(folder: str, home: str) -> None:
+    """Warn if numba can keep compiled kernels neither beside the package nor at home: loading a kernel would fail."""
+    if "NUMBA_CACHE_DIR" in os.environ or any(os.access(_existing(path), os.W_OK) for path in (folder, home)):
+        return
+    import warnings
+
+    warnings.warn(
+        f"numba can keep compiled kernels neither in {folder} nor in {home}: set NUMBA_CACHE_DIR to a folder that you "
+        "can write",
+        RuntimeWarning,
+        stacklevel=2,
+    )
+
+
+def _existing(path: str) -> str:
+    """The nearest folder above that exists."""
+    while not os.path.exists(path) and os.path.dirname(path) != path:
+        path = os.path.dirname(path)
+    return path
+
+
+_check_cache(os.path.dirname(__file__), os.path.expanduser("~/.cache/numba"))
+
+
 def __getattr__(name: str) -> Any:
     # Kernels compile and torch loads on first use: ``import torchpcct`` stays quick.
     if name in _LAZY:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
+from torchpcct.validate import whole
 
 __all__ = ["DetectorWindow", "shadow"]
 
@@ -36,17 +37,14 @@ class DetectorWindow:
     rows: int = 1
 
     def __post_init__(self) -> None:
-        first = np.array(self.first_column, dtype=np.int64)
-        if first.ndim != 1 or first.size == 0 or first.min() < 0:
-            raise ValueError("first_column must be a non-empty 1-D array of indices ≥ 0")
+        given = np.asarray(self.first_column)
+        if given.dtype.kind not in "iu" or given.ndim != 1 or given.size == 0 or given.min() < 0:
+            raise ValueError(f"first_column must be a 1-D array of whole numbers ≥ 0, one per view, got {given!r:.80}")
+        first = given.astype(np.int64)
         first.setflags(write=False)
         object.__setattr__(self, "first_column", first)
-        object.__setattr__(self, "columns", int(self.columns))
-        object.__setattr__(self, "rows", int(self.rows))
-        if self.columns < 1 or self.rows < 1:
-            raise ValueError(f"a window needs at least 1 row and 1 column, got {self.rows} × {self.columns}")
-        if self.first_row < 0:
-            raise ValueError(f"first_row must be at least 0, got {self.first_row}")
+        for name, low in (("columns", 1), ("first_row", 0), ("rows", 1)):
+            object.__setattr__(self, name, whole(name, getattr(self, name), low))
 
     def __eq__(self, other: object) -> bool:
         return (
@@ -163,7 +161,8 @@ def shadow(geometry: Geometry, grid: VolumeGrid, margin: int = 0, motion: Any = 
         motion: displacement of the grid per view as for ``Projector``, or None.
 
     Raises:
-        ValueError: a motion of the wrong shape, the grid leaves the field of view, or the source's orbit crosses it.
+        ValueError: a motion of the wrong shape, the grid leaves the field of view, no row sees it, or the source's
+            orbit crosses it.
     """
     gz = grid.extent[0] / 2 if grid.ndim == 3 else 0.0
     cy, cx = grid.center[-2:]
@@ -198,6 +197,11 @@ def shadow(geometry: Geometry, grid: VolumeGrid, margin: int = 0, motion: Any = 
             v = geometry.sdd * (reach[:, None, None] + (shift[:, :1] if grid.ndim == 3 else 0.0)) / distance
             row0 = (v.min() - geometry.row_positions[0]) / geometry.pitch[0] - 0.5
             row1 = (v.max() - geometry.row_positions[0]) / geometry.pitch[0] + 0.5
+            if row1 < 0.0 or row0 > geometry.rows - 1:
+                raise ValueError(
+                    f"the grid (z = {reach[0]:g} … {reach[1]:g} mm) lies above or below all {geometry.rows} rows in "
+                    "every view: move it along z"
+                )
             first_row = int(np.clip(math.floor(row0), 0, geometry.rows - 1))
             rows = int(np.clip(math.ceil(row1), first_row, geometry.rows - 1)) - first_row + 1
     else:

@@ -16,6 +16,7 @@ Conventions (one page, used everywhere in the package)
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, TypeVar
@@ -25,9 +26,13 @@ from numpy.typing import NDArray
 
 from torchpcct.validate import choice, number, per_axis, whole
 
-__all__ = ["ConeBeam", "FanBeam", "Geometry", "ParallelBeam", "VolumeGrid", "full_turn"]
+__all__ = ["ConeBeam", "FanBeam", "Geometry", "ParallelBeam", "VolumeGrid", "full_turn", "view_step"]
 
 Floats = NDArray[np.float64]
+
+_DEGREES_SPAN_RAD, _DEGREES_STEP_RAD = 20.0, 0.04
+"""Angles over more than three turns in steps of 2.3° and more: 20 and more degrees, up to 9000 views a turn, taken as
+rad. Helical scans of as many turns have far smaller steps."""
 
 
 def full_turn(views: int, start: float = 0.0) -> Floats:
@@ -37,15 +42,36 @@ def full_turn(views: int, start: float = 0.0) -> Floats:
 
 def _angles(value: Any) -> Floats:
     try:
-        angles = np.array(value, dtype=np.float64)
+        given = np.asarray(value)
+        if given.dtype.kind not in "fiu":  # numpy would drop an imaginary part, and take None for NaN
+            raise TypeError
+        angles = np.array(given, dtype=np.float64)
     except (TypeError, ValueError):
-        raise TypeError(f"angles must be numbers in rad, got {type(value).__name__}") from None
+        raise TypeError(f"angles must be real numbers in rad, got {type(value).__name__}: {value!r:.60}") from None
     if angles.ndim != 1 or angles.size == 0:
         raise ValueError(f"angles must be a non-empty 1-D sequence in rad, got shape {angles.shape}")
     if not np.isfinite(angles).all():
         raise ValueError(f"angles must be finite, but view {int(np.argmin(np.isfinite(angles)))} is not")
+    if np.ptp(angles) > _DEGREES_SPAN_RAD and view_step(angles) > _DEGREES_STEP_RAD:
+        warnings.warn(
+            f"the angles cover {np.ptp(angles) / (2 * math.pi):.0f} turns in steps of {view_step(angles):.3g} rad: "
+            "they look like degrees; give rad (numpy.deg2rad), or angles modulo 2π if they are rad",
+            UserWarning,
+            stacklevel=4,
+        )
     angles.setflags(write=False)
     return angles
+
+
+def view_step(angles: Floats) -> float:
+    """The usual angle between neighbouring views in rad, whatever their order; 0 for fewer than two distinct views.
+
+    Args:
+        angles: ``(views,)`` rad. Views closer than 1e-9 rad are repetitions of one view.
+    """
+    steps = np.diff(np.sort(angles))
+    steps = steps[steps > 1e-9]
+    return float(np.median(steps)) if steps.size else 0.0
 
 
 def _axis(count: int, pitch: float, offset: float) -> Floats:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections.abc import Mapping
@@ -14,9 +13,13 @@ import torch
 from torch import Tensor
 
 from torchpcct import counting_noise as noise
+from torchpcct.dead_cells import bridge
 from torchpcct.detector_window import DetectorWindow
-from torchpcct.files import VERSION, read_hdf5, written_whole
-from torchpcct.geometry import ConeBeam
+from torchpcct.files import read_hdf5
+from torchpcct.geometry import ConeBeam, Geometry
+from torchpcct.readings import counted, inverse_variance, logged, smoothed
+from torchpcct.scan_checks import check_exposure, check_scan
+from torchpcct.scan_file import scan_fields, write_scan
 from torchpcct.scanner.linearisation import WaterLinearisation
 from torchpcct.validate import number
 
@@ -25,21 +28,17 @@ __all__ = ["NOISE_FREE_EXPOSURE_S", "Scan"]
 NOISE_FREE_EXPOSURE_S = 1.0
 """The exposure that the expected readings of a noise-free scan stand for."""
 
-_VERSION = 2
-"""2: energy-integrating scans with their noise model. Counting scans are still written as version 1."""
-# Compress in blocks of whole views: fast to write, and a window of views can be read without the rest.
-_HDF5_COMPRESSION = {"compression": "lzf", "shuffle": True}
-
 
 @dataclass(frozen=True)
 class Scan:
     """Readings of one scan.
 
     Args:
-        counts: ``(views, rows, columns)``, spectral ``(bins, views, rows, columns)``, float32. Counts if noisy
+        counts: ``(views, rows, columns)``, spectral ``(bins, views, rows, columns)``, float32; of a parallel or fan
+            beam ``(views, columns)`` or, of several slices, ``(slices, views, columns)``. Counts if noisy
             (``exposure_s`` given); else expected counts for :data:`NOISE_FREE_EXPOSURE_S`. With a window, only its
             cells: ``(..., views, window.rows, window.columns)``.
-        air: ``(rows, columns)`` or ``(bins, rows, columns)`` expected readings without the object, same exposure.
+        air: ``counts`` without the axis of views: expected readings without the object, same exposure.
         geometry: the scan geometry of the WHOLE detector.
         linearisation: water beam-hardening correction of the scanner.
         exposure_s: duration of the scan in s; None: noise free.
@@ -54,15 +53,24 @@ class Scan:
             None: the noise of this signal is not known.
         electronic_noise: energy integrating only: standard deviation in keV that the electronics add to every reading,
             whatever the exposure.
+        flux: ``(views,)`` relative intensity of the source in each view; None: the same in all.
+        dead: bool, the shape of ``counts``: readings that say nothing; None: there are none. They are bridged by their
+            neighbours in line integrals, and weigh nothing.
+        logged: the readings come from given line integrals: their logarithm is taken as it is.
+        unit: of volumes, "HU" or, where the attenuation of water is not known or means nothing, "mm^-1".
+
+    Scans of other scanners: :meth:`from_counts`, :meth:`from_line_integrals`, :mod:`torchpcct.formats`.
 
     Raises:
-        ValueError: NaN, Inf or negative counts, no counts at all, air readings ≤ 0, an exposure ≤ 0, shapes that do
-            not fit the geometry.
+        ValueError: NaN, Inf or negative counts, no counts at all, readings in air or of the surround that are NaN,
+            infinite or ≤ 0, an exposure ≤ 0, shapes that do not fit the geometry, a water correction of another
+            detector, a window beyond the detector.
+        TypeError: a member of the wrong kind.
     """
 
     counts: Tensor
     air: Tensor
-    geometry: ConeBeam
+    geometry: Any  # a Geometry; most users know which
     linearisation: WaterLinearisation
     exposure_s: float | None = None
     seed: int | None = None
@@ -72,45 +80,89 @@ class Scan:
     info: Mapping[str, Any] = field(default_factory=dict)
     quantum: Tensor | None = None
     electronic_noise: float = 0.0
+    flux: Tensor | None = None
+    dead: Tensor | None = None
+    logged: bool = False
+    unit: str = "HU"
 
     def __post_init__(self) -> None:
-        g, w = self.geometry, self.window
-        cells = g.shape if w is None else w.shape
-        if tuple(self.counts.shape[-3:]) != cells or self.counts.ndim not in (3, 4):
-            raise ValueError(f"counts have shape {tuple(self.counts.shape)}, expected (…, {cells})")
-        expected_air = (*self.counts.shape[:-3], g.rows, g.columns)
-        if tuple(self.air.shape) != expected_air:
-            raise ValueError(f"air has shape {tuple(self.air.shape)}, expected {expected_air}")
-        if (w is None) != (self.surround is None):
-            raise ValueError("a windowed scan needs the readings of its surround, a full scan has none")
-        if w is not None and w.views != g.views:
-            raise ValueError(f"the window has {w.views} views, the geometry {g.views}")
-        if self.surround is not None and self.surround.shape != self.air.shape:
-            raise ValueError(f"surround has shape {tuple(self.surround.shape)}, air {tuple(self.air.shape)}")
-        check_exposure(self.exposure_s)
-        low, high = (float(v) for v in torch.aminmax(self.counts)) if self.counts.numel() else (0.0, 0.0)
-        if not (np.isfinite(low) and np.isfinite(high)):  # aminmax propagates NaN
-            bad = int((~torch.isfinite(self.counts)).sum())
-            raise ValueError(f"{bad} readings are NaN or Inf: mask dead cells and interpolate them before")
-        # Electronic noise makes readings of starved rays negative.
-        if low < 0 and not (self.electronic_noise > 0 and not self.noise_free):
-            raise ValueError(f"counts must not be negative, the lowest is {low}: give raw counts, not line integrals")
-        if high == 0:
-            raise ValueError("all counts are zero: the scan holds no signal (exposure too low, or beam blocked)")
-        if not bool((self.air > 0).all()):
-            raise ValueError("air readings must be greater than 0 in every cell: mask dead cells before")
-        self._check_noise_model()
+        check_scan(self)
 
-    def _check_noise_model(self) -> None:
-        number("electronic_noise", self.electronic_noise, low=0.0, unit="keV")
-        if self.quantum is None:
-            return
-        if self.counting:
-            raise ValueError("quantum belongs to energy-integrating scans (counting=False): counts are Poisson")
-        if self.quantum.shape != self.counts.shape:
-            raise ValueError(f"quantum has shape {tuple(self.quantum.shape)}, counts {tuple(self.counts.shape)}")
-        if not bool((self.quantum > 0).all()):
-            raise ValueError("quantum must be greater than 0 keV in every reading")
+    @classmethod
+    def from_counts(
+        cls,
+        readings: Any,
+        geometry: Geometry,
+        *,
+        air: Any,
+        dark: Any = 0.0,
+        gain: float | None = None,
+        flux: Any = None,
+        dead: Any = None,
+        electronic_noise: float | None = None,
+        linearisation: Any = None,
+        mu_water: float | None = None,
+        exposure_s: float = 1.0,
+        info: Mapping[str, Any] | None = None,
+    ) -> Scan:
+        """A scan from the readings of any detector.
+
+        ``(readings − dark) / gain`` are photons, with Poisson noise and the electronics'. Readings are dead if they are
+        NaN or Inf or ``dead`` says so; cells if they read nothing in all views, or no more in air than in the dark.
+
+        Args:
+            readings: raw, the shape of ``counts``, any real dtype.
+            geometry: parallel, fan or cone beam.
+            air: readings without the object: one frame, the shape of ``readings`` without views, or several
+                ``(frames, …)``, or one number.
+            dark: readings without beam, as ``air``.
+            gain: reading of one photon. None: from the variance of four air frames or more (photon transfer), else 1.
+            flux: ``(views,)`` intensity of the source relative to ``air``; None: the same.
+            dead: bool mask of cells or of readings, True where dead.
+            electronic_noise: standard deviation in photons; None: from three dark frames or more, else 0.
+            linearisation: None: line integrals as they are. ``(c₁, c₂, …)``: c₁ p + c₂ p² + …, a beam-hardening
+                correction. Or a :class:`~torchpcct.scanner.linearisation.WaterLinearisation`.
+            mu_water: attenuation of water in mm⁻¹ (0.02 for a clinical beam): volumes in HU. None: in mm⁻¹.
+            exposure_s: duration of the scan in s.
+            info: provenance.
+
+        Raises:
+            ValueError: shapes that do not fit, negative counts without ``dark``, values out of range.
+            TypeError: values of the wrong kind.
+        """
+        fields = counted(readings, geometry, air, dark, gain, flux, dead, electronic_noise, linearisation, mu_water)
+        fields["info"] |= dict(info or {})
+        return cls(geometry=geometry, exposure_s=exposure_s, **fields)
+
+    @classmethod
+    def from_line_integrals(
+        cls,
+        lines: Any,
+        geometry: Geometry,
+        *,
+        photons: Any = None,
+        dead: Any = None,
+        linearisation: Any = None,
+        mu_water: float | None = None,
+        exposure_s: float = 1.0,
+        info: Mapping[str, Any] | None = None,
+    ) -> Scan:
+        """A scan from line integrals −ln(transmission) that another software made.
+
+        Args:
+            lines: the shape of ``counts``; NaN and Inf are dead.
+            geometry: parallel, fan or cone beam.
+            photons: of an unattenuated reading, one number or one per cell; it sets the statistical weights. None:
+                estimated from the noise between neighbouring columns.
+            dead, linearisation, mu_water, exposure_s, info: of :meth:`from_counts`.
+
+        Raises:
+            ValueError: shapes that do not fit, values that cannot be line integrals, values out of range.
+            TypeError: values of the wrong kind.
+        """
+        fields = logged(lines, geometry, photons, dead, linearisation, mu_water)
+        fields["info"] |= dict(info or {})
+        return cls(geometry=geometry, exposure_s=exposure_s, **fields)
 
     @property
     def noise_free(self) -> bool:
@@ -198,6 +250,8 @@ class Scan:
     def _first_index(self) -> Any:
         """Global index of the first reading of every detector row held in ``counts``."""
         g, w = self.geometry, self.window or DetectorWindow.full(self.geometry)
+        if not isinstance(g, ConeBeam):
+            return np.arange(math.prod(self.counts.shape[:-1])) * g.columns
         line = np.arange(g.views)[:, None] * g.rows + w.first_row + np.arange(w.rows)
         index = line * g.columns + w.first_column[:, None]
         bins = self.counts.shape[0] if self.counts.ndim == 4 else 1
@@ -206,7 +260,7 @@ class Scan:
     def _at_window(self, cells: Tensor) -> Tensor:
         """``(..., rows, columns)`` values of the cells as seen by the stored readings, ``(..., views | 1, r, c)``."""
         if self.window is None:
-            return cells.unsqueeze(-3)
+            return cells.unsqueeze(-len(self.geometry.shape))
         return self.window.take(cells)
 
     def line_integrals(self) -> Tensor:
@@ -221,12 +275,43 @@ class Scan:
         Raises:
             ValueError: a noisy energy-integrating scan that does not hold ``quantum``.
         """
-        p = self._positive().log_().neg_().add_(self._at_window(self.air.log()))
-        return self.linearisation.apply(p, self.window)
+        p = self.linearisation.apply(self._logarithm(), self.window)
+        return p if self.dead is None else bridge(p, self.dead, isinstance(self.geometry, ConeBeam))
+
+    def _logarithm(self) -> Tensor:
+        """``ln(air) − ln(readings)`` before the water correction; dead readings hold anything finite."""
+        positive = self._positive()
+        if self.dead is not None:
+            positive.masked_fill_(self.dead, 1.0)
+        p = positive.log_().neg_().add_(self._at_window(self.air.log()))
+        return p if self.flux is None else p.add_(self._per_view(self.flux.log()))
+
+    def _per_view(self, values: Tensor) -> Tensor:
+        return values.view(-1, *(1,) * (len(self.geometry.shape) - 1))
+
+    def weights(self) -> Tensor:
+        """Statistical weights of :meth:`line_integrals`: inverse variances, shape and dtype of ``counts``.
+
+        Of expected readings, not of the noisy ones, which would bias a weighted fit: the readings' local mean
+        (:func:`torchpcct.readings.smoothed`); expectations of a noise-free scan as they are. Dead readings weigh 0.
+
+        Raises:
+            ValueError: an energy-integrating scan that does not hold ``quantum``.
+        """
+        self._require_noise_model()
+        cone = isinstance(self.geometry, ConeBeam)
+        mean = self.counts if self.noise_free or self.window is not None else smoothed(self.counts, self.dead, cone)
+        quantum = torch.ones(1) if self.quantum is None else self.quantum
+        p = (self._at_window(self.air) / torch.maximum(mean, quantum / 2)).log_()
+        if self.flux is not None:
+            p += self._per_view(self.flux.log())
+        weights = inverse_variance(mean, quantum, self.electronic_noise)
+        weights /= self.linearisation.slope(p, self.window).square_()
+        return weights if self.dead is None else weights.masked_fill_(self.dead, 0.0)
 
     def _positive(self) -> Tensor:
         """A copy of the readings, shifted so that the logarithm is finite and nearly unbiased."""
-        if self.noise_free:
+        if self.noise_free or self.logged:
             return self.counts.clone()
         if self.counting:
             return self.counts + 0.5
@@ -251,41 +336,7 @@ class Scan:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write HDF5; the file appears under its name only when it is complete."""
-        import h5py
-
-        g = self.geometry
-        with written_whole(path) as part, h5py.File(part, "w") as file:
-            version = 1 if self.counting else _VERSION
-            file.attrs.update(format="torchpcct-scan", version=version, software=f"torchpcct {VERSION}")
-            file.attrs["counting"] = self.counting
-            file.attrs["info"] = json.dumps(dict(self.info), default=str)
-            if self.exposure_s is not None:
-                file.attrs["exposure_s"] = self.exposure_s
-            if self.seed is not None:
-                file.attrs["seed"] = self.seed
-            chunk = (*(1,) * (self.counts.ndim - 2), *self.counts.shape[-2:])
-            # Counts are whole numbers: as integers they compress, and they stay exact.
-            whole = self.counting and not self.noise_free and float(self.counts.max()) < 2**31
-            data = self.counts.to(torch.int32) if whole else self.counts
-            file.create_dataset("counts", data=data.numpy(), chunks=chunk, **_HDF5_COMPRESSION)
-            file.create_dataset("air", data=self.air.numpy())
-            if self.quantum is not None:
-                file.create_dataset("quantum_kev", data=self.quantum.numpy(), chunks=chunk, **_HDF5_COMPRESSION)
-            file.attrs["electronic_noise_kev"] = self.electronic_noise
-            geometry = file.create_group("geometry")
-            geometry["angles_rad"] = g.angles
-            geometry.attrs.update(
-                sod_mm=g.sod, sdd_mm=g.sdd, columns=g.columns, rows=g.rows, pitch_mm=g.pitch, offset_mm=g.offset
-            )
-            geometry.attrs["detector"] = g.detector
-            self.linearisation.save(file.create_group("linearisation"))
-            if self.window is not None and self.surround is not None:
-                window = file.create_group("window")
-                window["first_column"] = self.window.first_column
-                window["surround"] = self.surround.numpy()
-                window.attrs.update(columns=self.window.columns, first_row=self.window.first_row, rows=self.window.rows)
-            # Written last: a file without it was cut off.
-            file.attrs["complete"] = True
+        write_scan(self, path)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Scan:
@@ -293,49 +344,8 @@ class Scan:
 
         Raises:
             FileNotFoundError: no such file.
-            ValueError: the file is truncated, is no torchpcct scan, or is of a newer format.
+            ValueError: the file is truncated or altered (its checksum is verified), is no torchpcct scan, or is of a
+                newer format.
         """
         with read_hdf5(path, "scan") as file:
-            if int(file.attrs["version"]) > _VERSION:
-                raise ValueError(
-                    f"{path} has format version {file.attrs['version']}, this software reads up to {_VERSION}: "
-                    "update torchpcct"
-                )
-            if not file.attrs.get("complete", False):
-                raise ValueError(f"{path} was not written to its end: simulate it again")
-            return cls._from_file(file)
-
-    @classmethod
-    def _from_file(cls, file: Any) -> Scan:
-        a = file["geometry"].attrs
-        geometry = ConeBeam(
-            file["geometry/angles_rad"][()], float(a["sod_mm"]), float(a["sdd_mm"]), int(a["columns"]),
-            int(a["rows"]), tuple(a["pitch_mm"]), tuple(a["offset_mm"]), str(a["detector"]),
-        )  # fmt: skip
-        window = surround = None
-        if "window" in file:
-            w = file["window"]
-            window = DetectorWindow(
-                w["first_column"][()], int(w.attrs["columns"]), int(w.attrs["first_row"]), int(w.attrs["rows"])
-            )
-            surround = torch.from_numpy(w["surround"][()])
-        return cls(
-            counts=torch.from_numpy(file["counts"][()]).to(torch.float32),
-            air=torch.from_numpy(file["air"][()]),
-            geometry=geometry,
-            linearisation=WaterLinearisation.load(file["linearisation"]),
-            exposure_s=float(file.attrs["exposure_s"]) if "exposure_s" in file.attrs else None,
-            seed=int(file.attrs["seed"]) if "seed" in file.attrs else None,
-            window=window,
-            surround=surround,
-            counting=bool(file.attrs["counting"]),
-            info=json.loads(file.attrs["info"]),
-            quantum=torch.from_numpy(file["quantum_kev"][()]) if "quantum_kev" in file else None,
-            electronic_noise=float(file.attrs.get("electronic_noise_kev", 0.0)),
-        )
-
-
-def check_exposure(exposure_s: float | None) -> None:
-    """Raise ``ValueError`` unless the exposure is a finite time > 0 s, or None (noise free)."""
-    if exposure_s is not None:
-        number("exposure_s", exposure_s, positive=True, unit="s")
+            return cls(**scan_fields(file, path))

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["choice", "number", "numbers", "per_axis", "whole"]
+__all__ = ["choice", "coverage", "number", "numbers", "per_axis", "whole"]
 
 
 def number(
@@ -55,6 +55,19 @@ def number(
     if high is not None and result > high:
         raise ValueError(f"{name} must be at most {high:g}{unit}, got {result:g}")
     return result
+
+
+def coverage(name: str, value: Any) -> float:
+    """``value`` as the coverage of an interval: a number between 0 and 1, ends excluded.
+
+    Raises:
+        TypeError: no number.
+        ValueError: outside; the message reminds those who give per cent.
+    """
+    share = number(name, value)
+    if not 0.0 < share < 1.0:
+        raise ValueError(f"{name} must lie in (0, 1), got {share:g}: 95 % is 0.95")
+    return share
 
 
 def numbers(name: str, value: Any, count: int | None = None, **limits: Any) -> tuple[float, ...]:

@@ -6,19 +6,26 @@ import json
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from torchpcct.files import read_hdf5, written_whole
+from torchpcct.files import read_hdf5, write_hdf5
+from torchpcct.formats.volume_files import (
+    check_volume_name,
+    format_of,
+    read_dicom,
+    read_meta_image,
+    read_nifti,
+    write_dicom,
+    write_meta_image,
+    write_nifti,
+)
 from torchpcct.geometry import VolumeGrid
+from torchpcct.validate import choice
 
-__all__ = ["Volume", "check_volume_name", "to_hu"]
-
-_NIFTI, _HDF5 = (".nii", ".nii.gz"), (".h5", ".hdf5")
+__all__ = ["Volume", "check_volume_name", "from_hu", "to_hu"]
 
 
 def to_hu(attenuation: Tensor, mu_water: float) -> Tensor:
@@ -26,66 +33,57 @@ def to_hu(attenuation: Tensor, mu_water: float) -> Tensor:
     return 1000.0 * (attenuation / mu_water - 1.0)
 
 
-def check_volume_name(path: str | os.PathLike[str]) -> None:
-    """Raise ``ValueError`` unless the ending of ``path`` names a volume format."""
-    if not str(path).endswith((*_NIFTI, *_HDF5)):
-        raise ValueError(f"unknown volume format {Path(path).name!r}: use .nii, .nii.gz or .h5")
+def from_hu(numbers: Tensor, mu_water: float) -> Tensor:
+    """Attenuation in mm⁻¹ from CT numbers, the inverse of :func:`to_hu`."""
+    return mu_water * (1.0 + numbers / 1000.0)
 
 
 @dataclass(frozen=True)
 class Volume:
-    """A volume in HU.
+    """A volume in HU, or in mm⁻¹ (``unit``).
 
     Args:
-        data: ``(..., z, y, x)`` HU, float32 or float64.
+        data: ``(..., z, y, x)``, float32 or float64.
         grid: its voxel grid.
         report: how it was made: method, kernel, iterations, residual, seconds, …
+        unit: of ``data``: "HU", or "mm^-1" where the scan does not know the attenuation of water.
     """
 
     data: Tensor
     grid: VolumeGrid
     report: Mapping[str, Any] = field(default_factory=dict)
+    unit: str = "HU"
 
     def __post_init__(self) -> None:
         if not isinstance(self.data, Tensor) or not self.data.is_floating_point():
             raise TypeError(f"data must be a floating point tensor in HU, got {type(self.data).__name__}")
         if tuple(self.data.shape[-self.grid.ndim :]) != self.grid.shape:
             raise ValueError(f"data has shape {tuple(self.data.shape)}, its grid {self.grid.shape}")
+        choice("unit", self.unit, ("HU", "mm^-1"))
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write ``.nii`` / ``.nii.gz`` (NIfTI-1, mm, RAS) or ``.h5`` (HDF5 with grid and report).
+        """Write ``.nii`` / ``.nii.gz`` (NIfTI-1), ``.mha`` (MetaImage), ``.h5`` (HDF5 with grid and report), or, if the
+        name has no ending, a folder with a DICOM series in HU.
+
+        x, y, z of the scanner become right, anterior, superior. MetaImage and DICOM need the extra ``io``.
 
         Raises:
-            ValueError: another ending, or a batch of volumes (save them one by one).
+            ValueError: another ending, a batch of volumes (save them one by one), or what the format cannot hold.
+            ImportError: the package that writes the format is not installed.
         """
         check_volume_name(path)
         if self.data.ndim != self.grid.ndim:
             raise ValueError(f"save one volume at a time, this one has shape {tuple(self.data.shape)}")
-        if str(path).endswith(_NIFTI):
-            self._save_nifti(path)
-        else:
+        form = format_of(path)
+        if form == "HDF5":
             self._save_hdf5(path)
-
-    def _save_nifti(self, path: str | os.PathLike[str]) -> None:
-        import nibabel
-
-        if self.grid.ndim != 3:
-            raise ValueError("NIfTI needs a 3-D volume; save a 2-D image as .h5")
-        affine = np.diag([*self.grid.spacing[::-1], 1.0])
-        affine[:3, 3] = [axis[0] for axis in self.grid.axes[::-1]]
-        # NIfTI stores (x, y, z).
-        image = nibabel.Nifti1Image(self.data.detach().cpu().to(torch.float32).numpy().transpose(2, 1, 0), affine)
-        image.header.set_xyzt_units("mm")
-        image.header["descrip"] = b"torchpcct, HU"
-        with written_whole(path) as part:
-            nibabel.save(image, part)
+        else:
+            write = {"NIfTI": write_nifti, "MetaImage": write_meta_image, "DICOM": write_dicom}[form]
+            write(path, self.data.detach().cpu().numpy(), self.grid, self.unit)
 
     def _save_hdf5(self, path: str | os.PathLike[str]) -> None:
-        import h5py
-
-        with written_whole(path) as part, h5py.File(part, "w") as file:
-            file.attrs["format"] = "torchpcct-volume"
-            file.attrs["unit"] = "HU"
+        with write_hdf5(path, "volume") as file:
+            file.attrs["unit"] = self.unit
             file.attrs["spacing_mm"] = self.grid.spacing
             file.attrs["center_mm"] = self.grid.center
             file.attrs["report"] = json.dumps(dict(self.report), default=str)
@@ -93,14 +91,21 @@ class Volume:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Volume:
-        """Read a volume written by :meth:`save` as HDF5.
+        """Read a volume of any format that :meth:`save` writes; the report comes back from HDF5 only.
 
         Raises:
-            ValueError: the file is truncated, or is no torchpcct volume.
+            FileNotFoundError: no such file or folder.
+            ValueError: an unknown ending; a file that is damaged, foreign, oblique or incomplete.
+            ImportError: the package that reads the format is not installed.
         """
+        form = format_of(path)
+        if form != "HDF5":
+            read = {"NIfTI": read_nifti, "MetaImage": read_meta_image, "DICOM": read_dicom}[form]
+            values, grid = read(path)
+            return cls(torch.from_numpy(values), grid, {"file": str(path)})
         with read_hdf5(path, "volume") as file:
             data = torch.from_numpy(file["data"][()])
             grid = VolumeGrid(
                 tuple(int(n) for n in data.shape), tuple(file.attrs["spacing_mm"]), tuple(file.attrs["center_mm"])
             )
-            return cls(data, grid, json.loads(file.attrs["report"]))
+            return cls(data, grid, json.loads(file.attrs["report"]), str(file.attrs["unit"]))

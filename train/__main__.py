@@ -50,14 +50,15 @@ def build(config: TrainConfig) -> tuple[Unrolled, Data, Objective]:
     """Model with its starting weights, data, and objective."""
     import torch
 
-    from recon.mbir.prior import PriorConfig
+    from recon.mbir.network import NetworkConfig
     from recon.mbir.unrolled import Unrolled
     from train.data import Data
     from train.objective import Objective
 
     torch.manual_seed(config.seed)
-    model = Unrolled(PriorConfig(**config.prior), steps=config.unroll)
-    return model, Data(config.data), Objective(config.objective)
+    model = Unrolled(NetworkConfig(**config.network), steps=config.unroll)
+    model.network.half_precision = config.bfloat16
+    return model, Data(config.data), Objective(config.objective, config.single)
 
 
 @contextmanager

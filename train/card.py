@@ -74,7 +74,12 @@ def export(folder: Path, weights: Mapping[str, Tensor], config: TrainConfig, sta
         "written": datetime.now(UTC).isoformat(timespec="seconds"),
     }
     # Enough to build the model that the weights belong to, without the card.
-    header = {"prior": card["config"]["prior"], "unroll": config.unroll, "step": best["step"], "score": best["score"]}
+    header = {
+        "network": card["config"]["network"],
+        "unroll": config.unroll,
+        "step": best["step"],
+        "score": best["score"],
+    }
     write_tensors(folder / "weights.safetensors", WEIGHTS_FORMAT, weights, header)
     texts = {"card.json": json.dumps(card, indent=2, ensure_ascii=False) + "\n", "card.md": _markdown(card, config)}
     for name, text in texts.items():

@@ -1,6 +1,6 @@
 """Configuration of a training run and its YAML form.
 
-A YAML file holds the fields that differ from the defaults of :class:`TrainConfig`. Sections (``prior``, ``data``,
+A YAML file holds the fields that differ from the defaults of :class:`TrainConfig`. Sections (``network``, ``data``,
 ``objective``) are mappings. Unknown keys are errors, so that a misspelt one does not silently train the default. Every
 class checks its own values, whether they come from YAML or from Python.
 """
@@ -16,7 +16,7 @@ from typing import Any, Self
 
 import yaml
 
-from recon.mbir.prior import PriorConfig
+from recon.mbir.network import NetworkConfig
 from torchpcct.validate import number, numbers, whole
 from train.scenes.scene import SceneConfig
 
@@ -91,6 +91,8 @@ class DataConfig:
         views: views of the scans whose Gram operators are taken (their exposure is that of the whole scan).
         situations: one Gram operator each; one is drawn per step.
         scenes: changes of :class:`train.scenes.scene.SceneConfig`.
+        pool: different scenes; each comes again with other noise, exposure and mirroring.
+        along_z: share of the scenes whose vessels run about z; the others run about y or x.
         core_roi, tissue_roi: ranges of the radii of the random ROIs, mm.
         flat_roi: share of ROIs that are discs of one slice, as in an axial image, instead of balls.
 
@@ -98,12 +100,14 @@ class DataConfig:
         TypeError, ValueError: a value is out of its range, or ``scenes`` or a situation has an unknown key.
     """
 
-    shape: tuple[int, int, int] = (20, 24, 24)
+    shape: tuple[int, int, int] = (40, 32, 32)
     voxel_mm: float = 0.2
-    exposure_s: tuple[float, float] = (0.2, 16.0)
+    exposure_s: tuple[float, float] = (0.2, 8.0)
     views: int = 984
     situations: tuple[Situation, ...] = _SITUATIONS
     scenes: dict[str, Any] = field(default_factory=dict)
+    pool: int = 4000
+    along_z: float = 0.5
     core_roi: tuple[float, float] = (0.25, 0.8)
     tissue_roi: tuple[float, float] = (0.15, 0.45)
     flat_roi: float = 0.6
@@ -120,6 +124,8 @@ class DataConfig:
             voxel_mm=number("voxel_mm", self.voxel_mm, positive=True),
             views=whole("views", self.views),
             situations=tuple(_section(Situation, s, f"situations[{i}]") for i, s in enumerate(self.situations)),
+            pool=whole("pool", self.pool),
+            along_z=number("along_z", self.along_z, low=0.0, high=1.0),
             flat_roi=number("flat_roi", self.flat_roi, low=0.0, high=1.0),
         )
         for name in ("exposure_s", "core_roi", "tissue_roi"):
@@ -135,10 +141,11 @@ class ObjectiveConfig:
 
     Args:
         data: of eᵀH e.
-        white: of ‖e‖², against ``data``.
-        contrast: of the ROI contrast's error.
-        bias_start, bias: κ at the start, and from the share ``bias_ramp`` of the training on; geometric in between.
+        white: of ‖e‖², against ``data``; edge: by how much more inside and next to bodies.
+        contrast: of the ROI contrasts' errors.
+        bias: κ.
         contrast_sd: an ROI contrast error, in noise units, that counts as 1.
+        looks: range of the look, uniform.
         validation_exposures_s: exposures of the validation scans.
         validation_draws: noise draws of each validation scene, contrast and exposure; 2 give a variance.
 
@@ -146,21 +153,24 @@ class ObjectiveConfig:
         TypeError, ValueError: a value is out of its range.
     """
 
-    data: float = 30.0
-    white: float = 0.05
-    contrast: float = 1.0
-    bias_start: float = 0.5
-    bias: float = 8.0
-    bias_ramp: float = 0.7
+    data: float = 60.0
+    white: float = 0.2
+    edge: float = 2.0
+    contrast: float = 0.2
+    bias: float = 1.0
     contrast_sd: float = 0.15
+    looks: tuple[float, float] = (0.0, 1.0)
     validation_exposures_s: tuple[float, ...] = (0.35, 2.0)
     validation_draws: int = 6
 
     def __post_init__(self) -> None:
-        for name in ("data", "white", "contrast", "bias"):
+        for name in ("data", "white", "edge", "contrast", "bias"):
             _set(self, **{name: number(name, getattr(self, name), low=0.0)})
-        for name in ("bias_start", "bias_ramp", "contrast_sd"):
-            _set(self, **{name: number(name, getattr(self, name), positive=True)})
+        _set(self, contrast_sd=number("contrast_sd", self.contrast_sd, positive=True))
+        low, high = numbers("looks", self.looks, 2)
+        if not 0 <= low <= high <= 1:
+            raise ValueError(f"looks must be a range within 0 … 1, got {self.looks}")
+        _set(self, looks=(low, high))
         exposures = numbers("validation_exposures_s", self.validation_exposures_s, positive=True)
         _set(
             self, validation_exposures_s=exposures, validation_draws=whole("validation_draws", self.validation_draws, 2)
@@ -184,8 +194,10 @@ class TrainConfig:
         checkpoint_seconds: time between checkpoints in s, ≤ 120.
         validate_every: steps between validations; the last step is always validated.
         log_every: steps between rows of the log.
-        prior: arguments of :class:`recon.mbir.prior.PriorConfig`.
+        network: arguments of :class:`recon.mbir.network.NetworkConfig`.
         unroll: steps K of :class:`recon.mbir.unrolled.Unrolled`.
+        single: share of the training with one step of the K: the network is the same in all, and one is cheaper.
+        bfloat16: convolve in that precision; half the time on processors that have it.
         data, objective: :class:`DataConfig` and :class:`ObjectiveConfig`, or mappings of their fields.
 
     Raises:
@@ -203,8 +215,10 @@ class TrainConfig:
     checkpoint_seconds: float = 60.0
     validate_every: int = 250
     log_every: int = 1
-    prior: dict[str, Any] = field(default_factory=dict)
-    unroll: int = 8
+    network: dict[str, Any] = field(default_factory=dict)
+    unroll: int = 2
+    single: float = 0.5
+    bfloat16: bool = True
     data: DataConfig = field(default_factory=DataConfig)
     objective: ObjectiveConfig = field(default_factory=ObjectiveConfig)
 
@@ -226,7 +240,10 @@ class TrainConfig:
         )
         if self.ema >= 1:
             raise ValueError(f"ema must be less than 1, got {self.ema:g}")
-        _section(PriorConfig, self.prior, "prior")
+        _set(self, single=number("single", self.single, low=0.0, high=1.0))
+        if not isinstance(self.bfloat16, bool):
+            raise TypeError(f"bfloat16 must be true or false, got {self.bfloat16!r}")
+        _section(NetworkConfig, self.network, "network")
 
     @classmethod
     def from_yaml(cls, text: str) -> Self:

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from recon.gram.gram import Gram
-from recon.mbir.unrolled import NormalisedProblem
+from recon.mbir.problem import NormalisedProblem
 from recon.pwls.inset_problem import InsetProblem
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.geometry import VolumeGrid
@@ -35,6 +35,10 @@ def seed_of(*key: int | str) -> int:
     return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "little") >> 1
 
 
+ROIS = 3
+"""Contrasts of each scene: two of small ROIs, one of a whole core."""
+
+
 @dataclass(frozen=True)
 class Batch:
     """Scenes with two independent noise draws each.
@@ -42,9 +46,9 @@ class Batch:
     Args:
         problem: of ``2 · size`` volumes, the first draws of all scenes, then the second ones.
         truth: ``(size, z, y, x)`` HU above the background.
-        contrast: ``(size, z, y, x)`` weights of a random ROI contrast: mean over a part of a core (or of plain tissue)
-            less mean over a part of the tissue around it; 0 where the scene offers none.
-        voxels: ``(size,)`` voxels of the smaller ROI, 0 if none.
+        contrast: ``(size, rois, z, y, x)`` weights of ROI contrasts: mean over a core (or of plain tissue) less mean
+            over the tissue around it, random small parts of both, last all of both; 0 where the scene offers none.
+        voxels: ``(size, rois)`` voxels of the smaller ROI, 0 if none.
     """
 
     problem: NormalisedProblem
@@ -59,12 +63,16 @@ class Batch:
 
 
 class Data:
-    """Draws batches; a pure function of seed, step and scene index once the Gram operators are made."""
+    """Draws batches; a pure function of seed, step and scene index once the Gram operators are made.
+
+    Scenes come from a pool and are kept once they are drawn.
+    """
 
     def __init__(self, config: DataConfig | None = None) -> None:
         self.config = config or DataConfig()
         self.scenes = SceneConfig(**self.config.scenes)
         self._grams: dict[int, tuple[Gram, float]] = {}
+        self._pool: dict[tuple[int, int], tuple[Tensor, Tensor, Tensor]] = {}
 
     def gram(self, situation: int) -> tuple[Gram, float]:
         """Gram operator per second of exposure, and 1 HU in mm⁻¹."""
@@ -82,7 +90,7 @@ class Data:
         """
         c = self.config
         gram, hu = self.gram(seed_of(seed, step) % len(c.situations))
-        drawn = [self._scene(seed_of(seed, step, i), gram, hu) for i in indices]
+        drawn = [self._drawn(seed, step, i, gram) for i in indices]
         truth, exposure, contrast, voxels, first, second = (torch.stack(list(v)) for v in zip(*drawn, strict=True))
         scaled = (hu * exposure).reshape(-1, 1, 1, 1)
         signal = gram.apply(truth) * scaled
@@ -90,15 +98,53 @@ class Data:
         problem = NormalisedProblem.from_statistic(gram, b, torch.cat([exposure, exposure]), hu, c.voxel_mm)
         return Batch(problem, truth, contrast, voxels)
 
-    def _scene(self, seed: int, gram: Gram, hu: float) -> tuple[Tensor, ...]:
+    def _drawn(self, seed: int, step: int, index: int, gram: Gram) -> tuple[Tensor, ...]:
         c = self.config
-        generator = torch.Generator().manual_seed(seed)
-        scene = random_scene(c.shape, (c.voxel_mm,) * 3, generator=generator, config=self.scenes)
+        own = seed_of(seed, step, index)
+        generator = torch.Generator().manual_seed(own)
+        maps = _mirrored(self._scene(seed, own % c.pool), generator)
         low, high = (math.log(v) for v in c.exposure_s)
         exposure = torch.exp(low + (high - low) * torch.rand((), generator=generator))
         noise = gram.noise((2,), generator=generator) * exposure.sqrt()
-        contrast, voxels = _random_contrast(scene.core[0], scene.surround[0], c, generator)
-        return scene.image[0] - scene.scenes[0].background, exposure, contrast, voxels, noise[0], noise[1]
+        core, tissue = maps[1] > 0, maps[2] > 0
+        found = [_random_contrast(core, tissue, c, generator) for _ in range(ROIS - 1)]
+        found.append(_whole_contrast(core, tissue))
+        contrast, voxels = (torch.stack(v) for v in zip(*found, strict=True))
+        return maps[0], exposure, contrast, voxels, noise[0], noise[1]
+
+    def _scene(self, seed: int, number: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Image in HU above the background; voxels wholly in a core, and wholly in the tissue around."""
+        if (seed, number) not in self._pool:
+            c = self.config
+            generator = torch.Generator().manual_seed(seed_of("scene", seed, number))
+            draw = float(torch.rand((), generator=generator))
+            axis = 0 if draw < c.along_z else 1 if draw < 0.5 * (1 + c.along_z) else 2
+            across, along = c.shape[axis], c.shape[0]
+            shape = (across, *(along if k == axis else n for k, n in enumerate(c.shape) if k))
+            scene = random_scene(
+                (shape[0], shape[1], shape[2]), (c.voxel_mm,) * 3, generator=generator, config=self.scenes
+            )
+            maps = (scene.image[0] - scene.scenes[0].background, scene.core[0] > 0.97, scene.surround[0] > 0.97)
+            z, y, x = (m.transpose(0, axis).contiguous() for m in maps)
+            self._pool[seed, number] = (z.to(torch.float16), y, x)
+        return self._pool[seed, number]
+
+
+def _mirrored(maps: tuple[Tensor, Tensor, Tensor], generator: torch.Generator) -> list[Tensor]:
+    """The maps as float32, along every axis mirrored or not, with y and x exchanged or not."""
+    flips = [axis for axis in range(3) if float(torch.rand((), generator=generator)) < 0.5]
+    exchange = float(torch.rand((), generator=generator)) < 0.5 and maps[0].shape[1] == maps[0].shape[2]
+    out = [m.float().flip(flips) for m in maps]
+    return [m.transpose(1, 2).contiguous() for m in out] if exchange else out
+
+
+def _whole_contrast(core: Tensor, tissue: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean over all of the core less mean over all tissue in its slices."""
+    tissue = tissue & core.any(2).any(1)[:, None, None]
+    n, m = int(core.sum()), int(tissue.sum())
+    if n < 8 or m < 8:
+        return torch.zeros(core.shape), torch.zeros(())
+    return core.float() / n - tissue.float() / m, torch.tensor(float(min(n, m)))
 
 
 def situation_gram(situation: Situation, config: DataConfig) -> tuple[Gram, float]:
@@ -114,10 +160,9 @@ def situation_gram(situation: Situation, config: DataConfig) -> tuple[Gram, floa
 
 
 def _random_contrast(
-    core: Tensor, tissue: Tensor, config: DataConfig, generator: torch.Generator
+    inside: Tensor, around: Tensor, config: DataConfig, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Weights of a random ROI contrast, and the voxels of its smaller ROI."""
-    inside, around = core > 0.97, tissue > 0.97
+    """Weights of a random ROI contrast between two masks, and the voxels of its smaller ROI."""
     if not inside.any():
         inside = around
     flat = float(torch.rand((), generator=generator)) < config.flat_roi
@@ -130,7 +175,7 @@ def _random_contrast(
         first, second = _fullest_slice(first), _fullest_slice(second)
     n, m = int(first.sum()), int(second.sum())
     if n < 4 or m < 4:
-        return torch.zeros(core.shape), torch.zeros(())
+        return torch.zeros(inside.shape), torch.zeros(())
     return first.float() / n - second.float() / m, torch.tensor(float(min(n, m)))
 
 

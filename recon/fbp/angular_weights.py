@@ -7,14 +7,18 @@ shares of such a pair add up to 1.
 
 from __future__ import annotations
 
+import logging
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam
 
-__all__ = ["angular_weights", "parker_share", "view_steps"]
+__all__ = ["angular_weights", "check_gaps", "is_offset", "offset_share", "parker_share", "view_steps"]
+
+_LOG = logging.getLogger(__name__)
 
 Floats = NDArray[np.float64]
 
@@ -22,8 +26,14 @@ Floats = NDArray[np.float64]
 OPEN_GAP_STEPS = 3.0
 #: Views closer than this, in rad, are repetitions of one view.
 SAME_VIEW_RAD = 1e-9
+#: A detector is an offset one if it reaches farther to one side by more than this share of its width.
+OFFSET_SHARE = 0.02
 #: A parallel-beam scan may lack this angle in rad before it is refused; below it the neighbours fill in.
 PARALLEL_GAP_RAD = math.radians(5.0)
+#: Views that lack inside of the covered arc: neighbours stand for them up to this angle in rad, with a warning.
+INNER_GAP_RAD = math.radians(5.0)
+#: The largest angle in rad that one view may stand for: five views a turn pass, as a test of operators, not of images.
+WIDEST_STEP_RAD = math.radians(75.0)
 
 
 def view_steps(
@@ -70,6 +80,40 @@ def view_steps(
     return out, start, span
 
 
+def check_gaps(angles: Floats, period: float = 2.0 * math.pi) -> None:
+    """Refuse views that are too few, or that lack inside of the arc they cover; log a warning where a few lack.
+
+    Args:
+        angles: ``(views,)`` rad, any order.
+        period: see :func:`view_steps`.
+
+    Raises:
+        ValueError: fewer than two distinct views, steps wider than 75°, or an inner gap of more than 5° and three
+            median steps.
+    """
+    ordered = np.sort(np.mod(angles, period))
+    gaps = np.append(np.diff(ordered), ordered[0] + period - ordered[-1])
+    gaps = gaps[gaps > SAME_VIEW_RAD]
+    usual = float(np.median(gaps)) if gaps.size > 1 else period
+    # The widest gap may be the scan's end, if it is far wider than the steps.
+    widest = np.sort(gaps)[::-1]
+    inner = widest[1] if widest.size > 1 and widest[0] > OPEN_GAP_STEPS * usual else widest[0]
+    if max(usual, min(inner, period)) > WIDEST_STEP_RAD + 1e-9 and inner <= OPEN_GAP_STEPS * usual:
+        raise ValueError(
+            f"{gaps.size} distinct view{'s' * (gaps.size > 1)} in steps of up to {math.degrees(inner):.0f}° are too "
+            f"few for filtered backprojection (at most {math.degrees(WIDEST_STEP_RAD):.0f}°): add views, or pass "
+            "`weights`"
+        )
+    if inner > OPEN_GAP_STEPS * usual:
+        lacking = (
+            f"views lack inside of the scan: besides its end a gap of {math.degrees(inner):.2f}° where the usual step "
+            f"is {math.degrees(usual):.2f}°"
+        )
+        if inner > INNER_GAP_RAD:
+            raise ValueError(f"{lacking}; reconstruct iteratively, interpolate the views, or pass `weights`")
+        _LOG.warning("%s: the views beside it stand for those that lack", lacking)
+
+
 def parker_share(beta: Floats, gamma: Floats, half_fan: float) -> Floats:
     """Parker's smooth share of a reading in a scan of ``π + 2 · half_fan``.
 
@@ -96,6 +140,37 @@ def parker_share(beta: Floats, gamma: Floats, half_fan: float) -> Floats:
     return np.where((beta < 0.0) | (beta > end), 0.0, share)
 
 
+def is_offset(geometry: Any) -> bool:
+    """Whether the detector reaches farther to one side by more than :data:`OFFSET_SHARE` of its width and two columns.
+
+    Quarter-column offsets are not meant: there nearly every line is measured twice.
+    """
+    u = geometry.column_positions
+    width = u[-1] - u[0]
+    return bool(abs(u[0] + u[-1]) > max(OFFSET_SHARE * width, 2.0 * width / max(u.size - 1, 1)) * (1.0 + 1e-9))
+
+
+def offset_share(position: Floats) -> Floats:
+    """Share of a reading in a full turn of an offset detector (Wang, Med. Phys. 29, 1634, 2002).
+
+    Lines that both halves of the turn measure are shared along a sine over the overlap, from 1 on the long side to 0
+    at the short edge, where the rows end; beyond the overlap the long side alone counts.
+
+    Args:
+        position: fan angles or, of parallel rays, cell positions: ``(columns,)``, evenly spaced, increasing.
+
+    Returns:
+        ``(columns,)`` with ``share(p) + share(-p) = 1`` inside the overlap.
+    """
+    half_cell = 0.5 * (position[-1] - position[0]) / max(position.size - 1, 1)
+    low, high = -(position[0] - half_cell), position[-1] + half_cell
+    if min(low, high) <= 0:
+        raise ValueError("the detector does not reach the projection of the rotation axis: no turn measures all lines")
+    side = 1.0 if high >= low else -1.0
+    phase = np.clip(side * position / min(low, high), -1.0, 1.0)
+    return 0.5 * (1.0 + np.sin(0.5 * math.pi * phase))
+
+
 def angular_weights(geometry: Geometry) -> Floats:
     """Weights of all readings: the angle of each view times the share of each column.
 
@@ -105,12 +180,19 @@ def angular_weights(geometry: Geometry) -> Floats:
     Returns:
         ``(views, columns)``, or ``(views, 1)`` where all columns share one weight; float64, rad.
         Parallel: the steps over π. Divergent: half the steps over a closed circle, Parker's smooth weights over an arc.
+        A full turn of an offset detector (:func:`is_offset`): the steps times :func:`offset_share`.
 
     Raises:
-        ValueError: the views cover less than π (parallel) or π plus the fan angle (divergent).
+        ValueError: the views cover less than π (parallel) or π plus the fan angle (divergent), or less than a full
+            turn of a divergent beam with an offset detector; they are too few, or lack inside of the arc.
         TypeError: not a geometry.
     """
     if isinstance(geometry, ParallelBeam):
+        check_gaps(geometry.angles, math.pi)
+        if is_offset(geometry):
+            steps, _, span = view_steps(geometry.angles)
+            if span >= 2.0 * math.pi:
+                return steps[:, None] * offset_share(geometry.column_positions)
         steps, _, span = view_steps(geometry.angles, math.pi, PARALLEL_GAP_RAD)
         if span < math.pi:
             raise ValueError(
@@ -119,10 +201,17 @@ def angular_weights(geometry: Geometry) -> Floats:
         return steps[:, None]
     if not isinstance(geometry, FanBeam | ConeBeam):
         raise TypeError(f"geometry must be a ParallelBeam, FanBeam or ConeBeam, got {type(geometry).__name__}")
+    check_gaps(geometry.angles)
     steps, start, span = view_steps(geometry.angles)
-    if span >= 2.0 * math.pi:
-        return 0.5 * steps[:, None]
     gamma = geometry.fan_angles
+    if span >= 2.0 * math.pi:
+        return steps[:, None] * (offset_share(gamma) if is_offset(geometry) else 0.5)
+    if is_offset(geometry):
+        raise ValueError(
+            f"the detector is offset (fan {math.degrees(gamma[0]):.1f}° … {math.degrees(gamma[-1]):.1f}°), which needs "
+            f"a full turn, but the views cover {math.degrees(span):.1f}°: add views, crop the long side, or pass "
+            "`weights`"
+        )
     half_fan = 0.5 * (span - math.pi)
     reach = float(np.abs(gamma).max())
     slack = float(steps.max())  # the scan's ends are known to about one step

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import logging
+import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, TypeVar
@@ -11,14 +14,20 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.fbp.angular_weights import angular_weights
+from recon.fbp.angular_weights import angular_weights, view_steps
 from recon.fbp.backproject import BackprojectionPlan, backproject, check_data, data_shape
+from recon.fbp.coverage import check_rows
+from recon.fbp.detector_edges import Rows, continued, cut_off, mirrored
 from recon.fbp.filter_plan import FilterPlan, kernel_names
 from recon.linear_operator import apply_linear
+from torchpcct.dead_cells import bridge
 from torchpcct.detector_window import DetectorWindow, shadow
-from torchpcct.geometry import ConeBeam, Geometry, VolumeGrid
+from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid, view_step
+from torchpcct.validate import number
 
 __all__ = ["backproject", "fbp", "filter_sinogram", "filter_windowed", "interleave"]
+
+_LOG = logging.getLogger(__name__)
 
 G = TypeVar("G", bound=Geometry)
 
@@ -123,6 +132,11 @@ def interleave(sinogram: Tensor, geometry: G) -> tuple[Tensor, G]:
     view aliases there, its opposite cancels. The windows of :mod:`recon.fbp.ramp` then refer to the doubled Nyquist
     frequency. Without the offset nothing cancels: details near the isocentre come out aliased.
 
+    The opposite of a ray falls between two views. What is aliased cancels where neighbouring views shift the object by
+    less than half a column: within pitch / (2 · view step) of the axis (of the paper's scan 78 mm, of one with 120
+    views 5 mm). Beyond, the two rays see different places, and the aliased details remain; a warning is logged if this
+    radius is less than a quarter of the field of view.
+
     Args:
         sinogram: ``(..., columns)``.
         geometry: parallel, fan or cone beam of a closed scan with an offset of about a quarter column.
@@ -131,9 +145,12 @@ def interleave(sinogram: Tensor, geometry: G) -> tuple[Tensor, G]:
         ``(..., 2 · columns)`` and its geometry, for :func:`fbp`.
 
     Raises:
-        ValueError, TypeError: a wrong shape or dtype.
+        ValueError: a wrong shape; a scan that is not closed (half a turn suffices for parallel rays); columns without
+            the quarter offset (more than a tenth of a column from it).
+        TypeError: a wrong dtype.
     """
     check_data("sinogram", sinogram, data_shape(geometry, DetectorWindow.full(geometry)))
+    _check_opposites(geometry)
     # the mean of a reading and a zero is half the reading
     spread = torch.stack([2.0 * sinogram, torch.zeros_like(sinogram)], dim=-1).flatten(-2)
     if isinstance(geometry, ConeBeam):
@@ -147,6 +164,32 @@ def interleave(sinogram: Tensor, geometry: G) -> tuple[Tensor, G]:
     return spread, replace(geometry, **changes)  # type: ignore[type-var]
 
 
+def _check_opposites(geometry: Any) -> None:
+    """Whether the opposite rays that :func:`interleave` relies on were measured, and fall between two columns."""
+    pitch, offset = geometry.pitch, geometry.offset
+    if isinstance(geometry, ConeBeam):
+        pitch, offset = pitch[1], offset[1]
+    quarters = (geometry.column_positions[0] / pitch) % 0.5
+    if abs(quarters - 0.25) > 0.1:
+        raise ValueError(
+            f"interleave needs columns a quarter pitch beside the axis, offset {offset:g} mm at a pitch of {pitch:g} "
+            "mm leaves opposite rays on one another: filter the sinogram as it is"
+        )
+    _, _, span = view_steps(geometry.angles)
+    if span < 2.0 * math.pi:
+        raise ValueError(
+            f"interleave needs the opposite of every ray, the views cover {math.degrees(span):.1f}° of 360°"
+        )
+    parallel = isinstance(geometry, ParallelBeam)
+    radius = pitch / (1.0 if parallel else geometry.magnification) / (2.0 * view_step(geometry.angles))
+    field = float(np.abs(geometry.column_positions).max()) if parallel else geometry.fov_radius
+    if radius < field / 4.0:
+        _LOG.warning(
+            "interleave: with %d views aliasing cancels only within %.1f mm of the axis: use more views, or filter the "
+            "sinogram as it is", geometry.views, radius,
+        )  # fmt: skip
+
+
 def fbp(
     sinogram: Tensor,
     geometry: Geometry,
@@ -156,6 +199,7 @@ def fbp(
     *,
     weights: Any = None,
     motion: Any = None,
+    outside: float | None = None,
 ) -> Tensor:
     """Filtered backprojection (Feldkamp, Davis and Kress, J. Opt. Soc. Am. A 1, 612, 1984, for a cone beam).
 
@@ -163,8 +207,12 @@ def fbp(
     Borgert, Rasche and Grass, IEEE Trans. Med. Imaging 25, 895, 2006). That neglects how the motion changes the
     density of the rays through the object, by (mm per rad of rotation) / sod: 0.1 % for a coronary artery.
 
+    A full turn of an offset detector (half fan) is weighted after Wang (Med. Phys. 29, 1634, 2002), and the grid may
+    reach as far as the long side. Where the rows end inside the object, they are continued by cylinders of ``outside``.
+
     Args:
-        sinogram: line integrals ``(..., views, [rows,] columns)``, float32 or float64.
+        sinogram: line integrals ``(..., views, [rows,] columns)``, float32 or float64. NaN and Inf are dead readings:
+            they are bridged by their neighbours (:func:`torchpcct.dead_cells.bridge`) with a warning.
         geometry: parallel, fan or cone beam; a closed circle, a short scan (at least π plus the fan angle), views in
             any order, irregularly spaced or repeated.
         grid: voxels to reconstruct, 2-D for parallel and fan beams, 3-D for cone beams.
@@ -172,19 +220,65 @@ def fbp(
         window: readings to filter and backproject; default: the grid's shadow.
         weights: angular weights that replace the automatic ones, see :func:`filter_sinogram`.
         motion: displacement of everything in the scan in every view, see :func:`backproject`.
+        outside: attenuation in mm⁻¹ (unit of ``sinogram`` per mm) of the object beyond the detector's edges, e.g. that
+            of water; 0: there is none, rows that do not end in air are inconsistent. None: 0, with a warning if the
+            rows look cut off.
 
     Returns:
-        ``(..., *grid.shape)`` mm⁻¹; with a sequence of kernels a leading axis of kernels. Differentiable to any order.
+        ``(..., *grid.shape)`` mm⁻¹; with a sequence of kernels a leading axis of kernels. Differentiable to any order
+        (columns that were added beyond the edges count as constant).
 
     Raises:
-        ValueError, TypeError: as :func:`filter_sinogram` and :func:`backproject`.
+        ValueError, TypeError: as :func:`filter_sinogram` and :func:`backproject`; views of which more than a quarter is
+            dead; a negative ``outside``.
     """
     check_data("sinogram", sinogram, data_shape(geometry, DetectorWindow.full(geometry)))
+    for text in check_rows(geometry, grid, motion):
+        _LOG.warning("%s", text)
+    sinogram = _without_dead(sinogram, geometry)
+    rows = Rows(sinogram, geometry, _check_weights(weights, geometry), 0)
+    known = sinogram.numel() > 0 and not _transformed()
+    if (outside is None or number("outside", outside, low=0.0, unit="mm⁻¹") > 0) and known:
+        sides = cut_off(sinogram, geometry, rows.weights)
+        if any(sides) and outside is None:
+            warnings.warn(
+                f"the rows end inside the object at the {' and the '.join(_SIDES[i] for i in (0, 1) if sides[i])} "
+                "column: CT numbers will be wrong, most near the edge of the field of view; pass outside= the "
+                "attenuation in mm⁻¹ of what lies beyond (0 to do without)",
+                UserWarning,
+                stacklevel=2,
+            )
+        rows = continued(rows, sides, outside or 0.0)
+    shift = 0.0 if motion is None else float(np.hypot(*np.asarray(motion, dtype=np.float64)[:, -2:].T).max())
+    rows = mirrored(rows, grid, shift)
     if window is None:
-        window = _shadow_or_whole(geometry, grid, motion)
-    plan = BackprojectionPlan(geometry, grid, window, motion)
-    filtered = filter_sinogram(sinogram, geometry, kernel, window, weights=weights)
+        window = _shadow_or_whole(rows.geometry, grid, motion)
+    elif rows.added:
+        window = DetectorWindow(window.first_column + rows.added, window.columns, window.first_row, window.rows)
+    plan = BackprojectionPlan(rows.geometry, grid, window, motion)
+    filtered = filter_sinogram(rows.lines, rows.geometry, kernel, window, weights=rows.weights)
     return apply_linear(filtered, plan.forward, plan.transpose)
+
+
+_SIDES = ("first", "last")
+
+
+def _transformed() -> bool:
+    """Whether values cannot be looked at: inside ``torch.func`` transforms the data may stand for a whole batch."""
+    return torch._C._functorch.maybe_current_level() is not None
+
+
+def _without_dead(sinogram: Tensor, geometry: Geometry) -> Tensor:
+    if _transformed() or not sinogram.numel() or all(map(math.isfinite, torch.aminmax(sinogram.detach()))):
+        return sinogram
+    dead = ~torch.isfinite(sinogram.detach())
+    warnings.warn(
+        f"{int(dead.sum())} of {dead.numel()} readings are NaN or Inf: they are taken for dead and bridged by their "
+        "neighbours",
+        UserWarning,
+        stacklevel=3,
+    )
+    return bridge(sinogram, dead, isinstance(geometry, ConeBeam))
 
 
 def _shadow_or_whole(geometry: Geometry, grid: VolumeGrid, motion: Any = None) -> DetectorWindow:

@@ -26,7 +26,7 @@ from recon.gram.impulse_response import Nodes, kernel_at, node_positions, slice_
 from recon.gram.positive_definite import cholesky, make_definite
 from torchpcct.validate import number
 
-__all__ = ["Gram", "check_weights"]
+__all__ = ["Gram", "check_weights", "information_at_reference"]
 
 # Bands along z whose energy is below this share of the kernel's are dropped (float32 rounding).
 BAND_ENERGY = 1e-13
@@ -153,6 +153,19 @@ class Gram:
         spectrum = self._periodic * self.factor
         return spectrum[0] if self._flat else spectrum
 
+    def lag_kernels(self) -> Tensor:
+        """The K_c in space, factor included: ``(terms, reach + 1, nz, py, px)``, lags (y, x) on the padded ring.
+
+        Entry [c, b, z, ly, lx] couples slice z to slice z + b at the in-plane lag (to minus from) modulo ``padded``, so
+        G between two voxels is K₀ plus the mean of both polynomials times K_c (:attr:`polynomials`).
+        """
+        return torch.fft.irfft2(self._spectra, s=self.padded) * self.factor
+
+    @property
+    def polynomials(self) -> Tensor:
+        """The b_c on the in-plane grid, ``(terms, ny, nx)``; the first is 1."""
+        return self._basis
+
     def information(self, hu: float) -> float:
         """The data's information on a 0.5 lp/mm in-plane wave, in 1/(HU² mm³) (2-D: 1/(HU² mm²)).
 
@@ -162,17 +175,10 @@ class Gram:
         Args:
             hu: 1 HU in mm⁻¹ (μ_ref / 1000).
         """
-        py, px = self.padded
-        hy, hx = self.grid.spacing[-2:]
-        f = torch.hypot(torch.fft.fftfreq(py, hy)[:, None], torch.fft.rfftfreq(px, hx)[None, :])
-        distance = (f - REFERENCE_FREQUENCY).abs() + torch.where(f == 0, math.inf, 0.0)
-        ring = distance <= max(0.1, float(distance.min()) * 1.001)
         kernel = self._spectra[0]
         # A wave that is constant along z sees the sum over the bands.
         summed = (kernel[:1].real + 2 * kernel[1:].real.sum(0, keepdim=True)).sum(0)
-        # S ∝ 1/f: refer every frequency of the ring to the reference.
-        per_slice = (summed[:, ring.to(summed.device)] * (f[ring] / REFERENCE_FREQUENCY).to(summed)).mean(1)
-        return float(per_slice.median()) * self.factor * hu**2 / math.prod(self.grid.spacing)
+        return information_at_reference(summed, self.padded, self.grid.spacing, hu) * self.factor
 
     def noise(self, batch: tuple[int, ...] = (), *, generator: torch.Generator) -> Tensor:
         """Draw AᵀW n for counting noise n ~ N(0, W⁻¹) without a projector: covariance G (stationary part).
@@ -212,6 +218,24 @@ class _SelfAdjoint(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads: Any) -> tuple[Tensor, None]:
         return ctx.gram.apply(grads[0]), None
+
+
+def information_at_reference(spectra: Tensor, period: tuple[int, int], spacing: tuple[float, ...], hu: float) -> float:
+    """Information on a 0.5 lp/mm in-plane wave that is constant along z, in 1/(HU² mm³) (2-D: 1/(HU² mm²)).
+
+    Args:
+        spectra: ``(slices, period[0], period[1] // 2 + 1)`` in-plane spectra of what AᵀWA answers to such waves.
+        period: voxels of the ring that the spectra are of.
+        spacing: voxel size per axis in mm.
+        hu: 1 HU in mm⁻¹.
+    """
+    hy, hx = spacing[-2:]
+    f = torch.hypot(torch.fft.fftfreq(period[0], hy)[:, None], torch.fft.rfftfreq(period[1], hx)[None, :])
+    distance = (f - REFERENCE_FREQUENCY).abs() + torch.where(f == 0, math.inf, 0.0)
+    ring = distance <= max(0.1, float(distance.min()) * 1.001)
+    # S ∝ 1/f: refer every frequency of the ring to the reference.
+    per_slice = (spectra[:, ring.to(spectra.device)] * (f[ring] / REFERENCE_FREQUENCY).to(spectra)).mean(1)
+    return float(per_slice.median()) * hu**2 / math.prod(spacing)
 
 
 def check_weights(weights: Any, shape: tuple[int, ...]) -> None:

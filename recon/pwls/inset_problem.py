@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import copy
+import logging
+import math
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from recon.fbp.inset import require_inside, static_fbp
+from recon.fbp.coverage import check_rows
+from recon.fbp.inset import require_inside, require_same_surround, static_fbp
 from recon.gram.gram import Gram
-from recon.pwls.pwls import pwls
+from recon.pwls.field_model import FieldModel
+from recon.pwls.pwls import data_model, pwls
 from recon.pwls.qggmrf import QGGMRF
+from recon.pwls.surround import UnknownSurround, expected_counts
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import VolumeGrid
 from torchpcct.projector import Projector
@@ -23,6 +29,11 @@ from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
 from torchpcct.volume import Volume, to_hu
 
 __all__ = ["DEFAULT_PRIOR", "InsetProblem", "Statistic", "reconstruct_pwls"]
+
+if TYPE_CHECKING:
+    from torchpcct.metrics.residual_test import ResidualTest
+
+_LOG = logging.getLogger(__name__)
 
 DEFAULT_PRIOR = QGGMRF(strength=0.3, threshold=300.0)
 """Noise-normalised q-GGMRF, chosen for about the resolution of FBP's soft kernel: the curvatures of data and prior
@@ -49,7 +60,9 @@ class InsetProblem:
     """What all realisations of one scan on one grid share: projector, weights, Gram, background.
 
     Args:
-        scan: a counting-mode scan of the family; its noise does not matter.
+        scan: a counting-mode scan of the family; its noise does not matter. A scan of the whole detector without a
+            known surround serves too: what lies around the grid is then found from its own readings, scan by scan
+            (:mod:`recon.pwls.surround`), unless the grid holds the whole field of view.
         grid: ``(z, y, x)`` grid that holds everything the background does not.
         nodes: of the Gram operator. Linear in position (5) is enough for solvers: what the model lacks, the exact
             pairs repair, and each step costs half of that with 9.
@@ -63,6 +76,7 @@ class InsetProblem:
 
     Attributes:
         weights: on ``window``, at 1 s, of line integrals in mm⁻¹ · mm.
+        model: of AᵀWA at 1 s, :func:`recon.pwls.pwls.data_model`.
 
     Raises:
         ValueError: a grid outside the field of view or the scan's region; a spectral or energy-integrating scan.
@@ -73,21 +87,48 @@ class InsetProblem:
             raise ValueError("PWLS in HU needs a counting-mode scan; decompose or sum the energy bins before")
         if not scan.counting:
             raise ValueError("PWLS and MBIR weigh readings as photon counts; use fbp for an energy-integrating scan")
-        if scan.surround is None or scan.window is None:
-            raise ValueError("PWLS of an inset needs a scan with a known surround: acquire it with region=")
-        self.grid, self.geometry, self.outer = grid, scan.geometry, scan.window
-        require_inside(shadow(scan.geometry, grid, margin=1), scan.window)
+        self.grid, self.geometry = grid, scan.geometry
+        self.outer = scan.window or DetectorWindow.full(scan.geometry)
+        check_rows(scan.geometry, grid, motion)
         self.mu_ref = scan.linearisation.mu_ref
-        self.background = scan.surround_line_integrals()
+        self._nodes = nodes
+        self._around: UnknownSurround | None = None
+        self._background: Tensor | None = None
+        self.model: Gram | FieldModel
+        exposure = scan.exposure_s or NOISE_FREE_EXPOSURE_S
+        if scan.surround is None:
+            self._start_unknown(scan, exposure, motion)
+            return
+        require_inside(shadow(scan.geometry, grid, margin=1), self.outer)
+        self._background = scan.surround_line_integrals()
         # The background's own value inside the inset, from the same data by FBP.
-        self.level = float(static_fbp(self.background, scan.geometry, grid).mean())
+        self.level = float(static_fbp(self._background, scan.geometry, grid).mean())
         polychromatic = scan.air.log() - scan.surround.log()
         slope = scan.linearisation.slope(polychromatic)
-        exposure = scan.exposure_s or NOISE_FREE_EXPOSURE_S
         # Per second of exposure: the Gram of one exposure serves all by a factor.
         self._cell_weights = scan.surround / slope.square() / exposure
-        self._nodes = nodes
         self._place(motion)
+
+    def _start_unknown(self, scan: Scan, exposure: float, motion: Any) -> None:
+        """Weights from the smoothed readings themselves; what surrounds the inset is found scan by scan."""
+        if motion is not None:
+            raise ValueError("motion compensation needs the surround at rest: acquire the scan with region=")
+        geometry, grid = self.geometry, self.grid
+        radius = geometry.fov_radius
+        edges = zip(grid.extent[1:], grid.center[1:], strict=True)
+        whole = all(extent / 2 - abs(center) >= radius / math.sqrt(2) for extent, center in edges)
+        self.window = self.outer if whole else shadow(geometry, grid, margin=1)
+        counts = expected_counts(scan.counts).clamp_min(torch.finfo(scan.counts.dtype).tiny)
+        counts = self.outer.crop(counts, self.window)
+        polychromatic = self.window.take(scan.air.log()) - counts.clamp_min(0.5).log()
+        slope = scan.linearisation.slope(polychromatic, self.window)
+        self.weights = (counts / slope.square() / exposure).contiguous()
+        self.projector = Projector(geometry, grid, None if whole else self.window)
+        self.model = data_model(self.projector, self.weights, nodes=self._nodes)
+        self.level = 0.0
+        if not whole:
+            self._around = UnknownSurround(geometry, grid, self.window, self.projector)
+            self.level = self._around.level(scan.line_integrals())
 
     def _place(self, motion: Any) -> None:
         geometry, grid = self.geometry, self.grid
@@ -95,7 +136,7 @@ class InsetProblem:
         self.weights = self.window.take(self._cell_weights).contiguous()
         self.projector = Projector(geometry, grid, self.window, motion)
         if motion is None:
-            self.gram = Gram(self.projector, self.weights, nodes=self._nodes)
+            self.model = Gram(self.projector, self.weights, nodes=self._nodes)
             return
         # A displaced grid sees its voxels as the grid at rest does, a magnification of 0.3 % apart, but through the
         # weights of where it is.
@@ -103,7 +144,32 @@ class InsetProblem:
         first = np.clip(self.window.first_column, 0, geometry.columns - still.columns)
         along = DetectorWindow(first, still.columns, still.first_row, still.rows)
         weights = along.take(self._cell_weights).contiguous()
-        self.gram = Gram(Projector(geometry, grid, still), weights, nodes=self._nodes)
+        self.model = Gram(Projector(geometry, grid, still), weights, nodes=self._nodes)
+
+    @property
+    def background(self) -> Tensor:
+        """Line integrals of the known surround, ``(rows, columns)``.
+
+        Raises:
+            ValueError: nobody knows it.
+        """
+        if self._background is None:
+            raise ValueError("the surround of this scan is not known: acquire it with region=")
+        return self._background
+
+    @property
+    def gram(self) -> Gram:
+        """The FFT model of AᵀWA at 1 s.
+
+        Raises:
+            ValueError: the grid is no inset, so there is none: PWLS alone can do without.
+        """
+        if not isinstance(self.model, Gram):
+            raise ValueError(
+                "the grid takes more than half of the detector's columns, too much for the FFT model of a small inset: "
+                'use method="pwls", or a smaller grid'
+            )
+        return self.model
 
     def with_motion(self, motion: Any) -> InsetProblem:
         """The same problem for another displacement of the inset (None: at rest); the background is kept.
@@ -117,9 +183,16 @@ class InsetProblem:
 
     def data(self, scan: Scan) -> Tensor:
         """Line integrals of a scan on the grid's shadow, background taken off, ``(views, rows, columns)``."""
-        if scan.window != self.outer or scan.geometry != self.geometry:
+        if (scan.window or DetectorWindow.full(scan.geometry)) != self.outer or scan.geometry != self.geometry:
             raise ValueError("this scan has another geometry or window than the one the problem was made for")
-        return self.outer.crop(scan.line_integrals(), self.window) - self.window.take(self.background)
+        lines = scan.line_integrals()
+        if self._around is not None:
+            return self._around.take_off(lines, self.level)
+        kept = self.outer.crop(lines, self.window)
+        if self._background is None:
+            return kept
+        require_same_surround(scan, self._background)
+        return kept - self.window.take(self._background)
 
     def statistic(self, scan: Scan) -> Statistic:
         """What the solvers need of a scan, with the weights of its exposure (noise free: of 1 s)."""
@@ -127,6 +200,21 @@ class InsetProblem:
         weighted = self.weights * (scan.exposure_s or NOISE_FREE_EXPOSURE_S) * y
         energy = float((weighted * y).sum((-1, -2), dtype=torch.float64).sum())
         return Statistic(self.projector.T(weighted), energy, y.numel())
+
+    def residual_test(self, scan: Scan, volume: Tensor) -> ResidualTest:
+        """Whether a volume ``(z, y, x)`` in HU explains a noisy scan, by one projection of it.
+
+        The variances are those of the counts that the volume itself predicts. Raises ``ValueError`` for a noise-free
+        scan, which no statistic describes.
+        """
+        from torchpcct.metrics.residual_test import residual_test  # loads scipy.stats
+
+        if scan.noise_free:
+            raise ValueError("the residual of a noise-free scan is not noise: test a noisy one")
+        x = (volume / 1000.0 + 1.0) * self.mu_ref - self.level
+        fitted = self.projector(x.to(torch.float32))
+        weights = self.weights * self.exposure([scan]) * torch.exp(-fitted)
+        return residual_test(self.data(scan) - fitted, weights, fitted, unknowns=self.grid.voxels)
 
     @staticmethod
     def exposure(scans: Sequence[Scan]) -> float:
@@ -145,9 +233,22 @@ class InsetProblem:
         exposure = self.exposure(scans)
         result = pwls(
             self.projector, torch.stack([self.data(s) for s in scans]), self.weights * exposure, prior,
-            hu=self.mu_ref / 1000.0, gram=self.gram.scaled(exposure), **options,
+            hu=self.mu_ref / 1000.0, gram=self.model.scaled(exposure), **options,
         )  # fmt: skip
         return to_hu(result.x + self.level, self.mu_ref), dict(result.report)
+
+
+def _tested(problem: InsetProblem, scan: Scan, volume: Volume) -> Volume:
+    """The volume with what its residual says; findings are logged as warnings, too."""
+    found = problem.residual_test(scan, volume.data)
+    for text in found.findings:
+        _LOG.warning("%s", text)
+    tested = {
+        "chi2": found.chi2,
+        "residual_p": dict(found.p_values),
+        "warnings": [*volume.report["warnings"], *found.findings],
+    }
+    return replace(volume, report={**volume.report, **tested})
 
 
 def reconstruct_pwls(
@@ -174,7 +275,11 @@ def reconstruct_pwls(
         options: ``max_exact``, ``callback`` of :func:`recon.pwls.pwls.pwls`.
 
     Returns:
-        Volumes in HU with the solver's report.
+        Volumes in HU with the solver's report; of noisy scans also ``chi2`` (weighted squared residual per reading),
+        ``residual_p`` and ``warnings`` of :func:`torchpcct.metrics.residual_test.residual_test`: a volume that does not
+        explain its data (wrong centre, drifting gain, metal or a body beyond the grid) is not given out without a word.
+        A volume whose iteration did not reach ``tolerance`` says so in ``warnings``, too, and a :class:`RuntimeWarning`
+        is given.
 
     Raises:
         ValueError, TypeError: see :class:`InsetProblem` and :func:`recon.pwls.pwls.pwls`.
@@ -184,9 +289,21 @@ def reconstruct_pwls(
     volumes: list[Volume] = []
     for i in range(0, len(scans), batch):
         data, report = problem.solve(scans[i : i + batch], prior or DEFAULT_PRIOR, tolerance=tolerance, **options)
+        unfinished = [] if report["converged"] else [_unfinished(report)]
+        for text in unfinished:
+            warnings.warn(text, RuntimeWarning, stacklevel=2)
         report["seconds"] = round((time.perf_counter() - start) / len(data), 3)
-        volumes += [Volume(v.to(torch.float32), grid, report) for v in data]
+        for scan, values in zip(scans[i : i + batch], data, strict=True):
+            volume = Volume(values.to(torch.float32), grid, {**report, "warnings": unfinished})
+            volumes.append(volume if scan.noise_free else _tested(problem, scan, volume))
         start = time.perf_counter()
         if progress is not None:
             progress(min(i + batch, len(scans)) / len(scans))
     return volumes
+
+
+def _unfinished(report: Mapping[str, Any]) -> str:
+    return (
+        f"PWLS stopped {report['rmsd_hu'][-1]:.3g} HU from the minimum after {report['exact_pairs']} projection pairs "
+        f"(tolerance {report['tolerance_hu']:g} HU): raise max_exact, or strengthen the prior"
+    )

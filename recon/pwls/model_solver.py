@@ -10,7 +10,7 @@ from torch import Tensor
 from recon.conjugate_gradient import dot, per_volume
 from recon.pwls.qggmrf import BoundPrior
 
-__all__ = ["ModelSolver", "line_search"]
+__all__ = ["ModelSolver", "line_search", "mean_share"]
 
 # Steps below this many units of rounding of the first one are noise.
 ROUNDING = 30.0
@@ -45,7 +45,7 @@ class ModelSolver:
         d = torch.zeros_like(x)
         model = data_gradient
         q = model + prior.gradient(x)
-        share = self._mean_share(x)
+        share = mean_share(prior, x)
         z = self._precondition(q, share)
         qz = dot(q, z, axes)
         if self._floor is None:  # rounding: the first, largest energy sets what later steps can resolve
@@ -74,14 +74,14 @@ class ModelSolver:
             s = -z + per_volume(beta.clamp_min(0), x) * s
         return d, count
 
-    def _mean_share(self, x: Tensor) -> float:
-        """Mean curvature of the prior at x relative to that at gradient 0, for the preconditioner."""
-        prior = self.prior
-        if prior.lam == 0 or x.shape[0] == 0:
-            return 0.0
-        ratio = [float(prior.curvature(t).mean()) for t in prior.gradients(x[:1]) if t.numel()]
-        top = float(prior.curvature(torch.zeros(1, dtype=x.dtype, device=x.device)))
-        return max(sum(ratio) / max(len(ratio), 1) / top, 1e-3)
+
+def mean_share(prior: BoundPrior, x: Tensor) -> float:
+    """Mean curvature of the prior at x relative to that at gradient 0, for preconditioners."""
+    if prior.lam == 0 or x.shape[0] == 0:
+        return 0.0
+    ratio = [float(prior.curvature(t).mean()) for t in prior.gradients(x[:1]) if t.numel()]
+    top = float(prior.curvature(torch.zeros(1, dtype=x.dtype, device=x.device)))
+    return max(sum(ratio) / max(len(ratio), 1) / top, 1e-3)
 
 
 def line_search(

@@ -1,11 +1,16 @@
-"""Penalised weighted least squares on an inset, to the exact solution with a handful of projections.
+"""Penalised weighted least squares, to the minimum itself: of a small inset, or of a whole field of view.
 
     Φ(x) = ½ ‖y − A x‖²_W + R(x)
 
-The FFT model of AᵀWA (:class:`recon.gram.gram.Gram`) carries the inner iterations; each outer iteration measures the
-true gradient with one exact projection pair (A, Aᵀ) and lets the model solve for what is left (defect correction, as a
-flexible conjugate gradient method with exact line search, Notay 2000, SIAM J. Sci. Comput. 22:1444). So the result is
-the minimum of Φ itself, not of the model, and the exact gradient certifies it.
+One outer iteration: a step is proposed, one exact projection pair (A, Aᵀ) measures what it does, it is made conjugate
+to the step before, and a majorising line search from 0 sets its length (flexible conjugate gradients, Notay 2000, SIAM
+J. Sci. Comput. 22:1444; Huber's parabolas for R). So Φ falls in every iteration, whoever proposes the step, and the
+result is the minimum of Φ itself, not of a model. Two proposers:
+
+* Inset: the FFT model of AᵀWA (:class:`recon.gram.gram.Gram`) solves for what is left (defect correction). Its misfit
+  is measured with the first exact pair; a model that does not fit loses its place to
+* the preconditioned gradient (:class:`recon.pwls.field_model.GradientStep`), for whole fields from the start: there a
+  projection pair costs no more than the model would, and the weights change too much over the field.
 """
 
 from __future__ import annotations
@@ -16,18 +21,34 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.conjugate_gradient import dot, per_volume
 from recon.gram.gram import Gram, check_weights
+from recon.pwls.field_model import FieldModel, GradientStep
+from recon.pwls.memory import gram_bytes, require_memory
 from recon.pwls.model_solver import ModelSolver, line_search
 from recon.pwls.qggmrf import QGGMRF, BoundPrior
+from torchpcct.detector_window import shadow
 from torchpcct.validate import number, whole
 
-__all__ = ["PwlsResult", "pwls", "solve_normal", "weighted_data"]
+__all__ = ["PwlsResult", "data_model", "pwls", "solve_normal", "weighted_data"]
 
 _LOG = logging.getLogger(__name__)
+
+# Relative error of the FFT model on the first step beyond which it no longer leads the iteration.
+MISFIT_LIMIT = 0.5
+# A model whose proposals do not halve in so many pairs has no place either.
+PATIENCE = 4
+# The gradient is followed by recurrence and measured afresh after so many pairs: rounding adds up.
+REFRESH = 25
+# A grid that takes a larger share of the detector's columns is a whole field, not an inset.
+INSET_SHARE = 0.5
+# An FFT model that needs more is not built.
+GRAM_BYTES = 2**29
 
 
 @dataclass(frozen=True)
@@ -36,12 +57,15 @@ class PwlsResult:
 
     Args:
         x: ``(..., *grid.shape)`` mm⁻¹.
-        report: ``exact_pairs`` (A and Aᵀ applied together), ``inner_iterations`` (one entry per outer iteration),
-            ``gradient`` (norm of the exact gradient of Φ over that of the zero volume, worst volume of the batch,
-            one entry per outer iteration), ``rmsd_hu`` (root mean square distance to the minimum in HU, as the
-            model sees it from the exact gradient, worst volume, one entry per outer iteration), ``converged``,
-            ``tolerance_hu``, ``seconds``, and the prior (``strength``, ``lambda``, ``threshold_hu_per_mm``, ``p``,
-            ``q``).
+        report: ``exact_pairs`` (A and Aᵀ applied together), ``inner_iterations`` (of the FFT model, one entry per outer
+            iteration), ``gradient`` (norm of the exact gradient of Φ over that of the zero volume, worst volume of the
+            batch, one entry per outer iteration), ``rmsd_hu`` (root mean square distance to the minimum in HU, worst
+            volume, one entry per outer iteration: as the FFT model sees it from the exact gradient; for a whole field
+            extrapolated from the latest steps), ``converged``, ``tolerance_hu``, ``model`` ("gram" or "gradient": who
+            proposed the last step), ``model_misfit`` (of the FFT model on the first step, None without one),
+            ``misfit`` (weighted squared residual per reading of positive weight, one entry per volume: about 1 for the
+            right weights and enough unknowns; from :func:`solve_normal`, which does not know the data, None),
+            ``seconds``, and the prior (``strength``, ``lambda``, ``threshold_hu_per_mm``, ``p``, ``q``).
     """
 
     x: Tensor
@@ -54,30 +78,35 @@ def pwls(
     weights: Tensor,
     prior: QGGMRF | BoundPrior,
     *,
-    hu: float,
+    hu: float = 2e-5,
     gram: Any = None,
     start: Tensor | None = None,
     tolerance: float = 0.2,
-    max_exact: int = 12,
+    max_exact: int = 200,
+    memory: int | None = None,
     callback: Callable[[dict[str, Any]], None] | None = None,
 ) -> PwlsResult:
-    """Minimise ½‖y − A x‖²_W + R(x).
+    """Minimise ½‖y − A x‖²_W + R(x), in 2-D and 3-D, for an inset or a whole field of view.
 
     Args:
-        A: the exact operator (:class:`torchpcct.projector.Projector`).
-        y: line integrals with the background taken off, ``(..., *A.range_shape)`` float32 or float64; readings of
-            weight 0 may hold anything. Leading dimensions are independent noise realisations.
+        A: the exact operator (:class:`torchpcct.projector.Projector`, or any other with ``A.T``, ``domain_shape``,
+            ``range_shape`` and ``grid``).
+        y: line integrals ``(..., *A.range_shape)`` float32 or float64, of all that lies in the beam: whatever the grid
+            does not hold must have been taken off. Readings of weight 0 may hold anything. Leading dimensions are
+            independent noise realisations.
         weights: W, ``A.range_shape``: expected inverse variances of y (from smooth expected counts: weights taken
             from the noisy counts themselves bias the result).
         prior: a prior in noise-normalised units, or one that is bound already.
-        hu: 1 HU in mm⁻¹ (μ_ref / 1000).
-        gram: model of AᵀWA with these weights (:class:`recon.gram.gram.Gram`, kept from an earlier call); default: made
-            here.
+        hu: 1 HU in mm⁻¹ (μ of water / 1000); default: water at about 64 keV.
+        gram: model of AᵀWA with these weights (:class:`recon.gram.gram.Gram` or
+            :class:`recon.pwls.field_model.FieldModel`, kept from an earlier call); default: :func:`data_model`.
         start: first volume ``(..., *grid.shape)`` mm⁻¹, default 0. It costs one exact pair and does not change the
-            result.
+            result; the volume returned has no larger Φ.
         tolerance: stop when the volume is this close to the minimum: root mean square, in HU (see ``rmsd_hu``).
         max_exact: largest number of exact pairs; if it is reached, the report says ``converged: False`` and a
             warning is logged.
+        memory: bytes that may be used besides the arguments; default: what the machine has left. The need is
+            predicted before anything is allocated.
         callback: called after each outer iteration with a dict of ``outer``, ``exact_pairs``, ``gradient`` and
             ``rmsd_hu``.
 
@@ -86,24 +115,59 @@ def pwls(
 
     Raises:
         ValueError: shapes that do not fit, data that are not finite, weights that are negative or all 0,
-            a tolerance ≤ 0.
+            a tolerance ≤ 0, too little memory.
         TypeError: data or weights that are not float tensors.
     """
     started = time.perf_counter()
     check_weights(weights, A.range_shape)
-    weighted = weighted_data(y, tuple(A.range_shape), weights > 0, lambda v: weights.to(v.dtype) * v)
+    known = weights > 0
+    check_data(y, tuple(A.range_shape))
+    require_memory(A, y, memory)
+    weighted = weighted_data(y, tuple(A.range_shape), known, lambda v: weights.to(v.dtype) * v)
     w = weights.to(weighted.dtype)
-    model = Gram(A, weights) if gram is None else gram
+    model = data_model(A, weights) if gram is None else gram
 
     def exact(x: Tensor) -> Tensor:
         out: Tensor = A.T(w * A(x))
         return out
 
-    result = solve_normal(
+    axes = len(A.range_shape)
+    energy = dot(weighted, torch.where(known, y, torch.zeros_like(y)), axes)
+    result, change = _solve(
         A.T(weighted), exact, model, prior, hu=hu, spacing=A.grid.spacing, start=start, tolerance=tolerance,
         max_exact=max_exact, callback=callback,
     )  # fmt: skip
-    return PwlsResult(result.x, {**result.report, "seconds": time.perf_counter() - started})
+    misfit = (energy.reshape(-1) + 2 * change).clamp_min(0) / int(known.sum())
+    return PwlsResult(result.x, {**result.report, "misfit": misfit.tolist(), "seconds": time.perf_counter() - started})
+
+
+def data_model(A: Any, weights: Tensor, nodes: int = 9) -> Gram | FieldModel:
+    """The model of AᵀWA that suits the grid: FFT with position-dependent kernels for an inset, else the field's.
+
+    Args:
+        A: the exact operator.
+        weights: W, ``A.range_shape``.
+        nodes: of the FFT model.
+
+    Raises:
+        ValueError, TypeError: weights that :class:`recon.gram.gram.Gram` refuses.
+    """
+    geometry = getattr(A, "geometry", None)
+    inset = False
+    if geometry is not None and gram_bytes(geometry, A.grid, weights.element_size(), nodes) <= GRAM_BYTES:
+        try:
+            inset = shadow(geometry, A.grid).columns <= INSET_SHARE * geometry.columns
+        except ValueError:  # the grid reaches beyond the field of view
+            inset = False
+    return Gram(A, weights, nodes) if inset else FieldModel(A, weights)
+
+
+def check_data(y: Any, shape: tuple[int, ...]) -> None:
+    """Refuse data that are no float tensor (TypeError) or not ``(..., *shape)`` (ValueError)."""
+    if not isinstance(y, Tensor) or y.dtype not in (torch.float32, torch.float64):
+        raise TypeError(f"y must be a float32 or float64 tensor, got {getattr(y, 'dtype', type(y).__name__)}")
+    if tuple(y.shape[-len(shape) :]) != shape:
+        raise ValueError(f"y must have shape (..., {', '.join(map(str, shape))}), got {tuple(y.shape)}")
 
 
 def weighted_data(y: Any, shape: tuple[int, ...], known: Tensor, weigh: Callable[[Tensor], Tensor]) -> Tensor:
@@ -113,10 +177,7 @@ def weighted_data(y: Any, shape: tuple[int, ...], known: Tensor, weigh: Callable
         TypeError: no float tensor.
         ValueError: another shape, or readings of positive weight that are not finite.
     """
-    if not isinstance(y, Tensor) or y.dtype not in (torch.float32, torch.float64):
-        raise TypeError(f"y must be a float32 or float64 tensor, got {getattr(y, 'dtype', type(y).__name__)}")
-    if tuple(y.shape[-len(shape) :]) != shape:
-        raise ValueError(f"y must have shape (..., {', '.join(map(str, shape))}), got {tuple(y.shape)}")
+    check_data(y, shape)
     weighted = weigh(torch.where(known, y, torch.zeros((), dtype=y.dtype, device=y.device)))
     if not torch.isfinite(weighted).all():
         raise ValueError("y holds NaN or Inf in readings of positive weight: give these readings the weight 0")
@@ -134,7 +195,7 @@ def solve_normal(
     channels: bool = False,
     start: Tensor | None = None,
     tolerance: float = 0.2,
-    max_exact: int = 12,
+    max_exact: int = 200,
     callback: Callable[[dict[str, Any]], None] | None = None,
 ) -> PwlsResult:
     """The same from the sufficient statistic b = AᵀW y: minimise ½ xᵀHx − bᵀx + R(x).
@@ -142,11 +203,33 @@ def solve_normal(
     Args:
         b: ``(..., [channels,] *grid.shape)``.
         exact: x ↦ H x = AᵀWA x; ``gram.apply`` itself solves the model's problem.
-        gram: the model of H: ``apply(x)``, ``periodic_spectrum()`` and, for a :class:`QGGMRF`, ``information(hu)``.
+        gram: the model of H: ``apply(x)``, ``periodic_spectrum()`` and, for a :class:`QGGMRF`, ``information(hu)``; or
+            a :class:`recon.pwls.field_model.FieldModel`.
         spacing: voxel size per axis in mm.
         channels: whether the volumes have an axis of channels, which the prior joins and ``gram`` treats alike.
         prior, hu, start, tolerance, max_exact, callback: see :func:`pwls`.
     """
+    return _solve(
+        b, exact, gram, prior, hu=hu, spacing=spacing, channels=channels, start=start, tolerance=tolerance,
+        max_exact=max_exact, callback=callback,
+    )[0]  # fmt: skip
+
+
+def _solve(
+    b: Tensor,
+    exact: Callable[[Tensor], Tensor],
+    gram: Any,
+    prior: QGGMRF | BoundPrior,
+    *,
+    hu: float,
+    spacing: tuple[float, ...],
+    channels: bool = False,
+    start: Tensor | None = None,
+    tolerance: float = 0.2,
+    max_exact: int = 200,
+    callback: Callable[[dict[str, Any]], None] | None = None,
+) -> tuple[PwlsResult, Tensor]:
+    """:func:`solve_normal`, and ½ xᵀHx − bᵀx of each volume, ``(batch,)`` float64."""
     started = time.perf_counter()
     axes = len(spacing) + channels
     shape = b.shape[-axes:]
@@ -157,7 +240,8 @@ def solve_normal(
     bound = prior.bind(gram.information(hu), spacing, hu, channels) if isinstance(prior, QGGMRF) else prior
     lead = b.shape[:-axes]
     b = b.reshape(-1, *shape)
-    solver = ModelSolver(gram, bound, b)
+    proposer: ModelSolver | GradientStep
+    proposer = GradientStep.of(gram, bound, b) if isinstance(gram, FieldModel) else ModelSolver(gram, bound, b)
     reference = dot(b, b, axes).sqrt().clamp_min(torch.finfo(b.dtype).tiny)
 
     pairs = 0
@@ -173,29 +257,40 @@ def solve_normal(
     inner: list[int] = []
     gradients: list[float] = []
     distances: list[float] = []
+    moves = Moves()
+    misfit: float | None = None
     previous: tuple[Tensor, Tensor] | None = None
     converged = b.shape[0] == 0
     while not converged:
-        # Without exact pairs the first step starts from far: solve the model well. Later steps repair its error.
-        step, count = solver.step(x, data_gradient)
+        step, count = proposer.step(x, data_gradient)
         inner.append(count)
         gradient = data_gradient + bound.gradient(x)
         gradients.append(float((dot(gradient, gradient, axes).sqrt() / reference).max()))
-        distances.append(float((dot(step, step, axes) / step[0].numel()).sqrt().max()) / hu)
+        proposed = float((dot(step, step, axes) / step[0].numel()).sqrt().max()) / hu
+        by_model = isinstance(proposer, ModelSolver)
+        distances.append(proposed if by_model else max(proposed, moves.remaining() / hu))
         if callback is not None:
             callback({"outer": len(inner), "exact_pairs": pairs, "gradient": gradients[-1], "rmsd_hu": distances[-1]})
-        converged = distances[-1] <= tolerance
+        converged = distances[-1] <= tolerance and (by_model or moves.known or proposed == 0.0)
         if converged or pairs >= max_exact:
             break
         curved = exact(step)
         pairs += 1
+        if by_model and misfit is None:
+            misfit = _misfit(gram, step, curved, axes)
+        if by_model and (misfit > MISFIT_LIMIT or _stalled(distances)):  # type: ignore[operator]
+            proposer = GradientStep(gram.periodic_spectrum(), bound, b)
         if previous is not None:
             step, curved = _conjugate(x, step, curved, previous, bound)
-        # From the model's own α = 1.
-        alpha = per_volume(line_search(bound, x, step, curved, data_gradient, start=1.0, most=4, tolerance=1e-3), x)
+        # From 0: there a majorising search cannot end above where it began.
+        alpha = per_volume(line_search(bound, x, step, curved, data_gradient, start=0.0, most=12, tolerance=1e-3), x)
         x = x + alpha * step
         data_gradient = data_gradient + alpha * curved
+        moves.add(alpha * step)
         previous = (step, curved)
+        if pairs % REFRESH == 0 and pairs < max_exact:
+            data_gradient = exact(x) - b
+            pairs += 1
     if not converged:
         _LOG.warning(
             "PWLS stopped after %d exact pairs, %.3g HU from the minimum (tolerance %.3g HU): raise max_exact",
@@ -209,6 +304,9 @@ def solve_normal(
         "rmsd_hu": distances,
         "converged": converged,
         "tolerance_hu": tolerance,
+        "model": "gram" if isinstance(proposer, ModelSolver) else "gradient",
+        "model_misfit": misfit,
+        "misfit": None,
         "strength": prior.strength if isinstance(prior, QGGMRF) else None,
         "lambda": bound.lam,
         "threshold_hu_per_mm": bound.threshold,
@@ -216,7 +314,53 @@ def solve_normal(
         "q": bound.q,
         "seconds": time.perf_counter() - started,
     }
-    return PwlsResult(x.reshape(*lead, *shape), report)
+    return PwlsResult(x.reshape(*lead, *shape), report), 0.5 * dot(x, data_gradient - b, axes)
+
+
+class Moves:
+    """How far is it still? Extrapolated from how the moves of an iteration shrink, volume by volume.
+
+    The moves of the last third are compared with those of the third before: a geometric series goes on for their sum
+    times r / (1 − r), r the ratio of the two. Of the latest estimates the largest counts, since single ones can be low.
+    """
+
+    LEAST, SLOWEST = 3, 0.98
+
+    def __init__(self) -> None:
+        self._lengths: list[NDArray[np.float64]] = []
+        self._left: list[float] = []
+
+    def add(self, move: Tensor) -> None:
+        """Note one move, ``(batch, *shape)``."""
+        axes = move.dim() - 1
+        self._lengths.append((dot(move, move, axes) / move[0].numel()).sqrt().cpu().numpy())
+        span = max(self.LEAST, len(self._lengths) // 3)
+        if len(self._lengths) < 2 * span:
+            return
+        late = np.sum(self._lengths[-span:], axis=0)
+        early = np.sum(self._lengths[-2 * span : -span], axis=0)
+        ratio = np.minimum(late / np.maximum(early, np.finfo(np.float64).tiny), self.SLOWEST)
+        self._left.append(float((late * ratio / (1 - ratio)).max()))
+
+    @property
+    def known(self) -> bool:
+        """Whether there are moves enough."""
+        return bool(self._left)
+
+    def remaining(self) -> float:
+        """Root mean square distance to the limit, worst volume; 0 while not :attr:`known`."""
+        return max(self._left[-max(self.LEAST, len(self._lengths) // 3) :], default=0.0)
+
+
+def _misfit(gram: Any, step: Tensor, curved: Tensor, axes: int) -> float:
+    """Relative error of the model on a step whose exact image is known, worst volume."""
+    error = gram.apply(step) - curved
+    size = dot(curved, curved, axes).clamp_min(torch.finfo(torch.float64).tiny)
+    return float((dot(error, error, axes) / size).sqrt().max())
+
+
+def _stalled(distances: list[float]) -> bool:
+    return len(distances) > PATIENCE and distances[-1] > 0.5 * distances[-1 - PATIENCE]
 
 
 def _conjugate(

@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -187,16 +187,14 @@ class BoundPrior:
         if x.dim() < self.axes:
             raise ValueError(f"the prior needs a volume of {self.axes} axes, got shape {tuple(x.shape)}")
 
-    def gradients(self, x: Tensor) -> list[Tensor]:
+    def gradients(self, x: Tensor) -> Iterator[Tensor]:
         """Gradient of every pair in HU/mm, one tensor per entry of :attr:`offsets`; of channels its length,
         ``(..., 1, *pairs)``."""
         self._check(x)
-        found = []
         for step, d, _ in self.offsets:
             a, b = _pair(x, step)
             change = torch.linalg.vector_norm(a - b, dim=-self.axes, keepdim=True) if self.channels else a - b
-            found.append(change / (self.hu * d))
-        return found
+            yield change / (self.hu * d)
 
     def value(self, x: Tensor) -> Tensor:
         """R(x), ``(...)``, without unit. Differentiable."""

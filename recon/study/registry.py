@@ -10,11 +10,13 @@ import importlib
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from recon.study.report import Report
-from recon.study.study import Progress, silent
 from torchpcct.validate import choice
+
+if TYPE_CHECKING:
+    from recon.study.report import Report
+    from recon.study.study import Progress
 
 __all__ = ["STUDIES", "build_settings", "folder", "part", "run", "settings_of"]
 
@@ -27,6 +29,7 @@ STUDIES: dict[str, str] = {
     "motion": "residual motion in PCCT and EID-CT, and reconstruction with the motion known, exactly or not",
     "noise": "FBP with every kernel, voxel size and dose: CNR tables, and which rankings they establish",
     "resolution": "PCCT and EID-CT without noise, blurred step by step: lumen, cap and core by thresholds",
+    "hardcases": "starved, broken, incomplete and wrongly described scans: which results are wrong, and who says so",
     "spectral": "energy bins into PE and PVC: monochromatic images, best energy, tissue maps, by FBP and joint MBIR",
 }
 """Name → one line of help. The study ``some-name`` is the package ``recon.study.some_name``."""
@@ -106,6 +109,8 @@ def run(name: str, settings: Any, progress: Progress | None = None, pieces: str 
         ValueError: an unknown study; what the study itself refuses.
         TypeError: settings of another study.
     """
+    from recon.study.study import silent  # loads torch
+
     kind = part(name, "settings").Settings
     if not isinstance(settings, kind):
         raise TypeError(f"settings must be {kind.__module__}.Settings, got {type(settings).__name__}")

@@ -24,11 +24,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, ClassVar, Self
 
-import numba
 import numpy as np
-import scipy
-import torch
-from tqdm import tqdm
 
 import torchpcct
 from torchpcct.validate import whole
@@ -59,6 +55,8 @@ class ProgressBars:
         if not self.enabled:
             return
         if step != self._step:
+            from tqdm import tqdm
+
             self.close()
             self._step = step
             form = "{desc:<28} {bar:30} {percentage:3.0f}% {elapsed}<{remaining}"
@@ -132,6 +130,10 @@ class Clock:
 
 def environment() -> dict[str, Any]:
     """Versions and machine that made a result."""
+    import numba
+    import scipy
+    import torch
+
     return {
         "torchpcct": torchpcct.__version__,
         "python": platform.python_version(),

@@ -14,9 +14,9 @@ TINY: dict[str, dict[str, Any]] = {
         "pwls": False, "mbir": False, "placements": False,
     },
     "dose-factor": {
-        "n": 14, "slow_n": 12, "scene_n": 3, "doses": (2.0,), "scene_doses": (2.0,), "methods": ("linear", "qggmrf"),
-        "scenes": ("half_size_core",), "scene_methods": ("linear",), "views": 48, "voxel_mm": 0.4, "kernels": ("soft",),
-        "voxels_mm": (0.25,), "blurs_mm": (), "block": 7, "vessels": ("straight", "curved_5mm"),
+        "n": 14, "slow_n": 12, "scene_n": 9, "doses": (2.0,), "scene_doses": (2.0,), "methods": ("linear", "qggmrf"),
+        "scenes": ("half_size_core",), "scene_methods": ("linear", "qggmrf"), "views": 48, "voxel_mm": 0.4,
+        "kernels": ("soft",), "block": 7, "vessels": ("curved_5mm",),
     },
     "phantom": {"voxel_mm": 0.05, "sections": 2, "energies_kev": (55.0, 64.0)},
     "detector": {"photons": 4000, "dead_times_ns": (50.0,), "charge_sharing": (0.1,)},
@@ -24,6 +24,7 @@ TINY: dict[str, dict[str, Any]] = {
         "views": 96, "realizations": 2, "map_mm": 12.0, "cause_views": 24, "histories": 20_000, "plaque_views": 40,
         "plaque_doses": (2.0,), "plaque_realizations": 4,
     },
+    "hardcases": {"views": 120, "cases": ("sound", "dead-column", "centre-2", "three-views"), "methods": ("fbp",)},
     "motion": {
         "thinning": 24, "fractions": (0.2, 1.0), "eid_fractions": (0.2,), "errors": (0.2,), "voxel_mm": 0.4,
         "realizations": 1, "exposure_s": 20.0, "methods": ("fbp", "pwls"),

@@ -2,17 +2,23 @@
 
 import json
 
+import h5py
+import numpy as np
 import pytest
+import torch
+import yaml
+from analytic import Ellipsoid, line_integrals
 
 from recon.cli import main
-from torchpcct import Volume
+from recon.cli.config import read_config
+from torchpcct import ParallelBeam, Scan, Volume
 
 
 def test_command_line_simulate_and_reconstruct(tmp_path, capsys):
     scan, volume = tmp_path / "scan.h5", tmp_path / "plaque.nii.gz"
-    assert main(["simulate", "--views", "48", "--exposure", "2", "--seed", "3", "--out", str(scan)]) == 0
+    assert main(["simulate", "--views", "48", "--exposure", "2", "--seed", "3", "--json", "--out", str(scan)]) == 0
     assert json.loads(capsys.readouterr().out)["seed"] == 3
-    assert main(["reconstruct", str(scan), "--kernel", "soft", "--voxel", "0.4", "--out", str(volume)]) == 0
+    assert main(["reconstruct", str(scan), "--kernel", "soft", "--voxel", "0.4", "--json", "--out", str(volume)]) == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary["method"] == "fbp"
     assert json.loads((tmp_path / "plaque.nii.gz.json").read_text()) == summary
@@ -22,15 +28,84 @@ def test_command_line_simulate_and_reconstruct(tmp_path, capsys):
     assert Volume.load(h5).grid.spacing == (0.4, 0.4, 0.4)
 
 
+CONFIG = """
+scene: {kind: bodies, bodies: [{name: a, shape: cylinder, semi_axes: 20, material: water}]}
+scanner: {preset: pcct, views: 60, rows: 2, columns: 300}
+exposure_s: 1.0
+seed: 5
+"""
+
+
+def test_a_scene_from_a_configuration_to_a_picture(tmp_path, capsys):
+    config, scan, volume = tmp_path / "scene.yaml", tmp_path / "scan.h5", tmp_path / "v.mha"
+    config.write_text(CONFIG, encoding="utf-8")
+    assert main(["simulate", "--config", str(config), "--dry-run", "--out", str(scan)]) == 0
+    assert "sub-rays a reading" in capsys.readouterr().out
+    assert not scan.exists()
+    assert main(["simulate", "--config", str(config), "--out", str(scan)]) == 0
+    assert len(capsys.readouterr().out.splitlines()) == 1
+    # What was done stands beside the result, and does the same again.
+    again = tmp_path / "again.h5"
+    assert main(["simulate", "--config", f"{scan}.yaml", "--out", str(again)]) == 0
+    assert torch.equal(Scan.load(again).counts, Scan.load(scan).counts)
+    assert main(["reconstruct", str(scan), "--voxel", "2", "--dry-run", "--out", str(volume)]) == 0
+    assert "GiB" in capsys.readouterr().out
+    assert not volume.exists()
+    grid = ["--voxel", "2", "--extent", "2", "60", "60", "--center", "0", "0", "0"]
+    assert main(["reconstruct", str(scan), *grid, "--out", str(volume)]) == 0
+    assert yaml.safe_load((tmp_path / "v.mha.yaml").read_text())["geometry"]["kind"] == "cone"
+    assert main(["info", str(scan)]) == 0
+    assert main(["info", str(volume), "--json"]) == 0
+    assert '"kind": "volume"' in capsys.readouterr().out
+    picture = tmp_path / "v.png"
+    assert main(["view", str(volume), "--level", "0", "--window", "300", "--out", str(picture)]) == 0
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_example_configuration_is_complete(tmp_path, capsys):
+    assert main(["show-config"]) == 0
+    path = tmp_path / "example.yaml"
+    path.write_text(capsys.readouterr().out, encoding="utf-8")
+    config = read_config(path)
+    assert config.scene.names == ("patient", "spine", "nodule")
+    assert set(yaml.safe_load(path.read_text())) == set(config.values)
+    path.write_text(CONFIG.replace("views", "view"), encoding="utf-8")
+    with pytest.raises(ValueError, match="scanner: unknown view; it takes views, mode"):
+        read_config(path)
+
+
+def test_a_foreign_scan_in_one_command(tmp_path):
+    """A Data Exchange file to a volume, the axis found on the way."""
+    geometry = ParallelBeam(np.arange(121) * np.pi / 120, 96, 0.5, -1.0)
+    lines = line_integrals(geometry, [Ellipsoid((2.0, -3.0), 12.0, value=0.02), Ellipsoid((6.0, 5.0), 3.0, value=0.02)])
+    with h5py.File(tmp_path / "tooth.h5", "w") as file:
+        file["exchange/data"] = np.rint(4e4 * np.exp(-lines[:, None])).astype(np.uint16)
+        file["exchange/data_white"] = np.full((1, 1, 96), 40000, np.uint16)
+        file["exchange/theta"] = np.rad2deg(geometry.angles)
+    out = tmp_path / "v.h5"
+    command = ["reconstruct", str(tmp_path / "tooth.h5"), "--pitch", "0.5", "--find-axis", "--mu-water", "0.02"]
+    assert main([*command, "--out", str(out)]) == 0
+    volume = Volume.load(out)
+    assert volume.grid.shape[0] == 1
+    y, x = (np.abs(a - c).argmin() for a, c in zip(volume.grid.axes[1:], (0.0, -6.0), strict=True))
+    assert float(volume.data[0, y - 2 : y + 3, x - 2 : x + 3].mean()) == pytest.approx(0.0, abs=15)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (["simulate", "--out", "{tmp}/a.png"], "unknown ending of 'a.png'"),
+        (["simulate", "--config", "{tmp}/none.yaml", "--out", "{tmp}/a.h5"], "none.yaml"),
+        (["reconstruct", "{tmp}", "--method", "art", "--out", "{tmp}/a.h5"], "unknown method 'art'"),
+        (["view", "{tmp}/none.h5", "--out", "{tmp}/a.bmp"], "unknown ending of 'a.bmp'"),
+        (["info", "{tmp}/none.h5"], "none.h5"),
         (["simulate", "--exposure", "0", "--out", "{tmp}/a.h5"], "exposure_s"),
         (["simulate", "--seed", "-1", "--exposure", "1", "--out", "{tmp}/a.h5"], "seed"),
         (["simulate", "--out", "{tmp}/none/a.h5"], "does not exist"),
         (["reconstruct", "{tmp}/none.h5", "--out", "{tmp}/a.h5"], "none.h5"),
         (["reconstruct", "{tmp}/none.h5", "--out", "{tmp}/a.png"], "unknown volume format"),
         (["reconstruct", "{tmp}/none.h5", "--voxel", "0", "--out", "{tmp}/a.h5"], "--voxel must be greater than 0 mm"),
+        (["plaque", "{tmp}/none.h5", "--out", "{tmp}/a"], "none.h5"),
         (["compare", "--realizations", "2", "--out", "{tmp}/o"], "realizations must be at least 3"),
         (["dose-factor", "--n", "2", "--out", "{tmp}/o"], "n must be at least 8"),
         (["study", "magic", "--out", "{tmp}/o"], "unknown study 'magic'"),
@@ -43,7 +118,7 @@ def test_command_line_refuses_bad_input_and_writes_nothing(tmp_path, capsys, arg
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("command", ["compare", "dose-factor", "study", "simulate", "reconstruct"])
+@pytest.mark.parametrize("command", ["compare", "dose-factor", "study", "simulate", "reconstruct", "plaque"])
 def test_help(command, capsys):
     with pytest.raises(SystemExit) as stop:
         main([command, "--help"])

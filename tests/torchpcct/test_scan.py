@@ -10,6 +10,7 @@ import torch
 from recon import reconstruct
 from recon.fbp.inset import InsetFbp
 from torchpcct import Scan, VolumeGrid, acquire, full_turn
+from torchpcct.files import seal
 from torchpcct.scanner import presets
 from torchpcct.scene.plaque import plaque_scene
 
@@ -70,6 +71,7 @@ def test_truncated_foreign_and_newer_files(tmp_path, clean):
         Scan.load(tmp_path / "foreign.h5")
     with h5py.File(tmp_path / "scan.h5", "a") as file:
         file.attrs["version"] = 99
+    seal(tmp_path / "scan.h5")
     with pytest.raises(ValueError, match="update torchpcct"):
         Scan.load(tmp_path / "scan.h5")
     with pytest.raises(FileNotFoundError):

@@ -8,7 +8,7 @@ from train.config import TrainConfig, differences, load_config, packaged_config
 
 
 def test_round_trip(tmp_path):
-    config = TrainConfig(steps=7, clip=float("inf"), prior={"levels": 2, "thresholds": [0.1, 1.0]}, learning_rate=1e-5)
+    config = TrainConfig(steps=7, clip=float("inf"), network={"channels": [4, 6, 8]}, learning_rate=1e-5)
     assert TrainConfig.from_yaml(config.to_yaml()).to_yaml() == config.to_yaml()
     assert TrainConfig.from_yaml(config.to_yaml()) == config
     (tmp_path / "c.yaml").write_text(config.to_yaml())
@@ -30,7 +30,7 @@ def test_sections_from_plain_values():
     ("text", "message"),
     [
         ("stepps: 3", "unknown key 'stepps'"),
-        ("prior: {levels: 2, filterz: 3}", r"unknown key 'prior\.filterz'"),
+        ("network: {channels: [4, 6, 8], filters: 3}", r"unknown key 'network\.filters'"),
         ("data: {nonsense: 1}", r"unknown key 'data\.nonsense'"),
         ("data: {scenes: {nonsense: 1}}", r"data: unknown key 'scenes\.nonsense'"),
         ("data: {situations: [{x: 1}]}", r"data: situations\[0\]: .*'y'"),
@@ -40,9 +40,9 @@ def test_sections_from_plain_values():
         ("data: {situations: []}", "data: situations must name"),
         ("objective: {nonsense: 1}", r"unknown key 'objective\.nonsense'"),
         ("objective: {bias: -1}", "objective: bias must be at least 0"),
-        ("objective: {bias_ramp: 0}", "objective: bias_ramp must be greater than 0"),
+        ("objective: {looks: [0.5, 1.5]}", "objective: looks must be a range within"),
         ("objective: {validation_draws: 1}", "objective: validation_draws must be at least 2"),
-        ("prior: {filters: 32}", "prior: filters"),
+        ("network: {channels: [8, 8]}", "network: channels must name 3 levels"),
         ("steps: 3.5", "steps must be a whole number"),
         ("steps: true", "steps must be a whole number"),
         ("steps: 0", "steps must be at least 1"),
@@ -51,7 +51,10 @@ def test_sections_from_plain_values():
         ("checkpoint_seconds: 121", "checkpoint_seconds must be at most 120"),
         ("ema: 1.0", "ema must be less than 1"),
         ("final_fraction: 2", "final_fraction must lie in"),
-        ("prior: 3", "prior must be a mapping"),
+        ("network: 3", "network must be a mapping"),
+        ("single: 1.5", "single must lie in"),
+        ("bfloat16: 1", "bfloat16 must be true or false"),
+        ("data: {pool: 0}", "data: pool must be at least 1"),
         ("- 3", "mapping"),
         ("a: [", "not YAML"),
     ],
@@ -66,4 +69,4 @@ def test_bad_values_name_the_key(text, message, tmp_path):
 
 def test_packaged():
     assert packaged_config("default").steps > packaged_config("quick").steps
-    assert packaged_config("finish").objective.bias_start == 4.0
+    assert packaged_config("default").network == {}

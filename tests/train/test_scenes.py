@@ -61,7 +61,7 @@ def test_content_of_many_scenes() -> None:
     assert 0.3 <= 1.0 - float(batch.has_core.float().mean()) <= 0.6
     assert bool(torch.isfinite(batch.image).all())
     # Five SD of texture beyond the ranges
-    assert float(batch.image.min()) >= config.fat[0] + config.free_contrast[0] - 75.0
+    assert float(batch.image.min()) >= config.fat[0] + config.wide_contrast[0] - 75.0
     assert float(batch.image.max()) <= config.calcification_hu[1] + 75.0
     for mask in (batch.core, batch.surround):
         assert float(mask.min()) >= 0.0

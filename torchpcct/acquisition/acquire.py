@@ -12,15 +12,18 @@ import torch
 from torch import Tensor
 
 from torchpcct.acquisition.bodies import Bodies
+from torchpcct.acquisition.detection import quanta, recorded, signal_spectra
 from torchpcct.acquisition.plan import Plan, make_plan
 from torchpcct.acquisition.transmission import SUB_RAY_COUNTS, Beam, expected_readings
 from torchpcct.acquisition.transmission import sub_rays as sub_rays_of
+from torchpcct.acquisition.voxels import acquire_voxels
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import VolumeGrid
-from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan, check_exposure
-from torchpcct.scanner.pileup import PileUpMap
+from torchpcct.scan import Scan
+from torchpcct.scan_checks import check_exposure
 from torchpcct.scanner.scanner import Scanner
 from torchpcct.scene.scene import Scene
+from torchpcct.scene.voxels import VoxelScene
 from torchpcct.validate import whole
 
 __all__ = ["acquire", "plan"]
@@ -43,7 +46,7 @@ def plan(
 
 
 def acquire(
-    scene: Scene,
+    scene: Scene | VoxelScene,
     scanner: Scanner,
     *,
     exposure_s: float | None = None,
@@ -58,7 +61,8 @@ def acquire(
     """Simulate a scan: exact chords, polychromatic, finite focal spot, cells and views, quantum noise.
 
     Args:
-        scene: nested analytic bodies (mm).
+        scene: nested analytic bodies (mm), or a voxel volume, of which the whole detector is computed without the blur
+            of focal spot and turning gantry; none of the arguments after ``seed`` applies to it but ``progress``.
         scanner: source, filters, bowtie, detector and geometry.
         exposure_s: duration of the (one-turn) scan in s at the source's current; None: expected readings.
         seed: realisation of the noise, ≥ 0. A reading's noise depends on the seed and its place alone.
@@ -76,22 +80,23 @@ def acquire(
 
     Raises:
         ValueError: ``exposure_s`` ≤ 0, a bad seed, bodies outside ``region``, a region outside the field of view, a
-            moving scene without ``rotation_s``.
+            moving scene without ``rotation_s``, a ``duty`` outside (0, 1], ``tolerance_hu`` below 0 or NaN.
+        TypeError: an argument of the wrong kind.
     """
     check_exposure(exposure_s)
     seed = whole("seed", seed, low=0)
+    if isinstance(scene, VoxelScene):
+        if region is not None or rotation_s is not None or sub_rays is not None or duty != 1.0:
+            raise ValueError("a voxel volume is scanned whole, at rest: leave out region, rotation_s, duty, sub_rays")
+        clean = acquire_voxels(scene, scanner, progress=progress)
+        return clean if exposure_s is None else clean.with_noise(exposure_s, seed)
     start = time.perf_counter()
     g = scanner.geometry
     bodies = Bodies.of(scene, g, exposure_s if rotation_s is None else rotation_s, duty)
     plan_ = make_plan(bodies, scanner, region, tolerance_hu, sub_rays)
     log.info("%s", plan_.table())
-    energies, spectra = scanner.weights()
     bins, integrating = scanner.detector.bins, scanner.detector.energy_integrating
-    if integrating:
-        # The variance is one more "bin": the same transmission, weighted by the squared signal.
-        spectra = np.concatenate([spectra, scanner.noise_weights()[1]])
-    spectra = spectra * scanner.mas_per_view(NOISE_FREE_EXPOSURE_S)
-    air = np.einsum("bce,r->brc", spectra, scanner.row_factor)
+    energies, spectra, air = signal_spectra(scanner)
     beam = Beam(spectra, scanner.row_factor, scanner.source.focal_spot, plan_.points)
     # One view for all: the densest sampling of every effect costs nothing here.
     dense, one = beam._replace(points=sub_rays_of(SUB_RAY_COUNTS[-1])), g.select([0])
@@ -99,12 +104,8 @@ def acquire(
     surround = expected_readings(one, DetectorWindow.full(one), symmetric, dense, step).numpy()[:, 0]
     counts = _readings(plan_, bodies, scanner, energies, beam, surround, progress)
     if plan_.pile_up is not None:
-        counts, air, surround = _recorded(plan_.pile_up, counts, air, surround, plan_.kept or DetectorWindow.full(g))
-    quantum = None
-    if integrating:
-        # In place: the readings of a whole detector are large. Behind a perfect absorber any energy will do.
-        dark = counts[:bins] <= 0
-        quantum = counts[bins:].div_(counts[:bins]).masked_fill_(dark, float(energies[-1]))
+        counts, air, surround = recorded(plan_.pile_up, counts, air, surround, plan_.kept or DetectorWindow.full(g))
+    quantum = quanta(scanner, counts, energies)
 
     def squeezed(t: Tensor) -> Tensor:
         return t[0] if bins == 1 else t[:bins]
@@ -156,16 +157,3 @@ def _readings(
         if progress is not None:
             progress(views.stop / g.views)
     return out
-
-
-def _recorded(
-    pile_up: PileUpMap, counts: Tensor, air: Any, surround: Any, kept: DetectorWindow
-) -> tuple[Tensor, Any, Any]:
-    """What a detector with dead time records of the expected counts: readings, air, surround."""
-    cells = torch.from_numpy(np.array(air))
-    part = cells[:, kept.first_row : kept.first_row + kept.rows]
-    for v, seen in enumerate(kept.column_indices):
-        counts[:, v] = pile_up.apply(counts[:, v], part[..., torch.from_numpy(seen)], seen)
-    columns = np.arange(air.shape[-1])
-    recorded = pile_up.apply(cells, cells, columns).numpy()
-    return counts, recorded, pile_up.apply(torch.from_numpy(np.array(surround)), cells, columns).numpy()

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from torchpcct.geometry import ConeBeam
+from torchpcct.geometry import ConeBeam, view_step
 from torchpcct.scene.chords import pack
 from torchpcct.scene.scene import Scene
 
@@ -96,11 +96,10 @@ class Bodies:
         if moving.any():
             travel = np.abs(scene.offsets(np.linspace(0, float(rotation_s or 0), 256))).max((0, 1))
             low, high = low - travel, high + travel
-        steps = np.diff(geometry.angles)
-        view_step = duty * float(np.median(np.abs(steps))) if steps.size else 0.0
+        step = duty * view_step(geometry.angles)
         circle = (float(x), float(y), radius)
         angle = float(geometry.angles[0])
-        return cls(scene, order, varying, kinds, params, low, high, circle, angle, view_step, rotation_s)
+        return cls(scene, order, varying, kinds, params, low, high, circle, angle, step, rotation_s)
 
     def at(self, energies: ArrayLike, geometry: ConeBeam, *, still: bool = False) -> BodySet:
         """All bodies at ``energies`` (keV) in the views of ``geometry``; ``still``: as if nothing moved."""

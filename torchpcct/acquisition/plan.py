@@ -23,6 +23,7 @@ from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import ConeBeam, VolumeGrid
 from torchpcct.scanner.pileup import PileUpMap
 from torchpcct.scanner.scanner import Scanner
+from torchpcct.validate import number
 
 __all__ = ["NOISE_MARGIN_COLUMNS", "Effect", "Plan", "make_plan"]
 
@@ -204,8 +205,10 @@ def make_plan(
         sub_ray_count: force a number of sub-rays instead of choosing it.
 
     Raises:
-        ValueError: bodies that vary outside ``region``, a region outside the field of view.
+        ValueError: bodies that vary outside ``region``, a region outside the field of view; a tolerance below 0 or NaN.
+        TypeError: a tolerance that is no number.
     """
+    number("tolerance_hu", tolerance_hu, low=0.0, unit="HU")
     g = scanner.geometry
     kept = None if region is None else _kept_window(g, region, bodies)
     probe = _Probe(bodies, scanner)

@@ -4,7 +4,8 @@ Reading order: ``placement`` and ``roi`` say where is measured, ``cnr`` is the p
 ``data_limit`` the best that any unbiased method can reach. ``bootstrap`` gives every figure its interval. With it
 ``dose_curve`` → ``contrast_slope`` → ``dose_factor`` answer what dose FBP needs for what a method shows. ``observer``
 asks whether the core is seen, ``resolution`` and ``noise_power`` how sharp and how noisy an image is, and
-``plaque_measures`` what a reader takes from it: lumen, core and cap.
+``plaque_measures`` what a reader takes from it: lumen, core and cap. ``residual_test`` asks whether a volume explains
+its data at all, ``half_split`` what noise and resolution a real scan has, without a truth.
 """
 
 from torchpcct.metrics.bootstrap import Estimate
@@ -47,6 +48,7 @@ from torchpcct.metrics.observer import (
     template_channel,
 )
 from torchpcct.metrics.plaque_measures import cap_thickness, lumen_area, threshold_contour
+from torchpcct.metrics.residual_test import ResidualTest, residual_test
 from torchpcct.metrics.resolution import (
     TransferFunction,
     edge_profile,
@@ -71,6 +73,7 @@ __all__ = [
     "NoisePower",
     "ObserverResult",
     "RegionNoise",
+    "ResidualTest",
     "TransferFunction",
     "auc",
     "auc_from_d_prime",
@@ -111,6 +114,7 @@ __all__ = [
     "noise_power_spectrum",
     "observe",
     "paper_cnr_ceiling",
+    "residual_test",
     "roi_bias",
     "sd_interval",
     "task_transfer",

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
-from torchpcct.validate import whole
+from torchpcct.validate import coverage, whole
 
 __all__ = ["Estimate", "bca_interval", "evaluate", "generator", "leave_one_out", "resampling"]
 
@@ -60,8 +60,7 @@ def bca_interval(value: float, draws: Any, jackknife: Any, level: float = 0.95) 
         jackknife: ``(realizations,)`` with one left out; not finite: no acceleration.
         level: coverage, in (0, 1).
     """
-    if not 0 < level < 1:
-        raise ValueError(f"level must lie in (0, 1), got {level}")
+    coverage("level", level)
     d = np.sort(np.asarray(draws, dtype=np.float64))
     n = d.size
     below = np.clip(((d < value).sum() + (d <= value).sum()) / 2, 0.5, n - 0.5) / n

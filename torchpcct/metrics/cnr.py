@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from torchpcct.metrics.bootstrap import generator
+from torchpcct.validate import coverage, number, whole
 
 __all__ = ["Interval", "cnr", "cnr_from_moments", "cnr_interval", "cnr_range", "mean_interval", "sd_interval"]
 
@@ -72,16 +73,29 @@ def cnr_from_moments(fg_mean: Any, fg_sd: Any, bg_mean: Any, bg_sd: Any) -> Any:
 
 
 def mean_interval(means: Any, level: float = 0.95) -> Interval:
-    """Student's interval for the mean over realisations, ``means`` ``(realisations,)``."""
+    """Student's interval for the mean over realisations, ``means`` ``(realisations,)``.
+
+    Raises:
+        ValueError: another shape, fewer than 2 realisations, NaN or Inf, a level outside (0, 1).
+    """
     m = _means("means", means)
+    if m.ndim != 1:
+        raise ValueError(f"means must have the shape (realisations,), got {m.shape}: take one ROI at a time")
+    coverage("level", level)
     half = stats.t.ppf(0.5 + level / 2, m.size - 1) * m.std(ddof=1) / np.sqrt(m.size)
     return Interval(float(m.mean() - half), float(m.mean() + half))
 
 
 def sd_interval(sd: float, realizations: int, level: float = 0.95) -> Interval:
-    """χ² interval for a standard deviation estimated from ``realizations`` normal draws: ×[0.69, 1.83] at n = 10."""
-    if realizations < 2:
-        raise ValueError(f"realizations must be at least 2, got {realizations}")
+    """χ² interval for a standard deviation estimated from ``realizations`` normal draws: ×[0.69, 1.83] at n = 10.
+
+    Raises:
+        ValueError: fewer than 2 realisations, a negative or non-finite standard deviation, a level outside (0, 1).
+        TypeError: a number of realisations that is not whole.
+    """
+    whole("realizations", realizations, low=2)
+    number("sd", sd, low=0.0)
+    coverage("level", level)
     dof = realizations - 1
     high, low = stats.chi2.ppf([0.5 - level / 2, 0.5 + level / 2], dof)
     return Interval(float(sd * np.sqrt(dof / low)), float(sd * np.sqrt(dof / high)))
@@ -96,8 +110,11 @@ def cnr_interval(
 ) -> Interval:
     """Generalised confidence interval for the CNR of correlated, jointly normal ROI means.
 
-    A percentile bootstrap is far too narrow at n = 10. Here the unknown covariance is drawn from the Wishart pivot
-    and the unknown means from their normal pivot (Weerahandi 1993), which keeps its coverage at small n.
+    A percentile bootstrap is far too narrow at n = 10 (it covers 82 %). Here the unknown covariance is drawn from the
+    Wishart pivot and the unknown means from their normal pivot (Weerahandi 1993). Coverage is near, not at, the level:
+    simulated at 95 % with n = 3 … 10, correlations −0.7 … 0.9 and SDs 1 : 4 … 4 : 1 (2000 to 3000 experiments each), it
+    was 93 to 98 %, lowest (93–94 %) for independent means whose SDs differ twofold; most values that are missed lie
+    above the interval.
 
     Args:
         foreground_means, background_means: ``(realisations,)`` paired ROI means, HU; at least 3.
@@ -108,6 +125,7 @@ def cnr_interval(
     fg, bg = _means("foreground_means", foreground_means), _means("background_means", background_means)
     if fg.ndim != 1 or fg.shape != bg.shape or fg.size < 3:
         raise ValueError(f"cnr_interval needs two 1-D arrays of ≥ 3 paired means, got {fg.shape} and {bg.shape}")
+    coverage("level", level)
     n = fg.size
     data = np.stack([fg, bg])
     scatter = np.cov(data) * (n - 1)
@@ -139,6 +157,7 @@ def cnr_range(
     """
     if realizations < 3:
         raise ValueError(f"realizations must be at least 3, got {realizations}")
+    coverage("level", level)
     try:
         root = np.linalg.cholesky(np.asarray(covariance, dtype=np.float64))
     except np.linalg.LinAlgError:

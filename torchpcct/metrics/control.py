@@ -32,6 +32,7 @@ from scipy import stats
 
 from torchpcct.metrics.bootstrap import Estimate
 from torchpcct.metrics.jackknife import Jackknifed, combined
+from torchpcct.validate import coverage
 
 __all__ = [
     "controlled_cnr",
@@ -234,4 +235,5 @@ def expected_half_width(realizations: int, correlation: float, level: float = 0.
     """
     if realizations < 2 or not 0 <= correlation <= 1:
         raise ValueError(f"need realizations ≥ 2 and 0 ≤ correlation ≤ 1, got {realizations} and {correlation}")
+    coverage("level", level)
     return math.exp(float(stats.norm.ppf(0.5 + level / 2)) * math.sqrt(2.0 * (1.0 - correlation**4) / realizations))

@@ -1,14 +1,21 @@
 """Noise of a uniform region as image quality reports have it: SD, radial NPS, noise magnitude and central frequency.
 
 Reconstructions are judged against FBP by two ratios of the radially averaged noise power spectrum NPS(f) of axial
-images (Greffier et al. 2020, Eur. Radiol. 30:3951; AAPM Task Group 233, 2019):
+images:
 
 * noise magnitude ratio NMR = √(∫ NPS_method df / ∫ NPS_FBP df): below 1 the method is less noisy;
 * central frequency ratio CFR = f̄_method / f̄_FBP with f̄ = ∫ f NPS df / ∫ NPS df: below 1 the noise is coarser, the
   "plastic" texture of strong iterative reconstruction.
 
-Both integrals weigh frequencies equally, as is the custom; the ratio of the SDs weighs them by 2πf. Neither says
-anything about resolution: see :mod:`torchpcct.metrics.matched_resolution`. Intervals are paired over realisations.
+f̄ is the first moment of the one-dimensional radial mean, each frequency weighing the same: so
+``pylinac.core.nps.average_power`` has it, and so we understand the average frequency of AAPM Task Group 233 (2019) and
+of Solomon et al. (2020, Med. Phys. 47:3961). Their noise magnitude is the SD, the root of the integral over the plane,
+∫ NPS 2πf df; the ratio of SDs is that of :attr:`RegionNoise.sd_hu`. In the NMR, the root of the plain one-dimensional
+integral, low frequencies count more. The names are those of phantom studies (Greffier et al. 2020, Eur. Radiol.
+30:3951). None of these papers was at hand for a check by the word: compare formulas, not names.
+
+Neither ratio says anything about resolution: see :mod:`torchpcct.metrics.matched_resolution`. Intervals are paired over
+realisations.
 """
 
 from __future__ import annotations

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from torchpcct.metrics.bootstrap import Estimate
+from torchpcct.validate import coverage
 
 __all__ = ["Jackknifed", "combined", "log_of_sum"]
 
@@ -44,8 +45,7 @@ class Jackknifed:
 
     def estimate(self, level: float = 0.95) -> Estimate:
         """The figure with Student's interval of n − 1 degrees of freedom."""
-        if not 0 < level < 1:
-            raise ValueError(f"level must lie in (0, 1), got {level}")
+        coverage("level", level)
         half = float(stats.t.ppf(0.5 + level / 2, self.left_out.size - 1)) * self.standard_error
         return Estimate(self.value, self.value - half, self.value + half)
 
@@ -53,6 +53,24 @@ class Jackknifed:
         """exp(scale · figure) with the interval of the figure: for logarithms of a variance (½: the SD)."""
         value, *ends = (math.exp(scale * v) for v in self.estimate(level))
         return Estimate(value, *sorted(ends))
+
+    def among(self, realizations: int) -> Jackknifed:
+        """The same figure as one of more realisations, of which those after its own leave it as it is.
+
+        So a figure of the first k of n draws combines with one of all n. Standard error, and covariance with the other
+        in large samples, stay; Student's quantile is that of n − 1.
+
+        Args:
+            realizations: n, at least those of the figure.
+        """
+        k, n = self.left_out.size, realizations
+        if n < k:
+            raise ValueError(f"realizations must be at least the {k} of the figure, got {n}")
+        # The jackknife's sum of squares has the factor (n − 1) / n.
+        spread = math.sqrt((k - 1) / k * n / (n - 1))
+        left_out = np.full(n, float(self.left_out.mean()))
+        left_out[:k] += spread * (self.left_out - self.left_out.mean())
+        return Jackknifed(self.value, left_out)
 
 
 def combined(function: Callable[..., Any], *figures: Jackknifed | float) -> Jackknifed:

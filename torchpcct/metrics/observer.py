@@ -21,6 +21,7 @@ from scipy.special import expit, logit, ndtr, ndtri
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.bootstrap import Estimate, bca_interval, evaluate, leave_one_out, resampling
 from torchpcct.metrics.roi import as_array
+from torchpcct.validate import coverage
 
 __all__ = [
     "ObserverResult",
@@ -200,8 +201,7 @@ def auc(present: Any, absent: Any, *, paired: bool = True, level: float = 0.95) 
     a, b = _pair(present, absent)
     if paired and a.size != b.size:
         raise ValueError(f"paired scores must be equally many, got {a.size} and {b.size}: set paired=False")
-    if not 0 < level < 1:
-        raise ValueError(f"level must lie in (0, 1), got {level}")
+    coverage("level", level)
 
     def beaten(scores: Floats, by: Floats) -> Floats:
         ordered = np.sort(scores)
@@ -333,5 +333,6 @@ def false_positive_difference(
 
     value = float(statistic(np.arange(a.size)[None])[0])
     drawn = evaluate(statistic, resampling(a.size, draws, seed))
+    coverage("level", level)
     low, high = np.quantile(drawn, [0.5 - level / 2, 0.5 + level / 2])
     return Estimate(value, float(low), float(high))

@@ -6,16 +6,18 @@ import math
 from typing import Any, cast
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import Geometry, VolumeGrid
 from torchpcct.projector.engine import Engine
+from torchpcct.projector.manners import Operator
 from torchpcct.projector.tables import Tables
 
 __all__ = ["Projector"]
 
 _DTYPES = (torch.float32, torch.float64)
+_NARROW = (torch.float16, torch.bfloat16)
 
 
 class _Pass(torch.autograd.Function):
@@ -47,7 +49,7 @@ def _apply(x: Tensor, engine: Engine, transposed: bool) -> Tensor:
     return cast(Tensor, _Pass.apply(x, engine, transposed))
 
 
-class Projector(nn.Module):
+class Projector(Operator):
     """Cell-averaged line integrals of a voxel grid, and the exact adjoint.
 
     The model is distance-driven (De Man and Basu 2004, Phys. Med. Biol. 49:2463): in every slab of voxels a reading is
@@ -59,11 +61,13 @@ class Projector(nn.Module):
         - ``A(x)``: ``(..., *domain_shape)`` → ``(..., *range_shape)``, any number of leading batch dimensions.
         - ``A.T(y)``: ``(..., *range_shape)`` → ``(..., *domain_shape)``.
 
-    In and out have one dtype (float32 or float64) and one device. Units: ``x`` in mm⁻¹ gives line integrals without
-    unit. Both directions are differentiable any number of times and work under ``torch.func``. NaN and Inf in the
-    input reach the output (a NaN may also reach readings that share a grid line with it). The module has no
-    parameters and no state. On CUDA the Triton kernels are used if Triton is installed and their first-use check
-    against the CPU passes; otherwise the data travel to the CPU and back.
+    In and out have one dtype (float32 or float64) and one device; float16 and bfloat16, as autocast leaves them, are
+    computed and returned in float32. ``A @ x``, ``A.H``, ``A.norm()`` and the operator in the form of other libraries
+    (``as_scipy``, ``as_pylops``, ``as_deepinv``) come from :class:`torchpcct.projector.manners.Operator`. Units: ``x``
+    in mm⁻¹ gives line integrals without unit. Both directions are differentiable any number of times and work under
+    ``torch.func``. NaN and Inf in the input reach the output (a NaN may also reach readings that share a grid line with
+    it). The module has no parameters and no state. On CUDA the Triton kernels are used if Triton is installed and their
+    first-use check against the CPU passes; otherwise the data travel to the CPU and back.
 
     Args:
         geometry: ``ParallelBeam`` or ``FanBeam`` with a 2-D grid, ``ConeBeam`` with a 3-D grid.
@@ -114,7 +118,7 @@ class Projector(nn.Module):
         return self._adjoint[0]
 
     def forward(self, x: Tensor) -> Tensor:
-        _check(x, self.domain_shape, "x", "A")
+        x = _checked(x, self.domain_shape, "x", "A")
         return _apply(x, self._engine, False)
 
     def memory_estimate(
@@ -145,7 +149,7 @@ class Projector(nn.Module):
         return f"{type(self.geometry).__name__}, {self.domain_shape} -> {self.range_shape}"
 
 
-class _Adjoint(nn.Module):
+class _Adjoint(Operator):
     """``A.T``: the transpose of a :class:`Projector`."""
 
     def __init__(self, projector: Projector) -> None:
@@ -165,18 +169,22 @@ class _Adjoint(nn.Module):
         return self.T.domain_shape
 
     def forward(self, y: Tensor) -> Tensor:
-        _check(y, self.domain_shape, "y", "A.T")
+        y = _checked(y, self.domain_shape, "y", "A.T")
         return _apply(y, self.T._engine, True)
 
     def extra_repr(self) -> str:
         return f"{type(self.T.geometry).__name__}, {self.domain_shape} -> {self.range_shape}"
 
 
-def _check(x: Any, inner: tuple[int, ...], name: str, operator: str) -> None:
+def _checked(x: Any, inner: tuple[int, ...], name: str, operator: str) -> Tensor:
+    """``x`` in float32 or float64."""
     if not isinstance(x, Tensor):
         raise TypeError(f"{operator}({name}) needs a torch.Tensor, got {type(x).__name__}: use torch.as_tensor({name})")
+    if x.dtype in _NARROW:  # of an autocast region: sums of hundreds of voxels need more digits
+        x = x.float()
     if x.dtype not in _DTYPES:
         raise TypeError(f"{operator}({name}) needs float32 or float64, got {x.dtype}: use {name}.float()")
     if tuple(x.shape[-len(inner) :]) != inner:
         raise ValueError(f"{operator}({name}) needs a tensor of shape (..., {', '.join(map(str, inner))}), "
                          f"got {tuple(x.shape)}")  # fmt: skip
+    return x

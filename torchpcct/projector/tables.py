@@ -76,8 +76,9 @@ class Tables:
     @cached_property
     def layer(self) -> float:
         """Spacing of the depth layers (cone beam), see :func:`layer_spacing`."""
-        _, _, row0, row_pitch = self.heights
-        return layer_spacing(self.pose, self.grid, row0, row_pitch, self.rays.rows)
+        # Of all rows, whichever the window keeps: a reading must not depend on what else is read.
+        rows = self.geometry.shape[1]
+        return layer_spacing(self.pose, self.grid, self.rays.row_edge, self.rays.row_pitch, rows)
 
 
 def layer_spacing(pose: NDArray[np.float64], grid: VolumeGrid, row0: float, row_pitch: float, rows: int) -> float:

@@ -8,7 +8,7 @@ every radius and in every geometry; other materials keep the small nonlinearity 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,14 +18,26 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from torchpcct.detector_window import DetectorWindow
-from torchpcct.validate import number, whole
+from torchpcct.validate import number, numbers, whole
 
-__all__ = ["WaterLinearisation"]
+__all__ = ["POLYNOMIAL_UP_TO", "WaterLinearisation"]
 
 Floats = NDArray[np.float64]
 
+POLYNOMIAL_UP_TO = 12.0
+"""Largest line integral for which a polynomial of :meth:`WaterLinearisation.polynomial` is taken at its word."""
 _ORDER = 7
 _SAMPLES = 400
+
+
+def _table(name: str, values: Any) -> Floats:
+    array = np.asarray(values)
+    if array.dtype.kind not in "fiu":
+        raise TypeError(f"{name} must hold real numbers, got {array.dtype}")
+    array = np.ascontiguousarray(array, dtype=np.float64)
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} must be finite, {int((~np.isfinite(array)).sum())} entries are NaN or Inf")
+    return array
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,11 +48,48 @@ class WaterLinearisation:
         coefficients: ``(columns, order)`` float64; ``mu_ref t = p Σ_k coefficients[k] (p / scale)^k``.
         scale: ``(columns,)`` the largest p of the calibration; the map continues straight beyond it and below 0.
         mu_ref: attenuation in mm⁻¹ that water is given.
+
+    Raises:
+        ValueError: tables of other shapes, of no column or no coefficient, NaN or Inf, a scale or ``mu_ref`` ≤ 0.
+        TypeError: tables that are not real numbers.
     """
 
     coefficients: Floats
     scale: Floats
     mu_ref: float
+
+    def __post_init__(self) -> None:
+        # The kernel reads by index and checks nothing: a table of another shape would be read beyond its end.
+        coefficients, scale = (_table(name, getattr(self, name)) for name in ("coefficients", "scale"))
+        if coefficients.ndim != 2 or scale.ndim != 1 or coefficients.shape[0] != scale.size or not coefficients.size:
+            raise ValueError(
+                "coefficients must have the shape (columns, order) and scale (columns,), got "
+                f"{coefficients.shape} and {scale.shape}"
+            )
+        if not (scale > 0).all():
+            column = int(np.argmin(scale > 0))
+            raise ValueError(f"scale must be greater than 0 in every column, column {column} has {scale[column]:g}")
+        object.__setattr__(self, "coefficients", coefficients)
+        object.__setattr__(self, "scale", scale)
+        object.__setattr__(self, "mu_ref", number("mu_ref", self.mu_ref, positive=True, unit="mm⁻¹"))
+
+    @classmethod
+    def polynomial(cls, coefficients: Sequence[float], columns: int, mu_ref: float) -> WaterLinearisation:
+        """The same polynomial ``c₁ p + c₂ p² + …`` in every column; ``(1.0,)`` leaves the line integrals as they are.
+
+        Args:
+            coefficients: c₁, c₂, … of line integrals p up to :data:`POLYNOMIAL_UP_TO`; beyond it and below 0 the map
+                continues straight.
+            columns: of the detector.
+            mu_ref: attenuation of water in mm⁻¹.
+
+        Raises:
+            ValueError, TypeError: no coefficients, values that are not finite numbers, ``mu_ref`` ≤ 0.
+        """
+        given = np.array(numbers("coefficients", coefficients))
+        scaled = given * POLYNOMIAL_UP_TO ** np.arange(given.size)
+        number("mu_ref", mu_ref, positive=True, unit="mm⁻¹")
+        return cls(np.tile(scaled, (columns, 1)), np.full(columns, POLYNOMIAL_UP_TO), float(mu_ref))
 
     @classmethod
     def calibrate(
@@ -87,6 +136,8 @@ class WaterLinearisation:
         columns = self.scale.size if window is None else window.columns
         if p.shape[-1] != columns:
             raise ValueError(f"p must have {columns} columns on its last axis, got shape {tuple(p.shape)}")
+        if p.dtype not in (torch.float32, torch.float64):
+            raise TypeError(f"p must be float32 or float64, got {p.dtype}")
         flat = p.detach().cpu().contiguous().reshape(-1, columns)
         if window is None:
             first = np.zeros(1, np.int64)
@@ -96,6 +147,8 @@ class WaterLinearisation:
                     f"p must have the shape (..., {window.views}, {window.rows}, {columns}) on this window, "
                     f"got {tuple(p.shape)}"
                 )
+            if int(window.first_column.max()) + columns > self.scale.size:
+                raise ValueError(f"the window reaches beyond the {self.scale.size} columns of the water correction")
             first = np.repeat(window.first_column, window.rows)
         out = torch.empty_like(flat)
         evaluate(flat.numpy(), first, self.coefficients, self.scale, slope, out.numpy())

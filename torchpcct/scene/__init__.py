@@ -3,7 +3,8 @@
 Read :mod:`~torchpcct.scene.scene` first (what a scene is, how bodies nest), then :mod:`~.bodies` and :mod:`~.tubes`
 (shapes), :mod:`~.materials` with its :mod:`~.materials_tables`, :mod:`~.motion`. :mod:`~.chords` packs shapes for the
 numba kernels of :mod:`~.chord_kernels`: exact path lengths of rays. :mod:`~.raster` fills voxels, for reference images
-only. Ready-made scenes: :mod:`~torchpcct.scene.plaque`, :mod:`~torchpcct.scene.phantoms`.
+only. :mod:`~.voxels` makes a scene of a CT volume. Ready-made scenes: :mod:`~torchpcct.scene.plaque`,
+:mod:`~torchpcct.scene.phantoms`.
 """
 
 from typing import TYPE_CHECKING, Any

@@ -53,6 +53,7 @@ class Body:
             raise TypeError(f"name must be a non-empty text, got {self.name!r}")
         if not isinstance(self.shape, Shape):
             raise TypeError(f"body {self.name!r}: shape must be a Shape, got {type(self.shape).__name__}")
+        material_of(self.material)  # an unknown one is refused here, not in the middle of a simulation
 
 
 class Scene:

@@ -24,6 +24,9 @@ __all__ = ["VMI_ENERGIES_KEV", "VmiCurve", "sample_covariance", "vmi", "vmi_curv
 
 Floats = NDArray[np.float64]
 
+_SINGULAR = 1e-5
+"""Of the product of the variances, by which rounding of float32 may push a singular covariance below 0."""
+
 VMI_ENERGIES_KEV = tuple(float(e) for e in range(40, 141))
 
 
@@ -94,11 +97,14 @@ def vmi_noise(
         ``(E, ...)`` in HU.
 
     Raises:
-        ValueError: a wrong shape, a variance below 0.
+        ValueError: a wrong shape, a variance below 0, an indefinite matrix, NaN.
     """
     c = _pair("covariance", covariance, 3)
     if bool((c[0] < 0).any()) or bool((c[2] < 0).any()):
         raise ValueError("covariance holds negative variances: pack it as C11, C12, C22")
+    # Rounding may leave the determinant of a singular covariance slightly below 0.
+    if not bool((c[1] ** 2 <= c[0] * c[2] * (1 + _SINGULAR)).all()):
+        raise ValueError("covariance is not that of two images (C12² > C11 · C22, or NaN): pack it as C11, C12, C22")
     g = torch.from_numpy(vmi_weights(basis, energies_kev, water)[0]).to(c)
     terms = torch.stack([g[:, 0] ** 2, 2 * g[:, 0] * g[:, 1], g[:, 1] ** 2], dim=1)
     return torch.tensordot(terms, c, dims=1).clamp_min(0).sqrt()

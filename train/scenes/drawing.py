@@ -70,7 +70,10 @@ def _draw(draw: Draw, extent: Triple, config: SceneConfig) -> TrainingScene:
     vessels: tuple[Vessel, ...] = ()
     free: tuple[Solid, ...] = ()
     if draw.chance(config.free_probability):
-        free = tuple(_draw_free(draw, extent, config, background) for _ in range(draw.count(*config.free_count)))
+        contrast = config.wide_contrast if draw.chance(config.wide_probability) else config.free_contrast
+        free = tuple(
+            _draw_free(draw, extent, config, background, draw(contrast)) for _ in range(draw.count(*config.free_count))
+        )
     else:
         cores = draw.chance(config.core_probability)
         vessels = (_draw_vessel(draw, extent, config, cores),)
@@ -87,14 +90,13 @@ def _draw(draw: Draw, extent: Triple, config: SceneConfig) -> TrainingScene:
     return TrainingScene(background, vessels, free, tuple(textures))
 
 
-def _draw_free(draw: Draw, extent: Triple, config: SceneConfig, background: float) -> Solid:
+def _draw_free(draw: Draw, extent: Triple, config: SceneConfig, background: float, contrast: float) -> Solid:
     shape = ("ellipsoid", "superquadric", "tube")[draw.count(0, 2)]
     axes = draw.axes(config.free_size)
     if shape == "tube":
         # An ellipsoid longer than any inset: a body of slowly varying section.
         axes = (*axes[:2], 5.0 * max(extent))
     x, y, z = (draw((-0.5 * e, 0.5 * e)) for e in extent[::-1])
-    contrast = draw(config.free_contrast)
     return Solid(
         kind="free",
         shape=shape,

@@ -39,7 +39,8 @@ class SceneConfig:
     Args:
         fat, muscle: HU of the background; muscle_probability: of the second one.
         free_probability: of free-standing bodies instead of vessels; free_count, free_contrast, free_size: their
-            number, contrast to the background, and semi-axes (log-uniform).
+            number, contrast to the background, and semi-axes (log-uniform); wide_probability: of free bodies with
+            wide_contrast instead, like bone, air or contrast agent.
         second_vessel: probability of a second vessel.
         diameter, wall, wall_hu, fibrous_hu: outer diameter, thickness and HU of the layers.
         lumen_hu, unenhanced_hu, unenhanced_probability: HU of the lumen with and without contrast agent.
@@ -67,6 +68,8 @@ class SceneConfig:
     free_count: tuple[int, int] = (2, 6)
     free_contrast: Range = (-150.0, 300.0)
     free_size: Range = (0.3, 3.0)
+    wide_probability: float = 0.3
+    wide_contrast: Range = (-900.0, 1500.0)
     second_vessel: float = 0.25
     diameter: Range = (2.0, 5.0)
     wall: Range = (0.1, 0.6)
@@ -83,7 +86,7 @@ class SceneConfig:
     narrowing: Range = (0.0, 0.6)
     swelling: Range = (-0.15, 0.2)
     bump_width: Range = (0.8, 4.0)
-    wander: Range = (-0.6, 0.6)
+    wander: Range = (-1.0, 1.0)
     wander_width: Range = (2.0, 5.0)
     core_probability: float = 0.7
     core_counts: tuple[float, ...] = (0.65, 0.25, 0.1)

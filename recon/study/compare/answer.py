@@ -106,11 +106,12 @@ def dose_section(data: dict[str, Any]) -> str:
         return ""
     truth = data["true_values"]
     first = data["dose_factors"][0]
+    counts = " / ".join(str(e["realizations"]) for e in data["dose_factors"])
     parts = [
         "## Dose factors of MBIR against FBP soft 0.25 mm",
         "How many times the dose FBP needs for the same figure; square brackets: 95 %. FBP: exact. "
         + (
-            f"MBIR: {first['realizations']} paired draws with a linear control whose moments are exact (correlation of "
+            f"MBIR: {counts} paired draws with a linear control whose moments are exact (correlation of "
             "the contrasts, paper's ROIs / whole lesion: "
             + ", ".join(
                 f"{e['exposure_s']:.2f} s {e['contrast']['roi']['correlation']:.3f} / "
@@ -119,7 +120,7 @@ def dose_section(data: dict[str, Any]) -> str:
             )
             + "). "
             if first["controlled"]
-            else f"MBIR: {first['realizations']} paired draws. "
+            else f"MBIR: {counts} paired draws. "
         )
         + f"True contrast {truth['contrast_hu']:.1f} HU (rods of each tissue at the plaque's place). Slope: change of "
         "the contrast with the core put in, over the true one, from a twin without core and with the same noise; "

@@ -2,12 +2,7 @@
 
 The twin without core has the SAME noise: its b is that of the plaque plus the difference of the two noise-free ones.
 
-The control is the method's own first-order response about the noise-free b: one backward pass gives
-g = ∂(ROI mean)/∂b, and g·b of every draw costs nothing. Any functional g·b has the exactly known mean g·E[b] and
-variance gᵀ Cov(b) g of the readings' noise, whatever the method; the closer g follows the method, the higher the
-correlation and the narrower the interval (:mod:`torchpcct.metrics.control`). Measured at 0.35 s with 246 views, n = 24:
-correlation of MBIR's contrast in the paper's ROIs / in the whole lesion 0.999 / 0.997 with its own response, 0.995 /
-0.983 with its data steps alone, 0.850 / 0.966 with the dose-factor study's linear filter.
+The control is the method's own first-order response (:mod:`recon.study.dose_factor.response`).
 """
 
 from __future__ import annotations
@@ -21,11 +16,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.pwls.inset_problem import InsetProblem
-from recon.study.dose_factor.exact_linear import statistic_covariance
+from recon.study.dose_factor.response import Response
 from torchpcct.metrics.roi import RoiMean
-from torchpcct.scan import Scan
 
-__all__ = ["Control", "Draws", "linear_control", "reconstruct_draws"]
+__all__ = ["Draws", "reconstruct_draws"]
 
 Floats = NDArray[np.float64]
 Method = Callable[[InsetProblem, Tensor, float], Tensor]
@@ -33,24 +27,6 @@ Method = Callable[[InsetProblem, Tensor, float], Tensor]
 
 BATCH = 5
 """Volumes at a time."""
-
-
-@dataclass(frozen=True, eq=False)
-class Control:
-    """Linear functionals of b, one for each ROI, with their exact moments at one exposure.
-
-    Attributes:
-        adjoints: ``(rois, z, y, x)`` g in HU per unit of b; mean: ``(rois,)``; covariance: ``(rois, rois)`` HU².
-    """
-
-    adjoints: Tensor
-    mean: Floats
-    covariance: Floats
-
-    def of(self, b: Tensor) -> Floats:
-        """Of statistics ``(n, z, y, x)``: ``(n, rois)`` HU."""
-        found: Floats = torch.einsum("nzyx,rzyx->nr", b.to(torch.float64), self.adjoints).numpy()
-        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,38 +48,7 @@ class Draws:
     fat: Floats
     images: tuple[Tensor, Tensor]
     controls: Floats | None = None
-    control: Control | None = None
-
-
-def linear_control(
-    method: Method, problem: InsetProblem, rois: Sequence[RoiMean], clean: Scan, statistic: Tensor, exposure_s: float
-) -> Control:
-    """The first-order response of a method's ROI means about the noise-free b.
-
-    Args:
-        method: differentiable in b.
-        problem: of the scan.
-        rois: on the problem's grid.
-        clean: the noise-free scan.
-        statistic: ``(z, y, x)`` its b with the weights of ``exposure_s``.
-        exposure_s: in s.
-
-    Raises:
-        ValueError: a method that autograd cannot see through.
-    """
-    weights = torch.stack([r.weights for r in rois])
-    gradients = []
-    for weight in weights:  # one at a time: the graph of all would hold several GB
-        with torch.enable_grad():
-            leaf = statistic[None].clone().requires_grad_()
-            volume = method(problem, leaf, exposure_s)
-            if not volume.requires_grad:
-                raise ValueError("the control's method must be differentiable in b")
-            (gradient,) = torch.autograd.grad((volume[0] * weight.to(volume)).sum(), leaf)
-        gradients.append(gradient[0].to(torch.float64))
-    g = torch.stack(gradients)
-    mean = torch.einsum("zyx,rzyx->r", statistic.to(torch.float64), g).numpy()
-    return Control(g, mean, statistic_covariance(problem, g, exposure_s, clean))
+    control: Response | None = None
 
 
 def reconstruct_draws(
@@ -114,7 +59,7 @@ def reconstruct_draws(
     noisy: Tensor,
     change: Tensor,
     exposure_s: float,
-    control: Control | None = None,
+    control: Response | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Draws:
     """Reconstruct the draws of one exposure with and without the core.
@@ -126,7 +71,7 @@ def reconstruct_draws(
         noisy: ``(n, z, y, x)`` b of the draws.
         change: ``(z, y, x)`` what taking the core away adds to the noise-free b.
         exposure_s: in s.
-        control: of :func:`linear_control`.
+        control: of :func:`recon.study.dose_factor.response.first_order_response`.
         progress: called with the finished fraction.
     """
     where = torch.from_numpy(fat)

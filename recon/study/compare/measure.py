@@ -6,7 +6,6 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +18,12 @@ from recon.fbp.exact_noise import roi_covariance
 from recon.fbp.inset import InsetFbp
 from recon.mbir.mbir import Mbir
 from recon.pwls.inset_problem import InsetProblem
-from recon.study.compare.draws import Draws, linear_control, reconstruct_draws
+from recon.study.compare.draws import Draws, reconstruct_draws
 from recon.study.compare.placements import Placements, vary_placement
 from recon.study.compare.reference import Reference, exact_reference
 from recon.study.compare.regions import Regions
 from recon.study.compare.settings import Settings
+from recon.study.dose_factor.response import first_order_response
 from recon.study.paper import facts as paper
 from recon.study.paper.plaque_scan import (
     REFERENCE_KERNEL,
@@ -142,7 +142,7 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
         if pwls is not None and exposure in settings.pwls_s:
             _run_pwls(m, scanned, pwls, exposure, scans, progress)
             clock.lap("PWLS")
-        if mbir is not None and exposure in settings.mbir_s:
+        if mbir is not None and settings.mbir_draws(exposure):
             mbir(exposure)
     return m
 
@@ -188,12 +188,18 @@ def _realisations(
                 if k == 0 and exposure == paper.table_exposure(s.doses):
                     m.images["fbp", kernel, voxel] = volume
         clock.lap("FBP")
-        if mbir is not None and exposure in s.mbir_s:
+        if mbir is not None and k < s.mbir_draws(exposure):
             mbir.take(scan)
             clock.lap("MBIR")
         if s.pwls and exposure in s.pwls_s:
             kept.append(scan)
         progress("noise realisations, FBP", (before + k + 1) / (len(s.doses) * s.realizations))
+    if mbir is not None:
+        for k in range(s.realizations, s.mbir_draws(exposure)):
+            scan = scanned.clean.with_noise(exposure, s.seed + k)
+            clock.lap("noise")
+            mbir.take(scan)
+            clock.lap("MBIR")
     m.means.update({key: np.array(values) for key, values in means.items()})
     m.voxel_noise.update({key: math.sqrt(value) for key, value in squares.items()})
     return kept
@@ -248,6 +254,7 @@ class _MbirRun:
         self.grid = inset_grid(regions.plaque, self.network.voxel_mm)
         self.problem = InsetProblem(self.clean, self.grid)
         self.rois, self.fat = regions.on(self.grid), regions.fat(self.grid)
+        self.weights = torch.stack([r.weights for r in self.rois])
         self.statistic = self.problem.statistic(self.clean).b
         self.change = self.problem.statistic(absent).b - self.statistic
         self.noisy: list[torch.Tensor] = []
@@ -263,9 +270,7 @@ class _MbirRun:
         control = None
         if m.settings.control:
             self.progress("control of MBIR", 0.0)
-            # Without torch.no_grad, for the backward pass.
-            through = partial(Mbir.__call__.__wrapped__, self.network)  # type: ignore[attr-defined]
-            control = linear_control(through, self.problem, self.rois, self.clean, clean, exposure)
+            control = first_order_response(self.network, self.problem, self.weights, clean, exposure, self.clean)
             self.clock.lap("control of MBIR")
         draws = reconstruct_draws(
             self.network, self.problem, self.rois, self.fat, torch.stack(self.noisy), self.change * exposure, exposure,
@@ -275,7 +280,7 @@ class _MbirRun:
         self.clock.lap("MBIR")
         m.draws[exposure] = draws
         voxel = self.grid.spacing[0]
-        m.means[*MBIR, voxel, exposure] = draws.means[:, :2]
+        m.means[*MBIR, voxel, exposure] = draws.means[: m.settings.realizations, :2]
         if exposure == paper.table_exposure(m.settings.doses):
             m.grids[voxel] = self.grid
             m.images[*MBIR, voxel] = draws.images[0]

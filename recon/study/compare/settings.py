@@ -23,6 +23,8 @@ class Settings(StudySettings):
         kernels, voxels_mm, doses: the axes of the tables.
         pwls: whether to run PWLS; pwls_s: exposures at which it is run, those of ``doses``.
         mbir: whether to run MBIR, and with it the dose factors; mbir_s: exposures, those of ``doses``.
+        low_dose_draws: realisations of MBIR at the lowest of its exposures, at least ``realizations``: its figures vary
+            most there. The tables have the first ``realizations``.
         control: whether MBIR's figures are controlled by a linear functional of the same noise, which is worth its time
             from 8 realisations.
         placements: whether the checks outside their tolerance are computed again with ROIs and grid moved.
@@ -41,6 +43,7 @@ class Settings(StudySettings):
     pwls_s: tuple[float, ...] = (0.35, 2.00)
     mbir: bool = True
     mbir_s: tuple[float, ...] = (0.35, 0.70, 2.00)
+    low_dose_draws: int = 20
     control: bool = True
     placements: bool = True
 
@@ -53,17 +56,25 @@ class Settings(StudySettings):
         "doses": {"1x": 0.35, "5.7x": 2.00},
         "pwls": False,
         "mbir_s": (0.35, 2.00),
+        "low_dose_draws": 8,
         "placements": False,
     }
 
     def __post_init__(self) -> None:
-        self.check_whole(realizations=3, seed=0, views=8)
+        self.check_whole(realizations=3, low_dose_draws=0, seed=0, views=8)
         least = (8 if self.control else 5) if self.mbir else 3
         if self.realizations < least:
             raise ValueError(
                 f"realizations must be at least {least} for MBIR{' with control' if self.control else ''}, got "
                 f"{self.realizations}: set mbir=False{', or control=False from 5' if self.control else ''}"
             )
+
+    def mbir_draws(self, exposure_s: float) -> int:
+        """Realisations of MBIR at an exposure; 0: none."""
+        own = self.exposures(self.mbir_s) if self.mbir else ()
+        if exposure_s not in own:
+            return 0
+        return max(self.realizations, self.low_dose_draws) if exposure_s == min(own) else self.realizations
 
     def exposures(self, wanted: tuple[float, ...]) -> tuple[float, ...]:
         """Those of ``wanted`` that are among the doses."""

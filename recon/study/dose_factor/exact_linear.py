@@ -14,9 +14,6 @@ gives g, and with it
 Adjoints. A converged solve (H + Q)⁻¹ is its own adjoint: the method itself is run on the ROI (``"solve"``). A fixed
 number of steps is not symmetric: its adjoint is the vector-Jacobian product by autograd (``"vjp"``). Both are checked
 against the forward method, and a method that is not linear is refused.
-
-Directions of vessel smoothing depend on the data, so MBIR without its network is linear only at directions that are
-given: :class:`DataSteps` takes those of one statistic, e.g. the noise-free one.
 """
 
 from __future__ import annotations
@@ -31,13 +28,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.fbp.exact_noise import line_integral_variance
-from recon.mbir.mbir import Mbir
-from recon.mbir.prior import LearnedPrior
-from recon.mbir.unrolled import Unrolled
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
 from torchpcct.validate import choice, number
 
-__all__ = ["DataSteps", "ExactLinear", "exact_linear", "statistic_covariance"]
+__all__ = ["ExactLinear", "exact_linear", "statistic_covariance"]
 
 Floats = NDArray[np.float64]
 
@@ -202,42 +196,3 @@ def _by_autograd(method: Any, problem: Any, weights: Tensor, b: Tensor, exposure
             return None
         (gradient,) = torch.autograd.grad((volumes * weights.to(volumes)).sum(), leaf)
     return gradient.to(torch.float64)
-
-
-class _Silent(LearnedPrior):
-    """The learned prior without its network: the quadratic part and what sets the step lengths stay."""
-
-    def gradient(self, u: Tensor, scale_hu: Tensor) -> Tensor:
-        return torch.zeros_like(u)
-
-
-class DataSteps:
-    """MBIR without its network: the same unrolled steps on the data, the quadratic part and the vessel smoothing.
-
-    Linear, because the directions of the smoothing are those of a given statistic. With ``statistic=None`` they are
-    those of each b, as in MBIR; then it is not linear.
-
-    Args:
-        network: with its weights.
-        statistic: ``(z, y, x)`` of :attr:`exposure_s`, e.g. the noise-free one.
-        name: of the method.
-    """
-
-    def __init__(self, network: Mbir, statistic: Tensor | None = None, name: str = "mbir_data_steps") -> None:
-        model = network.model
-        quiet = Unrolled(model.prior.config, steps=model.steps, add_back=model.add_back)
-        quiet.prior = _Silent(model.prior.config)
-        quiet.to(model.log_step).load_state_dict(model.state_dict())
-        self.network, self.statistic, self.name = Mbir(quiet), statistic, name
-
-    def __call__(self, problem: Any, b: Tensor, exposure_s: float) -> Tensor:
-        """Volumes in HU, ``(batch, z, y, x)``; differentiable in b."""
-        model, normal = self.network.model, self.network.problem(problem, b, exposure_s)
-        directions = normal
-        if self.statistic is not None:
-            directions = self.network.problem(problem, self.statistic.to(b)[None], exposure_s)
-        smoothing = model.vessel_smoothing(directions)
-        u = model.descend(normal, smoothing)
-        if model.add_back is not None:
-            u = model.descend(model.added_back(normal, u), smoothing)
-        return self.network._hu(problem, u, normal)

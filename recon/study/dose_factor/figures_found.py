@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.study.dose_factor.controls import Controls
 from recon.study.dose_factor.measure import Measured
 from recon.study.dose_factor.measures import DOG_CHANNELS, OBSERVERS
 from recon.study.dose_factor.merit import Figures
@@ -17,7 +18,6 @@ from torchpcct.metrics import (
     Jackknifed,
     NoisePower,
     RegionNoise,
-    controlled_log_variance,
     controlled_mean,
     jackknifed_f50,
     task_transfer,
@@ -159,25 +159,18 @@ class _Control:
         self.count = len(c["covariance"]) // (2 * len(ROIS) + len(OBSERVERS) * _CHANNELS)
         shape = (-1, self.count, c["covariance"].shape[0] // self.count)
         self.mean_readings = c["mean"].reshape(shape)  # (scenes, controls, rows)
-        self.readings = c["readings"].reshape(shape)
-        self.covariance = c["covariance"].reshape(shape[1], shape[2], shape[1], shape[2])
+        covariance = c["covariance"].reshape(shape[1], shape[2], shape[1], shape[2])
+        self.known = Controls(c["readings"].reshape(shape), self.mean_readings[0], covariance)
         self.fbp, self.exact_fbp = c.get("fbp"), m.fbp[_base()]
         self.dose = dose
 
-    def _of(self, h: Floats, n: int) -> tuple[Floats, Floats]:
-        """Deviations ``(n, controls)`` of a combination of ROI readings, and their covariance."""
-        k = len(h)
-        deviation = (self.readings[:n] - self.mean_readings[0])[..., :k] @ h
-        return deviation, np.einsum("i,aibj,j->ab", h, self.covariance[:, :k, :, :k], h)
-
     def mean(self, readings: Floats, h: Floats) -> Jackknifed:
         """Expectation of a combination of ROI readings."""
-        deviation, _ = self._of(h, len(readings))
-        return controlled_mean(readings[:, : len(h)] @ h, deviation, np.zeros(self.count))
+        return self.known.expectation(readings[:, : len(h)] @ h, h)
 
     def log_variance(self, readings: Floats, h: Floats) -> Jackknifed:
         """ln of its variance."""
-        return controlled_log_variance(readings[:, : len(h)] @ h, *self._of(h, len(readings)))
+        return self.known.log_variance(readings[:, : len(h)] @ h, h)
 
     def detectability(self, present: Floats, absent: Floats, observer: str) -> Jackknifed | None:
         """ln d′² of the observer, less what the controls' own, of the same draws and training, differ from theirs."""
@@ -189,9 +182,9 @@ class _Control:
         controls, exact = [], []
         for k in range(self.count):
             delta = self.mean_readings[0, k, use] - self.mean_readings[1, k, use]
-            seen = self.readings[:n, k, use]
+            seen = self.known.readings[:n, k, use]
             controls.append(log_detectability(seen, seen - delta))
-            exact.append(_log_exact(delta, self.covariance[k, use, k, use]))
+            exact.append(_log_exact(delta, self.known.covariance[k, use, k, use]))
         if self.fbp is not None:
             readings = self.exact_fbp["readings"]
             delta = readings[0, use] - readings[1, use]

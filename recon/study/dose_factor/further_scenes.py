@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
-import numpy as np
-
-from recon.study.dose_factor.estimates import estimate, mean_of, paper_cnr
-from recon.study.dose_factor.exact import Exact, contrast_sd
+from recon.study.dose_factor.exact import Exact
+from recon.study.dose_factor.merit import attempt, joint, json_of
 from recon.study.dose_factor.scene import SceneFacts
-from torchpcct.metrics import auc, auc_from_d_prime, roi_bias
+from recon.study.dose_factor.seen import Seen
 
 __all__ = ["scene_rows"]
 
@@ -23,56 +20,35 @@ def scene_rows(exact: Exact) -> list[dict[str, Any]]:
     rows = []
     for name in exact.m.scenes:
         for dose in exact.s.scene_doses:
-            rows.append(_fbp_row(exact, name, dose))
+            rows.append(_row(exact.facts[name], name, dose, f"FBP {exact.base}", _fbp(exact, name, dose)))
             rows += [
-                _method_row(exact, k, name, dose) for k in exact.s.scene_methods if (k, name, dose) in exact.m.extra
-            ]
+                _row(exact.facts[name], name, dose, k, Seen.of(exact.m.extra[k, name, dose]))
+                for k in exact.s.scene_methods if (k, name, dose) in exact.m.extra
+            ]  # fmt: skip
     return rows
 
 
-def _head(facts: SceneFacts, name: str, dose: float, method: str) -> dict[str, Any]:
-    return {
-        "scene": name, "exposure_s": dose, "method": method,
-        "truth_hu": facts.truth_hu.tolist(), "true_contrast_hu": facts.contrast_hu,
-    }  # fmt: skip
-
-
-def _fbp_row(exact: Exact, name: str, dose: float) -> dict[str, Any]:
+def _fbp(exact: Exact, name: str, dose: float) -> Seen:
     facts, twin = exact.facts[name], exact.facts.get(f"{name}:absent")
-    c = facts.fbp_covariance[exact.base] / dose
-    sd = contrast_sd(c)
-    fg, bg = facts.fbp_hu[exact.base]
-    row = {
-        **_head(facts, name, dose, f"FBP {exact.base}"), "exact": True,
-        "bias_hu": [{"value": float(v)} for v in (fg, bg) - facts.truth_hu],
-        "contrast_hu": {"value": float(bg - fg)}, "contrast_sd_raw_hu": sd,
-        "paper_cnr": {"value": float((bg - fg) / math.sqrt(c[0, 0] + c[1, 1]))},
-    }  # fmt: skip
-    if twin is not None:
-        without = twin.fbp_contrast(exact.base)
-        row["false_contrast_hu"] = {"value": without}
-        row["auc"] = {"value": auc_from_d_prime(abs(bg - fg - without) / sd)}
-    elif abs(facts.contrast_hu) < _NO_CONTRAST_HU:
-        row["false_contrast_hu"] = row["contrast_hu"]
-    return row
+    assert facts.fbp_covariance is not None
+    return Seen.of_moments(facts.fbp_hu, facts.fbp_covariance / dose, None if twin is None else twin.fbp_hu)
 
 
-def _method_row(exact: Exact, method: str, name: str, dose: float) -> dict[str, Any]:
-    facts, entry = exact.facts[name], exact.m.extra[method, name, dose]
-    roi = entry["roi"].astype(np.float64)
-    contrast = roi[:, 1] - roi[:, 0]
+def _row(facts: SceneFacts, name: str, dose: float, method: str, seen: Seen) -> dict[str, Any]:
+    contrast = json_of(seen.contrast)
     row = {
-        **_head(facts, name, dose, method), "exact": False, "realizations": len(roi),
-        "bias_hu": [estimate(e) for e in roi_bias(roi, facts.truth_hu)],
-        "contrast_hu": mean_of(contrast), "contrast_sd_raw_hu": float(contrast.std(ddof=1)),
-        "paper_cnr": paper_cnr(roi),
+        "scene": name, "exposure_s": dose, "method": method, "realizations": seen.realizations,
+        "truth_hu": facts.truth_hu.tolist(), "true_contrast_hu": facts.contrast_hu,
+        "bias_hu": [
+            json_of(joint(lambda v, t=t: v - t, figure))
+            for figure, t in zip((seen.core, seen.fibrous), facts.truth_hu.tolist(), strict=True)
+        ],
+        "contrast_hu": contrast, "contrast_sd_hu": json_of(seen.log_contrast, 0.5), "paper_cnr": seen.cnr(),
     }  # fmt: skip
-    if "absent" in entry:
-        without = entry["absent"].astype(np.float64)
-        false = without[:, 1] - without[:, 0]
-        sign = 1.0 if facts.contrast_hu > 0 else -1.0
-        row["false_contrast_hu"] = mean_of(false)
-        row["auc"] = estimate(auc(sign * contrast, sign * false))
+    if seen.absent is not None:
+        row["false_contrast_hu"] = json_of(seen.absent)
+        row["slope"] = attempt(lambda: json_of(seen.slope(facts.contrast_hu)))
+        row["auc"] = attempt(lambda: seen.auc(1.0 if facts.contrast_hu > 0 else -1.0))
     elif abs(facts.contrast_hu) < _NO_CONTRAST_HU:
-        row["false_contrast_hu"] = row["contrast_hu"]
+        row["false_contrast_hu"] = contrast
     return row

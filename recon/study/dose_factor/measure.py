@@ -32,6 +32,7 @@ from recon.study.dose_factor.exact_figures import fbp_figures, linear_figures
 from recon.study.dose_factor.exact_linear import statistic_covariance
 from recon.study.dose_factor.measures import segmentation
 from recon.study.dose_factor.methods import Method, fingerprint, load_methods
+from recon.study.dose_factor.places import Place, Places, ScenePlace
 from recon.study.dose_factor.readings import Readings
 from recon.study.dose_factor.realisations import NOISY_SCENE, Realisations, joined
 from recon.study.dose_factor.scene import SceneFacts, StudyScene
@@ -47,7 +48,7 @@ from recon.study.dose_factor.settings import (
 from recon.study.dose_factor.shape_limit import shape_limits
 from recon.study.dose_factor.stability import worst_case_gains
 from recon.study.dose_factor.store import Store
-from recon.study.dose_factor.vessels import VesselScans
+from recon.study.dose_factor.vessels import VesselPlace
 from recon.study.study import Clock, Progress, silent
 
 __all__ = ["Measured", "measure"]
@@ -73,8 +74,7 @@ class Measured:
             ``mean (scenes, 2 · rows)`` and ``covariance``; ``fbp (n, channels)`` of FBP of the same readings.
         samples: (method, scene, dose) → ``readings (n, rows)``, with and without the core ``plane`` and ``z``
             ``(n, bins)``; of the paper's scene also ``fat``, ``square`` and ``shape``.
-        extra: (method, scene, dose) → ``roi`` and, with the core replaced by fibrous tissue, ``absent`` ``(n, 2)``.
-        vessels: (method, vessel, dose) → what :class:`recon.study.dose_factor.vessels.VesselScans` reads.
+        extra, vessels: (method, scene or vessel, dose) → :meth:`recon.study.dose_factor.places.Places.found`.
         volumes: (method or "fbp", scene, dose) → first realisation, HU.
         gains: dose → method or FBP variant → worst-case response, HU mm^1.5.
         shape_limits: dose → displacement of the outlines in mm → smallest contrast SD, HU.
@@ -153,8 +153,8 @@ class _Study:
         for method in self.methods:
             if method.name not in LINEAR_METHODS:
                 self._main(method)
-        self._extra()
-        self._vessels()
+        m.extra = self._elsewhere("further scenes", partial(ScenePlace, self.noise), m.scenes)
+        m.vessels = self._elsewhere("vessels", partial(VesselPlace, self.noise), s.vessels)
         m.gains = self._bounds(worst_case_gains, self.methods)
         m.shape_limits = self._bounds(shape_limits)
 
@@ -310,38 +310,19 @@ class _Study:
         wanted = bool(self.m.scenes or s.vessels)
         return [m for m in load_methods(s.scene_methods) if m.name not in IMAGE_METHODS] if wanted else []
 
-    def _vessels(self) -> None:
-        jobs = VesselScans(self.noise).jobs(self.settings.vessels, self._scene_methods())
-        self.m.vessels = {key: joined(pieces) for key, pieces in self._collected("vessels", jobs).items()}
-
-    def _extra(self) -> None:
-        s, methods = self.settings, self._scene_methods()
-        jobs = [
-            ((method.name, name, dose), partial(self._extra_piece, method, name, dose, block))
-            for name in self.m.scenes for dose in s.scene_doses for block in s.blocks(s.scene_n) for method in methods
-        ]  # fmt: skip
-        self.m.extra = {key: joined(pieces) for key, pieces in self._collected("further scenes", jobs).items()}
-
-    def _extra_piece(self, method: Method, name: str, dose: float, block: range) -> dict[str, Any]:
-        """ROI means with the scene's core and, on the same noise, with fibrous tissue in its place."""
-        scene = self.scene(name)
-
-        def compute() -> dict[str, Any]:
-            noise = self.noise.gram_noise(name, dose, block)
-            rois = scene.rois.on(scene.grid)
-            result: dict[str, Any] = {}
-            for label, other in (("roi", name), ("absent", f"{name}:absent")):
-                if name == "core_for_fibrous" and label == "absent":
-                    continue
-                b = torch.from_numpy(self.scene(other).facts.statistic) * dose + noise
-                volume, _ = _timed(method, scene, b, dose)
-                result[label] = torch.stack([r(volume) for r in rois], dim=-1).numpy()
-                if block.start == 0 and label == "roi":
-                    result["first"] = volume[0].numpy().astype(np.float16)
-            return result
-
-        place = f"methods/{method.name}/{name}_{dose:g}s_{block.start}-{block.stop}"
-        return self.store.piece(place, f"{self.noise.key} {fingerprint(method)}", compute)
+    def _elsewhere(self, step: str, of: Callable[[str], Place], names: Sequence[str]) -> dict[Any, dict[str, Any]]:
+        """Every method at the places of these names: (method, name, dose) → what is found."""
+        places, methods = Places(self.noise), self._scene_methods()
+        jobs = [(m, name, d) for name in names for m in methods for d in self.settings.scene_doses]
+        found, place = {}, None
+        for done, (method, name, dose) in enumerate(jobs):
+            self.report(step, done / len(jobs))
+            if place is None or place[0] != name:
+                place = (name, of(name))  # one at a time: what it keeps is large
+            found[method.name, name, dose] = places.found(method, place[1], dose)
+            if done + 1 == len(jobs):
+                self.report(step, 1.0)
+        return found
 
     def _bounds(self, compute: Callable[..., dict[Any, float]], *arguments: Any) -> dict[float, dict[Any, float]]:
         """A bound at every dose, if the settings ask for them."""

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.study.dose_factor.estimates import attempt, none
 from recon.study.dose_factor.measures import OBSERVERS
 from recon.study.dose_factor.readings import DIRECTIONS
 from recon.study.dose_factor.settings import ROIS
@@ -26,7 +25,7 @@ from torchpcct.metrics import (
     matched_noise_ratio,
 )
 
-__all__ = ["FACTOR_NAMES", "Figures", "entry_of", "factors_of", "json_of"]
+__all__ = ["FACTOR_NAMES", "Figures", "attempt", "entry_of", "factors_of", "joint", "json_of", "none"]
 
 Floats = NDArray[np.float64]
 Figure = float | Jackknifed
@@ -118,6 +117,19 @@ def json_of(figure: Figure, scale: float | None = None) -> dict[str, Any]:
     return {"value": figure if scale is None else math.exp(scale * figure)}
 
 
+def none(why: str) -> dict[str, Any]:
+    """No figure, and the reason."""
+    return {"value": None, "low": None, "high": None, "why": why}
+
+
+def attempt(compute: Callable[[], Any]) -> Any:
+    """The figure, or why there is none."""
+    try:
+        return compute()
+    except ValueError as error:
+        return none(str(error))
+
+
 def _root_of(bias: Figure, log_variance: Figure) -> dict[str, Any]:
     """Root mean square error of a value."""
     return json_of(joint(lambda b, v: np.log(np.square(b) + np.exp(v)), bias, log_variance), 0.5)
@@ -144,11 +156,14 @@ def entry_of(figures: Figures, reference: Figures, truth: dict[str, Floats]) -> 
     rois = {}
     for k, name in enumerate(ROIS):
         bias = joint(lambda v: v - core, figures.means["paper"][2 * k])
+        fibrous_bias = joint(lambda v: v - fibrous, figures.means["paper"][2 * k + 1])
         contrast = figures.contrast("paper", k)
         contrast_bias = joint(lambda v: v - (fibrous - core), contrast)
         rois[name] = {
             "core_bias_hu": json_of(bias), "core_sd_hu": json_of(figures.log_core[k], 0.5),
             "core_rmse_hu": _root_of(bias, figures.log_core[k]),
+            "fibrous_bias_hu": json_of(fibrous_bias), "fibrous_sd_hu": json_of(figures.log_fibrous[k], 0.5),
+            "fibrous_rmse_hu": _root_of(fibrous_bias, figures.log_fibrous[k]),
             "contrast_hu": json_of(contrast), "contrast_bias_hu": json_of(contrast_bias),
             "contrast_sd_hu": json_of(figures.log_contrast[k], 0.5),
             "contrast_rmse_hu": _root_of(contrast_bias, figures.log_contrast[k]),
@@ -161,6 +176,9 @@ def entry_of(figures: Figures, reference: Figures, truth: dict[str, Floats]) -> 
     return {
         "realizations": figures.realizations,
         "fat_sd_hu": json_of(figures.log_variance, 0.5),
+        "fat_nps": {
+            "frequency_lp_mm": figures.noise.frequencies.tolist(), "hu2_mm2": figures.noise.radial.tolist(),
+        },
         "noise_magnitude_ratio": json_of(joint(np.subtract, moments[1], moments[3]), 0.5),
         "central_frequency_ratio": json_of(joint(lambda a, b, c, d: (a - b) - (c - d), *moments)  , 1.0),
         "d_prime": {o: _seen(figures.log_detectability[o]) for o in OBSERVERS},

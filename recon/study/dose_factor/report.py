@@ -54,7 +54,7 @@ def _headline(data: dict[str, Any]) -> str:
     for dose, limit in zip(data["settings"]["doses"], data["limits"], strict=True):
         e = next(e for e in at_dose(data, dose) if e["method"] == method)
         f, c = e["factors"], limit["factors"]
-        asked = (("contrast_paper", "contrast in the paper's ROI"), ("contrast_tissue", "in the whole lesion"),
+        asked = (("contrast_paper", "contrast in the paper's ROI"), ("contrast_tissue", "contrast in the whole lesion"),
                  ("d_prime_volume", "d′ of the volume"))  # fmt: skip
         found = ", ".join(f"{text(f[k])} by {label} (limit {c[k]:.1f})" for k, label in asked)
         parts.append(f"at {dose:g} s {found}, {text(f['noise'])} by the noise in fat")

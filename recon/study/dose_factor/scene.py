@@ -17,12 +17,12 @@ from torch import Tensor
 from recon.fbp.exact_noise import FILTER_MARGIN_COLUMNS
 from recon.pwls.inset_problem import InsetProblem
 from recon.study.dose_factor.exact_fbp import exact_fbp
-from recon.study.dose_factor.settings import Settings
+from recon.study.dose_factor.settings import FBP_BASE, Settings
 from recon.study.dose_factor.store import Store
 from recon.study.dose_factor.tissue_values import least_squares
 from recon.study.dose_factor.variant import Variant
 from recon.study.paper.facts import FULL_VIEWS
-from recon.study.paper.plaque_scan import duty, enclosing
+from recon.study.paper.plaque_scan import REFERENCE_VOXEL_MM, duty, enclosing
 from recon.study.paper.rods import rod_values
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.detector_window import DetectorWindow, shadow
@@ -47,8 +47,8 @@ class SceneFacts:
         tissue_hu: true values, by rods of each tissue at the plaque's place (:mod:`recon.study.paper.rods`): of all
             tissues of the paper's scene, of core and fibrous tissue in the others.
         reference_hu: ROI means of noise-free standard FBP on 0.1 mm, ``(2,)``.
-        fbp_hu: FBP variant → its ROI means ``(2,)``; fbp_crop: image of the core; fbp_covariance: ``(F, F)`` HU² of the
-            ROI means and, where they were asked for, of the observer's channels.
+        fbp_hu, fbp_covariance: ROI means ``(2,)`` of the noise-free reference FBP, and their covariance ``(2, 2)`` HU²;
+            None in the main scenes.
     """
 
     statistic: NDArray[np.float32]
@@ -56,9 +56,8 @@ class SceneFacts:
     tissue_hu: dict[str, float]
     information: Floats
     reference_hu: Floats
-    fbp_hu: dict[str, Floats]
-    fbp_covariance: dict[str, Floats]
-    fbp_crop: dict[str, Any]
+    fbp_hu: Floats | None
+    fbp_covariance: Floats | None
 
     def tissue(self, name: str) -> int:
         """Index of a tissue."""
@@ -75,27 +74,17 @@ class SceneFacts:
         core, fibrous = self.truth_hu
         return float(fibrous - core)
 
-    def fbp_contrast(self, label: str) -> float:
-        """Noise-free contrast of an FBP variant, HU."""
-        fg, bg = self.fbp_hu[label]
-        return float(bg - fg)
-
     @classmethod
     def of(cls, arrays: dict[str, Any], tissue_hu: Mapping[str, float]) -> SceneFacts:
         """From the arrays of a piece and the true values."""
-
-        def all_of(prefix: str) -> dict[str, Any]:
-            return {k[len(prefix) :]: v for k, v in arrays.items() if k.startswith(prefix)}
-
         return cls(
             statistic=arrays["statistic"],
             tissues=[str(t) for t in arrays["tissues"]],
             tissue_hu=dict(tissue_hu),
             information=arrays["information"],
             reference_hu=arrays["reference_hu"],
-            fbp_hu=dict(zip(map(str, arrays["labels"]), arrays["fbp_hu"], strict=True)),
-            fbp_covariance=all_of("covariance "),
-            fbp_crop=all_of("crop "),
+            fbp_hu=arrays.get("fbp_hu"),
+            fbp_covariance=arrays.get("fbp_covariance"),
         )
 
 
@@ -138,7 +127,7 @@ class StudyScene(Variant):
             return None
 
     def _acquire(self, path: Path) -> Scan:
-        grids = [self.grid_of(v) for v in {*self.settings.voxels_mm, self.settings.voxel_mm, 0.1}]
+        grids = [self.grid_of(v) for v in {FBP_BASE[1], self.settings.voxel_mm, REFERENCE_VOXEL_MM}]
         on = duty(self.scanner, FULL_VIEWS["PCCT"])
         whole = acquire(self.scene, self.scanner, region=enclosing(grids), duty=on)
         assert whole.window is not None
@@ -188,7 +177,7 @@ class StudyScene(Variant):
                 **exact_fbp(self, self.clean),
             }  # fmt: skip
 
-        key = f"views={s.views} voxel={s.voxel_mm:g} {s.kernels} {s.voxels_mm} {s.blurs_mm} 2"
+        key = f"views={s.views} voxel={s.voxel_mm:g} 3"
         return SceneFacts.of(self.store.piece(f"scenes/{self._file}", key, compute), self._rods())
 
     def _rods(self) -> dict[str, float]:

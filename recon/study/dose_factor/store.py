@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
-import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,19 @@ from torchpcct.files import written_whole
 __all__ = ["Store"]
 
 log = logging.getLogger(__name__)
+
+
+_MARK = "\nSHA-256 "
+"""Parts the key from the checksum of the arrays. Pieces of earlier versions have none, and are taken as they are."""
+
+
+def _digest(key: str, arrays: Mapping[str, Any]) -> str:
+    total = hashlib.sha256(key.encode())
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        total.update(f"{name} {array.dtype.str} {array.shape};".encode())
+        total.update(array.tobytes())
+    return total.hexdigest()
 
 
 class Store:
@@ -46,12 +59,16 @@ class Store:
         if path.exists():
             try:
                 with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
-                    if str(file["key"]) == key:
-                        return {k: file[k] for k in file.files if k != "key"}
+                    arrays = {k: file[k] for k in file.files if k != "key"}
+                    found, mark, digest = str(file["key"]).partition(_MARK)
+                if mark and digest != _digest(found, arrays):
+                    raise ValueError("its content does not have its checksum")
+                if found == key:
+                    return arrays
                 log.info("%s was made with other settings: computed again", path)
-            except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            except Exception as error:  # a damaged archive can fail in any way
                 log.warning("%s cannot be read (%s): computed again", path, error)
         arrays = compute()
         with written_whole(path) as part:
-            np.savez(part, key=np.array(key), **arrays)
+            np.savez(part, key=np.array(key + _MARK + _digest(key, arrays)), **arrays)
         return arrays

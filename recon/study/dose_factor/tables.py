@@ -6,9 +6,9 @@ from typing import Any
 
 from recon.study.dose_factor.measures import LUMEN_HALF_HU, OBSERVERS
 from recon.study.dose_factor.merit import FACTOR_NAMES
-from recon.study.dose_factor.settings import FBP_BASE, METHOD_NAMES, PURPOSES, ROIS, fbp_label
+from recon.study.dose_factor.settings import FBP_BASE, METHOD_NAMES, PURPOSES, ROIS, TWIN_REALIZATIONS, fbp_label
 from recon.study.dose_factor.shape_limit import CORRELATION_MM
-from recon.study.dose_factor.vessels import FINE_MM, TWIN_REALIZATIONS
+from recon.study.dose_factor.vessels import FINE_MM
 from recon.study.report import markdown_table
 
 __all__ = ["at_dose", "tables", "text"]
@@ -54,23 +54,32 @@ def _count(e: dict[str, Any]) -> str:
 
 
 def _dose_section(data: dict[str, Any], dose: float) -> str:
-    """One dose: noise, task and error; quantification; dose factors. The same rows in each."""
+    """One dose: noise, task and error, quantification, dose factors. The same rows in each."""
     entries = at_dose(data, dose)
     limit = next(c for c in data["limits"] if c["exposure_s"] == dose)
-    header = ["", "n", "fat SD", "NMR", "CFR", "d′ axial", "d′ volume", "RMSE vessel", "fat"]
-    rows = [
+    noise = [
         [
             _name(e), _count(e), text(e["fat_sd_hu"], 1), text(e["noise_magnitude_ratio"]),
-            text(e["central_frequency_ratio"]), *(text(e["d_prime"][o]) for o in OBSERVERS),
-            text(e["rmse_hu"]["vessel"], 1), text(e["rmse_hu"]["fat"], 1),
+            text(e["central_frequency_ratio"]), text(e["f50_lp_mm"]["plane"]), text(e["f50_lp_mm"]["z"]),
+        ]
+        for e in entries
+    ]  # fmt: skip
+    task = [
+        [
+            _name(e), *(text(e["d_prime"][o]) for o in OBSERVERS), text(e["rmse_hu"]["vessel"], 1),
+            text(e["rmse_hu"]["fat"], 1),
         ]
         for e in entries
     ]  # fmt: skip
     ideal = f"{limit['d_prime']:.2f}"
-    rows.append(["limit of the data", "exact", "–", "–", "–", ideal, ideal, "–", "–"])
-    parts = [f"## {dose:g} s", "Noise, task, image error (HU):", markdown_table(header, rows)]
-    parts += ["Quantification, HU: bias and SD of the core, bias, SD and RMSE of the contrast, slope:"]
-    parts += [_roi_table(entries, roi, limit) for roi in ROIS]
+    task.append(["limit of the data", ideal, ideal, "–", "–"])
+    parts = [f"## {dose:g} s", "Noise (HU) and resolution (f50 of the core's edge, line pairs per mm):"]
+    parts += [markdown_table(["", "n", "fat SD", "NMR", "CFR", "f50 plane", "f50 z"], noise)]
+    parts += ["Task, and error of the image (HU):"]
+    parts += [markdown_table(["", "d′ axial", "d′ volume", "RMSE vessel", "RMSE fat"], task)]
+    parts += ["Quantification, HU: bias, SD and RMSE of core and fibrous tissue, then of the contrast:"]
+    for roi in ROIS:
+        parts += [_tissue_table(entries, roi), _contrast_table(entries, roi, limit)]
     parts += [f"Dose factors against FBP {BASE}, last row the limit (σ²: slope-corrected contrast variance):"]
     names = list(FACTOR_NAMES)
     for part in (names[:5], names[5:]):
@@ -87,8 +96,14 @@ def _limit(value: float | None) -> str:
 _ROI_TITLES = {"paper": "paper's ROIs", "section": "one slice", "tissue": "whole lesion"}
 
 
-def _roi_table(entries: list[dict[str, Any]], roi: str, limit: dict[str, Any]) -> str:
-    header = [_ROI_TITLES[roi], "core bias", "SD", "contrast bias", "SD", "RMSE", "slope"]
+def _tissue_table(entries: list[dict[str, Any]], roi: str) -> str:
+    header = [_ROI_TITLES[roi], "core bias", "SD", "RMSE", "fibrous bias", "SD", "RMSE"]
+    keys = [f"{tissue}_{key}_hu" for tissue in ("core", "fibrous") for key in ("bias", "sd", "rmse")]
+    return markdown_table(header, [[_name(e), *(text(e["rois"][roi][k], 1) for k in keys)] for e in entries])
+
+
+def _contrast_table(entries: list[dict[str, Any]], roi: str, limit: dict[str, Any]) -> str:
+    header = [_ROI_TITLES[roi], "contrast bias", "SD", "RMSE", "slope"]
     rows = []
     for e in entries:
         r, last = e["rois"][roi], {}
@@ -98,12 +113,12 @@ def _roi_table(entries: list[dict[str, Any]], roi: str, limit: dict[str, Any]) -
             shares = {k: None if v is None else 100 * v for k, v in e["efficiency_tissue"].items()}
             last = {"% of limit": text(shares, 0)}
         rows.append([
-            _name(e), text(r["core_bias_hu"], 1), text(r["core_sd_hu"], 1), text(r["contrast_bias_hu"], 1),
-            text(r["contrast_sd_hu"], 1), text(r["contrast_rmse_hu"], 1), text(r["slope"], 3), *last.values(),
+            _name(e), text(r["contrast_bias_hu"], 1), text(r["contrast_sd_hu"], 1), text(r["contrast_rmse_hu"], 1),
+            text(r["slope"], 3), *last.values(),
         ])  # fmt: skip
     sd = f"{limit['contrast_sd_hu']:.1f}"
     end = {"paper": [f"{limit['paper_cnr']:.2f}"], "tissue": ["100"]}.get(roi, [])
-    rows.append(["limit of the data", "0", "–", "0", sd, sd, "1", *end])
+    rows.append(["limit of the data", "0", sd, sd, "1", *end])
     return markdown_table([*header, *last], rows)
 
 
@@ -169,12 +184,12 @@ def _shape_table(data: dict[str, Any]) -> str:
             ])  # fmt: skip
     if not rows:
         return ""
-    header = ["", "lumen |error| 250 HU", "half maximum", "lost, %", "cap |error|, mm", "lost, %"]
+    header = ["", "lumen, 250 HU", "half max", "lost, %", "cap, mm", "lost, %"]
     return (
         "## Lumen area and cap thickness in single realisations\n\n"
-        f"True: {t['lumen_mm2']:.2f} mm², {t['cap_mm']:.2f} mm. Lumen (mm²): contour at 250 HU, as in the paper, and "
-        f"at {LUMEN_HALF_HU:.0f} HU, half way between blood and fibrous tissue. Cap: on the line from lumen to core, "
-        f"from 250 to 70 HU.\n\n{markdown_table(header, rows)}"
+        f"Mean absolute error; true: {t['lumen_mm2']:.2f} mm², {t['cap_mm']:.2f} mm. Lumen (mm²): contour at 250 HU, "
+        f"as in the paper, and at {LUMEN_HALF_HU:.0f} HU, half way between blood and fibrous tissue. Cap: on the line "
+        f"from lumen to core, from 250 to 70 HU.\n\n{markdown_table(header, rows)}"
     )
 
 
@@ -195,20 +210,45 @@ def _gain_table(data: dict[str, Any]) -> str:
     )
 
 
+def _count_of(rows: list[dict[str, Any]]) -> str:
+    """Realisations of the rows that are not exact."""
+    counts = sorted({e["realizations"] for e in rows if e["realizations"] is not None})
+    return f"{' … '.join(map(str, counts))} draws, controlled" if counts else "all exact"
+
+
+def _head(e: dict[str, Any], place: str) -> list[str]:
+    method = "FBP" if e["method"].startswith("FBP") else _name(e)
+    return [e[place].replace("_", " "), method]
+
+
+def _by_dose(rows: list[dict[str, Any]]) -> dict[float, list[dict[str, Any]]]:
+    return {dose: [e for e in rows if e["exposure_s"] == dose] for dose in sorted({e["exposure_s"] for e in rows})}
+
+
 def _scene_table(data: dict[str, Any]) -> str:
     if not data["scenes"] and not data["scenes_left_out"]:
         return ""
-    rows = []
-    for e in data["scenes"]:
-        rows.append([
-            f"{e['scene']}, {e['exposure_s']:g} s, {_name(e)}", f"{e['true_contrast_hu']:.1f}",
-            text(e["contrast_hu"], 1), *(text(b, 1) for b in e["bias_hu"]), f"{e['contrast_sd_raw_hu']:.1f}",
-            text(e.get("false_contrast_hu"), 1), text(e.get("auc"), 3),
-        ])  # fmt: skip
-    header = ["", "true", "contrast", "core bias", "fibrous", "SD", "no core", "AUC"]
+    parts = []
+    for dose, entries in _by_dose(data["scenes"]).items():
+        header = [f"{dose:g} s", "", "true", "contrast", "SD", "no core", "slope", "AUC"]
+        rows = [
+            [
+                *_head(e, "scene"), f"{e['true_contrast_hu']:.1f}", text(e["contrast_hu"], 1),
+                text(e["contrast_sd_hu"], 1), text(e.get("false_contrast_hu"), 1), text(e.get("slope")),
+                text(e.get("auc")),
+            ]
+            for e in entries
+        ]  # fmt: skip
+        parts.append(markdown_table(header, rows))
+        header = [f"{dose:g} s", "", "core bias", "fibrous bias", "CNR"]
+        rows = [[*_head(e, "scene"), *(text(b, 1) for b in e["bias_hu"]), text(e["paper_cnr"])] for e in entries]
+        parts.append(markdown_table(header, rows))
     return (
-        "## Further scenes\n\nContrasts in HU; FBP exact; methods with noise of the scene's own covariance. “No core” "
-        f"and AUC: the same scene with fibrous tissue in place of the core.\n\n{markdown_table(header, rows)}"
+        f"## Further scenes\n\nIn HU; paper's ROIs; FBP {BASE} and linear methods exact; others of "
+        f"{_count_of(data['scenes'])} by their own first-order response, with noise of the scene's own covariance. “No "
+        "core”, slope and AUC (of normal readings): against the same scene with fibrous tissue in place of the core, "
+        f"the first {TWIN_REALIZATIONS} draws.\n\n"
+        + "\n\n".join(parts)
         + "".join(f"\n\nLeft out: {k}, {v}." for k, v in data["scenes_left_out"].items())
     )
 
@@ -216,26 +256,25 @@ def _scene_table(data: dict[str, Any]) -> str:
 def _vessel_table(data: dict[str, Any]) -> str:
     if not data["vessels"]:
         return ""
-    header = ["", "contrast", "SD", "no core", "slope", "fat SD", "to linear", "kept"]
     parts = []
     for roi, title in (("section", "The paper's ROIs in the section across the vessel"), ("tissue", "All tissue")):
-        rows = [
-            [
-                f"{e['vessel'].replace('_', ' ')}, {e['exposure_s']:g} s, {METHOD_NAMES[e['method']]}",
-                text(e["contrast_hu"], 1), f"{e['contrast_sd_raw_hu']:.1f}", text(e["false_contrast_hu"], 1),
-                text(e["slope"], 3), text(e["fat_sd_hu"], 1), text(e["to_linear"]), text(e["kept"]),
-            ]
-            for e in data["vessels"] if e["roi"] == roi
-        ]  # fmt: skip
-        parts.append(f"### {title}\n\n{markdown_table(header, rows)}")
-    e = data["vessels"][0]
+        parts.append(f"### {title}")
+        for dose, entries in _by_dose([e for e in data["vessels"] if e["roi"] == roi]).items():
+            header = [f"{dose:g} s", "", "SD", "no core", "slope", "fat SD", "to linear", "kept"]
+            rows = [
+                [
+                    *_head(e, "vessel"), text(e["contrast_sd_hu"], 1), text(e["false_contrast_hu"], 1),
+                    text(e["slope"]), text(e["fat_sd_hu"], 1), text(e["to_linear"]), text(e["kept"]),
+                ]
+                for e in entries
+            ]  # fmt: skip
+            parts.append(markdown_table(header, rows))
     return (
         "## Vessels of any direction\n\nThe plaque on a vessel along z, tilted by 45°, in plane, curved and with a "
-        f"side branch at 45°: painted on voxels of {FINE_MM:g} mm, which are projected exactly; {e['realizations']} "
-        "realisations with noise of the paper scene's covariance, the same in all vessels. ROIs follow the tissues in "
-        f"space. In HU; true contrast {e['true_contrast_hu']:.1f}. No core: contrast without it. Slope: what the core "
-        "adds to the contrast, over the "
-        f"true one, from the first {TWIN_REALIZATIONS} realisations with and without it. To linear: slope-corrected "
-        "contrast variance of the isotropic linear filter over the method's, on the same noise. Kept: that "
-        "factor over the straight vessel's.\n\n" + "\n\n".join(parts)
+        f"side branch at 45°: painted on voxels of {FINE_MM:g} mm, which are projected exactly. Linear methods exact; "
+        f"others of {_count_of(data['vessels'])}, the same in all vessels. ROIs follow the tissues in space. In HU; "
+        f"true contrast {data['vessels'][0]['true_contrast_hu']:.1f}. SD: of the contrast. No core: contrast without "
+        f"it. Slope: what the core adds to the contrast, over the true one, of the first {TWIN_REALIZATIONS} draws "
+        "with and without it. To linear: slope-corrected contrast variance of the isotropic linear filter over the "
+        "method's. Kept: that factor over the straight vessel's.\n\n" + "\n\n".join(parts)
     )

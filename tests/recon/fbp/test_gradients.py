@@ -16,6 +16,9 @@ from recon.fbp.filter_plan import FilterPlan
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid, full_turn
 
+# Random numbers are no objects: they do not end in air.
+pytestmark = pytest.mark.filterwarnings("ignore:the rows end inside the object")
+
 SHORT = np.arange(16) * (math.pi + 0.9) / 16 + 0.3
 CASES: dict[str, tuple[Geometry, VolumeGrid]] = {
     "parallel": (ParallelBeam(np.arange(9) * math.pi / 9, 14, 1.1, 0.2), VolumeGrid((5, 6), 1.0, (0.4, -0.3))),

@@ -52,6 +52,13 @@ def test_prior_lowers_the_noise(clean, problem):
     assert stronger < strong < fbp
 
 
+def test_an_unfinished_iteration_warns_on_the_volume(clean, problem):
+    with pytest.warns(RuntimeWarning, match="raise max_exact"):
+        volume = reconstruct(clean, GRID, "pwls", prior=WEAK, problem=problem, tolerance=1e-9, max_exact=1)
+    assert "raise max_exact" in volume.report["warnings"][0]
+    assert reconstruct(clean, GRID, "pwls", prior=WEAK, problem=problem).report["warnings"] == []
+
+
 def test_refusals(clean):
     whole = replace(clean, geometry=clean.geometry, window=clean.window)
     with pytest.raises(ValueError, match="one exposure"):

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from tiny_studies import TINY as SMALLEST
 
 from recon.study.dose_factor.measures import crop_window
@@ -36,7 +35,7 @@ def test_pieces_of_other_settings_or_cut_off_are_made_again(tmp_path, caplog):
 def test_method_registry(caplog):
     assert [m.name for m in load_methods(["tv", "linear"])] == ["tv", "linear"]
     assert fingerprint(LinearFilter()) != fingerprint(LinearFilter(mu=0.7))
-    one, two = load_methods(["mbir_one_pass", "mbir"])
+    one, two = load_methods(["mbir_viewing", "mbir"])
     assert fingerprint(one) != fingerprint(two)
     with pytest.raises(ValueError, match="unknown method 'magic'"):
         load_methods(["magic"])
@@ -49,14 +48,15 @@ def test_add_back_is_linear_and_restores_contrast():
 
 
 def test_ablations_are_told_apart():
-    found = load_methods(["mbir", "mbir_no_cnn", "mbir_no_vessel", "mbir_one_pass"])
-    assert [m.name for m in found] == ["mbir", "mbir_no_cnn", "mbir_no_vessel", "mbir_one_pass"]
+    names = ["mbir", "mbir_no_cnn", "mbir_one_step", "mbir_free", "mbir_viewing", "mbir_measuring", "mbir_noise_half"]
+    found = load_methods(names)
+    assert [m.name for m in found] == names
     prints = [fingerprint(m) for m in found]
-    assert len(set(prints)) == 4
-    assert prints == [fingerprint(m) for m in load_methods([m.name for m in found])]
-    scale = torch.tensor([200.0])
-    own, without = (m.model.prior.along_strength(scale) for m in (found[0], found[2]))
-    assert own > 1e6 * without
+    assert len(set(prints)) == len(names)
+    assert prints == [fingerprint(m) for m in load_methods(names)]
+    assert found[1].parts == {"steps": 0}
+    assert found[3].parts == {"last_word": False}
+    assert found[4].look < found[0].look < found[5].look
 
 
 def test_missing_weights_leave_mbir_out(monkeypatch, caplog):

@@ -152,43 +152,46 @@ def test_the_statistic_of_a_vessel_on_the_methods_grid_is_the_grams():
 TWINS = 8
 
 
-def _samples(gains, n=400):
-    """Readings of a linear filter of 10 HU, and of a method with ``gains``, 0.8 of the contrast and 5 HU too little."""
+def _found(gains, n=40):
+    """What a linear filter of 10 HU shows, and a method with ``gains``: 0.8 of the contrast and 5 HU too little, its
+    noise that of the filter but for a factor. The second pair of ROIs reads twice the contrast of the first."""
     found = {}
+    covariance = np.kron(np.eye(2), np.diag([36.0, 64.0]))
     for seed, (name, gain) in enumerate(gains.items()):
         rng = np.random.default_rng(seed)
-        noise = rng.standard_normal((n, 1, 2)) @ np.diag([6.0, 8.0])
-        fat = 20.0 * rng.standard_normal((n, 50))
-        for method, slope, scale, off in (("linear", 1.0, 1.0, 0.0), ("mbir", 0.8, 0.8 / math.sqrt(gain), -5.0)):
-            # The second pair of ROIs reads twice the contrast of the first.
-            clean = np.array([[40.0, 40.0 + off + 60.0 * slope], [40.0, 40.0 + 2 * (off + 60.0 * slope)]])
-            twin = np.array([[100.0, 100.0 + off], [100.0, 100.0 + 2 * off]])
-            found[method, name, 2.0] = {
-                "roi": clean + scale * noise, "absent": (twin + scale * noise)[:TWINS], "fat": scale * fat,
-            }  # fmt: skip
+        noise = rng.standard_normal((n, 4)) * np.sqrt(np.diag(covariance))
+        for method, slope, off in (("linear", 1.0, 0.0), ("mbir", 0.8, -5.0)):
+            seen, false = off + 60.0 * slope, off
+            clean = np.array([[40.0, 40.0 + seen, 40.0, 40.0 + 2 * seen], [100.0, 100 + false, 100, 100 + 2 * false]])
             if method == "linear":
-                found[method, name, 2.0]["expected"] = np.stack([clean, twin])[None]
+                found[method, name, 2.0] = {"mean": clean, "covariance": covariance, "fat_variance": np.array(400.0)}
+                continue
+            scale = 0.8 / math.sqrt(gain)
+            found[method, name, 2.0] = {
+                "readings": clean[0] + scale * noise, "absent": clean[1] + scale * noise[:TWINS],
+                "fat": 20.0 * scale * rng.standard_normal((n, 50)), "controls": 7.0 + noise[:, None],
+                "control_mean": np.full((1, 4), 7.0), "control_covariance": covariance[None, :, None],
+            }  # fmt: skip
     return found
 
 
 def test_rows_say_what_is_gained_and_kept():
-    rows = vessel_rows(_samples({"straight": 3.0, "curved_5mm": 1.5}), 60.0)
+    rows = vessel_rows(_found({"straight": 3.0, "curved_5mm": 1.5}), 60.0)
     by = {(r["vessel"], r["method"]): r for r in rows if r["roi"] == "section"}
     assert len(rows) == 2 * len(by) == 8
     assert by["straight", "mbir"]["to_linear"]["value"] == pytest.approx(3.0)
     bent = by["curved_5mm", "mbir"]
-    assert bent["to_linear"]["value"] == pytest.approx(1.5)
-    # The two methods' draws are the same but for a factor: pairing leaves no sampling error.
-    assert bent["to_linear"]["low"] == pytest.approx(1.5, rel=0.01)
-    assert bent["kept"]["value"] == pytest.approx(0.5)
-    assert bent["slope"]["value"] == pytest.approx(0.8)
-    # The control makes the means exact, with the core and without.
-    assert bent["contrast_hu"]["value"] == pytest.approx(43.0)
-    assert bent["false_contrast_hu"]["value"] == pytest.approx(-5.0)
-    assert by["curved_5mm", "linear"]["fat_sd_hu"]["value"] == pytest.approx(20.0, rel=0.05)
-    assert by["curved_5mm", "linear"]["contrast_sd_raw_hu"] == pytest.approx(10.0, rel=0.15)
-    assert by["straight", "linear"]["contrast_hu"] == {"value": 60.0, "low": None, "high": None}
-    assert by["straight", "linear"]["to_linear"]["value"] is None
+    # The control follows the method: no sampling error, in the variance, the gain and the means.
+    for key, value in (("to_linear", 1.5), ("kept", 0.5), ("slope", 0.8), ("contrast_hu", 43.0),
+                       ("false_contrast_hu", -5.0), ("contrast_sd_hu", 8.0 / math.sqrt(1.5))):  # fmt: skip
+        assert [bent[key][k] for k in ("value", "low", "high")] == pytest.approx([value] * 3), key
+    assert bent["realizations"] == 40
+    assert bent["fat_sd_hu"]["value"] == pytest.approx(16.0 / math.sqrt(1.5), rel=0.05)
+    filtered = by["curved_5mm", "linear"]
+    assert filtered["realizations"] is None
+    for key, value in (("fat_sd_hu", 20.0), ("contrast_sd_hu", 10.0), ("contrast_hu", 60.0), ("slope", 1.0)):
+        assert filtered[key] == pytest.approx({"value": value}), key
+    assert filtered["to_linear"]["value"] is None
     assert by["straight", "mbir"]["kept"]["value"] is None
     wide = next(r for r in rows if (r["roi"], r["vessel"], r["method"]) == ("tissue", "curved_5mm", "mbir"))
     assert wide["slope"]["value"] == pytest.approx(1.6)
@@ -196,10 +199,9 @@ def test_rows_say_what_is_gained_and_kept():
 
 
 def test_rows_without_the_linear_filter_or_the_straight_vessel():
-    samples = _samples({"straight": 3.0, "tilted": 2.0})
-    alone = vessel_rows({k: v for k, v in samples.items() if k[0] == "mbir"}, 60.0)
+    found = _found({"straight": 3.0, "tilted": 2.0})
+    alone = vessel_rows({k: v for k, v in found.items() if k[0] == "mbir"}, 60.0)
     assert {r["to_linear"]["value"] for r in alone} == {None}
-    assert alone[0]["contrast_hu"]["low"] < 43.0 < alone[0]["contrast_hu"]["high"]
-    tilted = vessel_rows({k: v for k, v in samples.items() if k[1] == "tilted"}, 60.0)
+    tilted = vessel_rows({k: v for k, v in found.items() if k[1] == "tilted"}, 60.0)
     assert tilted[1]["to_linear"]["value"] == pytest.approx(2.0)
     assert tilted[1]["kept"]["value"] is None

@@ -40,7 +40,8 @@ def test_effects_say_what_is_modelled():
 
 
 COUNTS = {
-    "compare": "views", "dose-factor": "views", "detector": "photons", "bowtie": "views", "motion": "thinning",
+    "compare": "views", "dose-factor": "views", "detector": "photons", "bowtie": "views", "hardcases": "views",
+    "motion": "thinning",
     "noise": "views", "phantom": "sections", "resolution": "thinning", "spectral": "views",
 }  # fmt: skip
 """Study → a field that counts something."""

@@ -327,7 +327,7 @@ def test_bad_arguments_are_named():
         A.T(torch.zeros(5, 5))
     with pytest.raises(ValueError, match="got \\(5,\\)"):
         A(torch.zeros(5))
-    for dtype in (torch.float16, torch.bfloat16, torch.int32, torch.complex64):
+    for dtype in (torch.int32, torch.complex64):
         with pytest.raises(TypeError, match="float32 or float64"):
             A(torch.zeros(5, 5, dtype=dtype))
     with pytest.raises(TypeError, match=r"torch\.Tensor"):

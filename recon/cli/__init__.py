@@ -1,0 +1,238 @@
+"""Command line: ``torchpcct compare | dose-factor | hardcases | study | simulate | reconstruct | info | …``.
+
+Here stand the studies and :func:`main`; :mod:`~recon.cli.scans` has the commands of one scan, :mod:`~recon.cli.plaque`
+reads tissues, :mod:`~recon.cli.config` reads what ``simulate`` is told, :mod:`~recon.cli.parsing` is what all share.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import shlex
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from recon.cli.parsing import Commands, command
+
+# What loads torch or numba is imported by the commands: help and refusals come at once.
+from recon.cli.plaque import add_plaque
+from recon.cli.scans import add_info, add_reconstruct, add_show_config, add_simulate, add_view
+from recon.study import registry
+from torchpcct import __version__
+from torchpcct.files import require_writable, written_whole
+from torchpcct.validate import whole
+
+if TYPE_CHECKING:
+    from recon.study.study import ProgressBars
+
+__all__ = ["main"]
+
+
+# --- commands -----------------------------------------------------------------------------------------------------
+
+
+def _run_study(name: str, settings: Any, arguments: argparse.Namespace, progress: ProgressBars) -> None:
+    """Run a study of the registry, save and print its report."""
+    if hasattr(settings, "seed"):
+        whole("--seed", settings.seed, low=0)
+    folder = arguments.out or Path("out") / name
+    require_writable(folder)
+    minutes = {part: seconds / 60 for part, seconds in settings.estimated_seconds().items()}
+    if minutes:
+        listed = ", ".join(f"{part} {value:.1f}" for part, value in minutes.items())
+        total = f"about {sum(minutes.values()):.0f} min on two idle cores if nothing is finished yet"
+        print(f"{total} ({listed})", file=sys.stderr)
+    start = time.perf_counter()
+    report = registry.run(name, settings, progress, folder)
+    progress.close()
+    if "command" in report.data:
+        report.made_by(shlex.join(["torchpcct", *arguments.command_line]))
+    files = report.save(folder)
+    print(report.text)
+    print(f"\n{time.perf_counter() - start:.0f} s in all. Written: {', '.join(map(str, files))}")
+
+
+def _study(arguments: argparse.Namespace, progress: ProgressBars) -> None:
+    name, changes = arguments.name, arguments.changes
+    settings = registry.build_settings(name, quick=arguments.quick, seed=arguments.seed, changes=changes)
+    _run_study(name, settings, arguments, progress)
+
+
+def _own_study(arguments: argparse.Namespace, progress: ProgressBars) -> None:
+    """A study that is a command of its own, with options named like its settings."""
+    kind = registry.part(arguments.command, "settings").Settings
+    given = {f.name: getattr(arguments, f.name, None) for f in fields(kind)}
+    changes = {name: tuple(v) if isinstance(v, list) else v for name, v in given.items() if v is not None}
+    settings = kind.quick(**changes) if arguments.quick else kind(**changes)
+    _run_study(arguments.command, settings, arguments, progress)
+
+
+def _verify(arguments: argparse.Namespace, progress: ProgressBars) -> None:
+    from recon.study import verify
+
+    results, readme = arguments.root / "notebooks", arguments.root / "README.md"
+    claims, text = verify.load_claims(results / "claims.yaml"), readme.read_text(encoding="utf-8")
+    if arguments.write:
+        text = verify.rewrite(text, claims, results)
+        with written_whole(readme) as part:
+            part.write_text(text, encoding="utf-8")
+    wrong = [v for v in verify.verify(text, claims, results) if not v.ok]
+    for v in wrong:
+        print(f"FAIL  the results say: {v.said}\n      README.md says:  {v.found or 'nothing like it'}")
+    bare = list(verify.uncovered(text, claims, verify.RESULTS))
+    for line in bare:
+        print(f"FAIL  no claim covers the figures of: {line}")
+    print(f"{len(claims) - len(wrong)} of {len(claims)} sentences with figures say what the results say")
+    changed = []
+    for name in arguments.again:
+        committed = json.loads((results / registry.folder(name) / "report.json").read_text(encoding="utf-8"))
+        settings = registry.settings_of(name, committed["settings"])
+        again = json.loads(registry.run(name, settings, progress).json)
+        found = list(verify.differences(committed, again))
+        progress.close()
+        print("\n".join([f"{name}: {len(found)} figures differ from the committed ones", *found]))
+        changed += found
+    if wrong or bare or changed:
+        raise ValueError("README.md and the committed results do not agree: see above (--write mends the README)")
+
+
+# --- parsing ------------------------------------------------------------------------------------------------------
+
+
+def _add_compare(commands: Commands) -> None:
+    parser = command(
+        commands, "compare", _own_study, registry.STUDIES["compare"],
+        "Simulate the paper's plaque scan at full size, reconstruct it by FBP (kernels × voxel sizes), PWLS and MBIR "
+        "at 1×, 2×, 5.7× and 8× dose, and print what dose MBIR saves and the paper's tables beside its numbers.",
+        "folder for report.json, report.md and compare.png (default out/compare)",
+    )  # fmt: skip
+    parser.add_argument("--realizations", type=int, metavar="N", help="per dose (default 10)")
+    parser.add_argument("--quick", action="store_true", help="reduced views and settings: a first look, < 45 s")
+    parser.add_argument("--no-pwls", dest="pwls", action="store_const", const=False, help="leave PWLS out")
+    parser.add_argument("--no-mbir", dest="mbir", action="store_const", const=False, help="no MBIR, no dose factors")
+
+
+def _add_dose_factor(commands: Commands) -> None:
+    parser = command(
+        commands, "dose-factor", _own_study, registry.STUDIES["dose-factor"],
+        "Reconstruct the same noise realisations of the paper's scan by every method and measure the dose "
+        "at which FBP reaches the same figure: the paper's CNR, slope-corrected contrast variance, observer. Finished "
+        "pieces in the folder are kept: after an interruption the same command goes on.",
+        "folder for pieces, report.json, report.md and figures (default out/dose-factor)",
+    )  # fmt: skip
+    parser.add_argument("--n", type=int, help="paired realisations per dose and scene (default 200)")
+    parser.add_argument("--slow-n", type=int, help="the same for the slow baselines (default 48)")
+    parser.add_argument("--scene-n", type=int, help="realisations of each further scene and vessel (default 100)")
+    parser.add_argument("--doses", type=float, nargs="+", metavar="S", help="exposures in s")
+    parser.add_argument("--scene-doses", type=float, nargs="+", metavar="S", help="of further scenes")
+    parser.add_argument("--methods", nargs="+", metavar="M", help="linear quadratic qggmrf tv mbir mbir_measuring …")
+    parser.add_argument("--scenes", nargs="*", metavar="NAME", help="further scenes (none: leave out)")
+    parser.add_argument("--scene-methods", nargs="+", metavar="M", help="methods of further scenes and vessels")
+    parser.add_argument("--vessels", nargs="*", metavar="NAME", help="vessels of other directions (none: leave out)")
+    parser.add_argument(
+        "--fast-noise", action="store_const", const=True, help="draw the noise of AᵀW y, not that of the readings"
+    )
+    parser.add_argument("--quick", action="store_true", help="12 realisations, one dose, 164 views: about a minute")
+
+
+def _add_hardcases(commands: Commands) -> None:
+    parser = command(
+        commands, "hardcases", _own_study, registry.STUDIES["hardcases"],
+        "Break the plaque's scan in many ways, reconstruct what is left by every method, and print the error, what was "
+        "said, and whether it was wrong without a word.",
+        "folder for report.json, report.md and the figure (default out/hardcases)",
+    )  # fmt: skip
+    parser.add_argument("--quick", action="store_true", help="a quarter of the views")
+    parser.add_argument("--methods", nargs="+", metavar="M", help="fbp pwls … (default fbp pwls)")
+    parser.add_argument("--cases", nargs="+", metavar="NAME", help="only these cases")
+    parser.add_argument("--views", type=int, metavar="N", help="views of the scan (default 984)")
+
+
+def _add_study(commands: Commands) -> None:
+    parser = command(
+        commands, "study", _study, "one of the paper's studies; torchpcct study --help lists them",
+        "Run a study of the paper at full scale and print its figures beside the published ones.",
+        "folder for report.json, report.md and the figures (default out/NAME)",
+    )  # fmt: skip
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = "studies:\n" + "".join(f"  {name:<12} {text}\n" for name, text in registry.STUDIES.items())
+    parser.add_argument("name", metavar="NAME", help="of the study")
+    parser.add_argument("--quick", action="store_true", help="reduced settings: a first look, < 60 s")
+    parser.add_argument(
+        "--set",
+        dest="changes",
+        action="append",
+        default=[],
+        metavar="FIELD=VALUE",
+        help="change a setting (repeatable)",
+    )
+
+
+def _add_verify(commands: Commands) -> None:
+    text = "Compare every figure of the README with the key of the committed result that it comes from "
+    parser = commands.add_parser(
+        "verify", help="do the README's figures say what the committed results say?",
+        description=f"{text}(notebooks/claims.yaml), and compute studies again if asked.",
+    )  # fmt: skip
+    parser.set_defaults(run=_verify, device="cpu", no_progress=False, verbose=False)
+    parser.add_argument("--root", type=Path, default=Path(), help="folder of the repository (default: this one)")
+    parser.add_argument("--write", action="store_true", help="put the committed figures into the README")
+    parser.add_argument("--again", nargs="*", default=[], metavar="STUDY", help="compute these studies again, in full")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="torchpcct",
+        description="Photon-counting CT: simulate, reconstruct, and measure what model-based reconstruction saves.",
+    )
+    parser.add_argument("--version", action="version", version=f"torchpcct {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    scans = (add_simulate, add_show_config, add_reconstruct, add_info, add_view)
+    for add in (_add_compare, _add_dose_factor, _add_hardcases, _add_study, *scans, add_plaque, _add_verify):
+        add(commands)
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; returns the exit status: 0 done, 2 refused input, 130 interrupted."""
+    options = _parser().parse_args(arguments)
+    options.command_line = list(sys.argv[1:] if arguments is None else arguments)
+    logging.basicConfig(
+        level=logging.INFO if options.verbose else logging.WARNING, format="%(levelname)s %(name)s: %(message)s"
+    )
+    progress: Any = None
+    try:
+        from recon.study.study import ProgressBars
+
+        progress = ProgressBars(not options.no_progress and sys.stderr.isatty())
+        if options.device == "cuda" and not _cuda():
+            raise ValueError("--device cuda: PyTorch finds no CUDA device here; use --device cpu")
+        options.run(options, progress)
+    except (ValueError, TypeError, OSError, OverflowError, MemoryError) as error:
+        return _failed(options.command, progress, str(error) or "out of memory: use larger voxels or a smaller grid", 2)
+    except RuntimeError as error:
+        if "no locator available" not in str(error):
+            raise
+        text = "numba cannot keep compiled kernels: set NUMBA_CACHE_DIR to a folder that you can write"
+        return _failed(options.command, progress, text, 2)
+    except KeyboardInterrupt:
+        return _failed(options.command, progress, "interrupted, nothing half written", 130)
+    return 0
+
+
+def _cuda() -> bool:
+    import torch
+
+    return torch.cuda.is_available()
+
+
+def _failed(command: str, progress: Any, text: str, status: int) -> int:
+    if progress is not None:
+        progress.close()
+    print(f"torchpcct {command}: {text}", file=sys.stderr)
+    return status

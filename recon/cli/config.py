@@ -1,0 +1,165 @@
+"""Scene, scanner and exposure as YAML, for ``torchpcct simulate --config``."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from torchpcct.geometry import VolumeGrid
+from torchpcct.scanner import presets
+from torchpcct.scanner.scanner import Scanner
+from torchpcct.scene.bodies import Box, Ellipsoid, EllipticCylinder
+from torchpcct.scene.scene import Body, Scene
+from torchpcct.scene.voxels import VoxelScene
+from torchpcct.validate import choice
+from torchpcct.volume import Volume
+
+__all__ = ["EXAMPLE", "SimulationConfig", "read_config"]
+
+EXAMPLE = """\
+# A simulated scan: torchpcct simulate --config scene.yaml --out scan.h5
+scene:
+  kind: bodies              # plaque, thorax, water, bodies, or volume
+  # plaque: the paper's; patient_diameter, core_contrast, motion_amplitude …
+  # water: diameter, length, position
+  # volume: file: patient.nii.gz, energy_kev: 70 (a CT volume in HU)
+  bodies:                   # mm; parents before their children
+    - {name: patient, shape: cylinder, semi_axes: [160, 110], material: soft_tissue}
+    - {name: spine, shape: cylinder, semi_axes: 18, position: [0, -70, 0], material: spongiosa, parent: patient}
+    - name: nodule
+      shape: ellipsoid
+      semi_axes: [5, 5, 5]
+      position: [40, 20, 0]
+      material: fibrous_tissue
+      parent: patient
+scanner:
+  preset: pcct              # pcct or eid
+  views: 984
+  rows: 16
+  columns: 1500
+  bowtie: large
+  kvp: 100
+  current_ma: 1000
+exposure_s: 1.0             # null: expected readings without noise
+seed: 0
+region: null                # or a grid to keep: {shape: [z, y, x], spacing: mm, center: [z, y, x]}
+tolerance_hu: 0.5           # effects below it are left out
+"""
+
+_SHAPES: dict[str, Any] = {"cylinder": EllipticCylinder, "ellipsoid": Ellipsoid, "box": Box}
+_PRESETS: dict[str, Any] = {"pcct": presets.pcct, "eid": presets.eid}
+_KEYS = ("scene", "scanner", "exposure_s", "seed", "region", "tolerance_hu")
+
+
+@dataclass(frozen=True)
+class SimulationConfig:
+    """What to simulate, built and checked.
+
+    Attributes:
+        scene, scanner, region: objects for :func:`torchpcct.acquire`; region None: the whole detector.
+        exposure_s, seed, tolerance_hu: numbers for it.
+        values: the resolved YAML mapping, with every default.
+    """
+
+    scene: Scene | VoxelScene
+    scanner: Scanner
+    region: VolumeGrid | None
+    exposure_s: float | None
+    seed: int
+    tolerance_hu: float
+    values: dict[str, Any]
+
+
+def read_config(path: Path, **changes: Any) -> SimulationConfig:
+    """The configuration in a YAML file; ``changes`` replace its top-level values where they are not None.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError, TypeError: no mapping, unknown names, bad values; the message names them.
+    """
+    try:
+        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is no YAML: {error}") from error
+    values = {**_mapping(str(path), values, _KEYS), **{k: v for k, v in changes.items() if v is not None}}
+    folder = path.parent
+    scene, scene_values = _scene(values.get("scene"), folder)
+    scanner, scanner_values = _scanner(values.get("scanner"))
+    region = values.get("region")
+    grid = None if region is None else VolumeGrid(**_mapping("region", region, ("shape", "spacing", "center")))
+    exposure, seed = values.get("exposure_s"), values.get("seed", 0)
+    tolerance = float(values.get("tolerance_hu", 0.5))
+    resolved = {"scene": scene_values, "scanner": scanner_values, "exposure_s": exposure, "seed": seed,
+                "region": region, "tolerance_hu": tolerance}  # fmt: skip
+    return SimulationConfig(scene, scanner, grid, exposure, seed, tolerance, resolved)
+
+
+def _mapping(name: str, value: Any, keys: Any) -> dict[str, Any]:
+    if not isinstance(value, Mapping):
+        raise TypeError(f"{name} must be a mapping with {', '.join(keys)}, got {value!r}; see torchpcct show-config")
+    unknown = [str(k) for k in value if k not in keys]
+    if unknown:
+        raise ValueError(f"{name}: unknown {', '.join(unknown)}; it takes {', '.join(keys)}")
+    return dict(value)
+
+
+def _parameters(function: Any) -> dict[str, Any]:
+    """Parameters of a function or class with their defaults (none: empty)."""
+    return {n: p.default for n, p in inspect.signature(function).parameters.items() if p.kind is not p.VAR_KEYWORD}
+
+
+def _scanner(value: Any) -> tuple[Scanner, dict[str, Any]]:
+    given = dict(value) if isinstance(value, Mapping) else {}
+    preset = choice("scanner.preset", given.pop("preset", "pcct" if value is None else None), tuple(_PRESETS))
+    known = {n: d for n, d in _parameters(_PRESETS[preset]).items() if n != "detector"}
+    resolved = {**known, **_mapping("scanner", given, tuple(known))}
+    return _PRESETS[preset](**resolved), {"preset": preset, **resolved}
+
+
+def _scene(value: Any, folder: Path) -> tuple[Scene | VoxelScene, dict[str, Any]]:
+    if not isinstance(value, Mapping):
+        raise TypeError(f"scene must be a mapping with kind, got {value!r}; see torchpcct show-config")
+    given = dict(value)
+    kind = choice("scene.kind", given.pop("kind", None), ("plaque", "thorax", "water", "bodies", "volume"))
+    if kind == "volume":
+        return _voxels(_mapping("scene", given, ("file", "energy_kev")), folder)
+    if kind == "bodies":
+        _mapping("scene", given, ("bodies",))
+        return Scene([_body(k, b) for k, b in enumerate(given.get("bodies") or [])]), {"kind": kind, **given}
+    from torchpcct.scene.phantoms.quality import water_cylinder  # load what is asked for only
+    from torchpcct.scene.phantoms.thorax import thorax
+    from torchpcct.scene.plaque import plaque_scene
+
+    make: Any = {"plaque": plaque_scene, "thorax": thorax, "water": water_cylinder}[kind]
+    options = _mapping("scene", given, tuple(_parameters(make)))
+    made = make(**options)
+    return (made[0] if kind == "plaque" else made), {"kind": kind, **options}
+
+
+def _body(k: int, value: Any) -> Body:
+    name = f"scene.bodies[{k}]"
+    given = dict(value) if isinstance(value, Mapping) else {}
+    shape = _SHAPES[choice(f"{name}.shape", given.pop("shape", None), tuple(_SHAPES))]
+    common = {n: given.pop(n) for n in ("name", "material", "parent") if n in given}
+    missing = [n for n in ("name", "material") if n not in common]
+    if missing:
+        raise ValueError(f"{name} needs {', '.join(missing)}")
+    return Body(common["name"], shape(**_mapping(name, given, tuple(_parameters(shape)))), common["material"],
+                common.get("parent"))  # fmt: skip
+
+
+def _voxels(given: dict[str, Any], folder: Path) -> tuple[VoxelScene, dict[str, Any]]:
+    if "file" not in given:
+        raise ValueError("a scene of kind volume needs file, a CT volume in HU")
+    energy = float(given.get("energy_kev", 70.0))
+    volume = Volume.load(folder / given["file"])
+    if volume.unit != "HU":
+        raise ValueError(f"{given['file']} is in {volume.unit}: a scene is made of a volume in HU")
+    scene = VoxelScene(np.asarray(volume.data), volume.grid, energies_kev=energy)
+    return scene, {"kind": "volume", "file": str((folder / given["file"]).resolve()), "energy_kev": energy}

@@ -1,0 +1,389 @@
+"""The commands of one scan: ``simulate``, ``show-config``, ``reconstruct``, ``info``, ``view``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+# What loads torch or numba is imported by the commands: help and refusals come at once.
+from recon.cli.parsing import Commands, command, tell
+from torchpcct import VolumeGrid
+from torchpcct.files import require_folder, written_whole
+from torchpcct.formats.volume_files import check_volume_name
+from torchpcct.validate import choice, number, numbers, whole
+
+if TYPE_CHECKING:
+    from recon.cli.config import SimulationConfig
+    from recon.study.study import ProgressBars
+    from torchpcct.scan import Scan
+
+__all__ = ["add_info", "add_reconstruct", "add_show_config", "add_simulate", "add_view"]
+
+_SCAN_ENDINGS, _PICTURE_ENDINGS = (".h5", ".hdf5"), (".png", ".pdf", ".svg")
+_PAPER_VIEWS = 1968
+MOST_VOXELS = 2**31
+"""Of a volume, 8 GiB: what is asked for beyond is a slip of the voxel size."""
+_FBP_RATE = 1e8
+"""Voxel updates of the backprojection a second on one core, for a rough estimate."""
+
+
+def _ending(path: Path, endings: tuple[str, ...]) -> None:
+    if path.suffix.lower() not in endings:
+        raise ValueError(f"unknown ending of {path.name!r}: use {', '.join(endings)}")
+
+
+# --- simulate -----------------------------------------------------------------------------------------------------
+
+
+def _paper(arguments: argparse.Namespace) -> SimulationConfig:
+    """The paper's plaque scan, from the options alone."""
+    from recon.cli.config import SimulationConfig
+    from recon.study.paper.plaque_scan import inset_grid
+    from torchpcct.scanner import presets
+    from torchpcct.scene.plaque import plaque_scene
+
+    scene, plaque = plaque_scene()
+    views = _PAPER_VIEWS if arguments.views is None else arguments.views
+    region = None if arguments.whole else inset_grid(plaque, 0.1)
+    kept = None if region is None else {
+        "shape": list(region.shape), "spacing": list(region.spacing), "center": list(region.center)
+    }  # fmt: skip
+    values = {
+        "scene": {"kind": "plaque"},
+        "scanner": {"preset": "pcct", "views": views},
+        "exposure_s": arguments.exposure,
+        "seed": arguments.seed,
+        "region": kept,
+        "tolerance_hu": 0.5,
+    }
+    return SimulationConfig(scene, presets.pcct(views=views), region, arguments.exposure, arguments.seed, 0.5, values)
+
+
+def _simulate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
+    _ending(arguments.out, _SCAN_ENDINGS)
+    require_folder(arguments.out)
+    whole("--seed", arguments.seed, low=0)
+    if arguments.views is not None:
+        whole("--views", arguments.views)
+    if arguments.exposure is not None:
+        number("--exposure (exposure_s)", arguments.exposure, positive=True, unit="s")
+    if arguments.config is not None and not arguments.config.exists():
+        raise FileNotFoundError(f"{arguments.config} does not exist: torchpcct show-config prints an example")
+    from recon.cli.config import read_config
+    from torchpcct.acquisition.acquire import acquire, plan
+    from torchpcct.scene.voxels import VoxelScene
+
+    if arguments.config is None:
+        config = _paper(arguments)
+    else:
+        if arguments.views is not None or arguments.whole:
+            raise ValueError("--views and --whole are the plaque scan's: put views and region into the configuration")
+        config = read_config(arguments.config, exposure_s=arguments.exposure, seed=arguments.seed or None)
+    voxels = isinstance(config.scene, VoxelScene)
+    if arguments.dry_run:
+        import yaml
+
+        print(yaml.safe_dump(config.values, sort_keys=False, allow_unicode=True))
+        print(_voxel_plan(config) if isinstance(config.scene, VoxelScene) else plan(
+            config.scene, config.scanner, region=config.region, tolerance_hu=config.tolerance_hu,
+            rotation_s=config.exposure_s,
+        ).table())  # fmt: skip
+        return
+    options: dict[str, Any] = {} if voxels else {"region": config.region, "tolerance_hu": config.tolerance_hu}
+    scan = acquire(config.scene, config.scanner, exposure_s=config.exposure_s, seed=config.seed,
+                   progress=progress.of("simulate"), **options)  # fmt: skip
+    progress.close()
+    scan.save(arguments.out)
+    mean = float(scan.counts.mean())
+    short = f"{' × '.join(map(str, scan.counts.shape))} readings, mean {mean:.4g}, {scan.info['seconds']} s"
+    tell(arguments, short, config.values, readings=list(scan.counts.shape), exposure_s=scan.exposure_s, seed=scan.seed,
+         mean_count=mean, **scan.info)  # fmt: skip
+
+
+def _voxel_plan(config: SimulationConfig) -> str:
+    g = config.scanner.geometry
+    readings = math.prod(g.shape)
+    return f"{readings / 1e6:.2f} M readings of a voxel volume, about {readings * 4 * 2 / 2**30:.2f} GiB"
+
+
+def add_simulate(commands: Commands) -> None:
+    parser = command(
+        commands, "simulate", _simulate, "simulate a scan to an HDF5 file",
+        "Simulate a scan of any scene (--config, see show-config) or, without one, of the paper's plaque by the "
+        "deep-silicon PCCT, and write it to HDF5, with what was done beside (.json, .yaml).",
+        "HDF5 file to write", required=True,
+    )  # fmt: skip
+    parser.add_argument("--config", type=Path, metavar="YAML", help="scene, scanner and exposure")
+    parser.add_argument("--exposure", type=float, metavar="S", help="exposure in s (default: noise free)")
+    parser.add_argument("--views", type=int, help=f"views per rotation of the plaque scan (default {_PAPER_VIEWS})")
+    parser.add_argument(
+        "--whole", action="store_true", help="keep the whole detector, not only the plaque's surroundings"
+    )
+    _add_output(parser)
+
+
+def _add_output(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--dry-run", action="store_true", help="print the plan, memory and time; compute nothing")
+    parser.add_argument("--json", action="store_true", help="print the whole summary as JSON")
+
+
+def _show_config(arguments: argparse.Namespace, progress: ProgressBars) -> None:
+    from recon.cli.config import EXAMPLE
+
+    print(EXAMPLE, end="")
+
+
+def add_show_config(commands: Commands) -> None:
+    parser = commands.add_parser(
+        "show-config", help="print a full example for simulate --config", description="Print a full YAML example."
+    )
+    parser.set_defaults(run=_show_config, device="cpu", no_progress=True, verbose=False)
+
+
+# --- reconstruct --------------------------------------------------------------------------------------------------
+
+
+def _reader_options(arguments: argparse.Namespace) -> dict[str, Any]:
+    options: dict[str, Any] = {}
+    for name in ("axis", "pitch", "mu_water", "photons"):
+        value = getattr(arguments, name)
+        if value is not None:
+            options[name] = value
+    if arguments.slices is not None:
+        try:
+            first, last = (int(part) if part else None for part in arguments.slices.split(":"))
+        except ValueError:
+            raise ValueError(f"--slices must be first:last, got {arguments.slices!r}") from None
+        options["slices"] = slice(first, last)
+    if arguments.geometry is not None:
+        import yaml
+
+        from torchpcct.formats.geometry_yaml import geometry_of
+
+        values = yaml.safe_load(arguments.geometry.read_text(encoding="utf-8"))
+        options["geometry"] = geometry_of(values, arguments.geometry.parent)
+    return options
+
+
+def _grid(scan: Scan, arguments: argparse.Namespace) -> VolumeGrid:
+    """The grid that was asked for; else the plaque's inset for a windowed scan, the field of view for any other."""
+    import numpy as np
+
+    from torchpcct.geometry import ConeBeam, ParallelBeam
+
+    voxel = arguments.voxel
+    if scan.window is not None:
+        from recon.study.paper.plaque_scan import INSET_MM
+        from torchpcct.scene.plaque import PAPER_POSITION
+
+        voxel = voxel or 0.25
+        shape = tuple(math.ceil(e / voxel - 1e-6) for e in arguments.extent or INSET_MM)
+        return VolumeGrid(shape, voxel, tuple(arguments.center or PAPER_POSITION[::-1]))
+    g: Any = scan.geometry
+    u = g.column_positions
+    if isinstance(g, ParallelBeam):
+        cell, radius = g.pitch, max(-u[0], u[-1])
+    else:
+        pitch = g.pitch[1] if isinstance(g, ConeBeam) else g.pitch
+        cell, radius = pitch / g.magnification, g.sod * math.sin(float(np.abs(g.fan_angles).max()))
+    voxel = voxel or cell
+    side = 2.0 * radius
+    extent = list(arguments.extent or [0.0, side, side])
+    center = list(arguments.center or [0.0, 0.0, 0.0])
+    plane = [max(1, math.ceil(e / voxel - 1e-6)) for e in extent[1:]]
+    if isinstance(g, ConeBeam):
+        height = extent[0] or g.rows * g.pitch[0] / g.magnification * (1.0 - radius / g.sod)
+        return VolumeGrid((max(1, math.floor(height / voxel)), *plane), voxel, tuple(center))
+    slices = tuple(scan.counts.shape[:-2])
+    return VolumeGrid((*slices, *plane), voxel, tuple(center[3 - len(slices) - 2 :]))
+
+
+def _require_voxels(shape: tuple[int, ...]) -> None:
+    if math.prod(shape) > MOST_VOXELS:
+        raise ValueError(
+            f"--voxel makes {' × '.join(map(str, shape))} voxels, more than {MOST_VOXELS:.0e}: enlarge the voxels, or "
+            "reconstruct a smaller --extent"
+        )
+
+
+def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
+    require_folder(arguments.out)
+    check_volume_name(arguments.out)
+    if arguments.voxel is not None:
+        number("--voxel", arguments.voxel, positive=True, unit="mm")
+    if arguments.extent is not None:
+        numbers("--extent", arguments.extent, 3, positive=True, unit="mm")
+    if arguments.center is not None:
+        numbers("--center", arguments.center, 3, unit="mm")
+    if arguments.voxel is not None:
+        _require_voxels(tuple(math.ceil(e / arguments.voxel) for e in arguments.extent or (1.0, 1.0, 1.0)))
+    if not arguments.scan.exists():
+        raise FileNotFoundError(f"{arguments.scan} does not exist: make it with torchpcct simulate")
+    import yaml
+
+    from recon.api import METHODS, reconstruct
+    from torchpcct.formats.geometry_yaml import geometry_values
+    from torchpcct.formats.scans import check_scan_name, open_scan
+
+    choice("method", arguments.method, METHODS)
+    check_scan_name(arguments.scan)
+    scan = open_scan(arguments.scan, **_reader_options(arguments))
+    if arguments.find_axis:
+        from torchpcct.formats.preprocess import centred  # algotom
+
+        scan = centred(scan)
+    grid = _grid(scan, arguments)
+    _require_voxels(grid.shape)
+    options = {} if arguments.kernel is None else {"kernel": arguments.kernel}
+    config = {
+        "scan": str(arguments.scan), "geometry": geometry_values(scan.geometry), "method": arguments.method,
+        "grid": {"shape": list(grid.shape), "spacing": list(grid.spacing), "center": list(grid.center)},
+        "unit": scan.unit, **options,
+    }  # fmt: skip
+    if arguments.dry_run:
+        bytes_ = 4 * (3 * scan.counts.numel() + 2 * grid.voxels)
+        seconds = grid.voxels * scan.geometry.views / _FBP_RATE
+        print(yaml.safe_dump(config, sort_keys=False, allow_unicode=True))
+        print(
+            f"about {bytes_ / 2**30:.2f} GiB; FBP about {seconds:.1f} s on one core, iterative methods many times that"
+        )
+        return
+    volume = reconstruct(
+        scan, grid, arguments.method, progress=progress.of(arguments.method), device=arguments.device, **options
+    )
+    progress.close()
+    volume.save(arguments.out)
+    mean = float(volume.data.mean())
+    size = " × ".join(map(str, grid.shape))
+    spacing = " × ".join(f"{s:.4g}" for s in grid.spacing)
+    seconds = volume.report["seconds"]
+    short = f"{size} voxels of {spacing} mm, {arguments.method}, mean {mean:.4g} {volume.unit}, {seconds} s"
+    for text in volume.report.get("warnings", []):
+        short += f"\n  warning: {text}"
+    tell(arguments, short, config, shape=list(grid.shape), spacing_mm=list(grid.spacing), center_mm=list(grid.center),
+         unit=volume.unit, mean_hu=mean, **volume.report)  # fmt: skip
+
+
+def add_reconstruct(commands: Commands) -> None:
+    parser = command(
+        commands, "reconstruct", _reconstruct, "reconstruct a scan file to a volume",
+        "Reconstruct a scan, ours or a foreign one, and write the volume, with what was done beside (.json, .yaml).",
+        "volume to write: .nii, .nii.gz, .mha, .h5, or no ending for a DICOM series", required=True,
+    )  # fmt: skip
+    axes = ("Z", "Y", "X")
+    parser.add_argument("scan", type=Path, help=".h5 (ours or Data Exchange), .yaml stack, CatSim, DICOM-CT-PD folder")
+    parser.add_argument("--method", default="fbp", help="fbp, pwls or mbir (default fbp)")
+    parser.add_argument("--kernel", help="FBP kernel: soft, standard, detail, bone, ram-lak")
+    parser.add_argument("--voxel", type=float, metavar="MM", help="voxel size (default: the detector's; inset: 0.25)")
+    parser.add_argument("--center", type=float, nargs=3, metavar=axes, help="centre in mm (default: axis or plaque)")
+    parser.add_argument(
+        "--extent", type=float, nargs=3, metavar=axes, help="edge lengths in mm (default: what is seen)"
+    )
+    parser.add_argument("--geometry", type=Path, metavar="YAML", help="geometry of files that do not hold it")
+    parser.add_argument("--mu-water", type=float, metavar="MM⁻¹", help="attenuation of water: result in HU")
+    parser.add_argument("--axis", type=float, metavar="COLUMN", help="rotation axis (Data Exchange)")
+    parser.add_argument("--find-axis", action="store_true", help="search the rotation axis (parallel beams)")
+    parser.add_argument("--pitch", type=float, metavar="MM", help="cell width (Data Exchange without pixel size)")
+    parser.add_argument("--photons", type=float, metavar="N", help="of an unattenuated reading (line integrals)")
+    parser.add_argument("--slices", metavar="A:B", help="rows to read (Data Exchange)")
+    _add_output(parser)
+
+
+# --- info, view ---------------------------------------------------------------------------------------------------
+
+
+def _is_volume(path: Path) -> bool:
+    if path.suffix.lower() in _SCAN_ENDINGS:
+        import h5py
+
+        from torchpcct.formats.damage import reading
+
+        with reading(path, "HDF5"), h5py.File(path, "r") as file:
+            return str(file.attrs.get("format")) == "torchpcct-volume"
+    return str(path).endswith((".nii", ".nii.gz", ".mha"))
+
+
+def _info(arguments: argparse.Namespace, progress: ProgressBars) -> None:
+    import yaml
+
+    from torchpcct.formats.geometry_yaml import geometry_values
+    from torchpcct.formats.scans import open_scan
+    from torchpcct.volume import Volume
+
+    path: Path = arguments.file
+    if _is_volume(path):
+        volume = Volume.load(path)
+        values = volume.data.double()
+        about: dict[str, Any] = {
+            "kind": "volume", "shape": list(volume.grid.shape), "spacing_mm": list(volume.grid.spacing),
+            "center_mm": list(volume.grid.center), "unit": volume.unit, "lowest": float(values.min()),
+            "mean": float(values.mean()), "highest": float(values.max()), "report": dict(volume.report),
+        }  # fmt: skip
+    else:
+        scan = open_scan(path)
+        about = {
+            "kind": "scan", "readings": list(scan.counts.shape), "geometry": geometry_values(scan.geometry),
+            "exposure_s": scan.exposure_s, "seed": scan.seed, "counting": scan.counting, "unit": scan.unit,
+            "windowed": scan.window is not None, "mean": float(scan.counts.mean()), "zero_share": scan.zero_fraction,
+            "dead_readings": 0 if scan.dead is None else int(scan.dead.sum()), "info": dict(scan.info),
+        }  # fmt: skip
+    if arguments.json:
+        print(json.dumps({"file": str(path), **about}, indent=1, default=str))
+        return
+    for key in ("report", "info"):
+        about.pop(key, None)
+    print(yaml.safe_dump({"file": str(path), **about}, sort_keys=False, allow_unicode=True), end="")
+
+
+def add_info(commands: Commands) -> None:
+    parser = commands.add_parser("info", help="what a scan or volume file holds", description="What a file holds.")
+    parser.set_defaults(run=_info, device="cpu", no_progress=True, verbose=False)
+    parser.add_argument("file", type=Path, help="scan or volume")
+    parser.add_argument("--json", action="store_true", help="everything, as JSON")
+
+
+def _view(arguments: argparse.Namespace, progress: ProgressBars) -> None:
+    _ending(arguments.out, _PICTURE_ENDINGS)
+    require_folder(arguments.out)
+    width = number("--window", arguments.window, positive=True)
+    import numpy as np
+    from matplotlib.figure import Figure
+
+    from torchpcct.volume import Volume
+
+    volume = Volume.load(arguments.file)
+    data = volume.data if volume.data.ndim == 3 else volume.data[None]
+    axis = "zyx".index(arguments.plane)
+    index = data.shape[axis] // 2 if arguments.slice is None else arguments.slice
+    if not 0 <= index < data.shape[axis]:
+        raise ValueError(f"--slice must lie in 0 … {data.shape[axis] - 1} along {arguments.plane}, got {index}")
+    image = data.select(axis, index).numpy()
+    axes = volume.grid.axes if volume.grid.ndim == 3 else (np.zeros(1), *volume.grid.axes)
+    names = [n for n in (0, 1, 2) if n != axis]
+    across, up = axes[names[1]], axes[names[0]]
+    figure = Figure(figsize=(6.4, 6.0), dpi=120, layout="constrained")
+    panel = figure.subplots()
+    low, high = arguments.level - width / 2, arguments.level + width / 2
+    step = [float(a[1] - a[0]) if a.size > 1 else 1.0 for a in (across, up)]
+    extent = (across[0] - step[0] / 2, across[-1] + step[0] / 2, up[0] - step[1] / 2, up[-1] + step[1] / 2)
+    shown = panel.imshow(image, cmap="gray", vmin=low, vmax=high, origin="lower", extent=extent)
+    panel.set(xlabel=f"{'zyx'[names[1]]} / mm", ylabel=f"{'zyx'[names[0]]} / mm",
+              title=f"{arguments.plane} = {axes[axis][index]:.2f} mm")  # fmt: skip
+    figure.colorbar(shown, ax=panel, label=volume.unit)
+    with written_whole(arguments.out) as part:
+        figure.savefig(part)
+    print(f"{arguments.out}: slice {index} along {arguments.plane}, level {arguments.level:g}, window {width:g}")
+
+
+def add_view(commands: Commands) -> None:
+    parser = commands.add_parser("view", help="a slice of a volume as a picture", description="Draw a slice.")
+    parser.set_defaults(run=_view, device="cpu", no_progress=True, verbose=False)
+    parser.add_argument("file", type=Path, help="volume: .nii, .nii.gz, .mha, .h5 or a folder of a DICOM series")
+    parser.add_argument("--out", type=Path, required=True, metavar="PATH", help="picture: .png, .pdf or .svg")
+    parser.add_argument("--plane", choices=("z", "y", "x"), default="z", help="axis across the slice (default z)")
+    parser.add_argument("--slice", type=int, metavar="K", help="index along it (default: the middle)")
+    parser.add_argument("--level", type=float, default=40.0, help="centre of the grey scale (default 40)")
+    parser.add_argument("--window", type=float, default=400.0, help="its width (default 400)")

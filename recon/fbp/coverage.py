@@ -1,0 +1,83 @@
+"""Does the scan see what is to be reconstructed? FBP itself never fails: without data it extrapolates, plausibly."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid, view_step
+
+__all__ = ["check_rows", "sampling_warnings"]
+
+STREAK_CELLS = 10.0
+"""Distance between the paths of neighbouring views at the border of the field of view, in cells at the axis, from which
+streaks of an object at the border are wider than what the kernels smooth. 1968 views of the paper's scanner: 1.6."""
+
+
+def check_rows(geometry: Geometry, grid: VolumeGrid, motion: Any = None) -> list[str]:
+    """Refuse a grid that no view of a cone beam sees; say which slices are not seen by all views, or by none.
+
+    Args:
+        geometry: parallel and fan beams have no rows, and pass.
+        grid: ``(z, y, x)``.
+        motion: displacement of the grid per view, ``(views, 3)`` z, y, x mm, or None.
+
+    Returns:
+        Warnings; empty if all views see all slices.
+
+    Raises:
+        ValueError: the centres of all slices lie above or below the detector in every view.
+    """
+    if not isinstance(geometry, ConeBeam) or grid.ndim != 3:
+        return []
+    shift = np.zeros((1, 3)) if motion is None else np.asarray(motion, dtype=np.float64).reshape(-1, 3)
+    half = geometry.pitch[0] / 2
+    bottom, top = geometry.row_positions[0] - half, geometry.row_positions[-1] + half
+    # The grid's nearest and farthest voxels from the source over the turn: their rows are the highest and the lowest.
+    radius = min(grid.in_plane_radius + float(np.hypot(shift[:, 1], shift[:, 2]).max()), 0.999 * geometry.sod)
+    inner = max(float(np.hypot(*grid.center[1:])) - math.hypot(*grid.extent[1:]) / 2, 0.0)
+    heights = geometry.sdd / np.array([geometry.sod - radius, geometry.sod + radius, geometry.sod - inner])
+    z = grid.axes[0]
+    low, high = z + shift[:, 0].min(), z + shift[:, 0].max()
+    margin = 1e-6 * geometry.pitch[0]
+    by_all = (np.outer(heights, high).max(0) <= top + margin) & (np.outer(heights, low).min(0) >= bottom - margin)
+    by_some = (np.outer(heights, low).min(0) <= top + margin) & (np.outer(heights, high).max(0) >= bottom - margin)
+    reach = f"the {geometry.rows} rows cover z = {bottom / heights[2]:.2f} … {top / heights[2]:.2f} mm at the grid"
+    if not by_some.any():
+        raise ValueError(f"the grid (z = {z[0]:g} … {z[-1]:g} mm) is seen in no view: {reach}; move it along z")
+    found = []
+    for seen, how in ((by_some, "are seen in no view"), (by_all | ~by_some, "are not seen in every view")):
+        if not seen.all():
+            out = z[~seen]
+            found.append(
+                f"{out.size} of {z.size} slices (z = {out.min():g} … {out.max():g} mm) {how} and are extrapolated: "
+                f"{reach}"
+            )
+    return found
+
+
+def sampling_warnings(geometry: Geometry) -> list[str]:
+    """Whether the views are too few for the field of view.
+
+    Args:
+        geometry: of the scan.
+
+    Returns:
+        Warnings; empty if the views suffice.
+    """
+    if isinstance(geometry, ParallelBeam):
+        cell, radius = geometry.pitch, float(np.abs(geometry.column_positions).max())
+    else:
+        g: Any = geometry
+        cell, radius = (g.pitch[1] if isinstance(g, ConeBeam) else g.pitch) / g.magnification, g.fov_radius
+    apart = view_step(geometry.angles) * radius
+    if apart <= STREAK_CELLS * cell:
+        return []
+    needed = math.ceil(2 * math.pi * radius / (STREAK_CELLS * cell))
+    return [
+        f"{geometry.views} views are few: at the border of the field of view ({radius:.0f} mm) the paths of "
+        f"neighbouring views lie {apart:.1f} mm apart, {apart / cell:.0f} cells: edges there draw streaks; "
+        f"{needed} views a turn would keep them below {STREAK_CELLS:g} cells"
+    ]

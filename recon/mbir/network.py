@@ -1,0 +1,144 @@
+"""The learned prior: a small 3-D U-Net, blind to the unit of its input, that knows the noise level.
+
+It sees two volumes in noise units (:mod:`recon.mbir.problem`), the estimate so far and what a step towards the data
+would make of it, and gives a new estimate. (To give what must be added, the noise with the other sign, takes ten times
+as long to learn: the noise passes through every layer then.) Convolutions have no bias and every nonlinearity is a
+leaky ReLU, so the network is homogeneous: twice the input gives twice the output, and a volume of zeros stays zero
+(Mohan, Kadkhodaie, Simoncelli, Fernandez-Granda 2020, ICLR: bias-free networks generalise over noise levels). What it
+must know beside, the noise scale in HU (tissues have their HU), the look and the step, changes gains of its channels
+only.
+
+Blocks of 2 × 2 × 2 voxels become channels first (Shi et al. 2016, CVPR, sub-voxel convolution), two more halvings
+follow (Ronneberger, Fischer, Brox 2015, U-Net): at 0.2 mm the coarsest cells have 1.6 mm, and the network sees 6 mm
+about each voxel, a whole plaque.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from torchpcct.validate import number, whole
+
+__all__ = ["Network", "NetworkConfig"]
+
+CONDITIONS = 3
+"""Numbers that steer the gains: logarithm of the noise scale, look, step."""
+_SLOPE = 0.1
+_BLOCK = 2
+_DEPTH = 3
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """Size of the network.
+
+    Args:
+        channels: of the three levels.
+        voxel_mm: size of the cubic voxels that it is for.
+    """
+
+    channels: tuple[int, int, int] = (20, 32, 36)
+    voxel_mm: float = 0.2
+
+    def __post_init__(self) -> None:
+        if len(self.channels) != _DEPTH:
+            raise ValueError(f"channels must name {_DEPTH} levels, got {self.channels!r}")
+        object.__setattr__(self, "channels", tuple(whole("channels", c, 1) for c in self.channels))
+        object.__setattr__(self, "voxel_mm", number("voxel_mm", self.voxel_mm, positive=True))
+
+
+class Network(nn.Module):
+    """A new estimate from an old one and the data.
+
+    Args:
+        config: size.
+
+    Attributes:
+        half_precision: convolve in bfloat16 while training.
+    """
+
+    def __init__(self, config: NetworkConfig | None = None) -> None:
+        super().__init__()
+        self.config = c = config or NetworkConfig()
+        self.half_precision = False
+        first, middle, last = c.channels
+        self.enter = _convolution(2 * _BLOCK**3, first)
+        self.down = nn.ModuleList([_Block(first), _Block(middle), _Block(last)])
+        self.narrow = nn.ModuleList([_convolution(first, middle), _convolution(middle, last)])
+        self.widen = nn.ModuleList([_convolution(last, middle, 1), _convolution(middle, first, 1)])
+        self.up = nn.ModuleList([_Block(middle), _Block(first)])
+        self.leave = _convolution(first, _BLOCK**3)
+        # Small at the start: volumes are smooth, their blocks' channels nearly equal.
+        with torch.no_grad():
+            self.leave.weight.mul_(0.2)
+        # The layout that processors convolve fastest in (the overload is missing in torch's types).
+        self.to(memory_format=torch.channels_last_3d)  # type: ignore[call-overload]
+
+    def forward(self, estimate: Tensor, towards: Tensor, condition: Tensor) -> Tensor:
+        """The new estimate, ``(batch, z, y, x)``.
+
+        Args:
+            estimate, towards: ``(batch, z, y, x)`` in noise units.
+            condition: ``(batch, 3)``: ln(noise scale / 200 HU), look − ½, number of the step.
+        """
+        shape = estimate.shape[-3:]
+        period = _BLOCK * 2 ** (_DEPTH - 1)
+        extra = [(-n) % period for n in shape]
+        pad = (0, extra[2], 0, extra[1], 0, extra[0])
+        x = torch.cat([to_blocks(F.pad(v, pad)) for v in (estimate, towards)], 1)
+        with torch.autocast(x.device.type, torch.bfloat16, enabled=self.training and self.half_precision):
+            fine = self.down[0](F.leaky_relu(self.enter(x), _SLOPE), condition)
+            middle = self.down[1](self.narrow[0](F.avg_pool3d(fine, 2)), condition)
+            coarse = self.down[2](self.narrow[1](F.avg_pool3d(middle, 2)), condition)
+            middle = self.up[0](middle + _doubled(self.widen[0](coarse)), condition)
+            fine = self.up[1](fine + _doubled(self.widen[1](middle)), condition)
+            out = self.leave(fine)
+        return from_blocks(out.float())[..., : shape[0], : shape[1], : shape[2]]
+
+
+class _Block(nn.Module):
+    """Two convolutions about which the input passes by; gains between them tell the noise level."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.first = _convolution(channels, channels)
+        self.second = _convolution(channels, channels)
+        self.gain = nn.Linear(CONDITIONS, channels)
+        nn.init.zeros_(self.gain.weight)
+        nn.init.zeros_(self.gain.bias)
+        # Close to the identity at the start.
+        with torch.no_grad():
+            self.second.weight.mul_(0.3)
+
+    def forward(self, x: Tensor, condition: Tensor) -> Tensor:
+        gain = torch.exp(self.gain(condition).float()).to(x.dtype)
+        h = F.leaky_relu(self.first(x) * gain[..., None, None, None], _SLOPE)
+        return F.leaky_relu(x + self.second(h), _SLOPE)
+
+
+def _convolution(inputs: int, outputs: int, size: int = 3) -> nn.Conv3d:
+    layer = nn.Conv3d(inputs, outputs, size, padding=size // 2, bias=False)
+    nn.init.kaiming_normal_(layer.weight, a=_SLOPE)
+    return layer
+
+
+def _doubled(x: Tensor) -> Tensor:
+    return F.interpolate(x, scale_factor=2, mode="nearest")
+
+
+def to_blocks(u: Tensor) -> Tensor:
+    """``(batch, z, y, x)`` to ``(batch, 8, z/2, y/2, x/2)``."""
+    b, z, y, x = u.shape
+    return (
+        u.reshape(b, z // 2, 2, y // 2, 2, x // 2, 2).permute(0, 2, 4, 6, 1, 3, 5).reshape(b, 8, z // 2, y // 2, x // 2)
+    ).contiguous(memory_format=torch.channels_last_3d)
+
+
+def from_blocks(blocks: Tensor) -> Tensor:
+    """Inverse (and adjoint) of :func:`to_blocks`."""
+    b, _, z, y, x = blocks.shape
+    return blocks.reshape(b, 2, 2, 2, z, y, x).permute(0, 4, 1, 5, 2, 6, 3).reshape(b, 2 * z, 2 * y, 2 * x)

@@ -1,0 +1,89 @@
+"""The normalised problem: what the network sees looks the same at every dose and voxel size.
+
+With the data's information I at 0.5 lp/mm (1/(HU² mm³), see :meth:`recon.gram.gram.Gram.information`) and the voxel
+volume V, the noise scale is c = (I V)^(−1/2) HU, and
+
+    u = x / c,      H = c² G  (about 1 at 0.5 lp/mm),      β = c b,      β = H u + noise of covariance H.
+
+So the same tissue at four times the dose looks to the network like twice the contrast at the same noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+__all__ = ["NormalisedProblem", "filtered", "from_frequencies", "squared_frequencies", "to_frequencies"]
+
+
+@dataclass(frozen=True)
+class NormalisedProblem:
+    """A batch of normalised problems that share one Gram operator.
+
+    Args:
+        gram: ``apply`` and ``periodic_spectrum`` of G at unit exposure, in mm⁻¹ units (:class:`recon.gram.gram.Gram`).
+        beta: ``(batch, z, y, x)``, c·b in HU units.
+        scale_hu: ``(batch,)`` noise scales c.
+        factor: ``(batch,)`` so that H = factor · G.
+        voxel_mm: voxel size.
+    """
+
+    gram: Any
+    beta: Tensor
+    scale_hu: Tensor
+    factor: Tensor
+    voxel_mm: float
+
+    @classmethod
+    def from_statistic(cls, gram: Any, b: Tensor, exposure: Tensor, hu: float, voxel_mm: float) -> NormalisedProblem:
+        """From AᵀW y.
+
+        Args:
+            gram: Gram operator at unit exposure.
+            b: ``(batch, z, y, x)``, AᵀW y with the weights of the exposures, y in line integrals of mm⁻¹.
+            exposure: ``(batch,)`` factors on the Gram operator's weights.
+            hu: 1 HU in mm⁻¹.
+            voxel_mm: size of the cubic voxels.
+        """
+        unit = gram.information(hu)
+        scale = (unit * exposure.to(b) * voxel_mm**3).rsqrt()
+        factor = exposure.to(b) * (scale * hu) ** 2
+        return cls(gram, b * (scale * hu).reshape(-1, 1, 1, 1), scale, factor, voxel_mm)
+
+    def apply(self, u: Tensor) -> Tensor:
+        """H u."""
+        out: Tensor = self.gram.apply(u) * self.factor.reshape(-1, 1, 1, 1)
+        return out
+
+    def spectrum(self) -> Tensor:
+        """Eigenvalues of the circulant approximation of H, ``(batch, z, y, x//2 + 1)``."""
+        return self.gram.periodic_spectrum().to(self.beta) * self.factor.reshape(-1, 1, 1, 1)
+
+
+def squared_frequencies(shape: tuple[int, ...], voxel_mm: float, along: float = 1.0) -> Tensor:
+    """f_xy² + ``along`` · f_z² in (line pairs per mm)² on the frequencies of ``rfftn`` of ``(z, y, x)`` volumes."""
+    z, y, x = shape
+    total: Tensor = (
+        along * torch.fft.fftfreq(z, voxel_mm)[:, None, None] ** 2
+        + torch.fft.fftfreq(y, voxel_mm)[:, None] ** 2
+        + torch.fft.rfftfreq(x, voxel_mm) ** 2
+    )
+    return total
+
+
+def to_frequencies(v: Tensor) -> Tensor:
+    """``rfftn`` of volumes ``(..., z, y, x)``."""
+    return torch.fft.rfftn(v, dim=(-3, -2, -1))
+
+
+def from_frequencies(spectrum: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """Volumes ``(..., *shape)`` of :func:`to_frequencies`."""
+    return torch.fft.irfftn(spectrum, s=shape, dim=(-3, -2, -1))
+
+
+def filtered(v: Tensor, spectrum: Tensor) -> Tensor:
+    """Volumes ``(..., z, y, x)`` times ``spectrum`` on the frequencies of ``rfftn``."""
+    return from_frequencies(spectrum * to_frequencies(v), v.shape[-3:])

@@ -1,0 +1,110 @@
+"""The outline of a vessel in its own coordinates: r(θ, s), Fourier orders times B-splines, with a smooth prior."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.plaque.centreline import Coordinates
+
+__all__ = ["ORDERS", "Outline", "OutlineAt"]
+
+Floats = NDArray[np.float64]
+
+ORDERS = 4
+"""Fourier orders of a section: 1 moves it, 2 makes it an ellipse, 3 an egg; a flat ellipse needs 4."""
+
+_KNOT_MM = 0.9
+_CORRELATION_MM = 2.0
+"""ℓ of the prior's correlation along the vessel, Matérn's of order 5/2: smooth, but for sudden bends."""
+_SD_MM = (0.7, 0.5, 0.3, 0.1, 0.05)
+"""Prior standard deviation of every order."""
+
+
+@dataclass(frozen=True, eq=False)
+class OutlineAt:
+    """Everything of an outline that does not change with its shape, at given points.
+
+    Attributes:
+        first: ``(n,)`` first of the four splines that reach each point.
+        spline, spline_slope: ``(n, 4)`` their values and derivatives along s.
+        wave, wave_slope: ``(n, 2·ORDERS + 1)`` Fourier functions and their derivatives by θ.
+    """
+
+    first: NDArray[np.int64]
+    spline: Floats
+    spline_slope: Floats
+    wave: Floats
+    wave_slope: Floats
+
+    def radius(self, shape: Floats) -> tuple[Floats, Floats, Floats]:
+        """r, dr/dθ and dr/ds at the points for coefficients ``(splines, 2·ORDERS + 1)``."""
+        near = shape[self.first[:, None] + np.arange(4)]
+        along = np.einsum("ni,nik->nk", self.spline, near)
+        r, turn = np.einsum("nk,nk->n", along, self.wave), np.einsum("nk,nk->n", along, self.wave_slope)
+        return r, turn, np.einsum("ni,nik,nk->n", self.spline_slope, near, self.wave)
+
+    def spread(self, slope: Floats, out: Floats) -> None:
+        """Add slope · dr/d(coefficients) to ``out`` ``(n, splines · (2·ORDERS + 1))``, points with slope 0 left out."""
+        at = np.flatnonzero(slope)
+        waves = self.wave.shape[1]
+        for i in range(4):
+            columns = (self.first[at] + i)[:, None] * waves + np.arange(waves)
+            out[at[:, None], columns] += (slope[at] * self.spline[at, i])[:, None] * self.wave[at]
+
+
+@dataclass(frozen=True)
+class Outline:
+    """Splines from ``low`` to ``high`` along the line.
+
+    Args:
+        low, high: mm.
+    """
+
+    low: float
+    high: float
+
+    @property
+    def splines(self) -> int:
+        """Number of splines."""
+        return int(np.ceil((self.high - self.low) / _KNOT_MM)) + 3
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients."""
+        return self.splines * (2 * ORDERS + 1)
+
+    def at(self, c: Coordinates) -> OutlineAt:
+        """The outline's functions at points; beyond its ends it goes on as it ends."""
+        return self.at_angles(c.s, c.theta)
+
+    def at_angles(self, s: Floats, theta: Floats) -> OutlineAt:
+        """The same from positions and angles ``(n,)``."""
+        t = np.clip((s - self.low) / _KNOT_MM, 0.0, self.splines - 3 - 1e-9)
+        first = np.floor(t).astype(np.int64)
+        u = t - first
+        spline = np.stack([(1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, -3 * u**3 + 3 * u**2 + 3 * u + 1, u**3], 1) / 6
+        slope = np.stack([-((1 - u) ** 2), 3 * u**2 - 4 * u, -3 * u**2 + 2 * u + 1, u**2], 1) / (2 * _KNOT_MM)
+        k = np.arange(1, ORDERS + 1)
+        c, s_ = np.cos(theta[:, None] * k), np.sin(theta[:, None] * k)
+        ones = np.ones((len(theta), 1))
+        return OutlineAt(first, spline, slope, np.hstack([ones, c, s_]), np.hstack([0 * ones, -k * s_, k * c]))
+
+    def constant(self, radius: Floats, at: Floats) -> Floats:
+        """Coefficients ``(splines, 2·ORDERS + 1)`` of a round vessel of ``radius`` at positions ``at``, smoothed."""
+        shape = np.zeros((self.splines, 2 * ORDERS + 1))
+        centres = self.low + (np.arange(self.splines) - 1) * _KNOT_MM
+        weight = np.exp(-0.5 * ((centres[:, None] - at) / _KNOT_MM) ** 2) + 1e-9
+        shape[:, 0] = (weight @ radius) / weight.sum(1)
+        return shape
+
+    def precision(self) -> Floats:
+        """Prior inverse covariance of all coefficients, mm⁻²."""
+        centres = np.arange(self.splines) * _KNOT_MM
+        lag = math.sqrt(5.0) * np.abs(centres[:, None] - centres) / _CORRELATION_MM
+        k = (1 + lag + lag**2 / 3) * np.exp(-lag)
+        order = np.concatenate([[0], np.arange(1, ORDERS + 1), np.arange(1, ORDERS + 1)])
+        return np.kron(np.linalg.inv(k), np.diag(1.0 / np.array(_SD_MM)[order] ** 2))

@@ -1,0 +1,254 @@
+"""The reading of a vessel: tissues, plaque bodies and their figures, each with an interval, or refused."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.plaque.core import CorePrior, CoreSpace
+from recon.plaque.data import TissueData
+from recon.plaque.figures import Estimate, draws_of, estimate
+from recon.plaque.particles import Cloud, lead
+from recon.plaque.quality import misfit, texture
+from recon.plaque.start import find_vessel
+from recon.plaque.vessel import FAT, FIBROUS, Fit, Vessel
+from torchpcct.geometry import VolumeGrid
+from torchpcct.validate import number, numbers, whole
+
+__all__ = ["CERTAIN", "PlaqueReading", "read_plaque"]
+
+Floats = NDArray[np.float64]
+
+CERTAIN = 0.95
+"""Presence probability below which no contrast is given."""
+
+CALCIFIED_HU = 300.0
+"""A body of more contrast is a calcification."""
+_CALCIFICATION = CorePrior(1000.0, (0.25, 0.25, 0.4), 0.5, 0.25, 0.05, 0.7)
+_LOOK = 400
+_LEAST_LOG = 8.0
+"""Log evidence of a trial body that makes it worth looking for a calcification."""
+_MOST_BODIES = 3
+_PURE, _FEW, _LESS_PURE = 0.95, 8, 0.8
+"""Share of a tissue in voxels that are read in other volumes; where there are too few, the second."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlaqueReading:
+    """What was read of a vessel.
+
+    Attributes:
+        grid: of the data.
+        presence: probability that there is a plaque body of another value than the fibrous tissue.
+        calcifications: number of calcified bodies.
+        figures: name → :class:`recon.plaque.figures.Estimate`; the contrast is missing where presence is below
+            :data:`CERTAIN`.
+        refused: name → why a figure is missing.
+        given_core: the core's figures if it is there, however likely that is: for studies of the method, not to be
+            quoted where :attr:`presence` is low.
+        regions: tissue → ``grid.shape`` float32 share of each voxel (posterior mean; the core's if it is there).
+        image: ``grid.shape`` float32 HU, the fitted tissues, the core included.
+        chi2: mean square of the residual on the vessel's voxels, but for those at its ends inside of the volume, over
+            its expectation; chi2_sd: its standard deviation under the model.
+        texture_hu: standard deviation of a texture of 0.3 mm that the residual shows; texture_high_hu: its 95 % limit.
+        info: settings, and how the fit went.
+    """
+
+    grid: VolumeGrid
+    presence: float
+    calcifications: int
+    figures: Mapping[str, Estimate]
+    refused: Mapping[str, str]
+    given_core: Mapping[str, Estimate]
+    regions: Mapping[str, NDArray[np.float32]]
+    image: NDArray[np.float32]
+    chi2: float
+    chi2_sd: float
+    texture_hu: float
+    texture_high_hu: float
+    info: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def warnings(self) -> list[str]:
+        """What speaks against the model."""
+        found = []
+        if abs(self.chi2 - 1.0) > 4.0 * self.chi2_sd:
+            found.append(
+                f"the residual is {self.chi2:.2f} of what noise leaves ({self.chi2_sd:.2f} standard deviation): "
+                "there is something here that the model does not have; do not trust the intervals"
+            )
+        return found
+
+    def read(self, volume: Any) -> dict[str, float]:
+        """Mean HU of another volume on the same grid in each region, and the contrast fibrous − core.
+
+        Args:
+            volume: ``grid.shape`` HU, tensor or array.
+
+        Raises:
+            ValueError: another shape.
+        """
+        values = np.asarray(volume, dtype=np.float64)
+        if values.shape != tuple(self.grid.shape):
+            raise ValueError(f"volume must have the reading's shape {tuple(self.grid.shape)}, got {values.shape}")
+        found = {}
+        for name, share in self.regions.items():
+            inside = share > _PURE
+            if inside.sum() < _FEW:
+                inside = share > _LESS_PURE
+            if inside.any():
+                found[name] = float(values[inside].mean())
+        if "core" in found and "fibrous" in found:
+            found["contrast"] = found["fibrous"] - found["core"]
+        return found
+
+
+def read_plaque(
+    data: TissueData,
+    point: Any = None,
+    *,
+    point_sd: float = 0.4,
+    particles: int = 300,
+    prior: float = 0.5,
+    seed: int = 0,
+) -> PlaqueReading:
+    """Read the vessel in an inset.
+
+    Args:
+        data: :meth:`TissueData.of_scan`, or any other statistic with its operator.
+        point: ``(z, y, x)`` mm where a reader sees the plaque; None: blind, in the largest vessel.
+        point_sd: standard deviation of its error along each axis, mm.
+        particles: shapes of the core that are followed; fewer than 300 widen the spread of the result.
+        prior: probability of a core before the data.
+        seed: of the Monte Carlo.
+
+    Returns:
+        The reading. Given equal arguments it is the same.
+
+    Raises:
+        ValueError: no enhanced vessel (at the point), no layer that could hold a plaque, values out of range.
+        TypeError: values of the wrong kind.
+    """
+    where = None if point is None else numbers("point", point, 3)
+    place = None if where is None else (where[0], where[1], where[2])
+    point_sd = number("point_sd", point_sd, positive=True, unit="mm")
+    particles, seed = whole("particles", particles, 50), whole("seed", seed, 0)
+    prior = number("prior", prior, low=0.0, high=1.0)
+    rng = np.random.default_rng(seed)
+    start = find_vessel(data.pilot(), data.grid, None if where is None else np.array(where))
+    vessel = Vessel(data, start)
+    fit = vessel.fit(vessel.first_guess(), expected=True)
+    fit = _calcified(vessel, fit, particles, rng)
+    core = CorePrior(point=place, point_sd=point_sd)
+    return _read(vessel, fit, core, particles, prior, rng, seed)
+
+
+def _calcified(vessel: Vessel, fit: Fit, particles: int, rng: np.random.Generator) -> Fit:
+    """The fit with the calcifications that the data show."""
+    for _ in range(_MOST_BODIES):
+        space = CoreSpace(vessel, fit, _CALCIFICATION)
+        tries = space.draw_prior(_LOOK, rng)
+        seen = space.evidence(space.shares(tries))
+        if not np.any((seen.log > _LEAST_LOG) & (seen.mean > 0.5 * CALCIFIED_HU)):
+            break
+        cloud = lead(tries[:particles], space.nothing, space.target, rng)
+        found = space.evidence(space.shares(cloud.points))
+        if not (found.mean.mean() > 0.5 * CALCIFIED_HU and cloud.log_evidence > math.log(CERTAIN / (1 - CERTAIN))):
+            break
+        # The lumen's outline had taken some of it: its contrast shows in the fit that has the body.
+        other = _with_body(vessel, fit, space, cloud, float(found.mean.mean()), expected=True)
+        if other.parameters[-1] < CALCIFIED_HU:
+            break
+        fit = other
+    return fit
+
+
+def _with_body(
+    vessel: Vessel, fit: Fit, space: CoreSpace, cloud: Cloud, contrast: float, expected: bool = False
+) -> Fit:
+    """The vessel fitted again with the mean of a cloud of bodies beside those it has."""
+    layer = (fit.drawing.shares[1] - fit.drawing.shares[2])[space.chosen]
+    body = np.zeros((1, len(vessel.index)))
+    mean = space.shares(cloud.points).mean(0)
+    body[0, space.chosen] = np.where(layer > 0.02, np.clip(mean / np.maximum(layer, 0.02), 0.0, 1.0), 0.0)
+    return vessel.fit(np.append(fit.parameters, contrast), np.concatenate([fit.bodies, body]), expected=expected)
+
+
+def _read(
+    vessel: Vessel, fit: Fit, prior_of_core: CorePrior, particles: int, prior: float, rng: np.random.Generator,
+    seed: int,
+) -> PlaqueReading:  # fmt: skip
+    calcifications = len(fit.bodies)
+    space = CoreSpace(vessel, fit, prior_of_core)
+    cloud = lead(space.draw_prior(particles, rng), space.nothing, space.target, rng)
+    first = cloud.log_evidence
+    seen = space.evidence(space.shares(cloud.points))
+    # The vessel was fitted without a core, its tissues as expected. Now they are free: without a core, for comparison;
+    # with the one that was found; and then the core again.
+    without = CoreSpace(vessel, vessel.fit(fit.parameters, fit.bodies), prior_of_core)
+    fit = _with_body(vessel, fit, space, cloud, float(seen.mean.mean()))
+    again = CoreSpace(vessel, fit, prior_of_core, replaces=calcifications, against=without.none)
+    cloud = lead(cloud.points, space.target, again.target, rng, log_evidence=first)
+    space = again
+    odds = math.log(prior / (1 - prior)) if 0 < prior < 1 else math.copysign(math.inf, prior - 0.5)
+    presence = 1.0 / (1.0 + math.exp(-min(max(cloud.log_evidence + odds, -700.0), 700.0)))
+    shares = space.shares(cloud.points)
+    tau = texture(vessel, fit, rng)
+    draws = draws_of(vessel, fit, space, cloud.points, shares, tau, rng)
+    names = {"fat": "HU", "wall": "HU", "fibrous": "HU", "lumen": "HU", "wall thickness": "mm", "lumen area": "mm²",
+             "least lumen area": "mm²"}  # fmt: skip
+    plaque = {"contrast": "HU", "core": "HU", "core volume": "mm³", "cap thickness": "mm"}
+    refused = {}
+    given = {n: estimate(draws[n], unit) for n, unit in plaque.items()}
+    figures = {n: estimate(draws[n], unit) for n, unit in names.items() if n in draws}
+    if presence >= CERTAIN:
+        figures |= given
+    else:
+        refused = {n: f"a core is there with a probability of {presence:.2f} only" for n in plaque}
+    if calcifications:
+        index = [vessel.size + k for k in range(calcifications)]
+        for k, i in enumerate(index):
+            sd = math.sqrt(fit.covariance[i, i])
+            value = fit.parameters[i] + fit.parameters[FIBROUS]
+            figures[f"calcification {k + 1}"] = Estimate(value, value - 1.96 * sd, value + 1.96 * sd, sd, "HU")
+    square, spread = misfit(vessel, fit)
+    return PlaqueReading(
+        vessel.grid, presence, calcifications, figures, refused, given,
+        _regions(vessel, fit, space, shares, calcifications), _image(vessel, fit), square, spread, tau.sd_hu,
+        tau.high_hu,
+        {"particles": particles, "seed": seed, "log_evidence": cloud.log_evidence, "log_evidence_first": first,
+         "point": prior_of_core.point, "source": vessel.data.source, "voxels": len(vessel.index),
+         "core_center_mm": cloud.points[:, :3].mean(0).tolist(), "prior": prior},
+    )  # fmt: skip
+
+
+def _on_grid(vessel: Vessel, values: Floats, outside: float = 0.0) -> NDArray[np.float32]:
+    out = np.full(vessel.grid.shape, outside, np.float32)
+    out[tuple(vessel.index.T)] = values
+    return out
+
+
+def _regions(
+    vessel: Vessel, fit: Fit, space: CoreSpace, shares: NDArray[np.float32], calcifications: int
+) -> dict[str, NDArray[np.float32]]:
+    outer, inner, lumen = fit.drawing.shares
+    layer = np.clip(inner - lumen, 0.0, 1.0)
+    core = np.zeros(len(vessel.index))
+    core[space.chosen] = shares.mean(0)
+    hard = fit.bodies[:calcifications].sum(0) * layer
+    parts = {"wall": outer - inner, "fibrous": layer - np.minimum(core, layer) - hard, "lumen": lumen, "core": core}
+    if calcifications:
+        parts["calcification"] = hard
+    found = {"fat": _on_grid(vessel, 1.0 - outer, 1.0)}
+    found |= {name: _on_grid(vessel, np.clip(part, 0.0, 1.0)) for name, part in parts.items()}
+    return found
+
+
+def _image(vessel: Vessel, fit: Fit) -> NDArray[np.float32]:
+    fat = fit.parameters[FAT]
+    return _on_grid(vessel, fat + fit.drawing.image, fat)

@@ -1,0 +1,113 @@
+"""What a reading says: a table beside other volumes over the same regions, files, a picture."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from recon.plaque.reading import CERTAIN, PlaqueReading
+from torchpcct.files import written_whole
+from torchpcct.viz import Panel, panels
+from torchpcct.volume import Volume
+
+__all__ = ["picture", "save", "table"]
+
+_COLOURS = {"lumen": "tab:red", "fibrous": "tab:orange", "wall": "tab:blue", "core": "lime", "calcification": "white"}
+
+
+def table(reading: PlaqueReading, others: Mapping[str, Any] | None = None) -> str:
+    """Markdown: every figure with its 95 % interval, and what other volumes read over the same regions.
+
+    Args:
+        reading: to tell.
+        others: name → volume in HU on the reading's grid.
+    """
+    read = {name: reading.read(volume) for name, volume in (others or {}).items()}
+    lines = [
+        f"Plaque body: P = {reading.presence:.3f}"
+        + ("" if reading.presence >= CERTAIN else f" (less than {CERTAIN}: its figures are refused)")
+        + (f"; calcifications: {reading.calcifications}" if reading.calcifications else ""),
+        "",
+        " | ".join(["| figure", "tissues as unknowns [95 %]", *(f"{name}, same regions" for name in read)]) + " |",
+        "|---" * (2 + len(read)) + "|",
+    ]
+    for name, e in reading.figures.items():
+        digits = 1 if e.unit == "HU" else 2
+        cells = [f"{e.value:.{digits}f} [{e.low:.{digits}f}, {e.high:.{digits}f}] {e.unit}"]
+        cells += [f"{r[name]:.{digits}f}" if name in r else "–" for r in read.values()]
+        lines.append(" | ".join([f"| {name}", *cells]) + " |")
+    for name, why in reading.refused.items():
+        lines.append(" | ".join([f"| {name}", f"refused: {why}", *("–" for _ in read)]) + " |")
+    lines += [
+        "",
+        f"Read from a {reading.info['source']}. Residual: {reading.chi2:.3f} ± {reading.chi2_sd:.3f} of what noise "
+        f"leaves. Texture of 0.3 mm: {reading.texture_hu:.0f} HU, at most {reading.texture_high_hu:.0f} HU (95 %).",
+        *(f"Warning: {text}." for text in reading.warnings),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def picture(reading: PlaqueReading, others: Mapping[str, Any] | None = None) -> Any:
+    """Sections across and along z through the core's centre: other volumes with the outlines, and the fitted tissues.
+
+    Returns:
+        ``matplotlib.figure.Figure``.
+    """
+    grid = reading.grid
+    centre = np.array(reading.info["core_center_mm"])
+    index = [int(np.clip(round((c - a[0]) / s), 0, n - 1))
+             for c, a, s, n in zip(centre, grid.axes, grid.spacing, grid.shape, strict=True)]  # fmt: skip
+    (z0, z1), (y0, y1), (x0, x1) = ((a[0] - s / 2, a[-1] + s / 2) for a, s in zip(grid.axes, grid.spacing, strict=True))
+    certain = reading.presence >= CERTAIN
+    shown = {k: v for k, v in _COLOURS.items() if k in reading.regions and (k != "core" or certain)}
+    rows = []
+    for cut, extent in (((index[0],), (x0, x1, y0, y1)), ((slice(None), index[1]), (x0, x1, z0, z1))):
+        outlines = tuple((reading.regions[k][cut] > 0.5, colour) for k, colour in shown.items())
+        images = {**(others or {}), "fitted tissues": reading.image}
+        rows.append([Panel(np.asarray(v)[cut], extent, name, outlines) for name, v in images.items()])
+    return panels(rows, ("axial", "coronal"), title=f"plaque body: P = {reading.presence:.2f}")
+
+
+def save(reading: PlaqueReading, folder: Path, others: Mapping[str, Any] | None = None) -> list[Path]:
+    """Write ``report.md``, ``report.json``, ``tissues.nii.gz`` (labels), ``image.nii.gz`` and ``plaque.png``.
+
+    Labels: 0 fat, 1 wall, 2 fibrous, 3 lumen, 4 core, 5 calcification; the core only where it is certain.
+
+    Args:
+        reading: to write.
+        folder: made if it does not exist.
+        others: as for :func:`table`.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    names = ["fat", "wall", "fibrous", "lumen", "core", "calcification"]
+    shares = [reading.regions.get(n, np.zeros(reading.grid.shape, np.float32)) for n in names]
+    if reading.presence < CERTAIN:
+        shares[2], shares[4] = shares[2] + shares[4], 0 * shares[4]
+    labels = np.argmax(np.stack(shares), 0).astype(np.float32)
+    data = {
+        "presence": reading.presence,
+        "calcifications": reading.calcifications,
+        "figures": {n: e.as_dict() for n, e in reading.figures.items()},
+        "refused": dict(reading.refused),
+        "same_regions": {name: reading.read(volume) for name, volume in (others or {}).items()},
+        "chi2": reading.chi2,
+        "chi2_sd": reading.chi2_sd,
+        "texture_hu": reading.texture_hu,
+        "texture_high_hu": reading.texture_high_hu,
+        "warnings": reading.warnings,
+        "labels": {n: k for k, n in enumerate(names)},
+        "info": dict(reading.info),
+    }
+    for name, text in (("report.md", table(reading, others)), ("report.json", json.dumps(data, indent=1) + "\n")):
+        with written_whole(folder / name) as part:
+            part.write_text(text, encoding="utf-8")
+    Volume(torch.from_numpy(labels), reading.grid).save(folder / "tissues.nii.gz")
+    Volume(torch.from_numpy(reading.image), reading.grid).save(folder / "image.nii.gz")
+    with written_whole(folder / "plaque.png") as part:
+        picture(reading, others).savefig(part)
+    return [folder / n for n in ("report.md", "report.json", "tissues.nii.gz", "image.nii.gz", "plaque.png")]

@@ -1,0 +1,79 @@
+"""Where a vessel is, from thresholds on a smooth volume: what the fit starts with."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from recon.plaque.centreline import Centreline, follow, sections, smooth_line
+from recon.plaque.vessel import Start
+from torchpcct.geometry import VolumeGrid
+
+__all__ = ["find_vessel"]
+
+Floats = NDArray[np.float64]
+
+_BALL_MM = 1.8
+"""Larger than any lumen's radius."""
+_LEAST_STEP_HU = 120.0
+
+
+def find_vessel(pilot: Floats, grid: VolumeGrid, point: Floats | None) -> Start:
+    """Lumen and outer wall of the vessel nearest to a point, or of the largest one.
+
+    Args:
+        pilot: ``grid.shape`` HU, smooth.
+        grid: of the volume.
+        point: ``(3,)`` z, y, x mm, or None.
+
+    Raises:
+        ValueError: a point outside of the grid, no lumen brighter than its surroundings.
+    """
+    origin, step = np.array([a[0] for a in grid.axes]), np.array(grid.spacing)
+    fat = float(np.median(pilot))
+    top = float(np.percentile(pilot, 99.8))
+    bright = fat + 0.6 * (top - fat)
+    labels, count = ndimage.label(pilot > bright)
+    if not count or top - fat < _LEAST_STEP_HU:
+        raise ValueError(
+            f"nothing stands out of the surroundings ({fat:.0f} HU, brightest {top:.0f} HU): "
+            "the reader needs a vessel with contrast agent"
+        )
+    if point is None:
+        wanted = int(np.argmax(np.bincount(labels.ravel())[1:])) + 1
+    else:
+        at = (point - origin) / step
+        if np.any(at < -0.5) or np.any(at > np.array(grid.shape) - 0.5):
+            raise ValueError(f"the point {point.tolist()} mm (z, y, x) lies outside of the volume")
+        near, places = ndimage.distance_transform_edt(labels == 0, sampling=step, return_indices=True)
+        index = tuple(np.clip(np.rint(at).astype(int), 0, np.array(grid.shape) - 1))
+        if near[index] > 4.0:
+            raise ValueError(f"no vessel within 4 mm of the point {point.tolist()} mm (z, y, x)")
+        wanted = int(labels[tuple(p[index] for p in places)])
+    lumen = labels == wanted
+    blood = float(np.percentile(pilot[lumen], 75))
+    middle = origin + np.argwhere(lumen).mean(0) * step
+    if point is not None:
+        # The part of the lumen beside the point.
+        voxels = origin + np.argwhere(lumen) * step
+        middle = voxels[np.argsort(np.linalg.norm(voxels - point, axis=1))[:50]].mean(0)
+    half = 0.5 * (blood + 100.0)
+    line, ends = follow(pilot, grid, half, middle, _BALL_MM)
+    low, high = max(ends[0], -0.5), min(ends[1], line.length + 0.5)
+    region, _ = ndimage.label(pilot > half)
+    at = tuple(np.clip(np.rint((middle - origin) / step).astype(int), 0, np.array(grid.shape) - 1))
+    own = region == region[at] if region[at] else region > 0
+    s, centres, radii = sections(own, grid, line, low, high)
+    lumen_line = Centreline(smooth_line(centres))
+    shift = lumen_line.coordinates(line.point(np.array([0.0])))
+    ends = ends + float(shift.s[0])
+    wall = 0.5 * (fat + 80.0)
+    outside, _ = ndimage.label(pilot > wall)
+    vessel = outside == outside[at]
+    low, high = max(ends[0], -0.5), min(ends[1], lumen_line.length + 0.5)
+    s2, centres2, radii2 = sections(ndimage.binary_fill_holes(vessel), grid, lumen_line, low, high)
+    outer_line = Centreline(smooth_line(centres2))
+    s = lumen_line.coordinates(centres).s
+    s2 = outer_line.coordinates(centres2).s
+    return Start(lumen_line, outer_line, ends, ((s, radii), (s2, radii2)), (fat, blood))

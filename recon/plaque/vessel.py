@@ -1,0 +1,375 @@
+"""A vessel as tissues with outlines: fat, wall, fibrous layer, lumen; drawn on the grid, and fitted to the data.
+
+    x = fat + (wall − fat) O + (fibrous − wall) I + (lumen − fibrous) L + Σ δ_k B_k
+
+O, I and L are the shares of each voxel inside the vessel, inside its wall and in the lumen, B_k those of plaque bodies
+in the fibrous layer. An outline is a plane within a voxel, whose share is exact (:mod:`recon.plaque.kernels`). The wall
+is of one thickness; a lumen may cross it in the model, so that a layer of no thickness is estimated without bias.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+
+from recon.plaque.centreline import Centreline, Coordinates
+from recon.plaque.data import TissueData
+from recon.plaque.kernels import plane_fractions
+from recon.plaque.local_gram import LocalGram
+from recon.plaque.outline import Outline, OutlineAt
+
+__all__ = ["BLUR", "BLUR_UNIT", "FAT", "FIBROUS", "LUMEN", "THICKNESS", "WALL", "Drawing", "Fit", "Start", "Vessel"]
+
+Floats = NDArray[np.float64]
+
+FAT, WALL, FIBROUS, LUMEN, THICKNESS, BLUR, ENDS = 0, 1, 2, 3, 4, 5, 6
+_FIRST = 12
+"""Positions of the first parameters: values, log wall thickness, variance of the edges' blur in 0.01 mm², three for
+each end (position and tilts of a plane); then the lumen's and the outer outline's coefficients."""
+
+_VALUE_SD = (100.0, 25.0, 60.0, 300.0)
+_EXPECTED_SD = (10.0, 15.0)
+"""Of wall and fibrous tissue, HU, in a fit that expects them to be what they usually are."""
+_VALUE_MEAN = (-90.0, 50.0, 95.0)
+"""Prior of fat, wall and fibrous tissue, HU; the lumen's mean is what the start reads."""
+_WALL_MM, _WALL_LOG_SD = 0.2, 0.2
+_BLUR, _BLUR_SD, BLUR_UNIT = 0.2, 1.0, 0.01
+"""Variance by which edges are softer than the operator's: focal spot, turning gantry, tissue; in units of 0.01 mm²."""
+_DIFFERENCE = 0.02
+"""Of the blur, for its derivative."""
+_END_SD_MM = (1.0, 0.1, 0.1)
+_FAR = 30.0
+"""A step that promises more gain of the log posterior than this makes the curvature worth computing again."""
+_MARGIN_MM = 0.6
+"""Voxels so far outside of the outer wall's start may still become vessel."""
+_BODY_SD = 300.0
+"""Prior of a body's contrast in a fit that is given its shape, HU."""
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Where a vessel is, roughly.
+
+    Attributes:
+        lumen, outer: lines.
+        ends: ``(2,)`` positions on the lumen's line, mm; infinite where it leaves the volume.
+        radii: (positions, radii) of lumen and outer wall.
+        values: fat and lumen, HU.
+    """
+
+    lumen: Centreline
+    outer: Centreline
+    ends: Floats
+    radii: tuple[tuple[Floats, Floats], tuple[Floats, Floats]]
+    values: tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Drawing:
+    """A vessel drawn on its voxels.
+
+    Attributes:
+        image: ``(n,)`` HU above fat.
+        shares: ``(3, n)`` outer, inner, lumen.
+        jacobian: ``(n, parameters)`` float32, HU per unit; None where it was not asked for.
+        lumen_distance, inner_distance: ``(n,)`` mm, negative inside.
+        lumen_normals: ``(n, 3)`` half edges of a voxel times the lumen's normal, mm.
+    """
+
+    image: Floats
+    shares: Floats
+    jacobian: NDArray[np.float32] | None
+    lumen_distance: Floats
+    inner_distance: Floats
+    lumen_normals: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A vessel at the mode of its posterior.
+
+    Attributes:
+        parameters: ``(p,)``; the bodies' contrasts last.
+        drawing: there.
+        energy: ½ xᵀGx − bᵀx − log prior, without constants.
+        residual: ``(n,)`` b − Gx on the voxels, HU⁻¹.
+        curved: ``(n, p)`` float32, G times the Jacobian (that of fat: of the whole volume).
+        gradient: ``(p,)`` of −energy, about 0.
+        hessian: ``(p, p)``; factor: its Cholesky factor.
+        bodies: shares of the fibrous layer, ``(k, n)``.
+    """
+
+    parameters: Floats
+    drawing: Drawing
+    energy: float
+    residual: Floats
+    curved: NDArray[np.float32]
+    gradient: Floats
+    hessian: Floats
+    factor: Any
+    bodies: Floats
+
+    @cached_property
+    def log_determinant(self) -> float:
+        """Of the Hessian."""
+        return float(2 * np.log(np.diag(self.factor[0])).sum())
+
+    @cached_property
+    def covariance(self) -> Floats:
+        """``(p, p)``, of the Laplace approximation."""
+        return np.asarray(cho_solve(self.factor, np.eye(len(self.parameters))))
+
+
+class Vessel:
+    """The model of one vessel and its data.
+
+    Args:
+        data: statistic and operator.
+        start: where the vessel is.
+    """
+
+    def __init__(self, data: TissueData, start: Start) -> None:
+        grid = self.grid = data.grid
+        self.data, self.start = data, start
+        low = max(start.ends[0], -1.0) - 1.0
+        high = min(start.ends[1], start.lumen.length + 1.0) + 1.0
+        points = np.stack(np.meshgrid(*grid.axes, indexing="ij"), -1).reshape(-1, 3)
+        near = start.outer.coordinates(points)
+        reach = np.interp(near.s, *start.radii[1])
+        # Voxels of the vessel, and some beyond its ends, if it has any inside.
+        ends = start.lumen.coordinates(points).s
+        first, last = start.ends[0] - _MARGIN_MM, start.ends[1] + _MARGIN_MM
+        chosen = (near.rho < reach + _MARGIN_MM) & (ends > first) & (ends < last)
+        flat = np.flatnonzero(chosen)
+        self.index = np.stack(np.unravel_index(flat, grid.shape), 1).astype(np.int64)
+        self.points = points[flat]
+        self.half = np.array(grid.spacing) / 2
+        self.outer_at = Coordinates(near.s[flat], near.rho[flat], near.theta[flat], near.frame[flat])
+        self.lumen_at = start.lumen.coordinates(self.points)
+        self.lumen_outline = Outline(min(low, float(self.lumen_at.s.min())), max(high, float(self.lumen_at.s.max())))
+        self.outer_outline = Outline(float(self.outer_at.s.min()), float(self.outer_at.s.max()))
+        self._lumen, self._outer = self.lumen_outline.at(self.lumen_at), self.outer_outline.at(self.outer_at)
+        c = self.lumen_at
+        self._planes = np.stack([np.ones(len(flat)), c.rho * np.cos(c.theta), c.rho * np.sin(c.theta)], 1)
+        self.gram = LocalGram.of(data.gram, self.index, data.scale)
+        ones = data.apply(torch.ones(grid.shape)).double()
+        self.ones = ones.numpy()[tuple(self.index.T)]
+        self.ones_energy = float(ones.sum())
+        self.b = data.b.double().numpy()[tuple(self.index.T)]
+        self.b_sum = float(data.b.double().sum())
+        self._prior_mean, self._prior = self._prior_of()
+
+    body_precision = _BODY_SD**-2.0
+
+    # -- parameters ----------------------------------------------------------------------------------------------
+
+    @property
+    def size(self) -> int:
+        """Number of parameters without bodies."""
+        return _FIRST + self.lumen_outline.size + self.outer_outline.size
+
+    @property
+    def lumen_part(self) -> slice:
+        """The lumen's coefficients."""
+        return slice(_FIRST, _FIRST + self.lumen_outline.size)
+
+    @property
+    def outer_part(self) -> slice:
+        """The outer outline's coefficients."""
+        return slice(_FIRST + self.lumen_outline.size, self.size)
+
+    def lumen_shape(self, parameters: Floats) -> Floats:
+        """``(splines, orders)``."""
+        return parameters[self.lumen_part].reshape(self.lumen_outline.splines, -1)
+
+    def outer_shape(self, parameters: Floats) -> Floats:
+        """``(splines, orders)``."""
+        return parameters[self.outer_part].reshape(self.outer_outline.splines, -1)
+
+    def _prior_of(self) -> tuple[Floats, Floats]:
+        fat, blood = self.start.values
+        ends = [v for e in self.start.ends for v in (e if math.isfinite(e) else 0.0, 0.0, 0.0)]
+        first = [fat, *_VALUE_MEAN[1:], blood, math.log(_WALL_MM), _BLUR, *ends]
+        mean = np.concatenate([first, np.zeros(self.size - _FIRST)])
+        precision = np.zeros((self.size, self.size))
+        sd = np.array([*_VALUE_SD, _WALL_LOG_SD, _BLUR_SD, *_END_SD_MM, *_END_SD_MM])
+        precision[range(_FIRST), range(_FIRST)] = sd**-2.0
+        parts = ((self.lumen_part, self.lumen_outline), (self.outer_part, self.outer_outline))
+        for (part, outline), (_, radii) in zip(parts, self.start.radii, strict=True):
+            shape = np.zeros((outline.splines, outline.size // outline.splines))
+            shape[:, 0] = np.median(radii)
+            mean[part] = shape.ravel()
+            precision[part, part] = outline.precision()
+        return mean, precision
+
+    def first_guess(self) -> Floats:
+        """Parameters at the start."""
+        guess = self._prior_mean.copy()
+        (at, r), (at2, r2) = self.start.radii
+        guess[self.lumen_part] = self.lumen_outline.constant(r, at).ravel()
+        guess[self.outer_part] = self.outer_outline.constant(r2, at2).ravel()
+        return guess
+
+    # -- drawing -------------------------------------------------------------------------------------------------
+
+    def _distance(self, at: OutlineAt, c: Coordinates, shape: Floats) -> tuple[Floats, Floats, Floats]:
+        """Signed distance, half edges times the normal, and the change of the distance per change of the radius."""
+        r, turn, slope = at.radius(shape)
+        around = turn / np.maximum(c.rho, 0.3 * np.abs(r) + 0.05)
+        length = np.sqrt(1 + around**2 + slope**2)
+        normal = (c.frame[:, 0] - around[:, None] * c.frame[:, 1] - slope[:, None] * c.frame[:, 2]) / length[:, None]
+        # The distance's own mean over a voxel: its Laplacian is about one over the radius.
+        bend = np.mean(self.half**2) / 6.0 / np.maximum(np.abs(r), 0.2)
+        return (c.rho - r) / length + bend, normal * self.half, 1.0 / length
+
+    def draw(self, parameters: Floats, bodies: Floats, *, jacobian: bool = True) -> Drawing:
+        """The vessel with parameters ``(p,)`` and bodies ``(k, n)``, shares of the fibrous layer."""
+        fat, wall, fibrous, blood = parameters[:4]
+        thickness = math.exp(parameters[THICKNESS])
+        contrasts = parameters[self.size :]
+        n = len(self.index)
+        lumen_d, lumen_w, lumen_rate = self._distance(self._lumen, self.lumen_at, self.lumen_shape(parameters))
+        outer_d, outer_w, outer_rate = self._distance(self._outer, self.outer_at, self.outer_shape(parameters))
+        share, slope = np.empty((3, n)), np.empty((3, n))
+        blur, softer = BLUR_UNIT * parameters[BLUR], np.empty((3, n))
+        spare = np.empty(n)
+        for k, (d, w) in enumerate(((outer_d, outer_w), (outer_d + thickness, outer_w), (lumen_d, lumen_w))):
+            # Focal spot and gantry blur in the plane, not along z.
+            flat = 1.0 - (w[:, 0] / self.half[0]) ** 2
+            plane_fractions(d, w, blur * flat, share[k], slope[k])
+            if jacobian:
+                plane_fractions(d, w, (blur + BLUR_UNIT * _DIFFERENCE) * flat, softer[k], spare)
+        end_share, end_slope = np.ones((2, n)), np.zeros((2, n))
+        along = self.lumen_at.frame[:, 2] * self.half
+        for k, sign in enumerate((1.0, -1.0)):
+            if math.isfinite(self.start.ends[k]):
+                plane = self._planes @ parameters[ENDS + 3 * k : ENDS + 3 * k + 3]
+                plane_fractions(sign * (plane - self.lumen_at.s), along, np.zeros(n), end_share[k], end_slope[k])
+        inside = end_share.prod(0)
+        mixed = contrasts @ bodies if len(contrasts) else np.zeros(n)
+        steps = np.stack([np.full(n, wall - fat), fibrous - wall + mixed, blood - fibrous - mixed])
+        whole = (steps * share).sum(0)
+        image = inside * whole
+        shares = share * inside
+        single = None
+        if jacobian:
+            found = np.zeros((n, self.size + len(contrasts)))
+            found[:, FAT] = -shares[0]
+            found[:, WALL] = shares[0] - shares[1]
+            found[:, FIBROUS] = shares[1] - shares[2]
+            found[:, LUMEN] = shares[2]
+            found[:, THICKNESS] = -inside * steps[1] * slope[1] * thickness
+            found[:, BLUR] = inside * (steps * (softer - share)).sum(0) / _DIFFERENCE
+            found[:, ENDS : ENDS + 3] = (-whole * end_slope[0] * end_share[1])[:, None] * self._planes
+            found[:, ENDS + 3 : ENDS + 6] = (whole * end_slope[1] * end_share[0])[:, None] * self._planes
+            self._lumen.spread(inside * steps[2] * slope[2] * lumen_rate, found[:, self.lumen_part])
+            outward = inside * (steps[0] * slope[0] + steps[1] * slope[1]) * outer_rate
+            self._outer.spread(outward, found[:, self.outer_part])
+            for k, body in enumerate(bodies):
+                found[:, self.size + k] = body * (shares[1] - shares[2])
+            single = found.astype(np.float32)
+        return Drawing(image, shares, single, lumen_d, outer_d + thickness, lumen_w)
+
+    # -- fitting -------------------------------------------------------------------------------------------------
+
+    def _prior_with(self, bodies: Floats, expected: bool) -> tuple[Floats, Floats]:
+        k = len(bodies)
+        precision = np.zeros((self.size + k, self.size + k))
+        precision[: self.size, : self.size] = self._prior
+        if expected:
+            precision[[WALL, FIBROUS], [WALL, FIBROUS]] = np.array(_EXPECTED_SD) ** -2.0
+        precision[range(self.size, self.size + k), range(self.size, self.size + k)] = _BODY_SD**-2.0
+        return np.concatenate([self._prior_mean, np.zeros(k)]), precision
+
+    def _energy(self, parameters: Floats, drawing: Drawing, mean: Floats, precision: Floats) -> tuple[float, Floats]:
+        """Energy, and G times the image above fat on the voxels."""
+        f, v = parameters[FAT], drawing.image
+        curved = self.gram.apply(v.astype(np.float32)[:, None])[:, 0].astype(np.float64)
+        data = 0.5 * f * f * self.ones_energy + f * (self.ones @ v) + 0.5 * v @ curved - f * self.b_sum - self.b @ v
+        off = parameters - mean
+        return float(data + 0.5 * off @ precision @ off), curved
+
+    def fit(
+        self,
+        parameters: Floats,
+        bodies: Floats | None = None,
+        *,
+        expected: bool = False,
+        steps: int = 12,
+        tolerance: float = 0.1,
+    ) -> Fit:
+        """Levenberg–Marquardt from given parameters to the mode.
+
+        Args:
+            parameters: where to begin, ``(size + k,)``.
+            bodies: shares of the fibrous layer, ``(k, n)``.
+            expected: wall and fibrous tissue hardly leave their prior's mean. A core that the model does not have yet
+                would otherwise pull the fibrous value to its own, and make wall of the fibrous tissue.
+            steps: largest number of them.
+            tolerance: stop when a step promises less than this gain of the log posterior.
+        """
+        bodies = np.zeros((0, len(self.index))) if bodies is None else bodies
+        mean, precision = self._prior_with(bodies, expected)
+        theta = np.concatenate([parameters, np.zeros(len(mean) - len(parameters))])
+        drawing = self.draw(theta, bodies)
+        energy, curved_image = self._energy(theta, drawing, mean, precision)
+        damping, stale = 1e-4, False
+        curved, hessian = self._expand(drawing, precision)
+        for _ in range(steps):
+            gradient = self._gradient(theta, drawing, curved_image, mean, precision)
+            step = cho_solve(cho_factor(hessian + damping * np.diag(np.diag(hessian)), lower=True), gradient)
+            promised = float(gradient @ step - 0.5 * step @ hessian @ step)
+            tried = theta + step
+            other = self.draw(tried, bodies)
+            lower, curved_other = self._energy(tried, other, mean, precision)
+            # Single precision cannot tell energies closer than the tolerance: the last small step is taken unseen.
+            if lower > energy + tolerance:
+                damping *= 10
+                if stale:
+                    curved, hessian = self._expand(drawing, precision)
+                    stale = False
+                continue
+            theta, drawing, energy, curved_image = tried, other, lower, curved_other
+            damping, stale = damping / 10, True
+            if promised < tolerance:
+                break
+            if promised > _FAR:
+                curved, hessian = self._expand(drawing, precision)
+                stale = False
+        if stale:
+            curved, hessian = self._expand(drawing, precision)
+        gradient = self._gradient(theta, drawing, curved_image, mean, precision)
+        residual = self.b - theta[FAT] * self.ones - curved_image
+        factor = cho_factor(hessian, lower=True)
+        return Fit(theta, drawing, energy, residual, curved, gradient, hessian, factor, bodies)
+
+    def _gradient(
+        self, theta: Floats, drawing: Drawing, curved_image: Floats, mean: Floats, precision: Floats
+    ) -> Floats:
+        """Of −energy."""
+        assert drawing.jacobian is not None
+        residual = self.b - theta[FAT] * self.ones - curved_image
+        gradient: Floats = drawing.jacobian.T @ residual - precision @ (theta - mean)
+        # Fat fills the whole volume, beside what it leaves to the vessel.
+        gradient[FAT] += self.b_sum - theta[FAT] * self.ones_energy - self.ones @ drawing.image
+        return gradient
+
+    def _expand(self, drawing: Drawing, precision: Floats) -> tuple[NDArray[np.float32], Floats]:
+        """G J, and the Gauss–Newton Hessian."""
+        jacobian = drawing.jacobian
+        assert jacobian is not None
+        curved = self.gram.apply(jacobian)
+        hessian = (jacobian.T @ curved).astype(np.float64)
+        across = self.ones @ jacobian
+        hessian[FAT] += across
+        hessian[:, FAT] += across
+        hessian[FAT, FAT] += self.ones_energy
+        curved[:, FAT] += self.ones.astype(np.float32)
+        return curved, 0.5 * (hessian + hessian.T) + precision

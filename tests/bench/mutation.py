@@ -1,0 +1,213 @@
+"""Planted faults: does a test fail for each? ``python tests/bench/mutation.py [NAME …]``
+
+Every entry of :data:`FAULTS` is a fault that a person could make, in one place of the source, and the test that must
+notice. The repository's packages are copied, the fault is planted in the copy, and the test runs on it, in a process
+that is forked after the slow imports. A fault that its test does not notice is printed, and the exit status is 1. First
+every test must pass on the sound copy.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+LIMIT_S = 300
+
+
+class Fault(NamedTuple):
+    """``old`` in ``file`` becomes ``new``; ``test`` must fail."""
+
+    name: str
+    file: str
+    old: str
+    new: str
+    test: str
+
+
+_T = "tests/torchpcct/test_no_silent_errors.py::"
+_R = "tests/recon/test_no_silent_errors.py::"
+_C = "tests/recon/test_cli_refusals.py::"
+_D = "tests/torchpcct/test_defects.py::"
+_Q = "tests/torchpcct/metrics/test_residual_test.py::"
+_W = "tests/recon/fbp/test_angular_weights.py"
+_N = "tests/torchpcct/metrics/test_cnr.py::"
+_G = "torchpcct/geometry.py"
+_L = "torchpcct/scanner/linearisation.py"
+_A = "recon/fbp/angular_weights.py"
+_WATER = _T + "test_a_bad_water_correction_is_refused"
+
+FAULTS = (
+    Fault("offset sign", _G, "2.0) * pitch + offset", "2.0) * pitch - offset",
+          _T + "test_the_row_offset_moves_the_rows_up"),
+    Fault("index centre", _G, "- (count - 1) / 2.0)", "- count / 2.0)", _T + "test_the_row_offset_moves_the_rows_up"),
+    Fault("view step of stored neighbours", _G, "np.diff(np.sort(angles))", "np.abs(np.diff(angles))",
+          _T + "test_view_step_by_hand"),
+    Fault("repeated views count", _G, "steps = steps[steps > 1e-9]", "", _T + "test_view_step_by_hand"),
+    Fault("degrees unnoticed", _G, "_DEGREES_STEP_RAD = 20.0, 0.04", "_DEGREES_STEP_RAD = 1e9, 0.04",
+          _T + "test_degrees_for_radians_are_noticed"),
+    Fault("helix taken for degrees", _G, "_DEGREES_STEP_RAD = 20.0, 0.04", "_DEGREES_STEP_RAD = 20.0, 0.001",
+          _T + "test_degrees_for_radians_are_noticed"),
+    Fault("complex angles", _G, 'kind not in "fiu"', 'kind not in "fiuc"',
+          _T + "test_angles_that_are_no_real_numbers_are_refused"),
+    Fault("coverage of 1", "torchpcct/validate.py", "if not 0.0 < share < 1.0", "if not 0.0 <= share <= 1.0",
+          _T + "test_intervals_refuse_an_impossible_coverage"),
+    Fault("zero is positive", "torchpcct/validate.py", "positive and result <= 0", "positive and result < 0", _WATER),
+    Fault("NaN is a number", "torchpcct/validate.py", "if math.isnan(result) or", "if False or", _WATER),
+    Fault("grid beside the rows", "torchpcct/detector_window.py", "if row1 < 0.0 or row0 > geometry.rows - 1:",
+          "if False:", _T + "test_a_grid_that_no_row_sees_casts_no_shadow"),
+    Fault("short water table", _L, "coefficients.shape[0] != scale.size", "False", _WATER),
+    Fault("scale 0", _L, "if not (scale > 0).all():", "if False:", _WATER),
+    Fault("infinite water table", _L, "if not np.isfinite(array).all():", "if False:", _WATER),
+    Fault("window beyond the table", _L, "+ columns > self.scale.size:", "+ columns > 9 * self.scale.size:",
+          _T + "test_a_window_beyond_the_water_correction_is_refused"),
+    Fault("checksum ignored", "torchpcct/files.py", "    if head != (_MAGIC", "    if False and head != (_MAGIC",
+          _T + "test_damaged_volume_files_are_refused"),
+    Fault("checksum of the first bytes", "torchpcct/files.py",
+          '        file.seek(_BLOCK)\n        digest = hashlib.file_digest(file, "sha256").hexdigest()',
+          '        file.seek(_BLOCK)\n        digest = hashlib.sha256(file.read(64)).hexdigest()',
+          _T + "test_damaged_volume_files_are_refused"),
+    Fault("abandoned files stay", "torchpcct/files.py", "            part.unlink(missing_ok=True)\n        except",
+          "            pass\n        except", _C + "test_what_a_killed_process_left_is_swept_by_the_next_write"),
+    Fault("failed write leaves its part", "torchpcct/files.py", "    finally:\n        part.unlink(missing_ok=True)",
+          "    finally:\n        pass", "tests/torchpcct/test_files.py"),
+    Fault("write to a file's name as folder", "torchpcct/files.py", "if path.exists() and not path.is_dir():",
+          "if False:", _C + "test_folders_that_cannot_be_written_are_refused"),
+    Fault("each line counts twice", _A, "return 0.5 * steps[:, None]", "return steps[:, None]", _W),
+    Fault("Parker's rise mirrored", _A, "rise = 2.0 * (half_fan + gamma)", "rise = 2.0 * (half_fan - gamma)", _W),
+    Fault("Parker's fall mirrored", _A, "fall = math.pi + 2.0 * gamma", "fall = math.pi - 2.0 * gamma", _W),
+    Fault("repeated views weigh double", _A, "share = steps / np.bincount(group, minlength=distinct.size)",
+          "share = steps", _W),
+    Fault("four views pass", _A, "WIDEST_STEP_RAD = math.radians(75.0)", "WIDEST_STEP_RAD = math.radians(400.0)",
+          _R + "test_a_handful_of_views_is_refused"),
+    Fault("gaps pass", _A, "if inner > INNER_GAP_RAD:", "if False:",
+          _R + "test_views_that_lack_inside_of_the_scan_are_refused_or_named"),
+    Fault("small gaps unnamed", _A, "        _LOG.warning(", "        _LOG.debug(",
+          _R + "test_views_that_lack_inside_of_the_scan_are_refused_or_named"),
+    Fault("volume beside the rows", "recon/fbp/coverage.py", "if not by_some.any():", "if False:",
+          _R + "test_fbp_of_a_tensor_refuses_a_grid_beyond_the_rows"),
+    Fault("interleave without offset", "recon/fbp/fbp.py", "if abs(quarters - 0.25) > 0.1:", "if False:",
+          _R + "test_interleave_needs_a_quarter_column_opposite_rays_and_many_views"),
+    Fault("interleave an arc", "recon/fbp/fbp.py", "if span < 2.0 * math.pi:", "if False:",
+          _R + "test_interleave_needs_a_quarter_column_opposite_rays_and_many_views"),
+    Fault("noise added, not in squares", "torchpcct/metrics/cnr.py", "noise = np.hypot(fg_sd, bg_sd)",
+          "noise = fg_sd + bg_sd", _N + "test_definition_by_hand"),
+    Fault("variance of n", "torchpcct/metrics/cnr.py", "fg.std(-1, ddof=1), bg", "fg.std(-1, ddof=0), bg",
+          _N + "test_definition_by_hand"),
+    Fault("degrees of freedom of n", "torchpcct/metrics/cnr.py", "dof = realizations - 1", "dof = realizations",
+          _N + "test_sd_interval_matches_the_known_factors"),
+    Fault("indefinite covariance", "torchpcct/spectral/vmi.py", "if not bool((c[1] ** 2 <=",
+          "if False and bool((c[1] ** 2 <=", _T + "test_an_indefinite_covariance_has_no_noise"),
+    Fault("half the covariance", "torchpcct/spectral/vmi.py", "2 * g[:, 0] * g[:, 1]", "g[:, 0] * g[:, 1]",
+          "tests/torchpcct/spectral/test_vmi.py"),
+    Fault("shift of two columns", "torchpcct/metrics/residual_test.py", "lines[..., :-2]) / 2.0", "lines[..., :-2])",
+          _Q + "test_a_quarter_of_a_column_is_found_and_measured"),
+    Fault("one-sided p-value", "torchpcct/metrics/residual_test.py", "float(2.0 * stats.norm.sf(abs(score)))",
+          "float(stats.norm.sf(abs(score)))", _Q + "test_false_alarms_keep_their_rate"),
+    Fault("unknowns forgotten", "torchpcct/metrics/residual_test.py", "min(unknowns / count, 1.0)", "0.0",
+          _Q + "test_a_wrong_noise_level_is_found"),
+    Fault("a wide range of χ²", "torchpcct/metrics/residual_test.py", "MISFIT = 0.03", "MISFIT = 0.3",
+          _Q + "test_a_wrong_noise_level_is_found"),
+    Fault("views untested", "torchpcct/metrics/residual_test.py", '(("views", (1, 2), 2), ("rows", (0, 2), 1))',
+          '(("rows", (0, 2), 1),)', _Q + "test_gains_are_found"),
+    Fault("noise taken for dead cells", "torchpcct/defects.py", "BRIGHT = 30.0", "BRIGHT = 0.3",
+          _D + "test_starved_data_are_left_alone"),
+    Fault("half lost is dead", "torchpcct/defects.py", "dark > 0.75 * seen", "dark > 0.25 * seen",
+          _D + "test_readings_lost_at_random_are_found"),
+    Fault("edges of metal are lost readings", "torchpcct/defects.py", "for side in (-1, 1):", "for side in (1, 1):",
+          _D + "test_starved_data_are_left_alone"),
+    Fault("dead views pass", "torchpcct/defects.py", "zero.mean((1, 2)) > 0.99", "zero.mean((1, 2)) > 9",
+          _D + "test_every_kind_of_defect_is_found_and_nothing_else"),
+    Fault("hot cells pass", "torchpcct/defects.py", "mask[v] = view_dead[v] | (dead | hot)[parts[v]]",
+          "mask[v] = view_dead[v] | dead[parts[v]]", _D + "test_every_kind_of_defect_is_found_and_nothing_else"),
+    Fault("filled from the wrong side", "torchpcct/defects.py", "share = (k - b)", "share = (a - k)",
+          _D + "test_filling_is_exact_for_linear_data"),
+    Fault("window ignored", "torchpcct/defects.py", "parts = [np.s_[:, c : c + columns] for c in first]",
+          "parts = [np.s_[:, 0:columns] for c in first]", _D + "test_cells_are_followed_through_a_window"),
+    Fault("damaged pieces pass", "recon/study/dose_factor/store.py", "if mark and digest !=", "if False and digest !=",
+          _C + "test_damaged_pieces_are_computed_again"),
+    Fault("lock held for ever", "torchpcct/projector/engine.py", "after_in_child=_renew_lock",
+          "after_in_parent=_renew_lock", _C + "test_a_fork_while_another_thread_projects_does_not_hang"),
+    Fault("layers of the window", "torchpcct/projector/tables.py",
+          "self.grid, self.rays.row_edge, self.rays.row_pitch, rows)",
+          "self.grid, self.heights[2], self.rays.row_pitch, self.rays.rows)",
+          _T + "test_a_windowed_projection_equals_the_whole_one"),
+    Fault("any number of voxels", "recon/cli/scans.py", "MOST_VOXELS = 2**31", "MOST_VOXELS = 2**200",
+          _C + "test_refusals_name_value_and_remedy_and_leave_nothing"),
+)  # fmt: skip
+
+
+def _run(copy: Path, tests: list[str]) -> int:
+    """Exit status of pytest on the copy, 124 if it takes too long."""
+    sys.stdout.flush()
+    child = os.fork()
+    if child == 0:
+        os.chdir(copy)
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, 1)
+        os.dup2(null, 2)
+        os.environ["PYTHONPATH"] = str(copy)
+        sys.path.insert(0, str(copy))
+        import pytest
+
+        os._exit(int(pytest.main(["-n", "0", "-x", "-q", "-p", "no:cacheprovider", *tests])))
+    end = time.monotonic() + LIMIT_S * len(tests)
+    while time.monotonic() < end:
+        done, status = os.waitpid(child, os.WNOHANG)
+        if done:
+            return os.waitstatus_to_exitcode(status)
+        time.sleep(0.05)
+    os.kill(child, 9)
+    os.waitpid(child, 0)
+    return 124
+
+
+def main(names: list[str]) -> int:
+    """Plant the faults (all, or those whose names are given); 0 if all are noticed."""
+    chosen = [f for f in FAULTS if not names or f.name in names]
+    # Slow imports, none of them ours, once for all forks; no thread is started yet.
+    import h5py  # noqa: F401
+    import numba  # noqa: F401
+    import scipy.stats  # noqa: F401
+    import torch  # noqa: F401
+
+    missed = []
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / "copy"
+        for part in ("torchpcct", "recon", "train", "tests"):
+            shutil.copytree(ROOT / part, copy / part)  # with the kernels that numba has compiled
+        for file in ("pyproject.toml", "README.md"):
+            shutil.copy2(ROOT / file, copy / file)
+        if (status := _run(copy, sorted({f.test for f in chosen}))) != 0:
+            print(f"the tests do not pass on the sound source (status {status})")
+            return 1
+        for fault in chosen:
+            path = copy / fault.file
+            good = path.read_text(encoding="utf-8")
+            if good.count(fault.old) != 1:
+                print(f"{fault.name}: {fault.file} holds {fault.old!r} {good.count(fault.old)} times, not once")
+                missed.append(fault)
+                continue
+            before = path.stat()
+            path.write_text(good.replace(fault.old, fault.new), encoding="utf-8")
+            status = _run(copy, [fault.test])
+            path.write_text(good, encoding="utf-8")
+            os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+            for stale in (copy / fault.file).parent.glob(f"__pycache__/{path.stem}.cpython-*.pyc"):
+                stale.unlink()
+            # 1: a test failed; 2: an error while collecting, as of an import that breaks. Both are noticed.
+            caught = status in (1, 2, 124)
+            print(f"{'caught' if caught else 'MISSED'}  {fault.name:<36} {fault.test}", flush=True)
+            if not caught:
+                missed.append(fault)
+    print(f"{len(chosen) - len(missed)} of {len(chosen)} planted faults caught")
+    return 1 if missed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

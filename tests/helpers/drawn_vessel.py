@@ -1,0 +1,62 @@
+"""A tilted vessel with a fibrous layer and a core, averaged over voxels by brute force, and its noise-free data."""
+
+import numpy as np
+import torch
+from inset_operators import HU, problem
+
+from recon.gram.gram import Gram
+from recon.plaque.data import TissueData
+
+VALUES = {"fat": -90.0, "wall": 50.0, "fibrous": 100.0, "lumen": 400.0}
+TILT = 0.15
+LUMEN_MM, INNER_MM, WALL_MM = 1.1, 1.6, 0.2
+LUMEN_OFF, CORE_OFF, CORE_MM = -0.3, 1.15, (0.35, 0.8, 0.9)
+
+
+HARD_AT, HARD_MM = (0.75, 1.1), (0.25, 0.2, 0.6)
+
+
+def labels(points):
+    """0 fat, 1 wall, 2 fibrous, 3 lumen, 4 core, 5 calcification at points (z, y, x) about the inset's centre; the axis
+    tilts in y."""
+    z, y, x = np.moveaxis(points, -1, 0)
+    across, along = (y - TILT * z) / np.hypot(1, TILT), (z + TILT * y) / np.hypot(1, TILT)
+    out = (np.hypot(across, x) < INNER_MM + WALL_MM).astype(int)
+    out[np.hypot(across, x) < INNER_MM] = 2
+    core = sum((v / s) ** 2 for v, s in zip((x - CORE_OFF, across, along), CORE_MM, strict=True)) < 1
+    out[core & (out == 2)] = 4
+    out[np.hypot(across, x - LUMEN_OFF) < LUMEN_MM] = 3
+    off = (x - HARD_AT[0], across + HARD_AT[1], along - 1.0)
+    hard = sum((v / s) ** 2 for v, s in zip(off, HARD_MM, strict=True)) < 1
+    out[hard & (out == 2)] = 5
+    return out
+
+
+def image(grid, contrast, samples=5, hard=0.0):
+    """``grid.shape`` HU; the core is ``contrast`` HU below the fibrous tissue, the calcification ``hard`` above it."""
+    table = np.array([*VALUES.values(), VALUES["fibrous"] - contrast, VALUES["fibrous"] + hard])
+    axes = [a - c for a, c in zip(grid.axes, grid.center, strict=True)]
+    sub = (np.arange(samples) + 0.5) / samples - 0.5
+    out = np.zeros(grid.shape)
+    for dz in sub:
+        for dy in sub:
+            for dx in sub:
+                shift = np.array([dz, dy, dx]) * grid.spacing
+                points = np.stack(np.meshgrid(*(a + d for a, d in zip(axes, shift, strict=True)), indexing="ij"), -1)
+                out += table[labels(points)]
+    return torch.from_numpy(out / samples**3).float()
+
+
+def operator(shape=(26, 24, 24), voxel=0.3):
+    """Gram operator of a scan in which a core stands out of the noise."""
+    A, w = problem(views=120, shape=shape, voxel=voxel, rows=32)
+    return Gram(A, w, 5).scaled(200.0)
+
+
+def data(gram, volume, seed=None):
+    """Statistic of a volume; noise of the operator for a seed."""
+    shown = TissueData(torch.zeros(gram.grid.shape), gram, HU**2)
+    b = shown.apply(volume)
+    if seed is not None:
+        b = b + gram.noise(generator=torch.Generator().manual_seed(seed)) * HU
+    return TissueData(b, gram, HU**2)

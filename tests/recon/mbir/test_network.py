@@ -1,0 +1,121 @@
+"""The network: homogeneous, blind to nothing that it should see, any shape."""
+
+import pytest
+import torch
+
+from recon.mbir.network import Network, NetworkConfig, from_blocks, to_blocks
+
+SMALL = NetworkConfig((6, 8, 8), 0.4)
+
+
+@pytest.fixture(scope="module")
+def network():
+    """Random weights everywhere, the last layer and the gains included."""
+    torch.manual_seed(0)
+    made = Network(SMALL).double().requires_grad_(False)
+    for name, p in made.named_parameters():
+        if "gain" in name or "leave" in name:
+            p.normal_(0.0, 0.2)
+    return made.eval()
+
+
+def volumes(shape=(2, 12, 16, 8), seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn((2, *shape), generator=generator, dtype=torch.float64)
+
+
+CONDITION = torch.tensor([[0.3, -0.2, 0.0], [-1.0, 0.5, 1.0]], dtype=torch.float64)
+
+
+def test_homogeneous(network):
+    """Ten times the input gives ten times the output; nothing gives nothing."""
+    u, towards = volumes()
+    found = network(u, towards, CONDITION)
+    assert float(found.std()) > 0.01
+    torch.testing.assert_close(network(10 * u, 10 * towards, CONDITION), 10 * found)
+    assert not network(0 * u, 0 * towards, CONDITION).any()
+
+
+@pytest.mark.parametrize("which", range(3))
+def test_condition_counts(network, which):
+    u, towards = volumes()
+    other = CONDITION.clone()
+    other[0, which] += 1.0
+    first, second = network(u, towards, CONDITION), network(u, towards, other)
+    assert float((first[0] - second[0]).abs().max()) > 1e-3
+    assert torch.equal(first[1], second[1])
+
+
+def test_both_inputs_count(network):
+    u, towards = volumes()
+    found = network(u, towards, CONDITION)
+    assert float((network(towards, u, CONDITION) - found).abs().max()) > 1e-3
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (5, 7, 9), (8, 8, 8), (1, 13, 20)])
+def test_any_shape_is_padded_with_background(network, shape):
+    """What lies beyond the grid is 0, so a volume in a larger one of zeros gives the same as alone, but at the rim."""
+    u, towards = volumes((2, *shape))
+    found = network(u, towards, CONDITION)
+    assert found.shape == u.shape
+    padded = [torch.nn.functional.pad(v, (0, -shape[2] % 8, 0, -shape[1] % 8, 0, -shape[0] % 8)) for v in (u, towards)]
+    whole = network(*padded, CONDITION)[:, : shape[0], : shape[1], : shape[2]]
+    torch.testing.assert_close(found, whole)
+
+
+def test_shifted_volumes_give_shifted_results(network):
+    """By whole cells of the coarsest level, away from the rim: nothing depends on where a voxel lies."""
+    u, towards = volumes((2, 128, 8, 8))
+    for v in (u, towards):
+        v[:, :56], v[:, 64:] = 0.0, 0.0
+    found = network(u, towards, CONDITION)
+    moved = network(u.roll(8, 1), towards.roll(8, 1), CONDITION)
+    torch.testing.assert_close(moved, found.roll(8, 1))
+
+
+def test_blocks_and_back():
+    u = volumes()[0]
+    blocks = to_blocks(u)
+    assert blocks.shape == (2, 8, 6, 8, 4)
+    assert torch.equal(blocks[0, 0], u[0, ::2, ::2, ::2])
+    assert torch.equal(from_blocks(blocks), u)
+
+
+def test_untrained_network_is_smooth():
+    """Small at the start: what it gives of white noise is well below it."""
+    torch.manual_seed(0)
+    u, towards = volumes()
+    net = Network(SMALL).requires_grad_(False)
+    assert 0 < float(net(u.float(), towards.float(), CONDITION.float()).std()) < 0.6
+
+
+def test_low_precision_is_for_training_only():
+    torch.manual_seed(0)
+    net = Network(SMALL)
+    torch.nn.init.normal_(net.leave.weight, std=0.1)
+    u, towards = volumes().float()
+    condition = CONDITION.float()
+    net.requires_grad_(False)
+    exact = net.train()(u, towards, condition)
+    net.half_precision = True
+    rough = net(u, towards, condition)
+    assert rough.dtype == torch.float32
+    assert 0 < float((rough - exact).norm() / exact.norm()) < 0.05
+    assert torch.equal(net.eval()(u, towards, condition), exact)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"channels": (8, 8)}, "3 levels"),
+        ({"channels": (8, 0, 8)}, "channels"),
+        ({"voxel_mm": 0.0}, "voxel_mm"),
+    ],
+)
+def test_refusals(changes, message):
+    with pytest.raises(ValueError, match=message):
+        NetworkConfig(**changes)
+
+
+def test_shipped_size():
+    assert sum(p.numel() for p in Network().parameters()) <= 300_000

@@ -1,0 +1,34 @@
+"""``torchpcct plaque`` on a scan file. Few views would smear the vessel: the gantry turns during each."""
+
+import json
+
+import pytest
+
+from recon.cli import main
+
+
+@pytest.mark.slow
+def test_reads_a_scan_and_says_what_fbp_reads(tmp_path, capsys):
+    scan, out = tmp_path / "scan.h5", tmp_path / "reading"
+    assert main(["simulate", "--views", "984", "--exposure", "20", "--seed", "1", "--out", str(scan)]) == 0
+    capsys.readouterr()
+    point = ["--point", "0", "-30.4", "-28.1", "--particles", "100", "--voxel", "0.25"]
+    assert main(["plaque", str(scan), *point, "--out", str(out), "--no-progress"]) == 0
+    assert "soft FBP, same regions" in capsys.readouterr().out
+    told = json.loads((out / "report.json").read_text())
+    assert told["figures"]["lumen"]["value"] == pytest.approx(480, abs=15)
+    assert told["figures"]["lumen area"]["value"] == pytest.approx(4.11, abs=0.4)
+    assert told["same_regions"]["soft FBP"]["fat"] == pytest.approx(-93, abs=8)
+    assert {f.name for f in out.iterdir()} == {
+        "report.md", "report.json", "tissues.nii.gz", "image.nii.gz", "plaque.png",
+    }  # fmt: skip
+
+
+def test_refuses_a_point_outside(tmp_path, capsys):
+    scan = tmp_path / "scan.h5"
+    assert main(["simulate", "--views", "24", "--out", str(scan)]) == 0
+    capsys.readouterr()
+    arguments = ["plaque", str(scan), "--voxel", "0.5", "--point", "90", "0", "0", "--out", str(tmp_path / "reading")]
+    assert main([*arguments, "--no-progress"]) == 2
+    assert "outside of the volume" in capsys.readouterr().err
+    assert not (tmp_path / "reading").exists()

@@ -1,0 +1,92 @@
+"""Readings of a drawn vessel with and without a core: figures, refusal, files."""
+
+import json
+
+import drawn_vessel
+import numpy as np
+import pytest
+from drawn_vessel import VALUES
+
+from recon.plaque import TissueData, read_plaque
+from recon.plaque.report import save, table
+
+POINT_OFF = (0.0, 0.0, drawn_vessel.CORE_OFF)
+
+
+@pytest.fixture(scope="module")
+def gram():
+    return drawn_vessel.operator()
+
+
+@pytest.fixture(scope="module")
+def strong(gram):
+    """A core 100 HU below the fibrous tissue, with noise."""
+    return read_plaque(drawn_vessel.data(gram, drawn_vessel.image(gram.grid, 100.0), seed=1), particles=150)
+
+
+@pytest.fixture(scope="module")
+def absent(gram):
+    return read_plaque(drawn_vessel.data(gram, drawn_vessel.image(gram.grid, 0.0), seed=1), particles=150)
+
+
+def test_a_core_is_found_and_its_figures_hold_the_truth(strong):
+    assert strong.presence > 0.95
+    assert not strong.refused
+    figures = strong.figures
+    for name, truth in (("contrast", 100.0), ("fibrous", VALUES["fibrous"]), ("lumen", VALUES["lumen"]),
+                        ("lumen area", np.pi * drawn_vessel.LUMEN_MM**2)):  # fmt: skip
+        e = figures[name]
+        assert abs(e.value - truth) < 3 * e.sd, name
+        assert e.low < e.value < e.high
+    assert figures["contrast"].sd < 30
+    assert 0.9 < strong.chi2 < 1.1
+
+
+def test_no_core_is_claimed_where_there_is_none(absent):
+    assert absent.presence < 0.95
+    assert "contrast" not in absent.figures
+    assert "probability" in absent.refused["contrast"]
+    assert "fibrous" in absent.figures
+
+
+def test_regions_share_every_voxel_and_read_other_volumes(strong, gram):
+    total = sum(strong.regions.values())
+    assert np.allclose(total, 1.0, atol=0.03)
+    found = strong.read(drawn_vessel.image(gram.grid, 100.0))
+    assert found["fat"] == pytest.approx(VALUES["fat"], abs=3)
+    assert found["contrast"] == pytest.approx(found["fibrous"] - found["core"])
+    with pytest.raises(ValueError, match="reading's shape"):
+        strong.read(np.zeros((2, 2, 2)))
+
+
+def test_the_same_twice(gram):
+    data = drawn_vessel.data(gram, drawn_vessel.image(gram.grid, 100.0, samples=2), seed=2)
+    point = tuple(c + d for c, d in zip(gram.grid.center, POINT_OFF, strict=True))
+    first, second = (read_plaque(data, point, particles=50, seed=3) for _ in range(2))
+    assert first.figures == second.figures
+    assert np.linalg.norm(np.array(first.info["core_center_mm"]) - point) < 1.0
+
+
+def test_files(strong, absent, tmp_path, gram):
+    others = {"truth": drawn_vessel.image(gram.grid, 100.0, samples=2)}
+    files = save(strong, tmp_path / "a", others)
+    assert all(f.stat().st_size > 0 for f in files)
+    told = json.loads((tmp_path / "a" / "report.json").read_text())
+    assert told["figures"]["contrast"]["value"] == strong.figures["contrast"].value
+    assert told["same_regions"]["truth"]["lumen"] == pytest.approx(VALUES["lumen"], abs=5)
+    assert "truth, same regions" in table(strong, others)
+    assert "refused" in table(absent)
+
+
+def test_refusals(gram):
+    data = drawn_vessel.data(gram, drawn_vessel.image(gram.grid, 0.0, samples=1))
+    with pytest.raises(ValueError, match="point_sd"):
+        read_plaque(data, point_sd=0.0)
+    with pytest.raises(ValueError, match="particles"):
+        read_plaque(data, particles=3)
+    with pytest.raises(ValueError, match="point must be 3 numbers"):
+        read_plaque(data, (1.0, 2.0))
+    with pytest.raises(ValueError, match="NaN"):
+        TissueData(data.b * float("nan"), gram, 1.0)
+    with pytest.raises(ValueError, match="one \\(z, y, x\\) grid"):
+        TissueData(data.b[1:], gram, 1.0)

@@ -1,0 +1,108 @@
+"""The vessel's model: its drawing and derivatives, and the fit to noise-free data of known tissues."""
+
+import drawn_vessel
+import numpy as np
+import pytest
+import torch
+from drawn_vessel import INNER_MM, LUMEN_MM, VALUES, WALL_MM
+
+from recon.plaque.core import CorePrior, CoreSpace
+from recon.plaque.start import find_vessel
+from recon.plaque.vessel import FAT, FIBROUS, LUMEN, THICKNESS, Vessel
+
+
+@pytest.fixture(scope="module")
+def vessel():
+    gram = drawn_vessel.operator()
+    data = drawn_vessel.data(gram, drawn_vessel.image(gram.grid, 0.0))
+    return Vessel(data, find_vessel(data.pilot(), data.grid, None))
+
+
+@pytest.fixture(scope="module")
+def fit(vessel):
+    return vessel.fit(vessel.first_guess())
+
+
+def test_jacobian(vessel):
+    rng = np.random.default_rng(0)
+    theta = np.append(vessel.first_guess(), -40.0)
+    bodies = rng.random((1, len(vessel.index)))
+    found = vessel.draw(theta, bodies).jacobian
+    for k in [*range(6), *rng.choice(np.arange(12, vessel.size), 6, replace=False), vessel.size]:
+        step = np.zeros_like(theta)
+        step[k] = 1e-4 if k >= 12 and k != vessel.size else 1e-3
+        ahead, behind = (vessel.draw(theta + s * step, bodies, jacobian=False).image for s in (1, -1))
+        numeric = (ahead - behind) / (2 * step[k])
+        # What the normal's turn changes is left out of the derivative: second order in the outline's slope.
+        assert np.linalg.norm(found[:, k] - numeric) <= 0.06 * np.linalg.norm(numeric) + 1e-6
+
+
+def test_fit_finds_tissues_and_outlines(vessel, fit):
+    p = fit.parameters
+    assert p[FAT] == pytest.approx(VALUES["fat"], abs=1)
+    assert p[LUMEN] == pytest.approx(VALUES["lumen"], abs=4)
+    assert p[FIBROUS] == pytest.approx(VALUES["fibrous"], abs=8)
+    truth = drawn_vessel.image(vessel.grid, 0.0).numpy()[tuple(vessel.index.T)]
+    assert np.sqrt(np.mean((p[FAT] + fit.drawing.image - truth) ** 2)) < 8
+    assert fit.drawing.shares[2].sum() * 0.027 == pytest.approx(
+        np.pi * LUMEN_MM**2 * np.hypot(1, drawn_vessel.TILT) * 7.8, rel=0.02
+    )
+    outer = np.pi * (INNER_MM + WALL_MM) ** 2 * np.hypot(1, drawn_vessel.TILT) * 7.8
+    assert fit.drawing.shares[0].sum() * 0.027 == pytest.approx(outer, rel=0.03)
+    assert np.exp(p[THICKNESS]) == pytest.approx(WALL_MM, abs=0.08)
+
+
+def test_fit_is_a_mode(vessel, fit):
+    """A Newton step from the mode promises nothing, and the residual is b − Gx of the whole volume."""
+    assert 0.5 * fit.gradient @ fit.covariance @ fit.gradient < 0.2
+    volume = torch.full(vessel.grid.shape, fit.parameters[FAT])
+    volume[tuple(vessel.index.T)] += torch.from_numpy(fit.drawing.image).float()
+    exact = (vessel.data.b - vessel.data.apply(volume)).numpy()[tuple(vessel.index.T)]
+    assert np.allclose(fit.residual, exact, atol=2e-5 * float(vessel.data.b.abs().max()))
+
+
+def test_evidence_of_a_body_is_the_ratio_of_two_gaussian_integrals(vessel, fit):
+    """Against the joint Hessian of vessel and body, in float64."""
+    space = CoreSpace(vessel, fit, CorePrior())
+    shapes = space.draw_prior(5, np.random.default_rng(0))
+    shares = space.shares(shapes)
+    seen = space.evidence(shares)
+    p = len(fit.parameters)
+    for k in range(5):
+        c = np.zeros((len(vessel.index), 1), np.float32)
+        c[space.chosen, 0] = shares[k]
+        curved = vessel.gram.apply(c)[:, 0].astype(float)
+        joint = np.zeros((p + 1, p + 1))
+        joint[:p, :p] = fit.hessian
+        joint[p, :p] = joint[:p, p] = fit.curved.T.astype(float) @ c[:, 0]
+        joint[p, p] = curved @ c[:, 0] + 100.0**-2
+        pull = np.append(fit.gradient, c[:, 0] @ fit.residual)
+
+        def log(hessian, gradient):
+            return 0.5 * gradient @ np.linalg.solve(hessian, gradient) - 0.5 * np.linalg.slogdet(hessian)[1]
+
+        exact = log(joint, pull) - log(fit.hessian, fit.gradient) - np.log(100.0)
+        assert seen.log[k] == pytest.approx(exact, rel=1e-3, abs=2e-3)
+        assert seen.mean[k] == pytest.approx(np.linalg.solve(joint, pull)[p], rel=2e-3, abs=2e-2)
+        assert seen.variance[k] == pytest.approx(np.linalg.inv(joint)[p, p], rel=5e-3)
+
+
+def test_data_of_a_scan_in_hu(problem, clean):
+    """b and G in HU: the likelihood's mode is the least-squares volume, whatever unit it is written in."""
+    from recon.plaque.data import TissueData
+
+    found = TissueData.of_scan(clean, problem)
+    volume = 30.0 * torch.randn(problem.grid.shape, generator=torch.Generator().manual_seed(0))
+    hu = problem.mu_ref / 1000
+    attenuation = (volume / 1000 + 1) * problem.mu_ref - problem.level
+    exact = (problem.statistic(clean).b - problem.gram.apply(attenuation)) * hu
+    assert torch.allclose(found.b - found.apply(volume), exact, atol=1e-4 * float(exact.abs().max()))
+
+
+def test_no_vessel():
+    gram = drawn_vessel.operator((8, 12, 12))
+    data = drawn_vessel.data(gram, torch.full(gram.grid.shape, -90.0))
+    with pytest.raises(ValueError, match="nothing stands out"):
+        find_vessel(data.pilot(), data.grid, None)
+    with pytest.raises(ValueError, match="outside of the volume"):
+        find_vessel(drawn_vessel.image(gram.grid, 0.0).numpy(), gram.grid, np.array([50.0, -30.0, -30.0]))

@@ -1,0 +1,180 @@
+"""PWLS of whole fields of view: dense float64 minima, monotony, honest stops, the choice of the model, memory."""
+
+import itertools
+import math
+
+import pytest
+import torch
+from inset_operators import HU, problem
+
+from recon.gram.gram import Gram
+from recon.pwls.field_model import FieldModel
+from recon.pwls.pwls import data_model, pwls
+from recon.pwls.qggmrf import QGGMRF, quadratic
+from torchpcct import ConeBeam, FanBeam, ParallelBeam, Projector, VolumeGrid, full_turn
+
+EDGE = QGGMRF(0.3, 4.0, relative=True)
+# Nearly flat where noise makes gradients of thousands of HU/mm: converges slowly.
+FLAT = QGGMRF(0.3, 300.0)
+SCANS = {
+    # A dead column runs through all views.
+    "parallel": (ParallelBeam(torch.arange(40).numpy() * math.pi / 40, 26, 1.0), VolumeGrid((18, 18), 1.0)),
+    "short fan": (FanBeam(full_turn(60)[:36], 90.0, 150.0, 48, 1.0), VolumeGrid((20, 22), 1.0, (1.0, -0.5))),
+    "cone": (ConeBeam(full_turn(40), 60.0, 100.0, 30, 14, 1.2), VolumeGrid((5, 12, 12), 1.2)),
+}
+
+
+@pytest.fixture(scope="module", params=list(SCANS))
+def scan(request):
+    """A, noisy data, weights that change by an order of magnitude, the float64 matrix."""
+    geometry, grid = SCANS[request.param]
+    A = Projector(geometry, grid)
+    r = [torch.from_numpy(a) for a in grid.axes]
+    y, x = torch.meshgrid(r[-2], r[-1], indexing="ij")
+    body = 0.02 * (torch.hypot(y, x) < 0.4 * grid.extent[-1]) + 0.02 * (torch.hypot(y - 2, x + 3) < 2)
+    truth = body.expand(grid.shape).float()
+    lines = A(truth)
+    w = 4e4 * torch.exp(-4 * lines / lines.max())
+    if request.param == "parallel":
+        w[:, 9] = 0
+    data = lines + torch.randn(lines.shape, generator=torch.Generator().manual_seed(3)) / w.clamp_min(1).sqrt()
+    n = math.prod(A.domain_shape)
+    matrix = A(torch.eye(n, dtype=torch.float64).reshape(n, *A.domain_shape)).reshape(n, -1).T
+    return A, data, w, matrix
+
+
+def minimum(matrix, A, y, w, bound):
+    """With dense float64 matrices: majorise and minimise until the steps are below 1e-6 HU."""
+    weights = w.double().flatten()
+    H, b = matrix.T @ (weights[:, None] * matrix), matrix.T @ (weights * y.double().flatten())
+    shape, n = A.domain_shape, len(b)
+    unit = torch.eye(n, dtype=torch.float64).reshape(n, *shape)
+    x = torch.zeros_like(b)
+    for _ in range(300):
+        R = bound.majorizer(x.reshape(1, *shape).expand(n, *shape), unit).reshape(n, n)
+        new = torch.linalg.solve(H + R, b)
+        done = float((new - x).abs().max()) < 1e-6 * HU
+        x = new
+        if done:
+            return x.reshape(shape)
+    raise AssertionError("the reference did not converge")
+
+
+def energy(matrix, y, w, bound, x):
+    residual = y.double().flatten() - matrix @ x.double().flatten()
+    return float(0.5 * (w.double().flatten() * residual.square()).sum() + bound.value(x.double()))
+
+
+def hu_rms(a, b):
+    return float((a.double() - b.double()).square().mean().sqrt()) / HU
+
+
+@pytest.mark.parametrize("prior", [quadratic(0.3), EDGE], ids=["quadratic", "edge-preserving"])
+def test_finds_the_dense_minimum(scan, prior):
+    A, y, w, matrix = scan
+    bound = prior.bind(FieldModel(A, w).information(HU), A.grid.spacing, HU)
+    exact = minimum(matrix, A, y, w, bound)
+    found = pwls(A, y, w, prior, hu=HU, tolerance=0.5)
+    assert found.report["converged"]
+    assert found.report["model"] == "gradient"
+    assert hu_rms(found.x, exact) < 1.0
+    assert hu_rms(found.x, exact) < 3 * found.report["rmsd_hu"][-1]
+    residual = (w * (y - A(found.x)).square()).sum() / (w > 0).sum()
+    assert found.report["misfit"] == [pytest.approx(float(residual), rel=1e-3)]
+
+
+def test_every_pair_lowers_the_objective(scan):
+    """From a start that is far, from one that is near, and from the minimum itself."""
+    A, y, w, matrix = scan
+    bound = EDGE.bind(FieldModel(A, w).information(HU), A.grid.spacing, HU)
+    exact = minimum(matrix, A, y, w, bound)
+    noise = torch.randn(A.domain_shape, generator=torch.Generator().manual_seed(1))
+    model = FieldModel(A, w)
+    for start in (3000 * HU * noise, exact.float() + 5 * HU * noise, exact.float()):
+        values = [energy(matrix, y, w, bound, start)]
+        for pairs in range(2, 9):
+            x = pwls(A, y, w, bound, hu=HU, gram=model, start=start, tolerance=1e-9, max_exact=pairs).x
+            values.append(energy(matrix, y, w, bound, x))
+        slack = 1e-6 * energy(matrix, y, w, bound, torch.zeros(A.domain_shape))
+        assert all(b <= a + slack for a, b in itertools.pairwise(values)), values
+
+
+def test_batch_is_each_alone(scan):
+    A, y, w, _ = scan
+    both = pwls(A, torch.stack([y, 0.5 * y]), w, EDGE, hu=HU, tolerance=0.3)
+    assert len(both.report["misfit"]) == 2
+    for data, x in zip((y, 0.5 * y), both.x, strict=True):
+        assert hu_rms(x, pwls(A, data, w, EDGE, hu=HU, tolerance=0.3).x) < 1.0
+
+
+def test_a_stop_that_was_not_reached_is_said(scan, caplog):
+    A, y, w, _ = scan
+    with caplog.at_level("WARNING"):
+        short = pwls(A, y, w, EDGE, hu=HU, max_exact=2)
+    assert not short.report["converged"]
+    assert "raise max_exact" in caplog.text
+
+
+def test_voxels_that_some_views_miss_converge_last_and_that_is_said():
+    """Corners beyond the field of view hang on the prior alone; inside, the volume is at the minimum long before."""
+    A = Projector(ParallelBeam(torch.arange(40).numpy() * math.pi / 40, 26, 1.0), VolumeGrid((24, 24), 1.0))
+    r = torch.hypot(*torch.meshgrid(*[torch.from_numpy(a) for a in A.grid.axes], indexing="ij"))
+    y = A((0.02 * (r < 10)).float())
+    w = 4e4 * torch.exp(-4 * y / y.max())
+    n = math.prod(A.domain_shape)
+    matrix = A(torch.eye(n, dtype=torch.float64).reshape(n, *A.domain_shape)).reshape(n, -1).T
+    bound = EDGE.bind(FieldModel(A, w).information(HU), A.grid.spacing, HU)
+    exact = minimum(matrix, A, y, w, bound)
+    found = pwls(A, y, w, bound, hu=HU, tolerance=1.0)
+    assert hu_rms(found.x[r < 11], exact[r < 11]) < 2.0
+    assert found.report["rmsd_hu"][-1] > hu_rms(found.x, exact) / 3
+
+
+def test_a_flat_prior_is_not_called_converged_before_it_is(scan):
+    A, y, w, matrix = scan
+    bound = FLAT.bind(FieldModel(A, w).information(HU), A.grid.spacing, HU)
+    exact = minimum(matrix, A, y, w, bound)
+    for pairs in (20, 60):
+        found = pwls(A, y, w, bound, hu=HU, tolerance=1.0, max_exact=pairs)
+        assert found.report["rmsd_hu"][-1] > hu_rms(found.x, exact) / 3
+
+
+def test_model_is_chosen_by_the_grid_and_dropped_by_its_misfit():
+    A, w = problem(views=120, shape=(4, 9, 9), rows=6)
+    assert isinstance(data_model(A, w), Gram)
+    whole = Projector(*SCANS["cone"])
+    assert isinstance(data_model(whole, torch.ones(whole.range_shape)), FieldModel)
+    y = A(torch.full(A.domain_shape, 50 * HU))
+    gram = Gram(A, w)
+    prior = EDGE.bind(gram.information(HU), A.grid.spacing, HU)
+    right = pwls(A, y, w, prior, hu=HU, gram=gram, tolerance=0.05)
+    assert right.report["model"] == "gram"
+    assert right.report["model_misfit"] < 0.1
+    wrong = pwls(A, y, w, prior, hu=HU, gram=gram.scaled(20.0), tolerance=0.05)
+    assert wrong.report["model_misfit"] > 1
+    assert wrong.report["model"] == "gradient"
+    assert wrong.report["converged"]
+    assert hu_rms(right.x, wrong.x) < 0.2
+
+
+def test_information_is_that_of_the_fft_model():
+    A, w = problem(views=120, shape=(6, 21, 21), rows=8)
+    gram, field = Gram(A, w), FieldModel(A, w)
+    assert field.information(HU) == pytest.approx(gram.information(HU), rel=0.15)
+    assert field.scaled(3.0).information(HU) == pytest.approx(3 * field.information(HU), rel=1e-6)
+
+
+def test_memory_is_predicted_and_refused_before_anything_is_allocated(scan, monkeypatch):
+    A, y, w, _ = scan
+    monkeypatch.setattr(Projector, "forward", lambda self, x: pytest.fail("projected"))
+    with pytest.raises(ValueError, match=r"needs .* GiB, 0.00 GiB are available"):
+        pwls(A, y, w, EDGE, hu=HU, memory=1000)
+    big = Projector(ConeBeam(full_turn(4), 6000.0, 10000.0, 8, 8, 1.0), VolumeGrid((3000, 3000, 3000), 1e-3))
+    with pytest.raises(ValueError, match="larger or fewer voxels"):
+        pwls(big, torch.zeros(big.range_shape), torch.ones(big.range_shape), EDGE, memory=2**38)
+
+
+def test_rays_that_miss_the_grid_are_refused():
+    A = Projector(ParallelBeam([0.0, 1.0], 8, 1.0, 500.0), VolumeGrid((4, 4), 1.0))
+    with pytest.raises(ValueError, match="no ray of positive weight"):
+        pwls(A, torch.zeros(A.range_shape), torch.ones(A.range_shape), EDGE)

@@ -1,0 +1,261 @@
+"""Readers of foreign scans: files that h5py, pydicom, tifffile and numpy wrote, and damaged ones."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pydicom
+import pytest
+import tifffile
+import yaml
+from analytic import Ellipsoid, line_integrals
+from pydicom.dataset import FileMetaDataset
+from pydicom.uid import ExplicitVRLittleEndian, generate_uid
+
+from recon import reconstruct
+from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, VolumeGrid, full_turn
+from torchpcct.formats.dicom_ct_pd import read_dicom_ct_pd
+from torchpcct.formats.geometry_yaml import geometry_of, geometry_values
+from torchpcct.formats.preprocess import centred, find_axis, without_outliers, without_stripes
+from torchpcct.formats.rtk import read_rtk_vectors
+from torchpcct.formats.scans import open_scan
+from torchpcct.projector.vectors import to_vectors
+
+MU = 0.02
+BODY = [Ellipsoid((2.0, -3.0), (14.0, 18.0), value=MU), Ellipsoid((6.0, 5.0), 3.0, value=MU)]
+PARALLEL = ParallelBeam(np.arange(91) * math.pi / 90, 64, 1.0, -1.75)
+CONE = ConeBeam(full_turn(40), 300.0, 500.0, 64, 3, (1.5, 1.7))
+CURVED = ConeBeam(full_turn(72, 0.3), 300.0, 500.0, 64, 4, (1.5, 1.7), (0.25, 0.6), "curved")
+
+
+def damaged(path: Path, copies: int, seed: int = 0):
+    """Copies of a file that were cut off, or have flipped bits; half of the flips within the first kilobyte."""
+    content, rng = path.read_bytes(), np.random.default_rng(seed)
+    for k in range(copies):
+        broken = bytearray(content)
+        if k % 3 == 0:
+            broken = broken[: int(rng.integers(0, len(content)))]
+        else:
+            end = min(1024, len(content)) if k % 3 == 1 else len(content)
+            for at in rng.integers(0, end, 8):
+                broken[at] ^= 1 << int(rng.integers(0, 8))
+        yield bytes(broken)
+
+
+def survive(path: Path, read, copies: int = 60):
+    """Every damaged copy gives a clear error that names the file, or a scan; nothing else, and most are found."""
+    refused, content = 0, path.read_bytes()
+    for broken in damaged(path, copies):
+        path.write_bytes(broken)
+        try:
+            read()
+        except (ValueError, TypeError) as error:
+            refused += bool(str(error))
+        except OSError as error:
+            pytest.fail(f"a bare {type(error).__name__}: {error}")
+    path.write_bytes(content)
+    assert refused >= copies // 3  # all that were cut off
+
+
+def data_exchange(path: Path, **more):
+    """A scan as beamlines write it, by h5py alone: uint16 frames, theta in degrees, pixel size in µm."""
+    rng, lines = np.random.default_rng(0), line_integrals(PARALLEL, BODY, sub=1)
+    dark, white = 100 + rng.integers(0, 5, (4, 64)), 40000 + rng.integers(-2000, 2000, (4, 64))
+    data = dark + (white - dark) * np.exp(-np.stack([lines, 0.5 * lines, lines, lines], 1))
+    with h5py.File(path, "w") as file:
+        file["exchange/data"] = np.rint(data).astype(np.uint16)
+        file["exchange/data_white"] = np.stack([white] * 3).astype(np.uint16)
+        file["exchange/data_dark"] = np.stack([dark] * 2).astype(np.uint16)
+        file["exchange/theta"] = np.rad2deg(PARALLEL.angles)
+        file["exchange/theta"].attrs["units"] = "deg"
+        file["measurement/instrument/detector/pixel_size"] = 1000.0
+        file["measurement/instrument/detector/pixel_size"].attrs["units"] = "um"
+        for name, value in more.items():
+            file[name] = value
+    return path
+
+
+def test_data_exchange(tmp_path):
+    path = data_exchange(tmp_path / "tooth.h5")
+    scan = open_scan(path, axis=31.5 + 1.75, mu_water=MU, slices=slice(1, 3))
+    np.testing.assert_allclose(scan.geometry.angles, PARALLEL.angles, atol=1e-12)
+    assert (scan.geometry.pitch, scan.geometry.offset) == pytest.approx((1.0, -1.75))
+    lines = line_integrals(PARALLEL, BODY, sub=1)
+    np.testing.assert_allclose(scan.line_integrals()[1].numpy(), lines, atol=2e-3)
+    volume = reconstruct(scan, VolumeGrid((2, 32, 32), 1.0), "fbp").data
+    assert float(volume[1, 12:16, 10:14].abs().max()) < 60
+    with h5py.File(tmp_path / "tooth.h5", "a") as file:
+        del file["exchange/theta"]
+    with pytest.raises(ValueError, match=r"tooth\.h5 cannot be read as a Data Exchange file: it has no angles"):
+        open_scan(path)
+
+
+def test_the_axis_is_found_and_stripes_go(tmp_path):
+    scan = open_scan(data_exchange(tmp_path / "tooth.h5"), slices=slice(0, 1))
+    assert scan.geometry.offset == 0.0
+    assert find_axis(scan) == pytest.approx(31.5 + 1.75, abs=0.3)
+    assert centred(scan).geometry.offset == pytest.approx(-1.75, abs=0.3)
+    lines = scan.line_integrals()
+    striped = lines.clone()
+    striped[..., 30] += 0.05
+    striped[0, 40, 20] += 3.0
+    cleaned = without_stripes(without_outliers(striped))
+    assert cleaned.shape == lines.shape
+    assert float((cleaned - lines)[0, 40, 20].abs()) < 0.3
+    with pytest.raises(ValueError, match="found from parallel rays, this is a ConeBeam"):
+        find_axis(Scan.from_line_integrals(np.zeros(CONE.shape) + 0.1, CONE, photons=1e5))
+
+
+def test_damaged_data_exchange(tmp_path):
+    path = data_exchange(tmp_path / "scan.h5")
+    survive(path, lambda: open_scan(path))
+    with pytest.raises(FileNotFoundError, match=r"none\.h5"):
+        open_scan(tmp_path / "none.h5")
+
+
+@pytest.mark.parametrize("form", ["tif", "stack.tif", "npy"])
+def test_stacks_with_a_description(tmp_path, form):
+    lines = line_integrals(CONE, [Ellipsoid((2.0, -3.0), 15.0, value=MU)], sub=1)
+    counts = (5e4 * np.exp(-lines)).astype(np.float32)
+    (tmp_path / "p").mkdir()
+    if form == "tif":
+        for k, view in enumerate(counts):
+            tifffile.imwrite(tmp_path / "p" / f"{k:03d}.tif", view)
+        name = "p/*.tif"
+    elif form == "stack.tif":
+        tifffile.imwrite(tmp_path / "p" / "all.tif", counts)
+        name = "p/all.tif"
+    else:
+        np.save(tmp_path / "p" / "all.npy", counts)
+        name = "p/all.npy"
+    np.save(tmp_path / "dead.npy", np.zeros((3, 64), np.uint8))
+    text = {"readings": name, "kind": "counts", "air": 5e4, "dead": "dead.npy", "mu_water": MU,
+            "geometry": geometry_values(CONE)}  # fmt: skip
+    path = tmp_path / "scan.yaml"
+    path.write_text(yaml.safe_dump(text), encoding="utf-8")
+    scan = open_scan(path)
+    np.testing.assert_allclose(scan.geometry.angles, CONE.angles, atol=1e-12)
+    np.testing.assert_allclose(scan.line_integrals().numpy(), lines, atol=1e-4)
+    part = sorted((tmp_path / "p").iterdir())[0]
+    survive(part, lambda: open_scan(path), copies=30)
+    survive(path, lambda: open_scan(path), copies=30)
+    path.write_text(yaml.safe_dump(text | {"gian": 3}), encoding="utf-8")
+    with pytest.raises(ValueError, match="unknown in a scan of counts: gian"):
+        open_scan(path)
+
+
+@pytest.mark.parametrize("geometry", [PARALLEL, FanBeam(full_turn(7), 50.0, 90.0, 9, 1.0, 0.2, "curved"), CONE])
+def test_geometries_as_yaml(geometry, tmp_path):
+    back = geometry_of(yaml.safe_load(yaml.safe_dump(geometry_values(geometry))))
+    np.testing.assert_allclose(back.angles, geometry.angles, atol=1e-12)
+    assert geometry_values(back).keys() == geometry_values(geometry).keys()
+    (tmp_path / "a.txt").write_text("\n".join(map(str, np.rad2deg(geometry.angles))), encoding="utf-8")
+    values = geometry_values(geometry) | {"angles_deg": "a.txt"}
+    np.testing.assert_allclose(geometry_of(values, tmp_path).angles, geometry.angles, atol=1e-12)
+    with pytest.raises(ValueError, match=r"unknown in a .* geometry: sdds"):
+        geometry_of(values | {"sdds": 3}, tmp_path)
+    with pytest.raises(ValueError, match="geometry needs columns"):
+        geometry_of({"kind": "parallel", "angles_deg": [0, 1], "pitch": 1.0})
+
+
+def test_catsim(tmp_path):
+    lines = line_integrals(CONE, [Ellipsoid((2.0, -3.0), 15.0, value=MU)], sub=1)
+    lines.astype("<f4").tofile(tmp_path / "a.prep")
+    scan = open_scan(tmp_path / "a.prep", CONE, mu_water=MU, photons=1e5)
+    np.testing.assert_allclose(scan.line_integrals().numpy(), lines, atol=1e-5)
+    air, dark = np.full(CONE.shape[1:], 1e4), np.full(CONE.shape[1:], 50.0)
+    for end, values in (("scan", dark + (air - dark) * np.exp(-lines)), ("air", air), ("offset", dark)):
+        values.astype("<f4").tofile(tmp_path / f"b.{end}")
+    scan = open_scan(tmp_path / "b.scan", CONE, mu_water=MU)
+    np.testing.assert_allclose(scan.line_integrals().numpy(), lines, atol=2e-3)
+    with pytest.raises(ValueError, match="do not hold the geometry"):
+        open_scan(tmp_path / "a.prep")
+    (tmp_path / "a.prep").write_bytes(b"1234")
+    with pytest.raises(ValueError, match=r"a\.prep cannot be read.*it has 4 bytes"):
+        open_scan(tmp_path / "a.prep", CONE)
+
+
+def ct_pd(folder: Path, lines, geometry, climb: float = 0.0, spot: str = "FFSNONE"):
+    """DICOM-CT-PD by pydicom: focal spot at (−ρ sin φ, ρ cos φ), element i at φ + (i − i₀)Δ / d."""
+    folder.mkdir()
+    g, n, rows = geometry, geometry.columns, geometry.rows
+    centre = ((n + 1) / 2 + g.offset[1] / g.pitch[1], (rows + 1) / 2 - g.offset[0] / g.pitch[0])
+    for k, view in enumerate(lines):
+        d = pydicom.Dataset()
+        d.file_meta = FileMetaDataset()
+        d.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
+        d.file_meta.MediaStorageSOPClassUID = "1.2.840.10008.5.1.4.1.1.66"
+        d.file_meta.MediaStorageSOPInstanceUID = d.SOPInstanceUID = generate_uid()
+        d.SOPClassUID, d.InstanceNumber = "1.2.840.10008.5.1.4.1.1.66", k + 1
+        d.Rows, d.Columns = n, rows  # channels are image rows
+        d.SamplesPerPixel, d.PhotometricInterpretation, d.PixelRepresentation = 1, "MONOCHROME2", 0
+        d.BitsAllocated, d.BitsStored, d.HighBit = 16, 16, 15
+        d.RescaleSlope, d.RescaleIntercept = "0.0001", "-0.1"
+        for group in (0x7029, 0x7031, 0x7033, 0x7041):
+            d.add_new((group, 0x10), "LO", "DICOM-CT-PD")
+        for tag, vr, value in (
+            (0x70291002, "FL", g.pitch[1]), (0x70291006, "FL", g.pitch[0]), (0x7029100B, "CS", "CYLINDRICAL"),
+            (0x70291010, "US", rows), (0x70291011, "US", n), (0x70311001, "FL", g.angles[k] - math.pi / 2),
+            (0x70311002, "FL", climb * k), (0x70311003, "FL", g.sod), (0x70311031, "FL", g.sdd),
+            (0x70311033, "FL", list(centre)), (0x7033100E, "CS", spot), (0x70411001, "DS", str(MU)),
+        ):  # fmt: skip
+            d.add_new(tag, vr, value)
+        d.PixelData = np.rint((view[:, ::-1].T + 0.1) / 0.0001).astype("<u2").tobytes()
+        d.save_as(folder / f"{len(lines) - k:04d}.dcm", enforce_file_format=True)  # names in the other order
+    return folder
+
+
+def test_dicom_ct_pd(tmp_path):
+    lines = line_integrals(CURVED, BODY, sub=1)
+    folder = ct_pd(tmp_path / "axial", lines, CURVED)
+    scan = open_scan(folder)
+    np.testing.assert_allclose(scan.geometry.angles, CURVED.angles, atol=1e-6)
+    assert (scan.geometry.sod, scan.geometry.detector) == (300.0, "curved")
+    np.testing.assert_allclose(scan.geometry.offset, CURVED.offset, atol=1e-5)
+    np.testing.assert_allclose(scan.line_integrals().numpy(), lines, atol=1e-4)
+    inside = reconstruct(scan, VolumeGrid((1, 6, 6), 1.0, (0.0, -2.0, -6.0)), "fbp").data
+    assert float(inside.mean().abs()) < 15
+    sample = sorted(folder.iterdir())[3]
+    survive(sample, lambda: read_dicom_ct_pd(folder), copies=18)
+    sample.unlink()
+    with pytest.raises(ValueError, match="instance numbers have gaps"):
+        read_dicom_ct_pd(folder)
+
+
+def test_helical_and_flying_spots_are_refused(tmp_path):
+    part = CURVED.select(slice(0, 8))
+    lines = line_integrals(part, BODY, sub=1)
+    helix = read_dicom_ct_pd(ct_pd(tmp_path / "helix", lines, part, climb=0.5))
+    np.testing.assert_allclose(helix.motion[:, 0], -0.5 * np.arange(8), atol=1e-5)
+    with pytest.raises(ValueError, match=r"table travels by 3\.5 mm.*recon\.pwls"):
+        helix.scan()
+    flying = ct_pd(tmp_path / "ffs", lines, part, spot="FFSZ")
+    with pytest.raises(ValueError, match="focal spot flies"):
+        read_dicom_ct_pd(flying)
+    assert read_dicom_ct_pd(flying, ignore_flying_spot=True).motion is None
+
+
+def test_rtk_matrices(tmp_path):
+    """Matrices made from the rays that our own vectors describe, at random homogeneous scales."""
+    vectors = to_vectors(CONE).reshape(-1, 4, 3)[..., [1, 2, 0]]  # to RTK's axes
+    parts = []
+    for k, (source, centre, u, v) in enumerate(vectors):
+        # A point x meets the detector at centre + s û + t v̂: three homogeneous rows.
+        rays = np.stack([u / np.linalg.norm(u), v / np.linalg.norm(v), centre - source], 1)
+        inverse = np.linalg.inv(rays) * (-1.0) ** k * (1.0 + k)
+        matrix = np.concatenate([inverse, -(inverse @ source)[:, None]], 1)
+        parts.append(f"<Projection><Matrix>{' '.join(map(str, matrix.ravel()))}</Matrix></Projection>")
+    path = tmp_path / "geometry.xml"
+    distance = "<SourceToDetectorDistance>500</SourceToDetectorDistance>"
+    path.write_text(f"<RTKThreeDCircularGeometry>{distance}{''.join(parts)}</RTKThreeDCircularGeometry>")
+    found = read_rtk_vectors(path, CONE.columns, CONE.rows, CONE.pitch)
+    np.testing.assert_allclose(found, to_vectors(CONE), atol=1e-8)
+    survive(path, lambda: read_rtk_vectors(path, CONE.columns, CONE.rows, CONE.pitch))
+
+
+def test_unknown_endings_are_refused_first(tmp_path):
+    with pytest.raises(ValueError, match=r"unknown scan format 'a\.raw'"):
+        open_scan(tmp_path / "a.raw")

@@ -1,0 +1,124 @@
+"""Volumes in and out: what SimpleITK, nibabel and pydicom see of ours, and we of theirs."""
+
+from __future__ import annotations
+
+import shutil
+
+import nibabel
+import numpy as np
+import pydicom
+import pytest
+import SimpleITK
+import torch
+from pydicom.data import get_testdata_file
+
+from torchpcct import Volume, VolumeGrid
+
+GRID = VolumeGrid((4, 6, 5), (1.5, 0.5, 0.25), (3.0, -7.0, 11.0))
+DATA = torch.round(torch.linspace(-1000, 900, 120).reshape(GRID.shape))
+NAMES = ("v.nii.gz", "v.nii", "v.mha", "v.h5", "series")
+
+
+def sitk_read(path):
+    if path.is_dir():
+        reader = SimpleITK.ImageSeriesReader()
+        reader.SetFileNames(reader.GetGDCMSeriesFileNames(str(path)))
+        return reader.Execute()
+    return SimpleITK.ReadImage(str(path))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_round_trip(tmp_path, name):
+    Volume(DATA, GRID).save(tmp_path / name)
+    back = Volume.load(tmp_path / name)
+    assert torch.equal(back.data, DATA)
+    assert back.grid.shape == GRID.shape
+    np.testing.assert_allclose([*back.grid.spacing, *back.grid.center], [*GRID.spacing, *GRID.center], atol=1e-5)
+
+
+@pytest.mark.parametrize("name", [n for n in NAMES if n != "v.h5"])
+def test_other_software_sees_the_same_place(tmp_path, name):
+    """The point (x, y, z) of the scanner is (−x, −y, z) in ITK, in every format, and holds the same value."""
+    Volume(DATA, GRID).save(tmp_path / name)
+    image = sitk_read(tmp_path / name)
+    for k, j, i in ((0, 0, 0), (3, 1, 4), (2, 5, 0)):
+        z, y, x = (axis[n] for axis, n in zip(GRID.axes, (k, j, i), strict=True))
+        index = image.TransformPhysicalPointToIndex((-x, -y, z))
+        assert float(image[index]) == float(DATA[k, j, i])
+
+
+def test_nifti_has_qform_and_sform(tmp_path):
+    Volume(DATA, GRID).save(tmp_path / "v.nii.gz")
+    header = nibabel.load(tmp_path / "v.nii.gz").header
+    assert (int(header["qform_code"]), int(header["sform_code"])) == (1, 1)
+    np.testing.assert_allclose(header.get_qform(), header.get_sform(), atol=1e-6)
+
+
+def test_dicom_series_are_in_hu_and_whole(tmp_path):
+    Volume(DATA, GRID).save(tmp_path / "s")
+    first = pydicom.dcmread(tmp_path / "s" / "0001.dcm")
+    assert (first.RescaleType, first.Modality, len(list((tmp_path / "s").iterdir()))) == ("HU", "CT", 4)
+    with pytest.raises(ValueError, match="is not empty"):
+        Volume(DATA, GRID).save(tmp_path / "s")
+    (tmp_path / "s" / "0002.dcm").unlink()
+    with pytest.raises(ValueError, match="slices lack or repeat between z"):
+        Volume.load(tmp_path / "s")
+    with pytest.raises(ValueError, match=r"holds HU, this volume is in mm\^-1"):
+        Volume(DATA, GRID, unit="mm^-1").save(tmp_path / "t")
+
+
+@pytest.mark.parametrize("flip", [(1, 1, 1), (-1, 1, 1), (1, -1, -1)])
+def test_files_of_other_software_in_any_direction(tmp_path, flip):
+    """A volume written by SimpleITK with flipped axes reads as what SimpleITK itself says of every point."""
+    image = SimpleITK.GetImageFromArray(DATA.numpy().astype(np.int16))
+    image.SetSpacing((0.25, 0.5, 1.5))
+    image.SetOrigin((3.0, -8.0, 20.0))
+    image.SetDirection(tuple(np.diag(np.array(flip, float)).ravel()))
+    for name in ("a.mha", "a.nii.gz"):
+        SimpleITK.WriteImage(image, str(tmp_path / name))
+        volume = Volume.load(tmp_path / name)
+        z, y, x = np.meshgrid(*volume.grid.axes, indexing="ij")
+        for k, j, i in ((0, 0, 0), (3, 5, 4), (1, 2, 3)):
+            index = image.TransformPhysicalPointToIndex((-x[k, j, i], -y[k, j, i], z[k, j, i]))
+            assert float(volume.data[k, j, i]) == float(image[index])
+
+
+def test_a_clinical_slice_reads_as_pydicom_says(tmp_path):
+    path = get_testdata_file("CT_small.dcm")
+    (tmp_path / "ct").mkdir()
+    shutil.copy(path, tmp_path / "ct" / "a.dcm")
+    volume, d = Volume.load(tmp_path / "ct"), pydicom.dcmread(path)
+    expected = d.pixel_array * float(d.RescaleSlope) + float(d.RescaleIntercept)
+    np.testing.assert_array_equal(volume.data[0].numpy(), expected[::-1, ::-1])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_damaged_volumes_give_a_clear_error_or_a_volume(tmp_path, name):
+    Volume(DATA, GRID).save(tmp_path / name)
+    target = tmp_path / name
+    path = sorted(target.iterdir())[1] if target.is_dir() else target
+    content, rng, refused = path.read_bytes(), np.random.default_rng(0), 0
+    for k in range(60):
+        broken = bytearray(content)
+        if k % 2:
+            broken = broken[: int(rng.integers(0, len(content)))]
+        else:
+            for at in rng.integers(0, min(len(content), 400), 6):
+                broken[at] ^= 1 << int(rng.integers(0, 8))
+        path.write_bytes(bytes(broken))
+        try:
+            Volume.load(target)
+        except ValueError as error:
+            refused += path.name.split(".")[0] in str(error) or str(target) in str(error)
+    assert refused >= 25
+
+
+def test_unknown_endings_and_oblique_axes(tmp_path):
+    with pytest.raises(ValueError, match=r"unknown volume format 'v\.png': use \.nii"):
+        Volume(DATA, GRID).save(tmp_path / "v.png")
+    affine = np.array([[0.9, -0.4, 0, 0], [0.4, 0.9, 0, 0], [0, 0, 1.0, 0], [0, 0, 0, 1]])
+    nibabel.save(nibabel.Nifti1Image(np.zeros((3, 4, 5), np.float32), affine), tmp_path / "o.nii")
+    with pytest.raises(ValueError, match="oblique"):
+        Volume.load(tmp_path / "o.nii")
+    with pytest.raises(FileNotFoundError):
+        Volume.load(tmp_path / "none.nii")

@@ -1,0 +1,73 @@
+"""Noise and resolution from two halves of one scan, against repeated draws and known spectra."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from analytic import Ellipsoid, line_integrals
+
+from recon import reconstruct
+from torchpcct import FanBeam, Scan, VolumeGrid, full_turn
+from torchpcct.metrics.half_split import HalfSplit, half_split, halves
+
+MU = 0.02
+GEOMETRY = FanBeam(full_turn(240), 300.0, 500.0, 64, 1.7)
+LINES = line_integrals(GEOMETRY, [Ellipsoid((0.0, 0.0), 25.0, value=MU)], sub=1)
+GRID = VolumeGrid((24, 24), 1.0)
+
+
+def draw(seed):
+    counts = np.random.default_rng(seed).poisson(2000.0 * np.exp(-LINES)).astype(float)
+    return Scan.from_counts(counts, GEOMETRY, air=2000.0, mu_water=MU)
+
+
+def fbp(scan):
+    return reconstruct(scan, GRID, "fbp", kernel="soft").data
+
+
+@pytest.mark.parametrize("how", ["views", "counts"])
+def test_the_noise_is_that_of_repeated_scans(how):
+    """SD of 576 voxels (about 60 independent) from 5 scans each: standard error 6 %."""
+    repeated = torch.stack([fbp(draw(seed)) for seed in range(8)])
+    truth = float(repeated.var(0).mean().sqrt())
+    found = [half_split(draw(100 + seed), fbp, how, seed).noise() for seed in range(5)]
+    assert math.sqrt(np.mean(np.square(found))) == pytest.approx(truth, rel=0.15)
+
+
+def test_halves_of_counts_add_up_and_are_independent():
+    scan = draw(0)
+    a, b = halves(scan, "counts", 3)
+    assert torch.equal(a.counts + b.counts, scan.counts)
+    assert torch.equal(a.air * 2, scan.air)
+    expected = 1000.0 * torch.from_numpy(np.exp(-LINES)).float()
+    noise = [(h.counts - expected) / expected.sqrt() for h in (a, b)]
+    assert abs(float((noise[0] * noise[1]).mean())) < 5 / math.sqrt(scan.counts.numel())
+    views = halves(scan, "views")
+    assert [h.geometry.views for h in views] == [120, 120]
+    assert torch.equal(views[1].counts, scan.counts[1::2])
+
+
+def test_the_resolution_is_where_signal_and_noise_cross():
+    """White noise and a signal up to a known frequency: the halves agree just as far."""
+    generator = torch.Generator().manual_seed(0)
+    radius = np.hypot(np.fft.fftfreq(128)[:, None], np.fft.fftfreq(128))
+    low = torch.from_numpy(radius < 0.2)
+    signal = torch.fft.ifft2(torch.fft.fft2(torch.randn(4, 128, 128, generator=generator).double()) * low).real
+    pair = [signal + 0.1 * torch.randn(4, 128, 128, generator=generator).double() for _ in range(2)]
+    assert HalfSplit(*pair).resolution(0.5) == pytest.approx(0.2 / 0.5, rel=0.05)
+    noise = [torch.randn(4, 128, 128, generator=generator) for _ in range(2)]
+    assert HalfSplit(*noise).resolution(0.5) < 0.15
+
+
+def test_what_cannot_be_split_is_refused():
+    lines = Scan.from_line_integrals(LINES, GEOMETRY, photons=1e4)
+    with pytest.raises(ValueError, match='use how="views"'):
+        halves(lines, "counts")
+    assert halves(lines)[0].logged
+    with pytest.raises(ValueError, match="unknown how"):
+        halves(draw(0), "rows")
+    with pytest.raises(ValueError, match="two voxels"):
+        HalfSplit(torch.zeros(3, 3), torch.zeros(3, 3)).noise(np.eye(3) > 2)

@@ -1,0 +1,95 @@
+"""The residual's tests: their rate of false alarms, their power, and what they refuse."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+from torchpcct.metrics.residual_test import residual_test
+
+SHAPE = (60, 6, 24)
+W = torch.linspace(500.0, 1500.0, math.prod(SHAPE), dtype=torch.float64).reshape(SHAPE)
+U = torch.arange(24, dtype=torch.float64) - 11.5
+LINES = 0.1 * torch.exp(-((U - 4.0 * torch.sin(torch.linspace(0, 6.2, 60))[:, None, None]) ** 2) / 8).expand(SHAPE)
+
+
+def noise(seed):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(SHAPE, dtype=torch.float64, generator=generator) / W.sqrt()
+
+
+def shifted(columns):
+    """LINES of a detector that is moved by so many columns, less LINES: what a wrong centre leaves."""
+    moved = 0.1 * torch.exp(-((U - columns - 4.0 * torch.sin(torch.linspace(0, 6.2, 60))[:, None, None]) ** 2) / 8)
+    return moved.expand(SHAPE) - LINES
+
+
+def test_false_alarms_keep_their_rate():
+    """p-values of noise are uniform (Kolmogorov–Smirnov), and findings as rare as promised."""
+    found = [residual_test(noise(seed), W, LINES, false_alarms=0.2) for seed in range(400)]
+    alarms = sum(bool(f.findings) for f in found)
+    # At most 0.2, three standard errors above; what level, views and rows tolerate makes it less.
+    assert alarms <= 400 * (0.2 + 3 * math.sqrt(0.2 * 0.8 / 400))
+    assert alarms >= 400 * 0.04
+    assert stats.kstest([f.p_values["centre"] for f in found], "uniform").pvalue > 1e-3
+    assert sum(bool(residual_test(noise(s), W, LINES).findings) for s in range(400)) <= 8
+
+
+def test_a_quarter_of_a_column_is_found_and_measured():
+    found = residual_test(noise(1) + shifted(-0.25), W, LINES)
+    assert len(found.findings) == 1
+    assert "rotation centre" in found.findings[0]
+    # Of the shift the score's standard error is 1 / √⟨t, W t⟩.
+    t = torch.zeros(SHAPE, dtype=torch.float64)
+    t[..., 1:-1] = (LINES[..., 2:] - LINES[..., :-2]) / 2
+    assert found.sizes["centre"] == pytest.approx(0.25, abs=0.01 + 4 / math.sqrt(float((W * t * t).sum())))
+    assert abs(found.chi2 - 1) < 0.1  # χ² alone does not see it
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (torch.linspace(0, 0.01, 60)[:, None, None], "readings of some views"),
+        (0.005 * torch.randn(60, 1, 1, generator=torch.Generator().manual_seed(5)), "readings of some views"),
+        (torch.tensor([0.0, 0, 0.01, 0, 0, 0])[:, None], "readings of some rows"),
+    ],
+)
+def test_gains_are_found(change, match):
+    findings = residual_test(noise(2) + change.double(), W, LINES).findings
+    assert any(match in text for text in findings)
+
+
+def test_a_wrong_noise_level_is_found():
+    assert "stated noise variance" in residual_test(1.1 * noise(3), W, LINES).findings[0]
+    assert "stated noise variance" in residual_test(0.9 * noise(3), W, LINES).findings[0]
+    # A tenth of the readings were fitted: χ² of 0.9 is what must be.
+    assert residual_test(math.sqrt(0.9) * noise(3), W, LINES, unknowns=W.numel() // 10).findings == ()
+
+
+def test_readings_without_weight_do_not_count():
+    weights, residual = W.clone(), noise(4)
+    weights[::7, 2] = 0
+    damaged = residual.clone()
+    damaged[::7, 2] = math.nan
+    a = residual_test(damaged, weights, LINES)
+    b = residual_test(residual, weights, LINES)
+    assert a == b
+    assert a.findings == ()
+
+
+def test_bad_input_is_named():
+    r = noise(0)
+    for given, match in (
+        ((r[0], W[0], LINES[0]), "one shape"),
+        ((r, W[1:], LINES), "one shape"),
+        ((r, -W, LINES), "weights must be 0 or more"),
+        ((r, 0 * W, LINES), "weights must be 0 or more"),
+        ((r * math.nan, W, LINES), "finite"),
+    ):
+        with pytest.raises(ValueError, match=match):
+            residual_test(*given)
+    with pytest.raises(ValueError, match="false_alarms"):
+        residual_test(r, W, LINES, false_alarms=1.5)
+    assert np.isfinite(residual_test(r.float(), W.float(), LINES.float()).chi2)

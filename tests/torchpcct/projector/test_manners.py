@@ -1,0 +1,178 @@
+"""Operators in the manners of other libraries, narrow dtypes, forks and the notice of compilation."""
+
+import logging
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from geometries import REGISTRY
+
+from torchpcct import ParallelBeam, Projector, VolumeGrid
+
+CASES = ["parallel_half_turn", "fan_curved_short_scan", "cone_window"]
+
+
+@pytest.fixture(params=CASES)
+def A(request):
+    return Projector(*REGISTRY[request.param]())
+
+
+def dense(A):
+    n = int(np.prod(A.domain_shape))
+    return A(torch.eye(n, dtype=torch.float64).reshape(n, *A.domain_shape)).reshape(n, -1).T
+
+
+def test_product_and_adjoint(A):
+    x, y = torch.randn(2, *A.domain_shape), torch.randn(*A.range_shape)
+    assert torch.equal(A @ x, A(x))
+    assert torch.equal(A.H @ y, A.T(y))
+    assert A.H.H is A
+
+
+def test_norm_is_the_largest_singular_value(A):
+    exact = float(torch.linalg.matrix_norm(dense(A), 2))
+    assert A.norm() == pytest.approx(exact, rel=1e-3)
+    assert A.norm() <= exact * (1 + 1e-5)
+    assert A.T.norm() == pytest.approx(exact, rel=1e-3)
+
+
+def test_norm_is_kept(A, monkeypatch):
+    first = A.norm()
+    monkeypatch.setattr(type(A), "forward", lambda self, x: pytest.fail("computed again"))
+    assert A.norm() == first
+    with pytest.raises(pytest.fail.Exception):
+        A.norm(tolerance=1e-6)  # closer than what is kept
+
+
+def test_scipy_solves_with_it(A):
+    from scipy.sparse.linalg import lsqr
+
+    S, M = A.as_scipy(np.float64), dense(A).numpy()
+    assert S.shape == M.shape
+    assert S.dtype == np.float64
+    rng = np.random.default_rng(0)
+    X, Y = rng.standard_normal((M.shape[1], 3)), rng.standard_normal((M.shape[0], 2))
+    np.testing.assert_allclose(S @ X, M @ X, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(S.H @ Y, M.T @ Y, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(S @ X[:, 0], M @ X[:, 0], rtol=1e-9, atol=1e-9)
+    y = M @ X[:, 0]
+    found = lsqr(S, y, damp=0.1, atol=1e-12, btol=1e-12, iter_lim=3000)[0]
+    expected = np.linalg.solve(M.T @ M + 0.01 * np.eye(M.shape[1]), M.T @ y)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
+    assert A.as_scipy().matvec(X[:, 0]).dtype == np.float32
+    with pytest.raises(TypeError, match="float32 or float64"):
+        A.as_scipy(np.float16)
+
+
+def test_pylops_takes_it(A):
+    pylops = pytest.importorskip("pylops")
+    P = A.as_pylops(np.float64)
+    assert isinstance(P, pylops.LinearOperator)
+    assert pylops.utils.dottest(P, rtol=1e-9, raiseerror=False)
+    x = np.random.default_rng(0).standard_normal(P.shape[1])
+    np.testing.assert_allclose(P @ x, A(torch.from_numpy(x).reshape(A.domain_shape)).numpy().ravel(), rtol=1e-12)
+
+
+def test_deepinv_takes_it(A):
+    pytest.importorskip("deepinv")
+    physics = A.as_deepinv()
+    x = torch.randn(2, 1, *A.domain_shape)
+    assert torch.equal(physics.A(x), A(x))
+    assert float(physics.adjointness_test(x)) == pytest.approx(0.0, abs=1e-3 * float(A(x).square().sum()))
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_narrow_numbers_are_computed_in_float32(A, dtype):
+    x = torch.rand(*A.domain_shape).to(dtype).requires_grad_()
+    y = A(x)
+    assert y.dtype == torch.float32
+    assert torch.equal(y, A(x.detach().float()))
+    y.sum().backward()
+    assert x.grad.dtype == dtype
+    torch.testing.assert_close(x.grad, A.T(torch.ones_like(y)).to(dtype))
+
+
+def test_autocast(A):
+    """A network before the projector leaves bfloat16; the loss and its gradient are those of float32 from there on."""
+    layer = torch.nn.Linear(A.domain_shape[-1], A.domain_shape[-1])
+    x = torch.rand(*A.domain_shape)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        mixed = layer(x)
+        assert mixed.dtype == torch.bfloat16
+        y = A(mixed)
+    assert y.dtype == torch.float32
+    y.square().sum().backward()
+    assert torch.isfinite(layer.weight.grad).all()
+
+
+CHILD = """
+import os, sys
+import torch
+from torchpcct import ParallelBeam, Projector, VolumeGrid
+A = Projector(ParallelBeam([0.1, 0.4], 5, 1.9), VolumeGrid((3, 3), 2.0))
+x = torch.ones(3, 3)
+if sys.argv[1] == "before":
+    A(x)
+pid = os.fork()
+if pid == 0:
+    try:
+        print("sum", round(float(A(x).sum()), 3), flush=True)
+    except RuntimeError as error:
+        print("refused", error, flush=True)
+    os._exit(0)
+status = os.waitpid(pid, 0)[1]
+print("status", status, flush=True)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this platform")
+@pytest.mark.parametrize(
+    ("used", "layer"),
+    [
+        ("before", "omp"),
+        pytest.param("before", "workqueue", marks=pytest.mark.slow),
+        pytest.param("never", "omp", marks=pytest.mark.slow),
+    ],
+)
+def test_a_forked_worker_computes_or_says_why_not(used, layer):
+    environment = {**os.environ, "NUMBA_THREADING_LAYER": layer}
+    command = [sys.executable, "-W", "ignore", "-c", CHILD, used]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
+    assert "status 0" in done.stdout, done.stderr
+    if (used, layer) == ("before", "omp"):
+        assert "refused" in done.stdout
+        assert "spawn" in done.stdout
+    else:
+        A = Projector(ParallelBeam([0.1, 0.4], 5, 1.9), VolumeGrid((3, 3), 2.0))
+        assert f"sum {round(float(A(torch.ones(3, 3)).sum()), 3)}" in done.stdout
+
+
+def test_a_word_while_kernels_compile(caplog):
+    """Only for the package's own functions, and once."""
+    from numba.core import event
+
+    from torchpcct.projector.compiling import announce_compilation
+
+    announce_compilation()
+
+    class Dispatcher:
+        @staticmethod
+        def py_func():
+            pass
+
+    def compiled(module):
+        Dispatcher.py_func.__module__ = module
+        with event.trigger_event("numba:compile", data={"dispatcher": Dispatcher()}):
+            pass
+
+    listener = next(k for k in event._registered["numba:compile"] if type(k).__name__ == "Announce")
+    type(listener).said = False
+    with caplog.at_level(logging.WARNING):
+        compiled("somebody.else")
+        assert not caplog.records
+        compiled("torchpcct.projector.cpu.cone_kernels")
+        compiled("recon.gram.kernels")
+    assert [r.message for r in caplog.records if "compiling" in r.message] == [caplog.records[0].message]

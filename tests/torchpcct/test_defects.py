@@ -1,0 +1,123 @@
+"""Defective readings: found where they are, and only there; filled as their neighbours are."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from torchpcct import ConeBeam, Scan, full_turn
+from torchpcct.defects import filled, find_defects, mended
+from torchpcct.scanner.linearisation import WaterLinearisation
+
+VIEWS, ROWS, COLUMNS = 90, 6, 60
+U = np.arange(COLUMNS) - 29.5
+AIR = torch.full((ROWS, COLUMNS), 4000.0)
+
+
+def expected():
+    """Counts behind a 12 cm cylinder with an insert that walks over the columns, 20 … 4000."""
+    lines = 0.02 * 120 * np.sqrt(np.clip(1 - (U / 26) ** 2, 0, 1))
+    centre = 14 * np.sin(full_turn(VIEWS))[:, None]
+    lines = lines + 1.5 * np.exp(-((U - centre) ** 2) / 4)
+    return np.broadcast_to(4000 * np.exp(-lines)[:, None, :], (VIEWS, ROWS, COLUMNS))
+
+
+@pytest.fixture
+def counts():
+    return torch.from_numpy(np.random.default_rng(0).poisson(expected()).astype(np.float32))
+
+
+def test_good_data_are_left_alone(counts):
+    found = find_defects(counts, AIR)
+    assert not found.mask.any()
+    assert found.text == ""
+
+
+@pytest.mark.parametrize("level", [0.02, 0.3, 1.0])
+def test_starved_data_are_left_alone(level):
+    """Zeros of noise, anywhere and behind metal, are no defects."""
+    low = np.random.default_rng(1).poisson(expected() * level / 60).astype(np.float32)
+    assert not find_defects(torch.from_numpy(low), AIR * level / 60).mask.any()
+    opaque = np.array(expected())
+    for v in range(VIEWS):  # a bar of lead, three cells wide
+        c = int(30 + 14 * np.sin(full_turn(VIEWS)[v]))
+        opaque[v, :, c : c + 3] = 0.01
+    metal = np.random.default_rng(2).poisson(opaque).astype(np.float32)
+    assert not find_defects(torch.from_numpy(metal), AIR).mask.any()
+
+
+def test_every_kind_of_defect_is_found_and_nothing_else(counts):
+    bad = torch.zeros(counts.shape, dtype=torch.bool)
+    bad[:, 2, 10] = bad[:, :, 33] = bad[:, :, 34] = bad[40] = bad[17, 4, 50] = True
+    broken = counts.clone()
+    broken[bad] = 0
+    broken[:, 1, 45] *= 1.6
+    bad[:, 1, 45] = True
+    found = find_defects(broken, AIR)
+    assert torch.equal(found.mask, bad)
+    assert (found.dead_cells, found.hot_cells, found.dead_views, found.lost_readings) == (13, 1, 1, 1)
+    assert "13 dead detector cells, 1 cells of a wrong gain, 1 views without signal, 1 single lost" in found.text
+
+
+@pytest.mark.parametrize(("share", "least"), [(0.001, 0.99), (0.1, 0.99), (0.4, 0.99)])
+def test_readings_lost_at_random_are_found(counts, share, least):
+    lost = torch.rand(counts.shape, generator=torch.Generator().manual_seed(3)) < share
+    lost[:, :, [0, -1]] = False  # a reading at the edge has no neighbour on one side
+    found = find_defects(torch.where(lost, 0.0, counts), AIR).mask
+    assert not (found & ~lost).any()
+    bright = torch.from_numpy(expected() > 150)
+    assert float((found & lost & bright).sum() / (lost & bright).sum()) > least
+
+
+def test_a_dead_row_is_found(counts):
+    """The neighbours of its cells are in the other rows."""
+    bad = torch.zeros(counts.shape, dtype=torch.bool)
+    bad[:, 3] = True
+    assert torch.equal(find_defects(torch.where(bad, 0.0, counts), AIR).mask, bad)
+
+
+def test_cells_are_followed_through_a_window(counts):
+    first = (np.arange(VIEWS) % 7).astype(np.int64)
+    part = torch.stack([counts[v, :, f : f + 40] for v, f in enumerate(first)])
+    bad = torch.zeros(part.shape, dtype=torch.bool)
+    for v, f in enumerate(first):
+        bad[v, 3, 25 - f] = True
+    found = find_defects(torch.where(bad, 0.0, part), AIR, first)
+    assert torch.equal(found.mask, bad)
+    assert (found.dead_cells, found.lost_readings) == (1, 0)
+
+
+def test_filling_is_exact_for_linear_data():
+    v, r, c = np.meshgrid(np.arange(9.0), np.arange(5.0), np.arange(11.0), indexing="ij")
+    lines = torch.from_numpy(1 + 0.1 * v - 0.2 * r + 0.05 * c)
+    mask = torch.zeros(lines.shape, dtype=torch.bool)
+    mask[:, :, 4:6] = mask[3] = mask[:, 2] = True
+    broken = torch.where(mask, 1e9, lines)
+    torch.testing.assert_close(filled(broken, mask), lines)
+    # Nothing on one side: the nearest.
+    mask[:] = False
+    mask[:, :, 0] = mask[0] = True
+    full = filled(torch.where(mask, 1e9, lines), mask)
+    torch.testing.assert_close(full[1:, :, 0], lines[1:, :, 1])
+    with pytest.raises(ValueError, match="no good reading"):
+        filled(lines, torch.ones_like(mask))
+
+
+def test_a_scan_is_mended_and_says_so(counts):
+    g = ConeBeam(full_turn(VIEWS), 626.0, 1098.0, COLUMNS, ROWS, 1.0)
+    water = WaterLinearisation(np.ones((COLUMNS, 1)), np.ones(COLUMNS), 0.02)
+    scan = Scan(counts, AIR, g, water, exposure_s=1.0, seed=0)
+    same, said = mended(scan)
+    assert same is scan
+    assert said == []
+    broken = counts.clone()
+    broken[:, :, 33] = 0
+    fixed, said = mended(replace(scan, counts=broken))
+    assert "6 dead detector cells" in said[0]
+    truth = torch.from_numpy(np.log(4000 / expected()))
+    error = (fixed.line_integrals() - truth)[:, :, 33]
+    # Before: ln(4000 / ½) ≈ 9 for 2.4; now noise of two readings and the curvature between them.
+    assert float(error.square().mean().sqrt()) < 0.12
+    clean = replace(scan, counts=broken, exposure_s=None, seed=None)
+    assert mended(clean)[0] is clean

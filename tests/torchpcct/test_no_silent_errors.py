@@ -1,0 +1,310 @@
+"""What once gave a wrong result without a word: each is refused, warned of, or right (scenes, scans, operators)."""
+
+import math
+import time
+import warnings
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from small_scan import GRID, SCENE, scanner
+
+from torchpcct import ConeBeam, FanBeam, ParallelBeam, Projector, Scan, Volume, VolumeGrid, acquire, full_turn
+from torchpcct.acquisition.acquire import plan
+from torchpcct.detector_window import DetectorWindow, shadow
+from torchpcct.geometry import view_step
+from torchpcct.metrics import cnr_interval, mean_interval, sd_interval
+from torchpcct.metrics.control import expected_half_width
+from torchpcct.scanner.linearisation import WaterLinearisation
+from torchpcct.scene.materials import material
+from torchpcct.spectral import Basis, vmi_noise
+
+
+@pytest.fixture(scope="module")
+def clean():
+    return acquire(SCENE, scanner(), region=GRID, duty=0.06, sub_rays=16)
+
+
+def test_the_turn_of_a_view_does_not_depend_on_the_order_of_the_views():
+    """Views read out of order are the same views: counts follow them, blurred by the same turn."""
+    s = scanner(views=60, rows=4)
+    order = np.random.default_rng(0).permutation(60)
+    shuffled = s.replace(geometry=s.geometry.select(order))
+    straight = acquire(SCENE, s, region=GRID, sub_rays=16)
+    mixed = acquire(SCENE, shuffled, region=GRID, sub_rays=16)
+    np.testing.assert_array_equal(mixed.window.first_column, straight.window.first_column[order])
+    torch.testing.assert_close(mixed.counts, straight.counts[order], rtol=2e-6, atol=0)
+
+
+def test_view_step_by_hand():
+    assert view_step(full_turn(8)) == pytest.approx(math.pi / 4)
+    assert view_step(full_turn(8)[[3, 0, 5, 1, 2, 7, 4, 6]]) == pytest.approx(math.pi / 4)
+    assert view_step(np.array([0.0, 0.0, 0.5, 0.5, 1.0])) == 0.5
+    assert view_step(np.array([1.0])) == view_step(np.array([1.0, 1.0])) == 0.0
+
+
+@pytest.mark.parametrize("tolerance", [math.nan, -1.0, math.inf, -math.inf])
+def test_a_tolerance_that_compares_with_nothing_is_refused(tolerance):
+    """NaN compares false with every cost, so that all effects were left out; a negative one kept all."""
+    for call in (plan, acquire):
+        with pytest.raises(ValueError, match="tolerance_hu must be"):
+            call(SCENE, scanner(views=12, rows=2), tolerance_hu=tolerance)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "match"),
+    [
+        (lambda s: {"air": s.air * math.inf}, ValueError, "air readings must be finite"),
+        (lambda s: {"air": s.air * math.nan}, ValueError, "air readings must be finite"),
+        (lambda s: {"surround": s.surround * 0}, ValueError, "surround readings must be finite and greater than 0"),
+        (lambda s: {"surround": s.surround * math.nan}, ValueError, "surround readings"),
+        (lambda s: {"surround": -s.surround}, ValueError, "surround readings"),
+        (lambda s: {"counts": s.counts.numpy()}, TypeError, "counts must be a floating point tensor"),
+        (lambda s: {"counts": s.counts.long()}, TypeError, "counts must be a floating point tensor"),
+        (lambda s: {"air": 1e5}, TypeError, "air must be a floating point tensor"),
+        (lambda s: {"geometry": FanBeam([0.0], 1, 2, 3, 1)}, TypeError, "geometry must be a ConeBeam"),
+        (lambda s: {"linearisation": None}, TypeError, "linearisation must be a WaterLinearisation"),
+        (lambda s: {"window": "all"}, TypeError, "window must be a DetectorWindow"),
+        (lambda s: {"seed": -1}, ValueError, "seed must be at least 0"),
+        (lambda s: {"info": 3}, TypeError, "info must be a mapping"),
+        (
+            lambda s: {"linearisation": WaterLinearisation(np.ones((7, 1)), np.ones(7), 0.02)},
+            ValueError,
+            "water correction is that of 7 columns",
+        ),
+        (
+            lambda s: {"window": replace(s.window, first_column=s.window.first_column + 1500)},
+            ValueError,
+            "beyond the detector",
+        ),
+        (lambda s: {"window": replace(s.window, first_row=5)}, ValueError, "beyond the detector"),
+    ],
+)
+def test_members_of_a_scan_are_checked(clean, change, error, match):
+    with pytest.raises(error, match=match):
+        replace(clean, **change(clean))
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "match"),
+    [
+        ({"mu_ref": 0.0}, ValueError, "mu_ref must be greater than 0"),
+        ({"mu_ref": math.nan}, ValueError, "mu_ref must be finite"),
+        ({"mu_ref": -0.02}, ValueError, "mu_ref must be greater than 0"),
+        ({"scale": np.ones(3)}, ValueError, "shape"),
+        ({"scale": np.array([1.0, 0.0, 1.0, 1.0])}, ValueError, "column 1 has 0"),
+        ({"coefficients": np.ones((3, 2))}, ValueError, "shape"),
+        ({"coefficients": np.ones((4, 0))}, ValueError, "shape"),
+        ({"coefficients": np.full((4, 2), math.inf)}, ValueError, "8 entries are NaN or Inf"),
+        ({"coefficients": np.ones((4, 2), complex)}, TypeError, "real numbers"),
+        ({"coefficients": "abc"}, TypeError, "real numbers"),
+    ],
+)
+def test_a_bad_water_correction_is_refused(changes, error, match):
+    """Its kernel reads by index: a short table was an access beyond its end."""
+    with pytest.raises(error, match=match):
+        WaterLinearisation(**{"coefficients": np.ones((4, 2)), "scale": np.ones(4), "mu_ref": 0.02, **changes})
+
+
+def test_a_window_beyond_the_water_correction_is_refused():
+    correction = WaterLinearisation(np.ones((4, 2)), np.ones(4), 0.02)
+    with pytest.raises(ValueError, match="beyond the 4 columns"):
+        correction.apply(torch.ones(2, 1, 3), DetectorWindow(np.array([0, 2]), 3))
+    with pytest.raises(TypeError, match="float32 or float64"):
+        correction.apply(torch.ones(4, dtype=torch.int64))
+
+
+@pytest.mark.parametrize(
+    "degrees", [np.arange(360.0), np.arange(180.0), np.arange(720) / 2, np.arange(1968) * 360 / 1968]
+)
+def test_degrees_for_radians_are_noticed(degrees):
+    with pytest.warns(UserWarning, match="look like degrees"):
+        ParallelBeam(degrees, 10, 1.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        ParallelBeam(np.deg2rad(degrees), 10, 1.0)
+        ParallelBeam(np.arange(20 * 984) * (2 * math.pi / 984), 10, 1.0)  # a helix of 20 turns
+
+
+@pytest.mark.parametrize("angles", [[1 + 2j, 0.3], np.array([1j, 2j]), ["a"], None, [None, 1.0], [[0.1], [0.2, 0.3]]])
+def test_angles_that_are_no_real_numbers_are_refused(angles):
+    with pytest.raises(TypeError, match="angles must be real numbers in rad"):
+        ParallelBeam(angles, 10, 1.0)
+
+
+def test_a_windowed_projection_equals_the_whole_one():
+    """Whatever else is read: the depth layers of the cone beam must not depend on the rows that are kept."""
+    g = ConeBeam(full_turn(12), 400.0, 700.0, 60, 40, (2.0, 2.0), detector="curved")
+    grid = VolumeGrid((20, 24, 22), (1.9, 2.0, 2.1), (1.0, 4.0, -6.0))
+    x = torch.rand(grid.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    whole = Projector(g, grid)(x)
+    part = DetectorWindow(np.full(12, 17), 25, 18, 3)
+    windowed = Projector(g, grid, part)(x)
+    assert float((windowed - whole[:, 18:21, 17:42]).abs().max() / whole.max()) < 1e-12
+
+
+@pytest.mark.parametrize("detector", ["flat", "curved"])
+def test_the_row_offset_moves_the_rows_up(detector):
+    """Literal numbers: sod 500, sdd 1000, nine rows of 2 mm moved up by 6 mm. A voxel at z = 4 mm on the axis is seen
+    at 8 mm, by row 5; with the offset's sign turned it would be seen by none."""
+    g = ConeBeam([0.0, 1.0], 500.0, 1000.0, 5, 9, 2.0, (6.0, 0.0), detector)
+    np.testing.assert_allclose(g.row_positions, [-2, 0, 2, 4, 6, 8, 10, 12, 14])
+    grid = VolumeGrid((1, 1, 1), (0.5, 0.5, 0.5), (4.0, 0.0, 0.0))
+    y = Projector(g, grid)(torch.ones(1, 1, 1, dtype=torch.float64))
+    seen = y.sum(dim=(0, 2))
+    assert seen.argmax() == 5
+    assert float(seen[5] / seen.sum()) == pytest.approx(1.0)
+    window = shadow(g, grid)
+    assert window.first_row <= 5 < window.first_row + window.rows
+    assert window.rows <= 3
+
+
+@pytest.mark.parametrize("z", [500.0, -500.0, 40.0])
+def test_a_grid_that_no_row_sees_casts_no_shadow(z):
+    g = ConeBeam(full_turn(8), 500.0, 1000.0, 64, 16, 1.0)
+    with pytest.raises(ValueError, match="above or below all 16 rows"):
+        shadow(g, VolumeGrid((4, 4, 4), 0.5, (z, 0.0, 0.0)))
+
+
+@pytest.mark.parametrize("level", [2.0, 1.0, 0.0, -0.5, math.nan, 95])
+def test_intervals_refuse_an_impossible_coverage(level):
+    values = np.array([1.0, 2.0, 4.0])
+    for call in (
+        lambda: mean_interval(values, level=level),
+        lambda: sd_interval(1.0, 10, level=level),
+        lambda: cnr_interval(values, values[::-1] + 0.1, level=level),
+        lambda: expected_half_width(200, 0.9, level=level),
+    ):
+        with pytest.raises(ValueError, match="level must"):
+            call()
+
+
+def test_intervals_refuse_one_realisation():
+    with pytest.raises(ValueError, match="at least 2"):
+        sd_interval(1.0, 1)
+    with pytest.raises(ValueError, match="at least 2"):
+        mean_interval([1.0])
+    with pytest.raises(ValueError, match="sd must be"):
+        sd_interval(math.nan, 10)
+    with pytest.raises(ValueError, match="one ROI at a time"):
+        mean_interval(np.ones((3, 4)))
+
+
+def test_an_indefinite_covariance_has_no_noise():
+    """C12² > C11 C22 gives a negative variance at some energy, which was shown as 0 HU."""
+    basis = Basis(material("polyethylene"), material("pvc"))
+    for bad in ([1.0, 2.0, 1.0], [1.0, -1.1, 1.0], [math.nan, 0.0, 1.0], [0.0, 0.1, 1.0]):
+        with pytest.raises(ValueError, match="C12²"):
+            vmi_noise(torch.tensor(bad), basis)
+    singular = torch.tensor([4.0, -6.0, 9.0])
+    assert bool(torch.isfinite(vmi_noise(singular, basis)).all())
+
+
+def _damaged(good, rng, kind):
+    """A copy of a file with a flipped bit, an altered stretch, a cut end, or a hole."""
+    content = bytearray(good)
+    at = int(rng.integers(len(good)))
+    if kind == "bit":
+        content[at] ^= 1 << int(rng.integers(8))
+    elif kind == "stretch":
+        content[at : at + 64] = rng.integers(0, 256, len(content[at : at + 64]), dtype=np.uint8).tobytes()
+    elif kind == "cut":
+        del content[at:]
+    else:
+        content[at : at + 512] = bytes(len(content[at : at + 512]))
+    return bytes(content)
+
+
+def same_scan(a, b):
+    tensors = ("counts", "air", "surround", "quantum")
+    return (
+        all(
+            (x is None) == (y is None) and (x is None or (x.dtype == y.dtype and torch.equal(x, y)))
+            for x, y in ((getattr(a, n), getattr(b, n)) for n in tensors)
+        )
+        and (a.geometry, a.window, a.exposure_s, a.seed, a.counting, a.info, a.electronic_noise)
+        == (b.geometry, b.window, b.exposure_s, b.seed, b.counting, b.info, b.electronic_noise)
+        and np.array_equal(a.linearisation.coefficients, b.linearisation.coefficients)
+        and np.array_equal(a.linearisation.scale, b.linearisation.scale)
+        and a.linearisation.mu_ref == b.linearisation.mu_ref
+    )
+
+
+def _fuzz(path, load, same, count, seed=0):
+    """A damaged file gives the same content or a ValueError that names it; how many gave the error."""
+    good, expected = path.read_bytes(), load(path)
+    rng = np.random.default_rng(seed)
+    refused = 0
+    for trial in range(count):
+        path.write_bytes(_damaged(good, rng, ("bit", "bit", "stretch", "cut", "hole")[trial % 5]))
+        try:
+            found = load(path)
+        except ValueError as error:
+            assert str(path) in str(error)  # noqa: PT017 (the other outcome is checked as well)
+            refused += 1
+        else:
+            assert same(found, expected), f"damage {trial} of seed {seed} gave another content"
+    path.write_bytes(good)
+    return refused
+
+
+def _small_scan(tmp_path):
+    g = ConeBeam(full_turn(12), 626.0, 1098.0, 30, 6, (1.0, 1.1), (0.2, 0.3), "curved")
+    window = DetectorWindow(np.arange(12) % 3 + 4, 20, 1, 4)
+    rng = torch.Generator().manual_seed(0)
+    Scan(
+        counts=torch.poisson(torch.full(window.shape, 900.0), generator=rng),
+        air=1e4 + 100 * torch.rand(6, 30, generator=rng),
+        geometry=g,
+        linearisation=WaterLinearisation(np.random.default_rng(0).uniform(0.9, 1.1, (30, 3)), np.ones(30), 0.0193),
+        exposure_s=0.35,
+        seed=3,
+        window=window,
+        surround=1e3 + 10 * torch.rand(6, 30, generator=rng),
+        info={"scanner": "test", "plan": [1, 2.5, None]},
+    ).save(tmp_path / "scan.h5")
+    return tmp_path / "scan.h5"
+
+
+def test_damaged_scan_files_are_refused(tmp_path):
+    """Of 140 flipped bits, 71 changed counts without a word."""
+    path = _small_scan(tmp_path)
+    assert _fuzz(path, Scan.load, same_scan, 250) > 50
+
+
+def test_damaged_volume_files_are_refused(tmp_path):
+    data = torch.randn(5, 6, 7, generator=torch.Generator().manual_seed(0))
+    path = tmp_path / "volume.h5"
+    Volume(data, VolumeGrid((5, 6, 7), 0.3, (1.0, 2.0, 3.0)), {"method": "fbp", "seconds": 1.5}).save(path)
+
+    def same(a, b):
+        return a.data.dtype == b.data.dtype and torch.equal(a.data, b.data) and (a.grid, a.report) == (b.grid, b.report)
+
+    assert _fuzz(path, Volume.load, same, 250) > 50
+
+
+@pytest.mark.slow
+def test_damaged_files_are_refused_for_ten_minutes(tmp_path):
+    path, seed = _small_scan(tmp_path), 1
+    end = time.monotonic() + 600.0
+    while time.monotonic() < end:
+        _fuzz(path, Scan.load, same_scan, 500, seed)
+        seed += 1
+
+
+def test_files_of_earlier_versions_still_load(tmp_path):
+    """They are plain HDF5 from the first byte, without a checksum."""
+    path = _small_scan(tmp_path)
+    expected = Scan.load(path)
+    old = tmp_path / "old.h5"
+    old.write_bytes(path.read_bytes()[512:])
+    with h5py.File(old, "a") as file:
+        file.attrs["version"] = 1
+    assert same_scan(Scan.load(old), expected)
+
+
+def test_sealed_files_are_plain_hdf5_for_others(tmp_path):
+    with h5py.File(_small_scan(tmp_path), "r") as file:
+        assert file["counts"].shape == (12, 4, 20)

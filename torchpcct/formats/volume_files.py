@@ -1,0 +1,255 @@
+"""Volumes as NIfTI, MetaImage and DICOM series: what :class:`torchpcct.volume.Volume` saves and loads.
+
+The scanner's x, y, z are taken for right, anterior, superior: NIfTI's axes. DICOM and ITK have x and y the other way,
+so the same point carries the opposite sign there; every reader shows the same volume at the same place.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchpcct.files import require_folder, written_whole
+from torchpcct.formats.damage import check_size, needed, reading
+from torchpcct.geometry import VolumeGrid
+
+__all__ = [
+    "ENDINGS",
+    "check_volume_name",
+    "format_of",
+    "read_dicom",
+    "read_meta_image",
+    "read_nifti",
+    "write_dicom",
+    "write_meta_image",
+    "write_nifti",
+]
+
+ENDINGS = {"NIfTI": (".nii", ".nii.gz"), "MetaImage": (".mha",), "HDF5": (".h5", ".hdf5")}
+"""Of files; a name without ending is a folder for a DICOM series."""
+
+_STRAIGHT = 1e-4
+_HU_RANGE = (-32768, 32767)
+
+
+def format_of(path: str | os.PathLike[str]) -> str:
+    """Name of the format that the ending of ``path`` stands for.
+
+    Raises:
+        ValueError: none.
+    """
+    name = str(path)
+    for form, endings in ENDINGS.items():
+        if name.endswith(endings):
+            return form
+    if not Path(path).suffix and Path(path).name not in ("", ".", ".."):
+        return "DICOM"
+    known = ", ".join(e for endings in ENDINGS.values() for e in endings)
+    raise ValueError(f"unknown volume format {Path(path).name!r}: use {known}, or no ending for a DICOM series")
+
+
+def check_volume_name(path: str | os.PathLike[str]) -> None:
+    """Raise ``ValueError`` unless the ending of ``path`` names a volume format; none: a folder for a DICOM series."""
+    format_of(path)
+
+
+def _three_axes(grid: VolumeGrid, name: str) -> None:
+    if grid.ndim != 3:
+        raise ValueError(f"{name} needs a 3-D volume; save a 2-D image as .h5")
+
+
+def write_nifti(path: str | os.PathLike[str], data: Any, grid: VolumeGrid, unit: str) -> None:
+    """Write NIfTI-1, float32, mm, RAS, with qform and sform (scanner coordinates)."""
+    import nibabel
+
+    _three_axes(grid, "NIfTI")
+    affine = np.diag([*grid.spacing[::-1], 1.0])
+    affine[:3, 3] = [axis[0] for axis in grid.axes[::-1]]
+    # NIfTI stores (x, y, z).
+    image = nibabel.Nifti1Image(np.asarray(data, dtype=np.float32).transpose(2, 1, 0), affine)
+    image.set_qform(affine, code="scanner")
+    image.set_sform(affine, code="scanner")
+    image.header.set_xyzt_units("mm")
+    image.header["descrip"] = f"torchpcct, {unit}".encode()
+    with written_whole(path) as part:
+        nibabel.save(image, part)
+
+
+def read_nifti(path: str | os.PathLike[str]) -> tuple[Any, VolumeGrid]:
+    """Data ``(z, y, x)`` float32 and grid of a NIfTI volume, axes in any order or direction.
+
+    Raises:
+        FileNotFoundError: no such file. ValueError: damaged, not 3-D, oblique, or an affine without inverse.
+    """
+    import nibabel
+
+    with reading(path, "NIfTI"):
+        image: Any = nibabel.load(path)
+        check_size(image.shape, "the volume")
+        if len(image.shape) != 3:
+            raise ValueError(f"it has the shape {image.shape}, expected three axes")
+        image = nibabel.as_closest_canonical(image)
+        matrix = image.affine[:3, :3]
+        if not np.isfinite(image.affine).all():
+            raise ValueError("its affine is not finite")
+        spacing = np.diag(matrix).copy()
+        if (spacing <= 0).any() or np.abs(matrix - np.diag(spacing)).max() > _STRAIGHT * spacing.max():
+            raise ValueError("its axes are oblique: resample it to straight axes first")
+        data = np.asarray(image.dataobj, dtype=np.float32).transpose(2, 1, 0)
+        return np.ascontiguousarray(data), _grid(data.shape, spacing, image.affine[:3, 3])
+
+
+def _grid(shape: tuple[int, ...], spacing: Any, first: Any) -> VolumeGrid:
+    """Grid from spacing and first voxel, both x, y, z in mm."""
+    s, f = np.asarray(spacing, dtype=np.float64)[::-1], np.asarray(first, dtype=np.float64)[::-1]
+    center = f + s * (np.array(shape) - 1) / 2
+    return VolumeGrid(tuple(int(n) for n in shape), tuple(float(v) for v in s), tuple(float(v) for v in center))
+
+
+def write_meta_image(path: str | os.PathLike[str], data: Any, grid: VolumeGrid, unit: str) -> None:
+    """Write a MetaImage (``.mha``, float32) by SimpleITK."""
+    _three_axes(grid, "MetaImage")
+    sitk = needed("SimpleITK")
+    image = sitk.GetImageFromArray(np.ascontiguousarray(np.asarray(data, dtype=np.float32)))
+    image.SetSpacing(tuple(reversed(grid.spacing)))
+    x, y, z = (float(axis[0]) for axis in grid.axes[::-1])
+    image.SetOrigin((-x, -y, z))
+    image.SetDirection((-1, 0, 0, 0, -1, 0, 0, 0, 1))
+    image.SetMetaData("Unit", unit)
+    with written_whole(path) as part:
+        sitk.WriteImage(image, str(part), True)
+
+
+def read_meta_image(path: str | os.PathLike[str]) -> tuple[Any, VolumeGrid]:
+    """Data ``(z, y, x)`` float32 and grid of a MetaImage by SimpleITK; errors as :func:`read_nifti`."""
+    sitk = needed("SimpleITK")
+    with reading(path, "a MetaImage"):
+        reader = sitk.ImageFileReader()
+        reader.SetFileName(str(path))
+        reader.ReadImageInformation()
+        check_size(reader.GetSize(), "the volume")
+        if reader.GetDimension() != 3 or reader.GetNumberOfComponents() != 1:
+            raise ValueError(f"it has {reader.GetDimension()} axes of {reader.GetNumberOfComponents()} components")
+        image = sitk.DICOMOrient(reader.Execute(), "RAS")
+        direction = np.array(image.GetDirection()).reshape(3, 3)
+        if np.abs(direction - np.diag([-1.0, -1.0, 1.0])).max() > _STRAIGHT:
+            raise ValueError("its axes are oblique: resample it to straight axes first")
+        data = sitk.GetArrayFromImage(image).astype(np.float32)
+        x, y, z = image.GetOrigin()
+        return data, _grid(data.shape, image.GetSpacing(), (-x, -y, z))
+
+
+def write_dicom(folder: str | os.PathLike[str], data: Any, grid: VolumeGrid, unit: str) -> None:
+    """Write a CT series in HU, one file a slice (int16, rescale slope 1, intercept 0), into a new or empty folder.
+
+    Raises:
+        ValueError: a volume in mm⁻¹, values that are not finite or beyond int16, a folder that holds files.
+    """
+    _three_axes(grid, "DICOM")
+    pydicom = needed("pydicom")
+    from pydicom.dataset import FileMetaDataset
+    from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, generate_uid
+
+    if unit != "HU":
+        raise ValueError(f"a DICOM CT series holds HU, this volume is in {unit}: save it as .nii.gz, .mha or .h5")
+    values = np.asarray(data, dtype=np.float64)
+    if not np.isfinite(values).all() or values.min() < _HU_RANGE[0] or values.max() > _HU_RANGE[1]:
+        raise ValueError("DICOM holds whole HU from -32768 to 32767: the volume has values beyond, or NaN")
+    target = Path(folder)
+    require_folder(target)
+    target.mkdir(exist_ok=True)
+    if any(target.iterdir()):
+        raise ValueError(f"{target} is not empty: series in one folder mix, name a new one")
+    stored = np.rint(values).astype("<i2")
+    study, series, frame = (generate_uid() for _ in range(3))
+    x, y, z = (float(axis[0]) for axis in grid.axes[::-1])
+    dz, dy, dx = grid.spacing
+    for k, image in enumerate(stored):
+        meta = FileMetaDataset()
+        meta.TransferSyntaxUID, meta.MediaStorageSOPClassUID = ExplicitVRLittleEndian, CTImageStorage
+        meta.MediaStorageSOPInstanceUID = generate_uid()
+        d = pydicom.Dataset()
+        d.file_meta = meta
+        d.SOPClassUID, d.SOPInstanceUID = CTImageStorage, meta.MediaStorageSOPInstanceUID
+        d.StudyInstanceUID, d.SeriesInstanceUID, d.FrameOfReferenceUID = study, series, frame
+        d.Modality, d.Manufacturer, d.SeriesDescription = "CT", "torchpcct", "simulated or reconstructed by torchpcct"
+        d.ImageType = ["DERIVED", "PRIMARY", "AXIAL"]
+        d.PatientName, d.PatientID, d.PatientBirthDate, d.PatientSex = "", "torchpcct", "", ""
+        d.StudyDate = d.StudyTime = d.StudyID = d.AccessionNumber = d.ReferringPhysicianName = ""
+        d.SeriesNumber, d.InstanceNumber, d.PositionReferenceIndicator = 1, k + 1, ""
+        d.ImageOrientationPatient = [-1, 0, 0, 0, -1, 0]
+        d.ImagePositionPatient = [_ds(-x), _ds(-y), _ds(z + k * dz)]
+        d.PixelSpacing, d.SliceThickness = [_ds(dy), _ds(dx)], _ds(dz)
+        d.Rows, d.Columns = image.shape
+        d.SamplesPerPixel, d.PhotometricInterpretation = 1, "MONOCHROME2"
+        d.BitsAllocated, d.BitsStored, d.HighBit, d.PixelRepresentation = 16, 16, 15, 1
+        d.RescaleSlope, d.RescaleIntercept, d.RescaleType = "1", "0", "HU"
+        d.WindowCenter, d.WindowWidth, d.KVP, d.AcquisitionNumber = "40", "400", "", ""
+        d.PixelData = image.tobytes()
+        with written_whole(target / f"{k + 1:04d}.dcm") as part:
+            d.save_as(part, enforce_file_format=True)
+
+
+def _ds(value: float) -> str:
+    """A DICOM decimal string: at most 16 characters."""
+    return f"{value:.10g}"
+
+
+def read_dicom(folder: str | os.PathLike[str]) -> tuple[Any, VolumeGrid]:
+    """Data ``(z, y, x)`` float32 HU and grid of a DICOM CT series in a folder.
+
+    Raises:
+        FileNotFoundError: no such folder, or no files in it.
+        ValueError: damaged files, several series, missing slices, oblique axes.
+        ImportError: pydicom is not installed.
+    """
+    pydicom = needed("pydicom")
+    root = Path(folder)
+    paths = sorted(p for p in root.iterdir() if p.is_file() and not p.name.startswith(".")) if root.is_dir() else []
+    if not paths:
+        raise FileNotFoundError(f"no DICOM files in {folder}")
+    slices = []
+    for path in paths:
+        with reading(path, "a DICOM image"):
+            d = pydicom.dcmread(path)
+            check_size((len(paths), d.Rows, d.Columns), "the series")
+            pixels = d.pixel_array.astype(np.float32) * np.float32(d.RescaleSlope) + np.float32(d.RescaleIntercept)
+            slices.append((
+                str(d.SeriesInstanceUID), tuple(float(v) for v in d.ImageOrientationPatient),
+                np.array([float(v) for v in d.ImagePositionPatient]), tuple(float(v) for v in d.PixelSpacing), pixels,
+            ))  # fmt: skip
+    with reading(folder, "a DICOM series"):
+        return _joined(slices)
+
+
+def _joined(slices: list[Any]) -> tuple[Any, VolumeGrid]:
+    series, orientation, _, pixel, image = slices[0]
+    for other in slices[1:]:
+        if other[0] != series:
+            raise ValueError("it holds several series: keep each in a folder of its own")
+        if other[1] != orientation or other[3] != pixel or other[4].shape != image.shape:
+            raise ValueError("its slices differ in orientation, spacing or size")
+    row, column = np.array(orientation[:3]), np.array(orientation[3:])
+    if abs(abs(row[0]) - 1) > _STRAIGHT or abs(abs(column[1]) - 1) > _STRAIGHT:
+        raise ValueError("its slices are not axial: resample it to straight axes first")
+    slices.sort(key=lambda s: float(s[2][2]))
+    z = np.array([float(s[2][2]) for s in slices])
+    gaps = np.diff(z)
+    if gaps.size and (gaps.min() <= 0 or np.ptp(gaps) > 0.01 * float(np.median(gaps))):
+        at = int(np.argmax(np.abs(gaps - np.median(gaps))))
+        raise ValueError(f"slices lack or repeat between z = {z[at]:g} and {z[at + 1]:g} mm")
+    drift = np.abs(np.array([s[2][:2] for s in slices]) - slices[0][2][:2]).max()
+    if drift > 0.01 * min(pixel):
+        raise ValueError("its slices are shifted against each other (gantry tilt)")
+    data = np.stack([s[4] for s in slices])
+    x, y = -slices[0][2][0], -slices[0][2][1]  # LPS to RAS
+    dy, dx = pixel
+    if row[0] > 0:  # columns run to the left: ours to the right
+        data, x = data[..., ::-1], x - (data.shape[2] - 1) * dx
+    if column[1] > 0:
+        data, y = data[:, ::-1], y - (data.shape[1] - 1) * dy
+    dz = float(np.median(gaps)) if gaps.size else 1.0
+    return np.ascontiguousarray(data), _grid(data.shape, (dx, dy, dz), (x, y, z[0]))

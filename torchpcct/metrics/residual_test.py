@@ -1,0 +1,145 @@
+"""Does a volume explain its data? Tests of the residual y − A x that know their own rate of false alarms.
+
+χ² per reading alone sees little: an error of the rotation centre by half a column moves an image by 25 HU and χ² by a
+few per cent. What an error of the scanner does to the readings is known, however, up to its size. The score test
+(Rao 1948) of one cause projects the residual onto that pattern t,
+
+    s = ⟨t, W r⟩ / √⟨t, W t⟩,
+
+which is normal with variance 1 if only noise is left; several patterns of one cause are tested together by their χ².
+What the reconstruction has taken up of the pattern makes s smaller, never larger, so the rate of false alarms stays
+below the stated one. Blur by a prior is symmetric about an edge, and does not look like a shift.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from scipy import stats
+from torch import Tensor
+
+from torchpcct.validate import coverage, number
+
+__all__ = ["FALSE_ALARMS", "ResidualTest", "residual_test"]
+
+FALSE_ALARMS = 0.005
+"""Share of faultless scans for which any of the tests raises an alarm."""
+MISFIT = 0.03
+"""Part of χ² that voxels and prior may add or take away without being an error: discretisation and blur of edges that
+the data see; 1 % on the paper's plaque."""
+GAIN_TOLERANCE = 0.001
+"""Gain error (rms over views or rows) that a sound scan may have: calibration, and what voxels cannot show."""
+_HARMONICS = 3
+
+
+@dataclass(frozen=True)
+class ResidualTest:
+    """Result of :func:`residual_test`.
+
+    Attributes:
+        chi2: weighted squared residual per reading.
+        p_values: cause → probability that noise alone looks like it at least so much.
+        sizes: cause → its estimated size where it has one: ``centre`` in columns.
+        findings: what was found, in words; empty: nothing at the stated rate of false alarms.
+    """
+
+    chi2: float
+    p_values: Mapping[str, float]
+    sizes: Mapping[str, float]
+    findings: tuple[str, ...]
+
+
+def residual_test(
+    residual: Tensor, weights: Tensor, fitted: Tensor, *, unknowns: int = 0, false_alarms: float = FALSE_ALARMS
+) -> ResidualTest:
+    """Test what a reconstruction has left of its data.
+
+    Args:
+        residual: y − A x ``(views, rows, columns)``, views in the order of their angles.
+        weights: inverse variances of y, the same shape; 0 for readings to leave out.
+        fitted: A x, the same shape: an error of the centre shifts its columns.
+        unknowns: number of values that were fitted, by which χ² may be lower.
+        false_alarms: share of faultless scans with any finding, shared among the tests.
+
+    Returns:
+        The tests ``level`` (χ² itself), ``centre`` (a shift of the columns), ``views`` (gain from view to view and its
+        slow drift over the scan), ``rows`` (gain from row to row).
+
+    Raises:
+        ValueError: shapes that differ or have not three axes, negative weights or none at all, NaN or Inf where the
+            weight is not 0, a rate outside (0, 1).
+    """
+    coverage("false_alarms", false_alarms)
+    number("unknowns", unknowns, low=0)
+    if residual.ndim != 3 or residual.shape != weights.shape or residual.shape != fitted.shape:
+        raise ValueError(
+            "residual, weights and fitted must have one shape (views, rows, columns), got "
+            f"{tuple(residual.shape)}, {tuple(weights.shape)} and {tuple(fitted.shape)}"
+        )
+    w = weights.double()
+    count = int((w > 0).sum())
+    if not bool((w >= 0).all()) or count == 0:
+        raise ValueError("weights must be 0 or more, and some greater than 0: give inverse variances")
+    r, lines = (torch.where(w > 0, v.double(), 0.0) for v in (residual, fitted))
+    if not bool(torch.isfinite(r).all() and torch.isfinite(lines).all()):
+        raise ValueError("residual and fitted must be finite where the weight is not 0")
+    wr = w * r
+    chi2 = float((wr * r).sum()) / count
+    level = false_alarms / 4.0
+    p_values, sizes, findings = {}, {}, []
+
+    # χ²: too low only if the noise is less than stated, by more than what the unknowns have taken up.
+    spread = math.sqrt(2.0 / count)
+    above = (chi2 - 1.0 - MISFIT) / spread
+    below = (1.0 - MISFIT - min(unknowns / count, 1.0) - chi2) / spread
+    p_values["level"] = float(min(1.0, 2.0 * stats.norm.sf(max(above, below))))
+    if p_values["level"] < level:
+        findings.append(
+            f"the data differ from the volume by {chi2:.4g} times their stated noise variance (1 ± {spread:.2g} "
+            "expected): exposure, geometry or surround are not those of the scan, or something outside of the grid was "
+            "left out"
+        )
+
+    shifted = torch.zeros_like(lines)
+    shifted[..., 1:-1] = (lines[..., 2:] - lines[..., :-2]) / 2.0
+    power = float((w * shifted.square()).sum())
+    if power > 0.0:
+        score = float((shifted * wr).sum()) / math.sqrt(power)
+        p_values["centre"], sizes["centre"] = float(2.0 * stats.norm.sf(abs(score))), score / math.sqrt(power)
+        if p_values["centre"] < level:
+            findings.append(
+                f"the readings lie {abs(sizes['centre']):.2g} columns or more beside what the volume projects to "
+                f"({abs(score):.1f} standard deviations): the rotation centre (the detector's column offset) is wrong"
+            )
+
+    for name, axes, parts in (("views", (1, 2), 2), ("rows", (0, 2), 1)):
+        weight, total = w.sum(axes), wr.sum(axes)
+        known = weight > 0
+        scores = total[known] / weight[known].sqrt()
+        # Every view alone, and the slow drifts over all of them, which add up what single views cannot tell.
+        tolerated = GAIN_TOLERANCE**2 * float(weight.sum())
+        tails = [stats.ncx2.sf(float(scores.square().sum()), scores.numel(), tolerated)]
+        if parts == 2 and scores.numel() > 4 * _HARMONICS:
+            drift, degrees = _drift(total, weight)
+            tails.append(stats.ncx2.sf(drift, degrees, tolerated))
+        p_values[name] = float(min(1.0, parts * min(tails)))
+        if p_values[name] < level:
+            size = float((total[known] / weight[known]).square().mean().sqrt())
+            findings.append(
+                f"the readings of some {name} lie above or below what the volume projects to, {100 * size:.2g} % of "
+                f"intensity (root mean square): the gain changed from {name[:-1]} to {name[:-1]}, or the object moved"
+            )
+    return ResidualTest(chi2, p_values, sizes, tuple(findings))
+
+
+def _drift(total: Tensor, weight: Tensor) -> tuple[float, int]:
+    """χ² of slow additive changes over the views (a line, and a few harmonics), and its degrees of freedom."""
+    t = torch.linspace(-math.pi, math.pi, total.numel(), dtype=torch.float64)
+    waves = [t / math.pi, *(f(k * t) for k in range(1, _HARMONICS + 1) for f in (torch.cos, torch.sin))]
+    patterns = torch.stack(waves)
+    gram = (patterns * weight) @ patterns.T
+    score = patterns @ total
+    return float(score @ torch.linalg.pinv(gram, hermitian=True) @ score), len(waves)

@@ -1,0 +1,283 @@
+"""From the raw readings of any scanner to what a :class:`torchpcct.scan.Scan` holds: dark, gain, air, dead cells.
+
+Called by ``Scan.from_counts`` and ``Scan.from_line_integrals``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchpcct.geometry import ConeBeam, Geometry
+from torchpcct.scanner.linearisation import WaterLinearisation
+from torchpcct.validate import number
+
+__all__ = ["counted", "inverse_variance", "logged", "smoothed"]
+
+_PSEUDO_WATER = 0.02
+"""Attenuation in mm⁻¹ that stands for water where a scan is not in HU: it sets the scale of priors, nothing else."""
+_SILENT_VIEWS = 8
+"""Cells that read nothing in so many views, or more, are dead."""
+_TRANSFER_FRAMES = 4
+"""Air frames that a photon transfer needs at least."""
+_MAD = 1.4826
+
+
+def _tensor(name: str, values: Any) -> Tensor:
+    """Float32 tensor of numbers in any array.
+
+    Raises:
+        TypeError: no array of real numbers.
+    """
+    if isinstance(values, Tensor):
+        if values.is_complex():
+            raise TypeError(f"{name} must be real numbers, got {values.dtype}")
+        return values.detach().to("cpu", torch.float32)
+    array = np.asarray(values)
+    if array.dtype.kind not in "biuf":
+        raise TypeError(f"{name} must be an array of real numbers, got {type(values).__name__} of {array.dtype}")
+    return torch.from_numpy(np.array(array, dtype=np.float32, order="C"))
+
+
+def _frame(name: str, values: Any, cells: tuple[int, ...]) -> tuple[Tensor, Tensor | None]:
+    """Mean over frames ``cells``, and the frames ``(frames, *cells)`` if there are several."""
+    given = _tensor(name, values)
+    if given.ndim <= len(cells) and tuple(given.shape) == cells[len(cells) - given.ndim :]:
+        return given.expand(cells), None
+    if tuple(given.shape[1:]) == cells and len(given):
+        return given.mean(0), given
+    raise ValueError(
+        f"{name} must be one number, or have the shape {cells} of one frame or (frames, *{cells}), "
+        f"got {tuple(given.shape)}"
+    )
+
+
+def _shapes(name: str, readings: Tensor, geometry: Geometry) -> tuple[int, ...]:
+    """Shape of what all views share, ``(*lead, [rows,] columns)``."""
+    axes = len(geometry.shape)
+    if tuple(readings.shape[-axes:]) != geometry.shape or readings.ndim not in (axes, axes + 1):
+        expected = "bins" if isinstance(geometry, ConeBeam) else "slices"
+        raise ValueError(
+            f"{name} have the shape {tuple(readings.shape)}, the geometry needs ([{expected},] "
+            f"{', '.join(map(str, geometry.shape))}): views first, columns last"
+        )
+    return (*readings.shape[:-axes], *geometry.shape[1:])
+
+
+def _correction(linearisation: Any, columns: int, mu_water: float | None) -> tuple[WaterLinearisation, str]:
+    """The map of line integrals, and the unit of volumes."""
+    mu = _PSEUDO_WATER if mu_water is None else number("mu_water", mu_water, positive=True, unit="mm⁻¹")
+    unit = "mm^-1" if mu_water is None else "HU"
+    if isinstance(linearisation, WaterLinearisation):
+        if linearisation.scale.size != columns:
+            raise ValueError(f"linearisation has {linearisation.scale.size} columns, the detector {columns}")
+        return linearisation, "HU"
+    if linearisation is not None and (not isinstance(linearisation, Sequence) or isinstance(linearisation, str)):
+        raise TypeError(f"linearisation must be None, coefficients c₁, c₂, …, or a map, got {linearisation!r}")
+    coefficients = (1.0,) if linearisation is None else tuple(linearisation)
+    return WaterLinearisation.polynomial(coefficients, columns, mu), unit
+
+
+def _views(cells: Tensor, geometry: Geometry) -> Tensor:
+    """What all views share, with an axis of views."""
+    return cells.unsqueeze(-len(geometry.shape))
+
+
+def _dead(mask: Any, readings: Tensor, air: Tensor, geometry: Geometry) -> Tensor:
+    """Dead readings, ``readings.shape`` or the shape of one frame with an axis of views of length 1."""
+    cells = tuple(air.shape)
+    dead = _views(~(air > 0) | ~torch.isfinite(air), geometry)
+    if geometry.views >= _SILENT_VIEWS:
+        dead = dead | (readings == 0).all(-len(geometry.shape), keepdim=True)
+    if mask is not None:
+        given = torch.as_tensor(np.asarray(mask))
+        if given.dtype != torch.bool:
+            raise TypeError(f"dead must be a mask of bool, True where a cell is dead, got {given.dtype}")
+        if given.shape == readings.shape:
+            dead = dead | given
+        elif given.ndim <= len(cells) and tuple(given.shape) == cells[len(cells) - given.ndim :]:
+            dead = dead | _views(given.expand(cells), geometry)
+        else:
+            raise ValueError(f"dead must have the shape {cells} or that of the readings, got {tuple(given.shape)}")
+    bad = ~torch.isfinite(readings)
+    return dead | bad if bool(bad.any()) else dead
+
+
+def _photon_transfer(frames: Tensor | None, dark: Tensor) -> float:
+    """Signal per photon from the variance of air frames over their mean (Janesick 2007); 1 with too few frames."""
+    if frames is None or len(frames) < _TRANSFER_FRAMES:
+        return 1.0
+    signal = frames - dark
+    level = signal.flatten(1).median(1).values
+    signal = signal / level.view(-1, *(1,) * (signal.ndim - 1)) * level.mean()  # the tube may have drifted
+    mean = signal.mean(0)
+    # One degree of freedom goes into the mean; the median of a χ² of n - 1 degrees is below its mean.
+    ratio = (signal.var(0) / mean)[mean > 0.2 * mean.median()]
+    n = len(frames) - 1
+    gain = float(ratio.median()) / (1.0 - 2.0 / (9.0 * n)) ** 3
+    if not (math.isfinite(gain) and gain > 0):
+        raise ValueError("the air frames do not differ from each other: give gain=, the signal of one photon")
+    return gain
+
+
+def counted(
+    readings: Any,
+    geometry: Geometry,
+    air: Any,
+    dark: Any,
+    gain: float | None,
+    flux: Any,
+    dead: Any,
+    electronic_noise: float | None,
+    linearisation: Any,
+    mu_water: float | None,
+) -> dict[str, Any]:
+    """Fields of a scan from raw readings; see ``Scan.from_counts``."""
+    raw = _tensor("readings", readings)
+    cells = _shapes("readings", raw, geometry)
+    bright, bright_frames = _frame("air", air, cells)
+    black, black_frames = _frame("dark", dark, cells)
+    if gain is None:
+        gain = _photon_transfer(bright_frames, black)
+    number("gain", gain, positive=True)
+    if electronic_noise is None:
+        frames = black_frames if black_frames is not None and len(black_frames) > 2 else None
+        electronic_noise = 0.0 if frames is None else float(frames.var(0).mean().sqrt()) / gain
+    number("electronic_noise", electronic_noise, low=0.0)
+    offset = bool((black != 0).any())
+    counts, bright = (raw - _views(black, geometry)) / gain, (bright - black) / gain
+    if not float(bright.nanmedian()) > 0:
+        raise ValueError("air is not brighter than dark: are the two exchanged?")
+    mask = _dead(dead, counts, bright, geometry)
+    counts = counts.masked_fill(mask, 0.0)
+    bright = torch.where((bright > 0) & torch.isfinite(bright), bright, 1.0)
+    low = float(counts.min())
+    if low < 0 and not offset and not electronic_noise:
+        raise ValueError(f"counts must not be negative, the lowest is {low:g}: give dark=, or use from_line_integrals")
+    correction, unit = _correction(linearisation, geometry.columns, mu_water)
+    integrating = offset or electronic_noise > 0
+    fields: dict[str, Any] = {
+        "counts": counts,
+        "air": bright,
+        "linearisation": correction,
+        "unit": unit,
+        "dead": mask.expand(counts.shape) if bool(mask.any()) else None,
+        "counting": not integrating,
+        "electronic_noise": electronic_noise,
+        "quantum": torch.ones(1).expand(counts.shape) if integrating else None,
+        "info": {"dead_readings": int(mask.expand(counts.shape).sum()), "signal_of_one_photon": gain},
+    }
+    if flux is not None:
+        fields["flux"] = _flux(flux, geometry)
+    return fields
+
+
+def _flux(flux: Any, geometry: Geometry) -> Tensor:
+    given = _tensor("flux", flux)
+    if tuple(given.shape) != (geometry.views,):
+        raise ValueError(f"flux must have one number per view, ({geometry.views},), got {tuple(given.shape)}")
+    if not bool(((given > 0) & torch.isfinite(given)).all()):
+        raise ValueError("flux must be finite and greater than 0 in every view: leave out views without beam")
+    return given
+
+
+def logged(
+    lines: Any, geometry: Geometry, photons: Any, dead: Any, linearisation: Any, mu_water: float | None
+) -> dict[str, Any]:
+    """Fields of a scan from line integrals; see ``Scan.from_line_integrals``."""
+    p = _tensor("lines", lines)
+    cells = _shapes("lines", p, geometry)
+    mask = _dead(dead, p + 1.0, torch.ones(cells), geometry)  # a line integral of 0 is air, not a silent cell
+    p = p.masked_fill(mask, 0.0)
+    low, high = float(p.min()), float(p.max())
+    if high > _HIGHEST or low < -_HIGHEST:
+        raise ValueError(
+            f"lines reach from {low:g} to {high:g}, no line integrals (−ln of the transmission): are they counts, "
+            "percentages or HU? Use from_counts for readings"
+        )
+    estimated = photons is None
+    air = torch.tensor(_photons(p, mask, geometry)) if photons is None else _frame("photons", photons, cells)[0]
+    air = air.expand(cells).clone()
+    if not bool(((air > 0) & torch.isfinite(air)).all()):
+        raise ValueError("photons must be finite and greater than 0 in every cell")
+    correction, unit = _correction(linearisation, geometry.columns, mu_water)
+    return {
+        "counts": torch.exp(-p).mul_(_views(air, geometry)),
+        "air": air,
+        "linearisation": correction,
+        "unit": unit,
+        "dead": mask.expand(p.shape) if bool(mask.any()) else None,
+        "logged": True,
+        "info": {
+            "dead_readings": int(mask.expand(p.shape).sum()),
+            "photons": f"estimated, {float(air.flatten()[0]):.3g}" if estimated else "given",
+        },
+    }
+
+
+_HIGHEST = 40.0
+"""No reading of a line integral this large exists: exp(-40) of 1e12 photons is less than one."""
+
+
+def _photons(p: Tensor, mask: Tensor, geometry: Geometry) -> float:
+    """Photons of an unattenuated reading that explain the noise between neighbouring columns.
+
+    The second difference of smooth rows is noise of variance 6 / N; with N = N₀ e^−p, its product with e^(−p/2) is
+    alike everywhere. Edges are outliers to the median. Noise-free data give a large number, at most 1e8.
+    """
+    if p.shape[-1] < 8:
+        return 1e6
+    second = (p[..., 2:] - 2.0 * p[..., 1:-1] + p[..., :-2]) * torch.exp(-0.5 * p[..., 1:-1]) / math.sqrt(6.0)
+    dead = mask.expand(p.shape)
+    live = second[~(dead[..., 2:] | dead[..., 1:-1] | dead[..., :-2])]
+    live = live[:: max(1, live.numel() // 1_000_000)]
+    if not live.numel():
+        return 1e6
+    sd = _MAD * float(live.abs().median())
+    return float(min(max(1.0 / max(sd, 1e-4) ** 2, 1.0), 1e8))
+
+
+def inverse_variance(mean: Tensor, quantum: Tensor, electronic_noise: float) -> Tensor:
+    """Inverse variance of the logarithm of readings, by the delta method: mean² / (quantum · mean + electronic noise²).
+
+    What a starved reading says is bounded by half a quantum, as its logarithm is.
+    """
+    mean = mean.clamp(min=0.0)
+    return mean.square().div_(torch.maximum(mean * quantum + electronic_noise**2, quantum * quantum / 2))
+
+
+def smoothed(values: Tensor, dead: Tensor | None, rows: bool) -> Tensor:
+    """Mean over the neighbourhood of every reading, the dead left out: an estimate of the expected readings.
+
+    Binomial weights over five columns, three views and, of a cone beam, three rows. Weights made from a noisy reading
+    itself go up where the noise does and bias the result; the mean of 45 (15) readings hardly knows its own noise.
+
+    Args:
+        values: ``(..., views, [rows,] columns)``.
+        dead: bool of the same shape, or None.
+        rows: whether the last axis but one is the detector's rows.
+    """
+    out = values.clone()
+    share = None if dead is None else (~dead).to(values.dtype)
+    if share is not None:
+        out *= share
+    axes = ((-1, (1, 4, 6, 4, 1)), (-2, (1, 2, 1)), *(((-3, (1, 2, 1)),) if rows else ()))
+    for axis, weights in axes:
+        out = _filtered(out, axis, weights)
+        share = None if share is None else _filtered(share, axis, weights)
+    return out if share is None else out / share.clamp(min=1e-6)
+
+
+def _filtered(values: Tensor, axis: int, weights: tuple[int, ...]) -> Tensor:
+    """Weighted mean over neighbours along an axis; the outermost value is repeated."""
+    n, half = values.shape[axis], len(weights) // 2
+    out = torch.zeros_like(values)
+    index = torch.arange(n)
+    for k, w in enumerate(weights):
+        out.add_(values.index_select(axis, (index + k - half).clamp(0, n - 1)), alpha=w / sum(weights))
+    return out

@@ -1,0 +1,134 @@
+"""Scans as HDF5 files: :meth:`torchpcct.scan.Scan.save` and :meth:`~torchpcct.scan.Scan.load`."""
+
+from __future__ import annotations
+
+import json
+import os
+from typing import Any
+
+import torch
+
+from torchpcct.detector_window import DetectorWindow
+from torchpcct.files import VERSION, write_hdf5
+from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam
+from torchpcct.scanner.linearisation import WaterLinearisation
+
+__all__ = ["read_geometry", "scan_fields", "write_geometry", "write_scan"]
+
+_VERSION = 4
+"""2: energy-integrating scans with their noise model. 3: with a checksum (:func:`torchpcct.files.write_hdf5`). 4:
+parallel and fan beams, flux, dead readings, units; other scans are written as version 3."""
+# Compress in blocks of whole views: fast to write, and a window of views can be read without the rest.
+_HDF5_COMPRESSION = {"compression": "lzf", "shuffle": True}
+
+
+def write_scan(scan: Any, path: str | os.PathLike[str]) -> None:
+    """Write a scan; the file appears under its name only when it is complete."""
+    with write_hdf5(path, "scan") as file:
+        foreign = scan.unit != "HU" or scan.logged or not isinstance(scan.geometry, ConeBeam)
+        foreign = foreign or scan.flux is not None or scan.dead is not None
+        file.attrs.update(version=4 if foreign else 3, software=f"torchpcct {VERSION}")
+        file.attrs["counting"] = scan.counting
+        file.attrs.update(unit=scan.unit, logged=scan.logged)
+        file.attrs["info"] = json.dumps(dict(scan.info), default=str)
+        if scan.exposure_s is not None:
+            file.attrs["exposure_s"] = scan.exposure_s
+        if scan.seed is not None:
+            file.attrs["seed"] = scan.seed
+        chunk = (*(1,) * (scan.counts.ndim - 2), *scan.counts.shape[-2:])
+        # Counts are whole numbers: as integers they compress, and they stay exact.
+        whole = scan.counting and not (scan.noise_free or scan.logged) and float(scan.counts.max()) < 2**31
+        whole = whole and (not foreign or bool((scan.counts == scan.counts.round()).all()))
+        data = scan.counts.to(torch.int32) if whole else scan.counts
+        file.create_dataset("counts", data=data.numpy(), chunks=chunk, **_HDF5_COMPRESSION)
+        file.create_dataset("air", data=scan.air.numpy())
+        if scan.quantum is not None:
+            file.create_dataset("quantum_kev", data=scan.quantum.numpy(), chunks=chunk, **_HDF5_COMPRESSION)
+        file.attrs["electronic_noise_kev"] = scan.electronic_noise
+        if scan.flux is not None:
+            file["flux"] = scan.flux.numpy()
+        if scan.dead is not None:
+            file.create_dataset("dead", data=scan.dead.numpy(), chunks=chunk, **_HDF5_COMPRESSION)
+        write_geometry(file.create_group("geometry"), scan.geometry)
+        scan.linearisation.save(file.create_group("linearisation"))
+        if scan.window is not None and scan.surround is not None:
+            window = file.create_group("window")
+            window["first_column"] = scan.window.first_column
+            window["surround"] = scan.surround.numpy()
+            window.attrs.update(columns=scan.window.columns, first_row=scan.window.first_row, rows=scan.window.rows)
+        # Written last: a file without it was cut off.
+        file.attrs["complete"] = True
+
+
+def scan_fields(file: Any, path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Fields of the scan in an open HDF5 file.
+
+    Raises:
+        ValueError: a newer format, or a file that was not written to its end.
+        KeyError: something is missing.
+    """
+    if int(file.attrs["version"]) > _VERSION:
+        raise ValueError(
+            f"{path} has format version {file.attrs['version']}, this software reads up to {_VERSION}: update torchpcct"
+        )
+    if not file.attrs.get("complete", False):
+        raise ValueError(f"{path} was not written to its end: simulate it again")
+    window = surround = None
+    if "window" in file:
+        w = file["window"]
+        window = DetectorWindow(
+            w["first_column"][()], int(w.attrs["columns"]), int(w.attrs["first_row"]), int(w.attrs["rows"])
+        )
+        surround = torch.from_numpy(w["surround"][()])
+
+    def given(name: str) -> Any:
+        return torch.from_numpy(file[name][()]) if name in file else None
+
+    return {
+        "counts": torch.from_numpy(file["counts"][()]).to(torch.float32),
+        "air": torch.from_numpy(file["air"][()]),
+        "geometry": read_geometry(file["geometry"]),
+        "linearisation": WaterLinearisation.load(file["linearisation"]),
+        "exposure_s": float(file.attrs["exposure_s"]) if "exposure_s" in file.attrs else None,
+        "seed": int(file.attrs["seed"]) if "seed" in file.attrs else None,
+        "window": window,
+        "surround": surround,
+        "counting": bool(file.attrs["counting"]),
+        "info": json.loads(file.attrs["info"]),
+        "quantum": given("quantum_kev"),
+        "electronic_noise": float(file.attrs.get("electronic_noise_kev", 0.0)),
+        "flux": given("flux"),
+        "dead": given("dead"),
+        "logged": bool(file.attrs.get("logged", False)),
+        "unit": str(file.attrs.get("unit", "HU")),
+    }
+
+
+def write_geometry(group: Any, geometry: Geometry) -> None:
+    """Write a parallel, fan or cone beam into an HDF5 group (mm, rad)."""
+    g: Any = geometry
+    group["angles_rad"] = g.angles
+    group.attrs.update(kind=type(g).__name__, columns=g.columns, pitch_mm=g.pitch, offset_mm=g.offset)
+    if not isinstance(g, ParallelBeam):
+        group.attrs.update(sod_mm=g.sod, sdd_mm=g.sdd, detector=g.detector)
+    if isinstance(g, ConeBeam):
+        group.attrs["rows"] = g.rows
+
+
+def read_geometry(group: Any) -> Geometry:
+    """Read what :func:`write_geometry` wrote; a group without a kind holds a cone beam.
+
+    Raises:
+        KeyError: something is missing. ValueError: values that are no geometry, an unknown kind.
+    """
+    a, angles = group.attrs, group["angles_rad"][()]
+    kind, columns = str(a.get("kind", "ConeBeam")), int(a["columns"])
+    if kind == "ParallelBeam":
+        return ParallelBeam(angles, columns, float(a["pitch_mm"]), float(a["offset_mm"]))
+    orbit = (angles, float(a["sod_mm"]), float(a["sdd_mm"]), columns)
+    if kind == "FanBeam":
+        return FanBeam(*orbit, float(a["pitch_mm"]), float(a["offset_mm"]), str(a["detector"]))
+    if kind == "ConeBeam":
+        pitch, offset = tuple(a["pitch_mm"]), tuple(a["offset_mm"])
+        return ConeBeam(*orbit, int(a["rows"]), pitch, offset, str(a["detector"]))
+    raise ValueError(f"unknown geometry {kind!r}")
