@@ -143,7 +143,7 @@ class ObjectiveConfig:
         data: of eᵀH e.
         white: of ‖e‖², against ``data``; edge: by how much more inside and next to bodies.
         contrast: of the ROI contrasts' errors.
-        bias: κ.
+        bias: κ at look 0 and at look 1, linear between.
         contrast_sd: an ROI contrast error, in noise units, that counts as 1.
         looks: range of the look, uniform.
         validation_exposures_s: exposures of the validation scans.
@@ -157,16 +157,20 @@ class ObjectiveConfig:
     white: float = 0.2
     edge: float = 2.0
     contrast: float = 0.2
-    bias: float = 1.0
+    bias: tuple[float, float] = (1.0, 1.0)
     contrast_sd: float = 0.15
     looks: tuple[float, float] = (0.0, 1.0)
     validation_exposures_s: tuple[float, ...] = (0.35, 2.0)
     validation_draws: int = 6
 
     def __post_init__(self) -> None:
-        for name in ("data", "white", "edge", "contrast", "bias"):
+        for name in ("data", "white", "edge", "contrast"):
             _set(self, **{name: number(name, getattr(self, name), low=0.0)})
         _set(self, contrast_sd=number("contrast_sd", self.contrast_sd, positive=True))
+        first, last = numbers("bias", self.bias, 2)
+        if not (first >= 0 and last >= 0):
+            raise ValueError(f"bias must be two weights of at least 0, of look 0 and look 1, got {self.bias}")
+        _set(self, bias=(first, last))
         low, high = numbers("looks", self.looks, 2)
         if not 0 <= low <= high <= 1:
             raise ValueError(f"looks must be a range within 0 … 1, got {self.looks}")

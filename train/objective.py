@@ -9,7 +9,8 @@ terms, all from two independent noise draws of each scene with errors e₁, e₂
 * ``contrast``: the errors d of ROI contrasts, small ones and that of a whole core, (d₁² + d₂²) / 2 + κ d₁ d₂. The
   product of two draws is an unbiased estimate of the squared bias, so κ trades variance against bias.
 
-Every scene has a random look, so that one network serves all of them.
+Every scene has a random look, so that one network serves all of them; κ grows with it, since who measures minds bias
+more than noise.
 """
 
 from __future__ import annotations
@@ -106,7 +107,8 @@ class Objective:
         tame = 1.0 / (1.0 + data.detach() / _TAME_ERROR)
         total = 0.5 * c.data * (tame * (data + c.white * white)).sum()
         tame = 1.0 / (1.0 + variance.detach() / _TAME_CONTRAST)
-        total = total + c.contrast * (tame * (variance + c.bias * product)).sum()
+        kappa = (c.bias[0] + (c.bias[1] - c.bias[0]) * look)[:, None]
+        total = total + c.contrast * (tame * (variance + kappa * product)).sum()
         parts = {"data": data.sum() / 2, "white": white.sum() / 2, "contrast": variance.sum(), "bias": product.sum()}
         return Loss(total, {k: float(v.detach()) for k, v in parts.items()})
 

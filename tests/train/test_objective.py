@@ -6,8 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from recon.mbir.network import NetworkConfig
-from recon.mbir.unrolled import Unrolled
+from recon.mbir.unrolled import start
 from train.config import DataConfig, ObjectiveConfig, Situation
 from train.data import Data
 from train.objective import Objective
@@ -80,18 +79,46 @@ def test_steps_follow_the_training(data):
     assert 0 <= float(look.min()) <= float(look.max()) <= 1
 
 
+class Linear(nn.Module):
+    """The linear start itself, times a gain."""
+
+    def __init__(self, gain=1.0):
+        super().__init__()
+        self.gain = gain
+
+    def forward(self, problem, look):
+        return self.gain * start(problem, problem.spectrum())
+
+
 def test_validation_of_the_linear_start():
-    """An untrained network adds nothing: the lesion's variance is about that of the start, contrast shrinks."""
+    """The start against itself has a lesion factor of exactly 1, whatever its gain, for figures are slope-corrected."""
     data = Data(replace(CONFIG, shape=(28, 24, 24), voxel_mm=0.3))
-    model = Unrolled(NetworkConfig((4, 4, 4), 0.3), 1).eval().requires_grad_(False)
-    config = ObjectiveConfig(validation_exposures_s=(1.0,), validation_draws=4)
-    found = Objective(config).validate(model, data, 0)
+    objective = Objective(ObjectiveConfig(validation_exposures_s=(1.0,), validation_draws=4))
+    found = objective.validate(Linear(), data, 0)
     f = found.figures
     assert 0.4 < f["slope_1s"] < 1.2
-    assert f["lesion_1s"] == pytest.approx(1.0, abs=0.25)
+    assert f["lesion_1s"] == pytest.approx(1.0, rel=1e-4)
     assert f["sd_hu_1s"] > 0
     assert f["rmse_hu_1s"] > f["fat_hu_1s"] > 0
     assert found.pictures["1s_0"].shape == (24, 48)
-    again = Objective(config).validate(model, data, 0)
+    again = objective.validate(Linear(), data, 0)
     assert again.figures == f
     assert again.score == found.score
+    half = objective.validate(Linear(0.5), data, 0).figures
+    assert half["slope_1s"] == pytest.approx(0.5 * f["slope_1s"], rel=1e-4)
+    assert half["fat_hu_1s"] == pytest.approx(0.5 * f["fat_hu_1s"], rel=1e-4)
+    for same in ("sd_hu_1s", "lesion_1s"):
+        assert half[same] == pytest.approx(f[same], rel=1e-3)
+
+
+def test_bias_weighs_more_where_one_measures(data):
+    batch = data.batch(0, 2, range(3))
+    roi = batch.contrast[:, -1]
+    push = roi / roi.square().sum((1, 2, 3), keepdim=True).clamp_min(1e-6)
+    given = Given(truth_of(batch) + 0.01 * torch.cat([push, push]))
+    totals = [
+        float(Objective(ObjectiveConfig(bias=(0.0, 4.0), looks=(look, look)))(given, batch).total) for look in (0, 1)
+    ]
+    even = float(Objective(ObjectiveConfig(bias=(0.0, 0.0), looks=(1, 1)))(given, batch).total)
+    assert totals[0] == pytest.approx(even)
+    assert totals[1] > totals[0]
