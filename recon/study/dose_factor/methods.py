@@ -18,9 +18,9 @@ from torch import Tensor
 from recon.conjugate_gradient import conjugate_gradient
 from recon.mbir.mbir import Mbir
 from recon.mbir.problem import NormalisedProblem, filtered, squared_frequencies
-from recon.pwls.inset_problem import DEFAULT_PRIOR, InsetProblem
+from recon.pwls.inset_problem import InsetProblem
 from recon.pwls.pwls import solve_normal
-from recon.pwls.qggmrf import QGGMRF, quadratic
+from recon.pwls.qggmrf import DEFAULT_PRIOR, QGGMRF, quadratic
 from recon.study.dose_factor.settings import METHODS
 from torchpcct.volume import to_hu
 

@@ -23,7 +23,8 @@ import torch
 from torch import Tensor
 
 from recon.fbp.exact_noise import functional_covariance
-from recon.pwls.basis_problem import DEFAULT_JOINT_PRIOR, BasisProblem
+from recon.pwls.basis_problem import BasisProblem
+from recon.pwls.qggmrf import DEFAULT_PRIOR
 from recon.study.spectral.calibration import calibration_costs
 from recon.study.spectral.scan import SpectralScan, second_order_bound, starved_rays, water_hu
 from recon.study.spectral.settings import Settings
@@ -200,7 +201,7 @@ def _mbir(
     return {
         "anisotropy": problem.anisotropy,
         "whitening": problem.whitening.forward.tolist(),
-        "prior": asdict(DEFAULT_JOINT_PRIOR),
+        "prior": asdict(DEFAULT_PRIOR),
         "solves": reports,
         "at_best_energy": values,
     }, scores
