@@ -96,10 +96,10 @@ class QGGMRF:
 
 DEFAULT_PRIOR = QGGMRF(strength=0.3, threshold=16.0, relative=True)
 """Chosen on held-out plaques (not the paper's) at 0.35 and 2 s for the contrast slope of FBP's soft kernel with the
-least noise: the curvatures of data and prior are equal at 0.75 line pairs per mm at every dose. The threshold must
-follow the noise: one of 300 HU/mm lets that of 0.35 s pass as edges (338 HU of it in plain fat). A stronger prior lowers
-the noise of ROI means further, but shrinks the contrast of a millimetre-sized core: look at means and slope, not at CNR
-alone."""
+least noise: the curvatures of data and prior are equal at 0.75 line pairs per mm at every dose. The threshold
+must follow the noise: one of 300 HU/mm lets that of 0.35 s pass as edges (338 HU of it in plain fat). A stronger
+prior lowers the noise of ROI means further, but shrinks the contrast of a millimetre-sized core: look at means
+and slope, not at CNR alone."""
 
 
 def quadratic(strength: float, neighbors: int = 26) -> QGGMRF:
