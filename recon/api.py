@@ -55,9 +55,9 @@ def reconstruct(
             slices, ``(slices, y, x)``.
         method: ``"fbp"`` (FDK; option ``kernel``) or ``"pwls"`` (penalised weighted least squares with a q-GGMRF
             prior, of an inset or a whole field; options of :func:`recon.pwls.inset_problem.reconstruct_pwls`; a volume
-            that did not converge carries ``warnings`` in its report) or ``"mbir"`` (unrolled
-            steps with the learned prior that ships with the package; options of
-            :func:`recon.mbir.mbir.reconstruct_mbir`).
+            that did not converge carries ``warnings`` in its report) or ``"mbir"`` (unrolled steps with the learned
+            prior that ships with the package, of an inset or a whole field; options of
+            :func:`recon.mbir.mbir.reconstruct_mbir`; what the training has not seen is named in ``warnings``).
         progress: called with the finished fraction, 0…1.
         device: where the returned volumes lie.
         options: of the method.

@@ -23,6 +23,7 @@ from recon.mbir.network import NetworkConfig
 from recon.mbir.problem import NormalisedProblem
 from recon.mbir.unrolled import DEFAULT_LOOK, Unrolled, look_frequency, low_residual
 from recon.mbir.weights_io import read_tensors
+from recon.pwls.field_problem import is_whole_field
 from recon.pwls.inset_problem import InsetProblem
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
@@ -187,11 +188,11 @@ def reconstruct_mbir(
     look: float | None = None,
     noise_map: bool = False,
 ) -> list[Volume]:
-    """Unrolled MBIR with the learned prior.
+    """Unrolled MBIR with the learned prior, of an inset or of a whole field (:mod:`recon.mbir.field`).
 
     Args:
-        scans: realisations of one windowed scan.
-        grid: the inset.
+        scans: realisations of one scan.
+        grid: the inset, or the field.
         progress: called with the finished fraction.
         network: with its weights; None: those of the package.
         problem: kept from an earlier call with the same scan and (working) grid; None: made here.
@@ -215,6 +216,12 @@ def reconstruct_mbir(
     network = network or Mbir.load()
     if look is not None:
         network = Mbir(network.model, look, **network.parts)
+    if problem is None and is_whole_field(scans[0], grid):
+        from recon.mbir.field import reconstruct_field_mbir  # it imports this module
+
+        if noise_map:
+            raise ValueError("noise_map needs the FFT model of a small inset: ask for a smaller grid")
+        return reconstruct_field_mbir(scans, grid, network=network, progress=progress)
     work = working_grid(grid, network.voxel_mm)
     problem = problem or InsetProblem(scans[0], work)
     if problem.grid != work:

@@ -1,6 +1,7 @@
 """Penalised weighted least squares with a q-GGMRF prior, to the exact minimum.
 
-Read :mod:`~recon.pwls.inset_problem` (from a scan to HU; surround unknown: :mod:`~recon.pwls.surround`), then
+Read :mod:`~recon.pwls.inset_problem` (from a scan to HU; surround unknown: :mod:`~recon.pwls.surround`; whole field:
+:mod:`~recon.pwls.field_problem`), then
 :mod:`~recon.pwls.pwls` (exact pairs; steps proposed by :mod:`~recon.pwls.model_solver` for an inset, by
 :mod:`~recon.pwls.field_model` for a whole field; :mod:`~recon.pwls.memory` first) and the prior,
 :mod:`~recon.pwls.qggmrf` (CPU passes beside it in ``qggmrf_kernels``).

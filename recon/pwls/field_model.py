@@ -23,6 +23,8 @@ __all__ = ["FieldModel", "GradientStep"]
 
 # Smallest eigenvalue of K, as a share of the median one: between the views' directions it is 0 or, cut off, negative.
 LEAST = 0.02
+# Voxels that fewer rays meet than this share of those through the middle are not determined by the data.
+DETERMINED = 0.75
 # Voxels that the rays hardly meet are scaled as if they met this share of what the best seen voxel has.
 LEAST_SEEN = 1e-4
 
@@ -36,6 +38,8 @@ class FieldModel:
 
     Attributes:
         seen: AᵀW 1, ``domain_shape``: 0 where no ray of positive weight passes.
+        determined: bool, ``domain_shape``: voxels that (nearly) all views see. Beyond, in the corners of a grid that is
+            wider than the field of view and in slices that some views miss, directions are left to the prior alone.
 
     Raises:
         ValueError, TypeError: weights as :class:`recon.gram.gram.Gram` refuses them, or a grid that no ray meets.
@@ -49,6 +53,8 @@ class FieldModel:
         if not bool((self.seen > 0).any()):
             raise ValueError("no ray of positive weight meets the grid: check its centre, in mm, and the geometry")
         self.at = _central(self.seen)
+        met = projector.T((weights > 0).to(weights.dtype))
+        self.determined: Tensor = met >= DETERMINED * met[self.at]
         impulses = torch.zeros(2, *shape, dtype=weights.dtype, device=weights.device)
         impulses[0][self.at] = 1.0
         # The whole column along z: what a wave that is constant along z sees.
@@ -58,23 +64,25 @@ class FieldModel:
         self.spectrum = _periodic(response / self.seen[self.at], self.at)
         self._column = column if self.grid.ndim == 3 else column[None]
 
-    def information(self, hu: float) -> float:
+    def information(self, hu: float, spacing: tuple[float, ...] | None = None) -> float:
         """The data's information at 0.5 lp/mm in the middle of the grid, see :meth:`recon.gram.gram.Gram.information`.
 
         Args:
             hu: 1 HU in mm⁻¹.
+            spacing: as if the voxels had this size in mm; None: their own.
         """
         rolled = torch.roll(self._column, [-k for k in self.at[-2:]], (-2, -1))
         # Slices that the rays do not meet say nothing.
         kept = rolled[rolled[..., 0, 0] > 0]
         return information_at_reference(
-            torch.fft.rfft2(kept).real, (rolled.shape[-2], rolled.shape[-1]), self.grid.spacing, hu
+            torch.fft.rfft2(kept).real, (rolled.shape[-2], rolled.shape[-1]), spacing or self.grid.spacing, hu
         )
 
     def scaled(self, factor: float) -> FieldModel:
         """The model of ``factor`` · W."""
         other = object.__new__(FieldModel)
         other.grid, other.at, other.spectrum = self.grid, self.at, self.spectrum
+        other.determined = self.determined
         other.seen, other._column = self.seen * factor, self._column * factor
         return other
 

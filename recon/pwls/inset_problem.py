@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import copy
 import logging
-import math
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -19,9 +18,10 @@ from recon.fbp.coverage import check_rows
 from recon.fbp.inset import require_inside, require_same_surround, static_fbp
 from recon.gram.gram import Gram
 from recon.pwls.field_model import FieldModel
+from recon.pwls.field_problem import is_whole_field, reconstruct_field, unfinished
 from recon.pwls.pwls import data_model, pwls
 from recon.pwls.qggmrf import DEFAULT_PRIOR, QGGMRF
-from recon.pwls.surround import UnknownSurround, expected_counts
+from recon.pwls.surround import UnknownSurround
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import VolumeGrid
 from torchpcct.projector import Projector
@@ -57,7 +57,8 @@ class InsetProblem:
     Args:
         scan: a counting-mode scan of the family; its noise does not matter. A scan of the whole detector without a
             known surround serves too: what lies around the grid is then found from its own readings, scan by scan
-            (:mod:`recon.pwls.surround`), unless the grid holds the whole field of view.
+            (:mod:`recon.pwls.surround`). Of a grid that holds the whole field of view see
+            :class:`recon.pwls.field_problem.FieldProblem`.
         grid: ``(z, y, x)`` grid that holds everything the background does not.
         nodes: of the Gram operator. Linear in position (5) is enough for solvers: what the model lacks, the exact
             pairs repair, and each step costs half of that with 9.
@@ -106,24 +107,17 @@ class InsetProblem:
 
     def _start_unknown(self, scan: Scan, exposure: float, motion: Any) -> None:
         """Weights from the smoothed readings themselves; what surrounds the inset is found scan by scan."""
+        if is_whole_field(scan, self.grid):
+            raise ValueError("the grid holds the whole field of view: use recon.pwls.field_problem.FieldProblem")
         if motion is not None:
             raise ValueError("motion compensation needs the surround at rest: acquire the scan with region=")
         geometry, grid = self.geometry, self.grid
-        radius = geometry.fov_radius
-        edges = zip(grid.extent[1:], grid.center[1:], strict=True)
-        whole = all(extent / 2 - abs(center) >= radius / math.sqrt(2) for extent, center in edges)
-        self.window = self.outer if whole else shadow(geometry, grid, margin=1)
-        counts = expected_counts(scan.counts).clamp_min(torch.finfo(scan.counts.dtype).tiny)
-        counts = self.outer.crop(counts, self.window)
-        polychromatic = self.window.take(scan.air.log()) - counts.clamp_min(0.5).log()
-        slope = scan.linearisation.slope(polychromatic, self.window)
-        self.weights = (counts / slope.square() / exposure).contiguous()
-        self.projector = Projector(geometry, grid, None if whole else self.window)
+        self.window = shadow(geometry, grid, margin=1)
+        self.weights = self.outer.crop(scan.weights(), self.window) / exposure
+        self.projector = Projector(geometry, grid, self.window)
         self.model = data_model(self.projector, self.weights, nodes=self._nodes)
-        self.level = 0.0
-        if not whole:
-            self._around = UnknownSurround(geometry, grid, self.window, self.projector)
-            self.level = self._around.level(scan.line_integrals())
+        self._around = UnknownSurround(geometry, grid, self.window, self.projector)
+        self.level = self._around.level(scan.line_integrals())
 
     def _place(self, motion: Any) -> None:
         geometry, grid = self.geometry, self.grid
@@ -266,13 +260,15 @@ def reconstruct_pwls(
     tolerance: float = 1.0,
     **options: Any,
 ) -> list[Volume]:
-    """PWLS with a q-GGMRF prior, to convergence.
+    """PWLS with a q-GGMRF prior, to convergence: of an inset, or of a whole field of view
+    (:func:`recon.pwls.field_problem.reconstruct_field`, for every scan of a parallel or fan beam).
 
     Args:
-        scans: realisations of one windowed scan at one exposure.
-        grid: the inset.
+        scans: realisations of one scan at one exposure.
+        grid: the inset, or the field.
         progress: called with the finished fraction.
-        prior: None: :data:`recon.pwls.qggmrf.DEFAULT_PRIOR`.
+        prior: None: :data:`recon.pwls.qggmrf.DEFAULT_PRIOR`; of a whole field
+            :func:`recon.pwls.field_problem.field_prior`.
         problem: kept from an earlier call with the same scan and grid; None: made here.
         batch: volumes solved at a time; they iterate until the slowest has converged.
         tolerance: stop within so many HU (root mean square) of the exact minimum.
@@ -288,26 +284,21 @@ def reconstruct_pwls(
     Raises:
         ValueError, TypeError: see :class:`InsetProblem` and :func:`recon.pwls.pwls.pwls`.
     """
+    if problem is None and is_whole_field(scans[0], grid):
+        return reconstruct_field(scans, grid, progress=progress, prior=prior, tolerance=tolerance, **options)
     start = time.perf_counter()
     problem = problem or InsetProblem(scans[0], grid)
     volumes: list[Volume] = []
     for i in range(0, len(scans), batch):
         data, report = problem.solve(scans[i : i + batch], prior or DEFAULT_PRIOR, tolerance=tolerance, **options)
-        unfinished = [] if report["converged"] else [_unfinished(report)]
-        for text in unfinished:
+        open_ends = [] if report["converged"] else [unfinished(report)]
+        for text in open_ends:
             warnings.warn(text, RuntimeWarning, stacklevel=2)
         report["seconds"] = round((time.perf_counter() - start) / len(data), 3)
         for scan, values in zip(scans[i : i + batch], data, strict=True):
-            volume = Volume(values.to(torch.float32), grid, {**report, "warnings": unfinished})
+            volume = Volume(values.to(torch.float32), grid, {**report, "warnings": open_ends})
             volumes.append(volume if scan.noise_free else _tested(problem, scan, volume))
         start = time.perf_counter()
         if progress is not None:
             progress(min(i + batch, len(scans)) / len(scans))
     return volumes
-
-
-def _unfinished(report: Mapping[str, Any]) -> str:
-    return (
-        f"PWLS stopped {report['rmsd_hu'][-1]:.3g} HU from the minimum after {report['exact_pairs']} projection pairs "
-        f"(tolerance {report['tolerance_hu']:g} HU): raise max_exact, or strengthen the prior"
-    )

@@ -21,9 +21,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.conjugate_gradient import dot, per_volume
@@ -61,11 +59,14 @@ class PwlsResult:
             iteration), ``gradient`` (norm of the exact gradient of Φ over that of the zero volume, worst volume of the
             batch, one entry per outer iteration), ``rmsd_hu`` (root mean square distance to the minimum in HU, worst
             volume, one entry per outer iteration: as the FFT model sees it from the exact gradient; for a whole field
-            extrapolated from the latest steps), ``converged``, ``tolerance_hu``, ``model`` ("gram" or "gradient": who
-            proposed the last step), ``model_misfit`` (of the FFT model on the first step, None without one),
-            ``misfit`` (weighted squared residual per reading of positive weight, one entry per volume: about 1 for the
-            right weights and enough unknowns; from :func:`solve_normal`, which does not know the data, None),
-            ``seconds``, and the prior (``strength``, ``lambda``, ``threshold_hu_per_mm``, ``p``, ``q``).
+            extrapolated from the latest steps, over the voxels that the data determine:
+            :attr:`recon.pwls.field_model.FieldModel.determined`), ``undetermined`` (share of the other voxels),
+            ``undetermined_rmsd_hu`` (the same estimate over them), ``converged``, ``tolerance_hu``, ``model`` ("gram"
+            or "gradient": who proposed the last step), ``model_misfit`` (of the FFT model on the first step, None
+            without one), ``misfit`` (weighted squared residual per reading of positive weight, one entry per volume:
+            about 1 for the right weights and many more readings than unknowns; from :func:`solve_normal`, which does
+            not know the data, None), ``seconds``, and the prior (``strength``, ``lambda``, ``threshold_hu_per_mm``,
+            ``p``, ``q``).
     """
 
     x: Tensor
@@ -102,13 +103,14 @@ def pwls(
             :class:`recon.pwls.field_model.FieldModel`, kept from an earlier call); default: :func:`data_model`.
         start: first volume ``(..., *grid.shape)`` mm⁻¹, default 0. It costs one exact pair and does not change the
             result; the volume returned has no larger Φ.
-        tolerance: stop when the volume is this close to the minimum: root mean square, in HU (see ``rmsd_hu``).
+        tolerance: stop when the volume is this close to the minimum: root mean square, in HU (see ``rmsd_hu``), where
+            the data determine it; corners that some views miss hang on the prior and converge last.
         max_exact: largest number of exact pairs; if it is reached, the report says ``converged: False`` and a
             warning is logged.
         memory: bytes that may be used besides the arguments; default: what the machine has left. The need is
             predicted before anything is allocated.
-        callback: called after each outer iteration with a dict of ``outer``, ``exact_pairs``, ``gradient`` and
-            ``rmsd_hu``.
+        callback: called before each outer iteration with a dict of ``outer``, ``exact_pairs``, ``gradient``,
+            ``rmsd_hu`` and ``x``, the volumes so far ``(batch, *grid.shape)``, not to be changed.
 
     Returns:
         The volume in the dtype of y, and the report.
@@ -257,7 +259,10 @@ def _solve(
     inner: list[int] = []
     gradients: list[float] = []
     distances: list[float] = []
-    moves = Moves()
+    determined = (
+        gram.determined if isinstance(gram, FieldModel) else torch.ones(shape[-len(spacing) :], dtype=torch.bool)
+    )
+    approach, beyond = Approach(x, determined), Approach(x, ~determined)
     misfit: float | None = None
     previous: tuple[Tensor, Tensor] | None = None
     converged = b.shape[0] == 0
@@ -268,10 +273,12 @@ def _solve(
         gradients.append(float((dot(gradient, gradient, axes).sqrt() / reference).max()))
         proposed = float((dot(step, step, axes) / step[0].numel()).sqrt().max()) / hu
         by_model = isinstance(proposer, ModelSolver)
-        distances.append(proposed if by_model else max(proposed, moves.remaining() / hu))
+        distances.append(proposed if by_model else approach.remaining() / hu if approach.known else proposed)
         if callback is not None:
-            callback({"outer": len(inner), "exact_pairs": pairs, "gradient": gradients[-1], "rmsd_hu": distances[-1]})
-        converged = distances[-1] <= tolerance and (by_model or moves.known or proposed == 0.0)
+            callback({
+                "outer": len(inner), "exact_pairs": pairs, "gradient": gradients[-1], "rmsd_hu": distances[-1], "x": x,
+            })  # fmt: skip
+        converged = distances[-1] <= tolerance and (by_model or approach.known or proposed == 0.0)
         if converged or pairs >= max_exact:
             break
         curved = exact(step)
@@ -286,7 +293,8 @@ def _solve(
         alpha = per_volume(line_search(bound, x, step, curved, data_gradient, start=0.0, most=12, tolerance=1e-3), x)
         x = x + alpha * step
         data_gradient = data_gradient + alpha * curved
-        moves.add(alpha * step)
+        approach.add(x)
+        beyond.add(x)
         previous = (step, curved)
         if pairs % REFRESH == 0 and pairs < max_exact:
             data_gradient = exact(x) - b
@@ -303,6 +311,8 @@ def _solve(
         "gradient": gradients,
         "rmsd_hu": distances,
         "converged": converged,
+        "undetermined": 1.0 - float(determined.double().mean()),
+        "undetermined_rmsd_hu": beyond.remaining() / hu,
         "tolerance_hu": tolerance,
         "model": "gram" if isinstance(proposer, ModelSolver) else "gradient",
         "model_misfit": misfit,
@@ -317,39 +327,58 @@ def _solve(
     return PwlsResult(x.reshape(*lead, *shape), report), 0.5 * dot(x, data_gradient - b, axes)
 
 
-class Moves:
-    """How far is it still? Extrapolated from how the moves of an iteration shrink, volume by volume.
+class Approach:
+    """How far is it still? Extrapolated from how far the iterates have come, volume by volume.
 
-    The moves of the last third are compared with those of the third before: a geometric series goes on for their sum
-    times r / (1 − r), r the ratio of the two. Of the latest estimates the largest counts, since single ones can be low.
+    After k iterations the way d from iterate ¾ k to k is compared with that from ½ k to ¾ k: if it is q times as long,
+    a geometric series goes on for q d / (1 − q). That is not believed below d itself. Single estimates can be low: of
+    the latest the largest counts. On whole fields of 160² and 416² voxels it was 1 to 3 times the true distance, from
+    1 HU on. Seen on a sample of the voxels, so that the iterates need not be kept.
+
+    Args:
+        x: the first volumes ``(batch, *shape)``.
+        voxels: bool ``shape`` or its last axes: where; None: everywhere.
     """
 
-    LEAST, SLOWEST = 3, 0.98
+    LEAST, SLOWEST, LATEST, SAMPLE = 3, 0.98, 3, 2**15
 
-    def __init__(self) -> None:
-        self._lengths: list[NDArray[np.float64]] = []
+    def __init__(self, x: Tensor, voxels: Tensor | None = None) -> None:
+        here = torch.arange(x.shape[1:].numel(), device=x.device)
+        if voxels is not None:
+            here = here[voxels.expand(x.shape[1:]).flatten()]
+        if here.numel() > self.SAMPLE:
+            picked = torch.randperm(here.numel(), generator=torch.Generator().manual_seed(0))[: self.SAMPLE]
+            here = here[picked.to(here.device)]
+        self._here = here
+        self._seen = [self._sample(x)]
         self._left: list[float] = []
 
-    def add(self, move: Tensor) -> None:
-        """Note one move, ``(batch, *shape)``."""
-        axes = move.dim() - 1
-        self._lengths.append((dot(move, move, axes) / move[0].numel()).sqrt().cpu().numpy())
-        span = max(self.LEAST, len(self._lengths) // 3)
-        if len(self._lengths) < 2 * span:
+    def _sample(self, x: Tensor) -> Tensor:
+        return x.flatten(1)[:, self._here]
+
+    def _way(self, first: int, last: int) -> Tensor:
+        """Root mean square distance between two iterates, ``(batch,)``."""
+        return (self._seen[last] - self._seen[first]).double().square().mean(1).sqrt()
+
+    def add(self, x: Tensor) -> None:
+        """Note the next iterate."""
+        self._seen.append(self._sample(x))
+        k = len(self._seen) - 1
+        lag = max(self.LEAST, k // 4)
+        if not self._here.numel() or k < 2 * lag:
             return
-        late = np.sum(self._lengths[-span:], axis=0)
-        early = np.sum(self._lengths[-2 * span : -span], axis=0)
-        ratio = np.minimum(late / np.maximum(early, np.finfo(np.float64).tiny), self.SLOWEST)
-        self._left.append(float((late * ratio / (1 - ratio)).max()))
+        late, early = self._way(k - lag, k), self._way(k - 2 * lag, k - lag)
+        ratio = (late / early.clamp_min(torch.finfo(torch.float64).tiny)).clamp_max(self.SLOWEST)
+        self._left.append(float((late * (ratio / (1 - ratio)).clamp_min(1)).max()))
 
     @property
     def known(self) -> bool:
-        """Whether there are moves enough."""
+        """Whether there are iterates enough."""
         return bool(self._left)
 
     def remaining(self) -> float:
         """Root mean square distance to the limit, worst volume; 0 while not :attr:`known`."""
-        return max(self._left[-max(self.LEAST, len(self._lengths) // 3) :], default=0.0)
+        return max(self._left[-self.LATEST :], default=0.0)
 
 
 def _misfit(gram: Any, step: Tensor, curved: Tensor, axes: int) -> float:

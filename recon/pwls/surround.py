@@ -19,36 +19,18 @@ from dataclasses import replace
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from recon.fbp.fbp import fbp
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, VolumeGrid
 from torchpcct.projector import Projector
 
-__all__ = ["UnknownSurround", "expected_counts"]
+__all__ = ["UnknownSurround"]
 
 # Voxels of the whole field, and its detector cells at the axis, in mm: about 1 lp/mm.
 COARSE_MM = 0.6
 # Rows are joined to about this height at the axis, in mm: patients change slowly along z.
 COARSE_ROW_MM = 1.5
-# Cells over which noisy counts are averaged for the weights, (views, rows, columns).
-SMOOTH = (5, 5, 5)
-
-
-def expected_counts(counts: Tensor) -> Tensor:
-    """Smooth estimate of the expected counts: means over :data:`SMOOTH` readings, ``(views, rows, columns)``.
-
-    Weights from single noisy counts would favour readings that happen to be high; of 125 readings each holds 1 %.
-    The views go around.
-    """
-    views, rows, columns = counts.shape
-    size = [min(k, n - (n + 1) % 2) for k, n in zip(SMOOTH, (views, rows, columns), strict=True)]
-    half = [k // 2 for k in size]
-    out = torch.cat([counts[views - half[0] :], counts, counts[: half[0]]])[None, None]
-    out = F.avg_pool3d(out, (size[0], 1, 1), 1)
-    padded = F.pad(out, (half[2], half[2], half[1], half[1], 0, 0), mode="replicate")
-    return F.avg_pool3d(padded, (1, size[1], size[2]), 1)[0, 0]
 
 
 class UnknownSurround:

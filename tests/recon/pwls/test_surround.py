@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from recon.pwls.surround import UnknownSurround, expected_counts
+from recon.pwls.surround import UnknownSurround
 from torchpcct import ConeBeam, Projector, VolumeGrid, full_turn
 from torchpcct.detector_window import shadow
 
@@ -31,14 +31,3 @@ def test_nothing_is_left_of_a_uniform_inset(lines):
     assert left.shape == window.shape
     assert float(lines.max()) > 2.0
     assert float(left.mean((0, 2)).abs().max()) < 2e-4
-
-
-def test_expected_counts_are_smooth_and_keep_the_mean():
-    counts = torch.poisson(torch.full((40, 8, 30), 100.0), generator=torch.Generator().manual_seed(0))
-    smooth = expected_counts(counts)
-    assert smooth.shape == counts.shape
-    assert float(smooth.mean()) == pytest.approx(float(counts.mean()), rel=0.01)
-    assert float(smooth.std()) < 0.2 * float(counts.std())
-    ramp = torch.arange(30.0).expand(40, 8, 30)
-    torch.testing.assert_close(expected_counts(ramp)[..., 2:-2], ramp[..., 2:-2])
-    assert expected_counts(torch.ones(3, 1, 2)).shape == (3, 1, 2)

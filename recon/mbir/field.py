@@ -1,0 +1,306 @@
+"""The learned prior on a whole field of view, for scans of any scanner.
+
+Four things differ from an inset (:mod:`recon.mbir.mbir`):
+
+* AᵀWA is applied by the projector itself: the FFT model of an inset does not hold over a whole field.
+* Noise changes over the field. With s(x) = (AᵀW 1 at the middle / AᵀW 1 at x)^½ the problem is solved for
+  u = x / (c s), c the noise scale at the middle. S AᵀWA S has everywhere about the spectrum of the middle (Fessler and
+  Booth 1999, IEEE Trans. Image Process. 8:688), so noise looks to the network as it did in training.
+* What the inset's surround is there, a strongly regularised PWLS is here: it takes the body's outline, bones and lungs
+  off the data, and the network sees the rest, as in training. It need not converge, the data decide about the sum.
+* The network sees blocks that overlap, each with its own noise scale as condition.
+
+Voxels: what the network knows is measured in voxels of about a detector cell at the axis. A scan with cells half as
+large is the same scan of an object half as large; lengths are counted in voxels, and grids whose voxels are not within
+:data:`VOXELS_PER_CELL` of a cell are reconstructed on voxels that are, and averaged. Parallel and fan beams: the slices
+of a stack are one volume.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from recon.mbir.mbir import Mbir, average_onto
+from recon.mbir.network import Network
+from recon.mbir.problem import NormalisedProblem, filtered
+from recon.mbir.unrolled import REFERENCE_SCALE_HU, consistent, low_residual, start
+from recon.pwls.field_model import FieldModel
+from recon.pwls.field_problem import FieldProblem, field_prior
+from recon.pwls.memory import require_memory
+from recon.pwls.pwls import pwls
+from torchpcct.geometry import ConeBeam, VolumeGrid
+from torchpcct.scan import Scan
+from torchpcct.volume import Volume, to_hu
+
+__all__ = ["FieldGram", "blockwise", "reconstruct_field_mbir", "trained_grid"]
+
+_LOG = logging.getLogger(__name__)
+
+VOXELS_PER_CELL = (0.7, 1.5)
+"""Voxel over detector cell at the axis: the training has 0.2 mm voxels on cells of 0.2 mm × 0.29 mm."""
+SOLVES = (16, 10)
+"""Conjugate gradients of start and data consistency on exact pairs."""
+LARGEST_RATIO = 4.0
+"""Voxels that rays hardly meet are treated as if their noise were so many times that of the middle."""
+BLOCK, HALO = 64, 16
+SURROUND_STRENGTH, SURROUND_HU, SURROUND_PAIRS = 10.0, 5.0, 60
+"""Of the PWLS that takes off the edges: prior, tolerance, projection pairs."""
+_TOWARDS = 0.1
+_PERIOD = 8
+
+
+class FieldGram:
+    """S AᵀWA S of a whole field, in the form that :class:`recon.mbir.problem.NormalisedProblem` asks for.
+
+    Args:
+        problem: of the scan.
+        weights: of each slice, ``problem.projector.range_shape``; of a cone beam one.
+        voxel_mm: size that the network gives its voxels.
+
+    Attributes:
+        ratio: s, ``(z, y, x)``.
+        determined: bool ``(z, y, x)``, see :class:`recon.pwls.field_model.FieldModel`.
+    """
+
+    def __init__(self, problem: FieldProblem, weights: Sequence[Tensor], voxel_mm: float) -> None:
+        self._problem, self._weights, self._voxel_mm = problem, list(weights), voxel_mm
+        A = problem.projector
+        model = FieldModel(A, self._weights[len(self._weights) // 2])
+        self._middle = float(model.seen[model.at])
+        rest = model.seen[None] if len(self._weights) == 1 else torch.stack([A.T(w) for w in self._weights])
+        seen = rest if problem.plane else rest[0]
+        self.ratio = (self._middle / seen.clamp_min(self._middle / LARGEST_RATIO**2)).sqrt()
+        self.determined = model.determined.expand(self.ratio.shape)
+        self._spectrum = (model.spectrum[None] if problem.plane else model.spectrum) * self._middle
+        self._model = model
+
+    def exact(self, x: Tensor) -> Tensor:
+        """AᵀWA of volumes ``(batch, z, y, x)``."""
+        A = self._problem.projector
+        if not self._problem.plane:
+            found: Tensor = A.T(self._weights[0] * A(x))
+            return found
+        return torch.stack([A.T(w * A(v)) for v, w in zip(x.unbind(1), self._weights, strict=True)], 1)
+
+    def apply(self, u: Tensor) -> Tensor:
+        """S AᵀWA S u, ``(batch, z, y, x)``."""
+        return self.ratio * self.exact(self.ratio * u)
+
+    def periodic_spectrum(self) -> Tensor:
+        """Eigenvalues of the circulant model at the middle, ``rfftn`` layout; of slices the same at all z."""
+        return self._spectrum
+
+    def information(self, hu: float) -> float:
+        """So that the noise scale of the middle is right, see :class:`recon.mbir.problem.NormalisedProblem`."""
+        n = self._model.grid.ndim
+        spacing = (self._voxel_mm,) * n
+        return self._model.information(hu, spacing) * self._voxel_mm ** (n - 3)
+
+
+def trained_grid(grid: VolumeGrid, geometry: Any) -> VolumeGrid:
+    """The grid of cubic voxels that the network can work on; ``grid`` itself if it is one.
+
+    Args:
+        grid: ``(y, x)`` or ``(z, y, x)``; the z axis of slices does not matter.
+        geometry: of the scan.
+    """
+    pitch = geometry.pitch[1] if isinstance(geometry.pitch, tuple) else geometry.pitch
+    cell = pitch / getattr(geometry, "magnification", 1.0)
+    h = grid.spacing[-1]
+    cubic = max(abs(s / h - 1.0) for s in grid.spacing) <= 0.01
+    if cubic and VOXELS_PER_CELL[0] <= h / cell <= VOXELS_PER_CELL[1]:
+        return grid
+    return VolumeGrid(tuple(max(1, math.ceil(e / cell - 1e-6)) for e in grid.extent), cell, grid.center)
+
+
+def blockwise(
+    network: Network, estimate: Tensor, towards: Tensor, condition: Callable[[tuple[slice, ...]], Tensor],
+    block: int = BLOCK, halo: int = HALO,
+) -> Tensor:  # fmt: skip
+    """The network on volumes ``(1, z, y, x)`` of any size, block by block; neighbours fade into each other.
+
+    Args:
+        network: the learned prior.
+        estimate, towards: see :meth:`recon.mbir.network.Network.forward`.
+        condition: ``(1, 3)`` of the voxels that it is given.
+        block: voxels along each axis that a block gives; with those it shares with its neighbours ``2 · halo`` more. A
+            multiple of 8, as ``halo``: blocks of voxels must be those of the whole.
+        halo: voxels on each side that help only, or fade.
+    """
+    shape = estimate.shape[-3:]
+    if max(shape) <= block + 2 * halo:
+        return network(estimate, towards, condition((slice(None),) * 3))
+    total, weight = torch.zeros_like(estimate), torch.zeros(shape, dtype=estimate.dtype, device=estimate.device)
+    for part in _parts(shape, block, halo):
+        out = network(estimate[(..., *part)], towards[(..., *part)], condition(part))
+        fade = torch.ones((), dtype=estimate.dtype, device=estimate.device)
+        for axis, (s, n) in enumerate(zip(part, shape, strict=True)):
+            fade = fade * _fade(s, n, halo).to(estimate).reshape(-1, *[1] * (2 - axis))
+        total[(..., *part)] += out * fade
+        weight[part] += fade
+    return total / weight
+
+
+def _parts(shape: Sequence[int], block: int, halo: int) -> Iterator[tuple[slice, ...]]:
+    along = [[slice(max(k - halo, 0), min(k + block + halo, n)) for k in range(0, n, block)] for n in shape]
+    for z in along[0]:
+        for y in along[1]:
+            for x in along[2]:
+                yield z, y, x
+
+
+def _fade(part: slice, n: int, halo: int) -> Tensor:
+    """1 inside, falling linearly over the inner half of the halo; the outer half only helps the network."""
+    at = torch.arange(part.start, part.stop, dtype=torch.float64)
+    low = (at - part.start - halo / 2 + 0.5) / (halo + 1) if part.start > 0 else torch.ones_like(at)
+    high = (part.stop - 1 - at - halo / 2 + 0.5) / (halo + 1) if part.stop < n else torch.ones_like(at)
+    return torch.minimum(low, high).clamp(1e-6, 1.0)
+
+
+def reconstruct_field_mbir(
+    scans: Sequence[Scan],
+    grid: VolumeGrid,
+    *,
+    network: Mbir,
+    progress: Callable[[float], None] | None = None,
+    memory: int | None = None,
+) -> list[Volume]:
+    """Unrolled MBIR of whole fields.
+
+    Args:
+        scans: without a known surround, of one geometry.
+        grid: ``(z, y, x)``; of a parallel or fan beam ``(y, x)`` or ``(slices, y, x)``.
+        network: with its weights and look.
+        progress: called with the finished fraction.
+        memory: bytes that may be used; None: what the machine has left.
+
+    Returns:
+        Volumes in HU with the report of :func:`recon.mbir.mbir.reconstruct_mbir`, and ``noise_scale_hu`` (10 and 90 %
+        of the voxels), ``voxel_mm`` (of the grid that was worked on).
+
+    Raises:
+        ValueError: see :class:`recon.pwls.field_problem.FieldProblem`; too little memory; voxels finer than what the
+            detector resolves.
+    """
+    began = time.perf_counter()
+    flat = not isinstance(scans[0].geometry, ConeBeam)
+    asked = grid.slice if flat and grid.ndim == 3 else grid
+    work = trained_grid(asked, scans[0].geometry)
+    fine, cell = grid.spacing[-1], work.spacing[-1]
+    if cell > 1.01 * fine:
+        raise ValueError(
+            f"voxels of {fine:g} mm are finer than what the network was trained for on this detector, whose cells have "
+            f"{cell:g} mm at the axis: ask for voxels of {cell:g} mm or more and resample the result, or use "
+            'method="pwls"'
+        )
+    full = work
+    if asked is not grid:
+        full = VolumeGrid(
+            (grid.shape[0], *work.shape), (grid.spacing[0], *work.spacing), (grid.center[0], *work.center)
+        )
+    problem = FieldProblem(scans[0], full)
+    volumes = []
+    for i, scan in enumerate(scans):
+        slices = problem.slices(scan)
+        require_memory(problem.projector, slices[0][0], memory)
+        found, info = _one(problem, slices, network)
+        if not scan.noise_free:
+            tests = [problem.residual_test(y, w, x) for (y, w), x in zip(slices, found, strict=True)]
+            names = tests[0].p_values
+            info["residual_p"] = {name: min(t.p_values.get(name, 1.0) for t in tests) for name in names}
+            info["warnings"] += sorted({text for t in tests for text in t.findings})
+        info["warnings"] = [*problem.warnings, *info["warnings"]]
+        for text in info["warnings"]:
+            _LOG.warning("%s", text)
+        hu = problem.hu(found)
+        if work is not asked:
+            hu = _onto(hu, work, asked)
+        info["voxel_mm"], info["seconds"] = cell, round(time.perf_counter() - began, 3)
+        volumes.append(Volume(hu.to(torch.float32), grid, info))
+        began = time.perf_counter()
+        if progress is not None:
+            progress((i + 1) / len(scans))
+    return volumes
+
+
+def _onto(hu: Tensor, source: VolumeGrid, target: VolumeGrid) -> Tensor:
+    """Averages over the voxels of another grid, 2-D or 3-D."""
+    if source.ndim == 3:
+        return average_onto(hu, source, target)
+    source3, target3 = (VolumeGrid((1, *g.shape), (1.0, *g.spacing), (0.0, *g.center)) for g in (source, target))
+    return average_onto(hu.unsqueeze(-3), source3, target3).squeeze(-3)
+
+
+@torch.no_grad()
+def _one(
+    problem: FieldProblem, slices: Sequence[tuple[Tensor, Tensor]], network: Mbir
+) -> tuple[list[Tensor], dict[str, Any]]:
+    """The volume of each slice in mm⁻¹ (of a cone beam one), and the report."""
+    A, model, hu = problem.projector, network.model, problem.mu_ref / 1000.0
+    gram = FieldGram(problem, [w for _, w in slices], network.voxel_mm)
+    around = _surround(problem, slices)
+    projected = [A.T(w * (y - A(x))) for (y, w), x in zip(slices, around, strict=True)]
+    b = gram.ratio * _stacked(problem, projected)
+    normal = NormalisedProblem.from_statistic(gram, b[None], torch.ones(1), hu, network.voxel_mm)
+    scales = normal.scale_hu * gram.ratio
+    spectrum = normal.spectrum()
+    v = start(normal, spectrum, SOLVES[0])
+    steps = network.parts.get("steps")
+    for k in range(model.steps if steps is None else steps):
+        towards = v + filtered(normal.beta - normal.apply(v), 1.0 / (spectrum + _TOWARDS))
+
+        def condition(part: tuple[slice, ...], k: int = k) -> Tensor:
+            here = torch.log(scales[part] / REFERENCE_SCALE_HU).mean().clamp(-3.0, 3.0)
+            return torch.tensor([[float(here), network.look - 0.5, float(k)]])
+
+        v = blockwise(model.network, v, towards, condition)
+    looks = torch.full((1,), float(network.look))
+    u = consistent(normal, spectrum, v, looks, SOLVES[1]) if network.parts.get("last_word", True) else v
+    left = normal.beta - normal.apply(u)
+    whole = normal.beta + normal.apply(_stacked(problem, around)[None] / (scales * hu))
+    rest = (u[0] * scales) * hu
+    found = [x + d for x, d in zip(around, rest if problem.plane else [rest], strict=True)]
+    squares = [(w * (y - A(x)).square()).sum(dtype=torch.float64) for (y, w), x in zip(slices, found, strict=True)]
+    readings = sum(int((w > 0).sum()) for _, w in slices)
+    seen = scales[gram.determined]
+    seen = seen[:: max(1, seen.numel() // 10**6)]
+    low, high = (float(q) for q in torch.quantile(seen, seen.new_tensor([0.1, 0.9])))
+    peak = float(to_hu(_stacked(problem, found)[gram.determined].max(), problem.mu_ref))
+    warnings = [text for scale in (low, high) for text in network.check(scale, peak)]
+    if problem.plane and len(slices) == 1:
+        warnings.append("a single slice: the network was trained on volumes, which have neighbours along z")
+    info = {
+        "method": "mbir", "iterations": model.steps, "look": network.look,
+        "residual": float(low_residual(replace(normal, beta=whole), left, network.look)),
+        "chi2": float(torch.stack(squares).sum()) / max(readings, 1), "noise_scale_hu": (low, high),
+        "warnings": list(dict.fromkeys(warnings)),
+    }  # fmt: skip
+    return found, info
+
+
+def _stacked(problem: FieldProblem, volumes: Sequence[Tensor]) -> Tensor:
+    """``(z, y, x)`` of the volumes of all slices."""
+    return torch.stack(list(volumes)) if problem.plane else volumes[0]
+
+
+def _surround(problem: FieldProblem, slices: Sequence[tuple[Tensor, Tensor]]) -> list[Tensor]:
+    """The edges of each slice in mm⁻¹: PWLS with :data:`SURROUND_STRENGTH` times the strength of the default prior."""
+    usual = field_prior(problem.work.spacing[-1])
+    prior = replace(usual, strength=SURROUND_STRENGTH * usual.strength)
+    hu = problem.mu_ref / 1000.0
+    found = []
+    for y, w in slices:
+        result = pwls(
+            problem.projector, y, w, prior, hu=hu, start=problem.start(y), tolerance=SURROUND_HU,
+            max_exact=SURROUND_PAIRS,
+        )  # fmt: skip
+        found.append(result.x)
+    return found
