@@ -39,6 +39,8 @@ _R = "tests/recon/test_no_silent_errors.py::"
 _C = "tests/recon/test_cli_refusals.py::"
 _D = "tests/torchpcct/test_defects.py::"
 _Q = "tests/torchpcct/metrics/test_residual_test.py::"
+_O = "tests/torchpcct/metrics/test_opposite_rays.py::"
+_OPP = "torchpcct/metrics/opposite_rays.py"
 _W = "tests/recon/fbp/test_angular_weights.py"
 _N = "tests/torchpcct/metrics/test_cnr.py::"
 _G = "torchpcct/geometry.py"
@@ -142,6 +144,16 @@ FAULTS = (
           "self.grid, self.rays.row_edge, self.rays.row_pitch, rows)",
           "self.grid, self.heights[2], self.rays.row_pitch, self.rays.rows)",
           _T + "test_a_windowed_projection_equals_the_whole_one"),
+    Fault("opposite rays of the same side", _OPP, "math.pi - (0.0 if", "math.pi + (0.0 if",
+          _O + "test_a_wrong_centre_is_found_and_measured"),
+    Fault("the centre's error upside down", _OPP, "-difference * (smooth", "difference * (smooth",
+          _O + "test_a_wrong_centre_is_found_and_measured"),
+    Fault("every pair counts twice", _OPP, "(gamma > 0) & close", "(gamma != 0) & close",
+          _O + "test_a_window_that_follows_an_inset"),
+    Fault("no tolerance of the centre", _OPP, "CENTRE_TOLERANCE = 0.1", "CENTRE_TOLERANCE = 0.0",
+          _O + "test_false_alarms_keep_their_rate"),
+    Fault("centre untested", "recon/api.py", "found = centre_warnings(s, grid)", "found: list[str] = []",
+          _R + "test_fbp_of_a_wrong_rotation_centre_is_named"),
     Fault("any number of voxels", "recon/cli/scans.py", "MOST_VOXELS = 2**31", "MOST_VOXELS = 2**200",
           _C + "test_refusals_name_value_and_remedy_and_leave_nothing"),
 )  # fmt: skip
