@@ -140,11 +140,12 @@ def blockwise(
         return network(estimate, towards, condition((slice(None),) * 3))
     total, weight = torch.zeros_like(estimate), torch.zeros(shape, dtype=estimate.dtype, device=estimate.device)
     for part in _parts(shape, block, halo):
-        out = network(estimate[(..., *part)], towards[(..., *part)], condition(part))
+        here: Any = (..., *part)
+        out = network(estimate[here], towards[here], condition(part))
         fade = torch.ones((), dtype=estimate.dtype, device=estimate.device)
         for axis, (s, n) in enumerate(zip(part, shape, strict=True)):
             fade = fade * _fade(s, n, halo).to(estimate).reshape(-1, *[1] * (2 - axis))
-        total[(..., *part)] += out * fade
+        total[here] += out * fade
         weight[part] += fade
     return total / weight
 

@@ -36,6 +36,8 @@ _LOG = logging.getLogger(__name__)
 
 STRENGTH, THRESHOLD_HU = 0.3, 75.0
 REFERENCE_VOXEL_MM = 0.25
+# Distance from the minimum, beyond the field of view, from which it is named.
+UNDETERMINED_HU = 10.0
 # Readings that miss the grid see something if the mean of a patch of so many cells each way is above this line integral
 # (half a millimetre of water) and this share of the mean of the readings that meet it.
 PATCH = 8
@@ -236,6 +238,12 @@ def reconstruct_field(
         if not report["converged"]:
             found.append(unfinished(report))
             warnings.warn(found[-1], RuntimeWarning, stacklevel=2)
+        if report["undetermined_rmsd_hu"] > UNDETERMINED_HU:
+            found.append(
+                f"{100 * report['undetermined']:.0f} % of the voxels are missed by some views (corners beyond the "
+                "field of view, outer slices): there the volume is "
+                f"{report['undetermined_rmsd_hu']:.0f} HU from the minimum"
+            )
         found += sorted({text for test in tests for text in test.findings})
         if tests:
             report["chi2"] = sum(t.chi2 for t in tests) / len(tests)
