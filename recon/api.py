@@ -10,7 +10,7 @@ from typing import Any, overload
 
 import torch
 
-from recon.fbp.coverage import sampling_warnings
+from recon.fbp.coverage import centre_warnings, sampling_warnings
 from recon.fbp.inset import InsetFbp
 from recon.mbir.mbir import reconstruct_mbir
 from recon.pwls.inset_problem import reconstruct_pwls
@@ -117,8 +117,11 @@ def _fbp(scans: Sequence[Scan], grid: VolumeGrid, progress: Progress | None, ker
     volumes = []
     for i, s in enumerate(scans):
         data = run(s)[0][0].to(torch.float32)
+        found = centre_warnings(s, grid)
+        for text in found:
+            _LOG.warning("%s", text)
         seconds = time.perf_counter() - start
-        report = {"method": "fbp", "kernel": kernel, "seconds": round(seconds, 3), "warnings": list(warnings)}
+        report = {"method": "fbp", "kernel": kernel, "seconds": round(seconds, 3), "warnings": [*warnings, *found]}
         volumes.append(Volume(data, grid, report))
         start = time.perf_counter()
         if progress is not None:

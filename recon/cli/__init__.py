@@ -47,12 +47,15 @@ def _run_study(name: str, settings: Any, arguments: argparse.Namespace, progress
         listed = ", ".join(f"{part} {value:.1f}" for part, value in minutes.items())
         total = f"about {sum(minutes.values()):.0f} min on two idle cores if nothing is finished yet"
         print(f"{total} ({listed})", file=sys.stderr)
+    from recon.study.store import Pieces  # loads torch
+
     start = time.perf_counter()
     report = registry.run(name, settings, progress, folder)
     progress.close()
     if "command" in report.data:
         report.made_by(shlex.join(["torchpcct", *arguments.command_line]))
     files = report.save(folder)
+    Pieces.clear(folder)
     print(report.text)
     print(f"\n{time.perf_counter() - start:.0f} s in all. Written: {', '.join(map(str, files))}")
 
@@ -147,8 +150,8 @@ def _add_hardcases(commands: Commands) -> None:
         "said, and whether it was wrong without a word.",
         "folder for report.json, report.md and the figure (default out/hardcases)",
     )  # fmt: skip
-    parser.add_argument("--quick", action="store_true", help="a quarter of the views")
-    parser.add_argument("--methods", nargs="+", metavar="M", help="fbp pwls … (default fbp pwls)")
+    parser.add_argument("--quick", action="store_true", help="an eighth of the views, by FBP alone")
+    parser.add_argument("--methods", nargs="+", metavar="M", help="fbp pwls mbir (default: all)")
     parser.add_argument("--cases", nargs="+", metavar="NAME", help="only these cases")
     parser.add_argument("--views", type=int, metavar="N", help="views of the scan (default 984)")
 

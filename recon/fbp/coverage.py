@@ -1,4 +1,5 @@
-"""Does the scan see what is to be reconstructed? FBP itself never fails: without data it extrapolates, plausibly."""
+"""Does the scan see what is to be reconstructed, and agree with itself? FBP itself never fails: without data it
+extrapolates, plausibly, and a wrong rotation centre it draws as sharp double edges."""
 
 from __future__ import annotations
 
@@ -7,13 +8,17 @@ from typing import Any
 
 import numpy as np
 
+from torchpcct.detector_window import shadow
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid, view_step
+from torchpcct.scan import Scan
 
-__all__ = ["check_rows", "sampling_warnings"]
+__all__ = ["centre_warnings", "check_rows", "sampling_warnings"]
 
 STREAK_CELLS = 10.0
 """Distance between the paths of neighbouring views at the border of the field of view, in cells at the axis, from which
 streaks of an object at the border are wider than what the kernels smooth. 1968 views of the paper's scanner: 1.6."""
+_CENTRE_MARGIN = 8
+"""Columns beside a grid's shadow that the test of the rotation centre looks at."""
 
 
 def check_rows(geometry: Geometry, grid: VolumeGrid, motion: Any = None) -> list[str]:
@@ -81,3 +86,25 @@ def sampling_warnings(geometry: Geometry) -> list[str]:
         f"neighbouring views lie {apart:.1f} mm apart, {apart / cell:.0f} cells: edges there draw streaks; "
         f"{needed} views a turn would keep them below {STREAK_CELLS:g} cells"
     ]
+
+
+def centre_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
+    """Whether the opposite rays of a scan disagree (:mod:`torchpcct.metrics.opposite_rays`).
+
+    Args:
+        scan: counting or energy integrating, without energy bins; of several slices the middle one is looked at.
+        grid: what is reconstructed.
+
+    Returns:
+        Warnings; empty if nothing is found, or no opposite rays were measured.
+    """
+    from torchpcct.metrics.opposite_rays import centre_test  # loads scipy.stats
+
+    lines, window, about = scan.line_integrals(), scan.window, (0.0, 0.0)
+    if lines.ndim > len(scan.geometry.shape):
+        lines = lines[lines.shape[0] // 2]
+    if window is not None:
+        part = shadow(scan.geometry, grid, margin=_CENTRE_MARGIN).within(window)
+        lines = window.crop(lines - window.take(scan.surround_line_integrals()), part)
+        window, about = part, (grid.center[-2], grid.center[-1])
+    return list(centre_test(lines, scan.geometry, window, about).findings)

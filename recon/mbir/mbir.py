@@ -230,7 +230,8 @@ def reconstruct_mbir(
     for i in range(0, len(scans), batch):
         part = scans[i : i + batch]
         exposure = problem.exposure(part)
-        statistics = [problem.statistic(s) for s in part]
+        data = [problem.data(s) for s in part]
+        statistics = [problem.statistic(s, y) for s, y in zip(part, data, strict=True)]
         b = torch.stack([s.b for s in statistics])
         normal = network.problem(problem, b, exposure)
         with torch.no_grad():
@@ -249,7 +250,7 @@ def reconstruct_mbir(
             }  # fmt: skip
             info["warnings"] = network.check(float(normal.scale_hu[k]), float(volume.max()))
             if not part[k].noise_free:
-                tested = problem.residual_test(part[k], volume)
+                tested = problem.residual_test(part[k], volume, data[k])
                 info["residual_p"] = dict(tested.p_values)
                 info["warnings"] += tested.findings
             for text in info["warnings"]:
@@ -257,8 +258,8 @@ def reconstruct_mbir(
             if noise_map:
                 sd = network.noise_map(problem, statistic.b, exposure)
                 info["noise_sd_hu"] = sd if work is grid else average_onto(sd, work, grid)
-            data = volume if work is grid else average_onto(volume, work, grid)
-            volumes.append(Volume(data.to(torch.float32), grid, info))
+            averaged = volume if work is grid else average_onto(volume, work, grid)
+            volumes.append(Volume(averaged.to(torch.float32), grid, info))
         start = time.perf_counter()
         if progress is not None:
             progress(min(i + batch, len(scans)) / len(scans))

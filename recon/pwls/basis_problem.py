@@ -10,7 +10,7 @@ from torch import Tensor
 from recon.fbp.inset import static_fbp
 from recon.gram.gram import Gram
 from recon.pwls.joint import joint_pwls, mean_weights
-from recon.pwls.qggmrf import QGGMRF
+from recon.pwls.qggmrf import DEFAULT_PRIOR, QGGMRF
 from recon.pwls.whitening import Whitening
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import VolumeGrid
@@ -19,16 +19,11 @@ from torchpcct.scan import Scan
 from torchpcct.spectral import SpectralModel, cramer_rao, decompose_surround, inverse, vmi_weights
 from torchpcct.validate import number
 
-__all__ = ["DEFAULT_JOINT_PRIOR", "REFERENCE_KEV", "BasisProblem"]
+__all__ = ["REFERENCE_KEV", "BasisProblem"]
 
 REFERENCE_KEV = 52.0
 """The prior's gradients are in HU of the virtual monochromatic image at this energy, the best one for a necrotic core
 in Li et al.; whatever else the two basis images hold counts in units of equal noise."""
-
-DEFAULT_JOINT_PRIOR = QGGMRF(strength=0.3, threshold=16.0, relative=True)
-"""The strength of the counting-mode default, :data:`recon.pwls.inset_problem.DEFAULT_PRIOR`, with a threshold that
-follows the noise: 1200 HU/mm at 2 s and 0.2 mm voxels, 300 HU/mm at a quarter of the noise. Basis images are noisier
-than counting-mode images of the same scan; below about 1000 HU/mm at 2 s single voxels of noise pass as edges."""
 
 
 class BasisProblem:
@@ -87,7 +82,7 @@ class BasisProblem:
 
         Args:
             lines, window: decomposed line integrals, see :meth:`data`.
-            prior: None: :data:`DEFAULT_JOINT_PRIOR`.
+            prior: None: :data:`recon.pwls.qggmrf.DEFAULT_PRIOR`.
             dose: of the data relative to the model's exposure; it scales the information.
             options: ``tolerance``, ``max_exact``, ``callback`` of :func:`recon.pwls.joint.joint_pwls`.
 
@@ -99,7 +94,7 @@ class BasisProblem:
         """
         number("dose", dose, positive=True, unit="of the model's exposure")
         result = joint_pwls(
-            self.projector, self.data(lines, window), self.information * dose, prior or DEFAULT_JOINT_PRIOR,
+            self.projector, self.data(lines, window), self.information * dose, prior or DEFAULT_PRIOR,
             gram=self.gram.scaled(dose), **options,
         )  # fmt: skip
         images = self.whitening.undo(result.x) + self.level.to(lines.dtype).reshape(2, 1, 1, 1)

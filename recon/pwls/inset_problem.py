@@ -20,7 +20,7 @@ from recon.gram.gram import Gram
 from recon.pwls.field_model import FieldModel
 from recon.pwls.field_problem import is_whole_field, reconstruct_field, unfinished
 from recon.pwls.pwls import data_model, pwls
-from recon.pwls.qggmrf import QGGMRF
+from recon.pwls.qggmrf import DEFAULT_PRIOR, QGGMRF
 from recon.pwls.surround import UnknownSurround
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import VolumeGrid
@@ -28,17 +28,12 @@ from torchpcct.projector import Projector
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
 from torchpcct.volume import Volume, to_hu
 
-__all__ = ["DEFAULT_PRIOR", "InsetProblem", "Statistic", "reconstruct_pwls"]
+__all__ = ["InsetProblem", "Statistic", "reconstruct_pwls"]
 
 if TYPE_CHECKING:
     from torchpcct.metrics.residual_test import ResidualTest
 
 _LOG = logging.getLogger(__name__)
-
-DEFAULT_PRIOR = QGGMRF(strength=0.3, threshold=300.0)
-"""Noise-normalised q-GGMRF, chosen for about the resolution of FBP's soft kernel: the curvatures of data and prior
-are equal at 0.75 line pairs per mm, edges steeper than 300 HU/mm (lumen, fat) pass. A stronger prior lowers the noise
-of ROI means further, but shrinks the contrast of a millimetre-sized core: look at means and slope, not at CNR alone."""
 
 
 @dataclass(frozen=True)
@@ -179,27 +174,35 @@ class InsetProblem:
         """Line integrals of a scan on the grid's shadow, background taken off, ``(views, rows, columns)``."""
         if (scan.window or DetectorWindow.full(scan.geometry)) != self.outer or scan.geometry != self.geometry:
             raise ValueError("this scan has another geometry or window than the one the problem was made for")
-        lines = scan.line_integrals()
         if self._around is not None:
-            return self._around.take_off(lines, self.level)
-        kept = self.outer.crop(lines, self.window)
+            return self._around.take_off(scan.line_integrals(), self.level)
         if self._background is None:
-            return kept
+            return self.outer.crop(scan.line_integrals(), self.window)
         require_same_surround(scan, self._background)
-        return kept - self.window.take(self._background)
+        # Only what the inset shadows is taken the logarithm of; the bridge over dead readings needs their neighbours.
+        near = scan if scan.dead is not None or scan.window is None else scan.crop(self.window)
+        lines = near.line_integrals()
+        if near is scan:
+            lines = self.outer.crop(lines, self.window)
+        return lines - self.window.take(self._background)
 
-    def statistic(self, scan: Scan) -> Statistic:
-        """What the solvers need of a scan, with the weights of its exposure (noise free: of 1 s)."""
-        y = self.data(scan)
+    def statistic(self, scan: Scan, data: Tensor | None = None) -> Statistic:
+        """What the solvers need of a scan, with the weights of its exposure (noise free: of 1 s).
+
+        Args:
+            scan: of the family.
+            data: its :meth:`data`, where it is at hand already.
+        """
+        y = self.data(scan) if data is None else data
         weighted = self.weights * (scan.exposure_s or NOISE_FREE_EXPOSURE_S) * y
         energy = float((weighted * y).sum((-1, -2), dtype=torch.float64).sum())
         return Statistic(self.projector.T(weighted), energy, y.numel())
 
-    def residual_test(self, scan: Scan, volume: Tensor) -> ResidualTest:
+    def residual_test(self, scan: Scan, volume: Tensor, data: Tensor | None = None) -> ResidualTest:
         """Whether a volume ``(z, y, x)`` in HU explains a noisy scan, by one projection of it.
 
-        The variances are those of the counts that the volume itself predicts. Raises ``ValueError`` for a noise-free
-        scan, which no statistic describes.
+        The variances are those of the counts that the volume itself predicts. ``data`` is :meth:`data` of the scan,
+        where it is at hand already. Raises ``ValueError`` for a noise-free scan, which no statistic describes.
         """
         from torchpcct.metrics.residual_test import residual_test  # loads scipy.stats
 
@@ -208,7 +211,8 @@ class InsetProblem:
         x = (volume / 1000.0 + 1.0) * self.mu_ref - self.level
         fitted = self.projector(x.to(torch.float32))
         weights = self.weights * self.exposure([scan]) * torch.exp(-fitted)
-        return residual_test(self.data(scan) - fitted, weights, fitted, unknowns=self.grid.voxels)
+        y = self.data(scan) if data is None else data
+        return residual_test(y - fitted, weights, fitted, unknowns=self.grid.voxels)
 
     @staticmethod
     def exposure(scans: Sequence[Scan]) -> float:
@@ -263,7 +267,8 @@ def reconstruct_pwls(
         scans: realisations of one scan at one exposure.
         grid: the inset, or the field.
         progress: called with the finished fraction.
-        prior: None: :data:`DEFAULT_PRIOR`; of a whole field :func:`recon.pwls.field_problem.field_prior`.
+        prior: None: :data:`recon.pwls.qggmrf.DEFAULT_PRIOR`; of a whole field
+            :func:`recon.pwls.field_problem.field_prior`.
         problem: kept from an earlier call with the same scan and grid; None: made here.
         batch: volumes solved at a time; they iterate until the slowest has converged.
         tolerance: stop within so many HU (root mean square) of the exact minimum.

@@ -3,11 +3,12 @@
 Every entry of :data:`FAULTS` is a fault that a person could make, in one place of the source, and the test that must
 notice. The repository's packages are copied, the fault is planted in the copy, and the test runs on it, in a process
 that is forked after the slow imports. A fault that its test does not notice is printed, and the exit status is 1. First
-every test must pass on the sound copy.
+every test must pass on the sound copy. What was found is kept in ``mutation.json`` beside this file, fault by fault.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import sys
@@ -17,7 +18,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parent.parent.parent
+RESULT = Path(__file__).with_suffix(".json")
 LIMIT_S = 300
+HOW = {1: "fails", 2: "cannot be collected", 124: f"hangs ({LIMIT_S} s)"}
+"""Exit status of pytest → how a fault is noticed: a test failed; an import broke; nothing came back."""
 
 
 class Fault(NamedTuple):
@@ -35,6 +39,10 @@ _R = "tests/recon/test_no_silent_errors.py::"
 _C = "tests/recon/test_cli_refusals.py::"
 _D = "tests/torchpcct/test_defects.py::"
 _Q = "tests/torchpcct/metrics/test_residual_test.py::"
+_O = "tests/torchpcct/metrics/test_opposite_rays.py::"
+_OPP = "torchpcct/metrics/opposite_rays.py"
+_P = "tests/recon/study/test_store.py::"
+_SAME = _P + "test_finished_pieces_are_used_again_by_the_same_settings_and_source_only"
 _W = "tests/recon/fbp/test_angular_weights.py"
 _N = "tests/torchpcct/metrics/test_cnr.py::"
 _G = "torchpcct/geometry.py"
@@ -78,7 +86,8 @@ FAULTS = (
           "    finally:\n        pass", "tests/torchpcct/test_files.py"),
     Fault("write to a file's name as folder", "torchpcct/files.py", "if path.exists() and not path.is_dir():",
           "if False:", _C + "test_folders_that_cannot_be_written_are_refused"),
-    Fault("each line counts twice", _A, "return 0.5 * steps[:, None]", "return steps[:, None]", _W),
+    Fault("each line counts twice", _A, "(offset_share(gamma) if is_offset(geometry) else 0.5)",
+          "(offset_share(gamma) if is_offset(geometry) else 1.0)", _W),
     Fault("Parker's rise mirrored", _A, "rise = 2.0 * (half_fan + gamma)", "rise = 2.0 * (half_fan - gamma)", _W),
     Fault("Parker's fall mirrored", _A, "fall = math.pi + 2.0 * gamma", "fall = math.pi - 2.0 * gamma", _W),
     Fault("repeated views weigh double", _A, "share = steps / np.bincount(group, minlength=distinct.size)",
@@ -123,13 +132,13 @@ FAULTS = (
           _D + "test_starved_data_are_left_alone"),
     Fault("dead views pass", "torchpcct/defects.py", "zero.mean((1, 2)) > 0.99", "zero.mean((1, 2)) > 9",
           _D + "test_every_kind_of_defect_is_found_and_nothing_else"),
-    Fault("hot cells pass", "torchpcct/defects.py", "mask[v] = view_dead[v] | (dead | hot)[parts[v]]",
-          "mask[v] = view_dead[v] | dead[parts[v]]", _D + "test_every_kind_of_defect_is_found_and_nothing_else"),
+    Fault("hot cells pass", "torchpcct/defects.py", "lost | (dead | hot)[part]", "lost | dead[part]",
+          _D + "test_every_kind_of_defect_is_found_and_nothing_else"),
     Fault("filled from the wrong side", "torchpcct/defects.py", "share = (k - b)", "share = (a - k)",
           _D + "test_filling_is_exact_for_linear_data"),
     Fault("window ignored", "torchpcct/defects.py", "parts = [np.s_[:, c : c + columns] for c in first]",
           "parts = [np.s_[:, 0:columns] for c in first]", _D + "test_cells_are_followed_through_a_window"),
-    Fault("damaged pieces pass", "recon/study/dose_factor/store.py", "if mark and digest !=", "if False and digest !=",
+    Fault("damaged pieces pass", "recon/study/store.py", "if mark and digest !=", "if False and digest !=",
           _C + "test_damaged_pieces_are_computed_again"),
     Fault("lock held for ever", "torchpcct/projector/engine.py", "after_in_child=_renew_lock",
           "after_in_parent=_renew_lock", _C + "test_a_fork_while_another_thread_projects_does_not_hang"),
@@ -137,6 +146,22 @@ FAULTS = (
           "self.grid, self.rays.row_edge, self.rays.row_pitch, rows)",
           "self.grid, self.heights[2], self.rays.row_pitch, self.rays.rows)",
           _T + "test_a_windowed_projection_equals_the_whole_one"),
+    Fault("opposite rays of the same side", _OPP, "math.pi - (0.0 if", "math.pi + (0.0 if",
+          _O + "test_a_wrong_centre_is_found_and_measured"),
+    Fault("the centre's error upside down", _OPP, "-difference * (smooth", "difference * (smooth",
+          _O + "test_a_wrong_centre_is_found_and_measured"),
+    Fault("every pair counts twice", _OPP, "(gamma > 0) & close", "(gamma != 0) & close",
+          _O + "test_a_window_that_follows_an_inset"),
+    Fault("no tolerance of the centre", _OPP, "CENTRE_TOLERANCE = 0.1", "CENTRE_TOLERANCE = 0.0",
+          _O + "test_false_alarms_keep_their_rate"),
+    Fault("centre untested", "recon/api.py", "found = centre_warnings(s, grid)", "found: list[str] = []",
+          _R + "test_fbp_of_a_wrong_rotation_centre_is_named"),
+    Fault("pieces of other settings", "recon/study/store.py", "if found == key:", "if True:", _SAME),
+    Fault("pieces of another version", "recon/study/store.py", 'f"{settings!r} {_source()}"', 'f"{settings!r}"', _SAME),
+    Fault("pieces written in place", "recon/study/store.py", "with written_whole(path) as part:", "for part in [path]:",
+          _P + "test_kills_at_random_moments_lose_one_piece_at_most"),
+    Fault("starved scans keep the usual threshold", "recon/pwls/inset_problem.py", "if least <= DEFAULT_PRIOR.threshold:", "if True:",
+          "tests/recon/pwls/test_inset_problem.py::test_the_default_prior_follows_the_noise_of_starved_scans"),
     Fault("any number of voxels", "recon/cli/scans.py", "MOST_VOXELS = 2**31", "MOST_VOXELS = 2**200",
           _C + "test_refusals_name_value_and_remedy_and_leave_nothing"),
 )  # fmt: skip
@@ -167,8 +192,19 @@ def _run(copy: Path, tests: list[str]) -> int:
     return 124
 
 
+def _keep(fault: Fault, found: str) -> None:
+    """Put the finding of a fault into :data:`RESULT`; faults that no longer exist leave it."""
+    rows = {r["fault"]: r for r in json.loads(RESULT.read_text(encoding="utf-8"))} if RESULT.exists() else {}
+    rows[fault.name] = {"fault": fault.name, "file": fault.file, "test": fault.test, "test_then": found}
+    listed = [rows[f.name] for f in FAULTS if f.name in rows]
+    RESULT.write_text(json.dumps(listed, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
 def main(names: list[str]) -> int:
     """Plant the faults (all, or those whose names are given); 0 if all are noticed."""
+    if unknown := set(names) - {f.name for f in FAULTS}:
+        print(f"no such fault: {', '.join(sorted(unknown))}")
+        return 2
     chosen = [f for f in FAULTS if not names or f.name in names]
     # Slow imports, none of them ours, once for all forks; no thread is started yet.
     import h5py  # noqa: F401
@@ -200,10 +236,9 @@ def main(names: list[str]) -> int:
             os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
             for stale in (copy / fault.file).parent.glob(f"__pycache__/{path.stem}.cpython-*.pyc"):
                 stale.unlink()
-            # 1: a test failed; 2: an error while collecting, as of an import that breaks. Both are noticed.
-            caught = status in (1, 2, 124)
-            print(f"{'caught' if caught else 'MISSED'}  {fault.name:<36} {fault.test}", flush=True)
-            if not caught:
+            print(f"{'caught' if status in HOW else 'MISSED'}  {fault.name:<36} {fault.test}", flush=True)
+            _keep(fault, HOW.get(status, "MISSED"))
+            if status not in HOW:
                 missed.append(fault)
     print(f"{len(chosen) - len(missed)} of {len(chosen)} planted faults caught")
     return 1 if missed else 0

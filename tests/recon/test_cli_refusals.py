@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from recon.cli import main
-from recon.study.dose_factor.store import Store
+from recon.study.store import Store
 from torchpcct.files import require_writable, written_whole
 
 ROOT = Path(__file__).parent.parent.parent

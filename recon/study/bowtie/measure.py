@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from recon.study.bowtie.dose_maps import (
 from recon.study.bowtie.muscle_dose import muscle_causes
 from recon.study.bowtie.settings import Settings
 from recon.study.bowtie.slices import Images, cupping, noise, phantom_grid, phantoms, wide_scanners
+from recon.study.store import Pieces
 from recon.study.study import Clock, Progress, silent
 from torchpcct.dose import CtdiDose
 
@@ -48,15 +50,15 @@ class Measured:
 
 
 def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
-    """Dose, noise, beam hardening, and the plaque by FBP and MBIR; nothing is kept in ``folder``."""
-    s, clock = settings, Clock()
+    """Dose, noise, beam hardening, and the plaque by FBP and MBIR, in resumable pieces."""
+    s, clock, pieces = settings, Clock(), Pieces(folder, settings)
     parts: dict[str, Any] = {}
     scenes = phantoms()
 
     scanners = wide_scanners(8)
     parts["transmission"] = transmission(scanners)
     parts["ramps"] = ramp_figures(scanners, s.exposure_s)
-    ctdi = ctdi_figures(scanners, s.exposure_s, s.histories, s.seed)
+    ctdi = pieces("ctdi", partial(ctdi_figures, scanners, s.exposure_s, s.histories, s.seed))
     progress("dose", 0.3)
     parts["ctdi_ratios"] = {k: ratios(v) for k, v in ctdi.items()}
     # The CTDI phantom's map is drawn only, its doses are those in the bores: no scatter.
@@ -64,17 +66,19 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     maps = {}
     for k, (name, (spacing, histories)) in enumerate(asked.items()):
         grid = phantom_grid(name, spacing)
-        maps[name] = dose_maps(scenes[name], scanners, grid, s.exposure_s, histories, s.seed)
+        mapped = partial(dose_maps, scenes[name], scanners, grid, s.exposure_s, histories, s.seed)
+        maps[name] = pieces(f"map_{name}", mapped)
         progress("dose", 0.3 + 0.3 * (k + 1))
     parts["thorax_dose_ratio"] = thorax_ratios(maps["thorax"], scenes["thorax"])
-    parts["patient_dose_ratio"] = patient_ratio(scanners, s.exposure_s, s.histories // 2, s.seed)
+    patient = partial(patient_ratio, scanners, s.exposure_s, s.histories // 2, s.seed)
+    parts["patient_dose_ratio"] = pieces("patient", patient)
     progress("dose", 1.0)
     clock.lap("dose")
 
     scanners, seeds = wide_scanners(s.views, s.detector), range(s.seed, s.seed + s.realizations)
     found = {}
     for k, (name, scene) in enumerate(scenes.items()):
-        found[name] = noise(name, scene, scanners, s.exposure_s, s.kernel, seeds)
+        found[name] = pieces(f"noise_{name}", partial(noise, name, scene, scanners, s.exposure_s, s.kernel, seeds))
         progress("noise", (k + 1) / len(scenes))
     parts["noise"] = {name: values for name, (values, _) in found.items()}
     clock.lap("noise")
@@ -86,18 +90,18 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
 
     if s.cause_views:
         first = range(s.seed, s.seed + min(s.realizations, 2))
-        parts["noise_causes"] = noise_causes(
-            s.cause_views, s.exposure_s, s.kernel, first, lambda f: progress("causes", 0.8 * f)
+        of_noise = partial(
+            noise_causes, s.cause_views, s.exposure_s, s.kernel, first, lambda f: progress("causes", 0.8 * f)
         )
-        parts["muscle_causes"] = muscle_causes(
-            max(s.map_mm, 4.0), s.exposure_s, lambda f: progress("causes", 0.8 + 0.2 * f)
-        )
+        parts["noise_causes"] = pieces("noise_causes", of_noise)
+        of_dose = partial(muscle_causes, max(s.map_mm, 4.0), s.exposure_s, lambda f: progress("causes", 0.8 + 0.2 * f))
+        parts["muscle_causes"] = pieces("muscle_causes", of_dose)
         clock.lap("causes")
 
     step = "plaque: MBIR and ROI bowtie"
     saved: dict[str, float] = {k: 1.0 / parts["ctdi_ratios"][k]["weighted"] for k in ("plane", "total") if k in ctdi}
     parts["combined"], parts["plaque_plan"] = combine(
-        s.plaque_doses, s.plaque_realizations, s.plaque_views, s.seed, saved, lambda f: progress(step, f)
+        s.plaque_doses, s.plaque_realizations, s.plaque_views, s.seed, saved, pieces, lambda f: progress(step, f)
     )
     clock.lap(step)
     images = {name: image for name, (_, image) in found.items()}

@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,7 @@ from recon.study.paper.plaque_scan import (
 )
 from recon.study.paper.rods import RodValues, rod_values
 from recon.study.paper.tables import table_checks
+from recon.study.store import Pieces
 from recon.study.study import Clock, Progress, silent
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.geometry import VolumeGrid
@@ -96,11 +98,11 @@ class Measured:
 
 def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
     """Simulate, reconstruct, measure; see :mod:`recon.study.study`."""
-    clock = Clock()
+    clock, pieces = Clock(), Pieces(folder, settings)
     scene = plaque_scene()
     scanned = prepare(
         settings.kernels, settings.voxels_mm, scene, presets.pcct(views=settings.views),
-        paper.FULL_VIEWS["PCCT"], lambda f: progress("simulate", f),
+        paper.FULL_VIEWS["PCCT"], lambda f: progress("simulate", f), pieces,
     )  # fmt: skip
     clean, fine, fbp = scanned.clean, scanned.fine, scanned.fbp
     clock.lap("simulate")
@@ -132,22 +134,27 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
         entry["covariance_hu2_s"] = matrix.tolist()
     clock.lap("exact noise of FBP")
     if settings.placements:
-        _vary_placements(m, scanned, progress)
+        _vary_placements(m, scanned, pieces, progress)
         clock.lap("ROIs and grids elsewhere")
-    mbir = _MbirRun(m, scanned, Regions(*scene, scanned.rois), clock, progress) if settings.mbir else None
+    mbir = _MbirRun(m, scanned, Regions(*scene, scanned.rois), pieces, clock, progress) if settings.mbir else None
     pwls = InsetProblem(clean, inset_grid(scene[1], PWLS_VOXEL_MM)) if settings.pwls else None
     clock.lap("PWLS")
     for exposure in settings.doses.values():
-        scans = _realisations(m, scanned, exposure, expected, mbir, clock, progress)
+        scans: list[Scan] = []
+        draw = partial(_realisations, m, scanned, exposure, expected, mbir, scans, clock, progress)
+        means, noise, images, noisy = pieces(f"realisations/{exposure:g}s", draw)
+        m.means.update(means)
+        m.voxel_noise.update(noise)
+        m.images.update(images)
         if pwls is not None and exposure in settings.pwls_s:
-            _run_pwls(m, scanned, pwls, exposure, scans, progress)
+            _run_pwls(m, scanned, pwls, exposure, scans, pieces, progress)
             clock.lap("PWLS")
         if mbir is not None and settings.mbir_draws(exposure):
-            mbir(exposure)
+            mbir(exposure, noisy)
     return m
 
 
-def _vary_placements(m: Measured, scanned: PlaqueScan, progress: Progress) -> None:
+def _vary_placements(m: Measured, scanned: PlaqueScan, pieces: Pieces, progress: Progress) -> None:
     """Move ROIs and grid for every FBP that has a figure of the paper's tables outside its tolerance."""
     outside: dict[float, list[str]] = {}
     for e in m.noise_free[1:]:
@@ -157,7 +164,12 @@ def _vary_placements(m: Measured, scanned: PlaqueScan, progress: Progress) -> No
             outside.setdefault(e["voxel_mm"], []).append(e["kernel"])
     for done, (voxel, kernels) in enumerate(outside.items()):
         progress("ROIs and grids elsewhere", done / len(outside))
-        m.placements += vary_placement(scanned.clean, m.grids[voxel], scanned.rois, kernels)
+        vary = partial(vary_placement, scanned.clean, m.grids[voxel], scanned.rois, kernels)
+        m.placements += pieces(f"placements/{voxel:g}mm", vary)
+
+
+Drawn = tuple[dict[Key, NDArray[np.float64]], dict[Key, float], dict[tuple[str, str, float], Any], Any]
+"""Of one exposure: ``means``, ``voxel_noise`` and ``images`` of :class:`Measured`; b of every realisation, or None."""
 
 
 def _realisations(
@@ -166,18 +178,26 @@ def _realisations(
     exposure: float,
     expected: Any,
     mbir: _MbirRun | None,
+    kept: list[Scan],
     clock: Clock,
     progress: Progress,
-) -> list[Scan]:
-    """FBP of every noise realisation of an exposure, and its b for MBIR; the scans, where PWLS needs them."""
+) -> Drawn:
+    """FBP of every noise realisation of an exposure, and its b for MBIR; what PWLS needs is added to ``kept``."""
     s = m.settings
     means: dict[Key, list[tuple[float, float]]] = {}
     squares: dict[Key, float] = {}
-    kept = []
+    images: dict[tuple[str, str, float], Any] = {}
+    noisy: list[torch.Tensor] = []
     before = list(s.doses.values()).index(exposure) * s.realizations
-    for k in range(s.realizations):
+    draws = s.mbir_draws(exposure) if mbir is not None else 0
+    for k in range(max(s.realizations, draws)):
         scan = scanned.clean.with_noise(exposure, s.seed + k)
         clock.lap("noise")
+        if mbir is not None and k < draws:
+            noisy.append(mbir.problem.statistic(scan).b)
+            clock.lap("MBIR")
+        if k >= s.realizations:
+            continue
         for grid, pair, volumes, truth in zip(scanned.grids, scanned.pairs, scanned.fbp(scan), expected, strict=True):
             voxel = grid.spacing[0]
             for kernel, volume, mean in zip(s.kernels, volumes, truth, strict=True):
@@ -186,44 +206,50 @@ def _realisations(
                 squares[key] = squares.get(key, 0.0) + float(torch.mean((volume - mean) ** 2)) / s.realizations
                 means.setdefault(key, []).append((float(pair[0](volume)), float(pair[1](volume))))
                 if k == 0 and exposure == paper.table_exposure(s.doses):
-                    m.images["fbp", kernel, voxel] = volume
+                    images["fbp", kernel, voxel] = volume
         clock.lap("FBP")
-        if mbir is not None and k < s.mbir_draws(exposure):
-            mbir.take(scan)
-            clock.lap("MBIR")
         if s.pwls and exposure in s.pwls_s:
             kept.append(scan)
         progress("noise realisations, FBP", (before + k + 1) / (len(s.doses) * s.realizations))
-    if mbir is not None:
-        for k in range(s.realizations, s.mbir_draws(exposure)):
-            scan = scanned.clean.with_noise(exposure, s.seed + k)
-            clock.lap("noise")
-            mbir.take(scan)
-            clock.lap("MBIR")
-    m.means.update({key: np.array(values) for key, values in means.items()})
-    m.voxel_noise.update({key: math.sqrt(value) for key, value in squares.items()})
-    return kept
+    return (
+        {key: np.array(values) for key, values in means.items()},
+        {key: math.sqrt(value) for key, value in squares.items()},
+        images,
+        torch.stack(noisy) if noisy else None,
+    )
 
 
 def _run_pwls(
-    m: Measured, scanned: PlaqueScan, problem: InsetProblem, exposure: float, scans: Sequence[Scan], progress: Progress
+    m: Measured,
+    scanned: PlaqueScan,
+    problem: InsetProblem,
+    exposure: float,
+    scans: Sequence[Scan],
+    pieces: Pieces,
+    progress: Progress,
 ) -> None:
-    grid = problem.grid
+    s, grid = m.settings, problem.grid
     pair = scanned.rois.on(grid)
-    volumes = reconstruct(scans, grid, "pwls", problem=problem, progress=lambda f: progress("PWLS", f))
-    m.means[*PWLS, PWLS_VOXEL_MM, exposure] = np.array([[float(roi(v.data)) for roi in pair] for v in volumes])
-    m.pwls.append(
-        {
+
+    def compute() -> tuple[NDArray[np.float64], dict[str, Any], torch.Tensor]:
+        # A run that found the FBP of these realisations finished has not drawn them.
+        drawn = scans or [scanned.clean.with_noise(exposure, s.seed + k) for k in range(s.realizations)]
+        volumes = reconstruct(drawn, grid, "pwls", problem=problem, progress=lambda f: progress("PWLS", f))
+        about = {
             "voxel_mm": PWLS_VOXEL_MM,
             "exposure_s": exposure,
             "largest_rmsd_hu": max(v.report["rmsd_hu"][-1] for v in volumes),
             "seconds_per_volume": float(np.mean([v.report["seconds"] for v in volumes])),
             **volumes[0].report,
         }
-    )
-    if exposure == paper.table_exposure(m.settings.doses):
+        return np.array([[float(roi(v.data)) for roi in pair] for v in volumes]), about, volumes[0].data
+
+    means, about, first = pieces(f"pwls/{exposure:g}s", compute)
+    m.means[*PWLS, PWLS_VOXEL_MM, exposure] = means
+    m.pwls.append(about)
+    if exposure == paper.table_exposure(s.doses):
         m.grids[PWLS_VOXEL_MM] = grid
-        m.images[*PWLS, PWLS_VOXEL_MM] = volumes[0].data
+        m.images[*PWLS, PWLS_VOXEL_MM] = first
 
 
 class _MbirRun:
@@ -233,19 +259,24 @@ class _MbirRun:
         m: where results go; the exact figures of FBP and the true values are found here.
         scanned: the plaque's scan.
         regions: what is read.
-        clock, progress: of the study.
+        pieces, clock, progress: of the study.
     """
 
-    def __init__(self, m: Measured, scanned: PlaqueScan, regions: Regions, clock: Clock, progress: Progress) -> None:
+    def __init__(
+        self, m: Measured, scanned: PlaqueScan, regions: Regions, pieces: Pieces, clock: Clock, progress: Progress
+    ) -> None:
         self.m, self.clean, self.regions, self.clock, self.progress = m, scanned.clean, regions, clock, progress
+        self.pieces = pieces
         scanner = presets.pcct(views=m.settings.views)
-        absent = acquire(
-            plaque_variant("paper", core_contrast=0.0)[0], scanner, region=enclosing([*scanned.grids, scanned.fine]),
+        without_core = plaque_variant("paper", core_contrast=0.0)[0]
+        simulate = partial(
+            acquire, without_core, scanner, region=enclosing([*scanned.grids, scanned.fine]),
             duty=duty(scanner, paper.FULL_VIEWS["PCCT"]), progress=lambda f: progress("simulate without core", f),
         )  # fmt: skip
+        absent = pieces("scan_absent", simulate)
         clock.lap("simulate")
         progress("exact noise of FBP", 0.0)
-        m.reference = exact_reference(self.clean, absent, regions)
+        m.reference = pieces("reference", partial(exact_reference, self.clean, absent, regions))
         clock.lap("exact noise of FBP")
         tissues = {b.name: b.material for b in regions.scene.bodies if b.name in ("core", "fibrous")}
         m.rods = rod_values(regions.scene, scanner, regions.plaque.position, tissues=tissues)
@@ -257,26 +288,24 @@ class _MbirRun:
         self.weights = torch.stack([r.weights for r in self.rois])
         self.statistic = self.problem.statistic(self.clean).b
         self.change = self.problem.statistic(absent).b - self.statistic
-        self.noisy: list[torch.Tensor] = []
         clock.lap("MBIR")
 
-    def take(self, scan: Scan) -> None:
-        """Keep the b of a realisation."""
-        self.noisy.append(self.problem.statistic(scan).b)
-
-    def __call__(self, exposure: float) -> None:
-        """Reconstruct what was taken."""
+    def __call__(self, exposure: float, noisy: torch.Tensor) -> None:
+        """Reconstruct the draws of one exposure, from their b ``(n, z, y, x)``."""
         m, clean = self.m, self.statistic * exposure
-        control = None
-        if m.settings.control:
-            self.progress("control of MBIR", 0.0)
-            control = first_order_response(self.network, self.problem, self.weights, clean, exposure, self.clean)
-            self.clock.lap("control of MBIR")
-        draws = reconstruct_draws(
-            self.network, self.problem, self.rois, self.fat, torch.stack(self.noisy), self.change * exposure, exposure,
-            control, lambda f: self.progress("MBIR", f),
-        )  # fmt: skip
-        self.noisy.clear()
+
+        def compute() -> Draws:
+            control = None
+            if m.settings.control:
+                self.progress("control of MBIR", 0.0)
+                control = first_order_response(self.network, self.problem, self.weights, clean, exposure, self.clean)
+                self.clock.lap("control of MBIR")
+            return reconstruct_draws(
+                self.network, self.problem, self.rois, self.fat, noisy, self.change * exposure, exposure, control,
+                lambda f: self.progress("MBIR", f),
+            )  # fmt: skip
+
+        draws = self.pieces(f"mbir/{exposure:g}s", compute)
         self.clock.lap("MBIR")
         m.draws[exposure] = draws
         voxel = self.grid.spacing[0]

@@ -47,8 +47,8 @@ from recon.study.dose_factor.settings import (
 )
 from recon.study.dose_factor.shape_limit import shape_limits
 from recon.study.dose_factor.stability import worst_case_gains
-from recon.study.dose_factor.store import Store
 from recon.study.dose_factor.vessels import VesselPlace
+from recon.study.store import Store
 from recon.study.study import Clock, Progress, silent
 
 __all__ = ["Measured", "measure"]

@@ -13,7 +13,7 @@ from recon.fbp.inset import InsetFbp
 from recon.study.dose_factor.measures import crop_window
 from recon.study.dose_factor.scene import StudyScene
 from recon.study.dose_factor.settings import FBP_BASE, Settings
-from recon.study.dose_factor.store import Store
+from recon.study.store import Store
 from torchpcct.scan import Scan
 
 __all__ = ["NOISY_SCENE", "Realisations", "joined"]

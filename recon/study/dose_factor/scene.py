@@ -18,12 +18,12 @@ from recon.fbp.exact_noise import FILTER_MARGIN_COLUMNS
 from recon.pwls.inset_problem import InsetProblem
 from recon.study.dose_factor.exact_fbp import exact_fbp
 from recon.study.dose_factor.settings import FBP_BASE, Settings
-from recon.study.dose_factor.store import Store
 from recon.study.dose_factor.tissue_values import least_squares
 from recon.study.dose_factor.variant import Variant
 from recon.study.paper.facts import FULL_VIEWS
 from recon.study.paper.plaque_scan import REFERENCE_VOXEL_MM, duty, enclosing
 from recon.study.paper.rods import rod_values
+from recon.study.store import Store
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.scan import Scan

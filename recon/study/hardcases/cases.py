@@ -95,6 +95,39 @@ def _drift(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
     return replace(scan, counts=torch.round(scan.counts * gain))
 
 
+def _million(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
+    assert scan.exposure_s is not None
+    return clean.with_noise(scan.exposure_s * 1e6, scan.seed or 0)
+
+
+def _harder(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
+    """2 keV more: water attenuates 1.2 % less at 64 keV than at 62 keV."""
+    air = scan._at_window(scan.air)
+    return replace(scan, counts=torch.round(air * (scan.counts / air) ** 0.988))
+
+
+def _bowtie(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
+    """The bowtie three columns (1 mm on the detector) beside where it was in the air calibration."""
+    return replace(scan, counts=torch.round(scan.counts * scan._at_window(scan.air.roll(3, -1) / scan.air)))
+
+
+def _moving(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
+    """Everything but its surround swings by six columns (1.2 mm) to either side, once in a turn."""
+    assert scan.surround is not None
+    still = scan._at_window(scan.surround)
+    shifts = np.round(6 * np.sin(scan.geometry.angles)).astype(int).tolist()
+    moved = torch.stack([ratio.roll(k, -1) for ratio, k in zip(scan.counts / still, shifts, strict=True)])
+    return replace(scan, counts=torch.round(moved * still))
+
+
+def _narrow(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
+    """Only the middle eighth of the columns around the inset was kept."""
+    assert scan.window is not None
+    w = scan.window
+    columns = w.columns // 8
+    return scan.crop(replace(w, first_column=w.first_column + (w.columns - columns) // 2, columns=columns))
+
+
 def _hundredth(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
     assert scan.exposure_s is not None
     return clean.with_noise(scan.exposure_s / 100, scan.seed or 0)
@@ -117,6 +150,7 @@ def _without(gaps: tuple[tuple[float, float], ...]) -> Callable[[int], np.ndarra
 CASES: dict[str, Case] = {
     "sound": Case("nothing", lambda clean, scan, rng: scan),
     "dose-100th": Case("1/100 of the dose", _hundredth, 10.0),
+    "dose-million": Case("a million times the dose", _million, 2**0.5),
     "lost-0.1": _lost(0.001),
     "lost-1": _lost(0.01),
     "lost-10": _lost(0.1),
@@ -140,6 +174,10 @@ CASES: dict[str, Case] = {
     "centre-0.5": _centre(0.5),
     "centre-1": _centre(1.0),
     "centre-2": _centre(2.0),
+    "motion": Case("strong motion", _moving),
+    "spectrum": Case("spectrum off by 2 keV", _harder),
+    "bowtie": Case("bowtie 1 mm beside its calibration", _bowtie),
+    "truncated": Case("columns cut off inside of the inset's shadow", _narrow),
     "gain-drift": Case("gain drifts by 1 %", _drift),
 }
 """Name → case. A new one needs nothing but its entry here."""

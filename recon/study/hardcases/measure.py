@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ import torch
 from recon import reconstruct
 from recon.study.hardcases.cases import CASES
 from recon.study.hardcases.settings import Settings
+from recon.study.store import Pieces
 from recon.study.study import Clock, Progress, silent
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.geometry import VolumeGrid
@@ -65,7 +67,7 @@ def verdict(error_hu: float | None, noise_hu: float, finite: bool, said: list[st
 
 def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
     """Reconstruct every case by every method; see :mod:`recon.study.study`."""
-    clock = Clock()
+    clock, pieces = Clock(), Pieces(folder, settings)
     scene, plaque = plaque_scene(vessel_length=_GRID_MM[0] - 0.2)
     scanner = presets.pcct(views=settings.views)
     scanner = scanner.replace(geometry=replace(scanner.geometry, rows=_ROWS))
@@ -73,19 +75,33 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     grid = VolumeGrid(shape, settings.voxel_mm, plaque.position[::-1])
     region = VolumeGrid((1, 1, 1), _GRID_MM, plaque.position[::-1])
     duty = settings.views / presets.PCCT_VIEWS
-    clean = acquire(scene, scanner, region=region, duty=min(duty, 1.0), progress=lambda f: progress("simulate", f))
+
+    def simulate() -> Scan:
+        return acquire(scene, scanner, region=region, duty=min(duty, 1.0), progress=lambda f: progress("simulate", f))
+
+    clean = pieces("scan", simulate)
     noisy = clean.with_noise(settings.exposure_s, settings.seed)
     clock.lap("simulate")
-    volumes = {m: reconstruct(noisy, grid, m) for m in settings.methods}
-    sound = {m: v.data for m, v in volumes.items()}
-    usual = {m: {_kind(text) for text in v.report.get("warnings", ())} for m, v in volumes.items()}
-    noise = {m: _rms(sound[m] - reconstruct(clean, grid, m).data) for m in settings.methods}
+    sound, usual, noise = {}, {}, {}
+    for m in settings.methods:
+
+        def both(m: str = m) -> tuple[torch.Tensor, list[str], float]:
+            volume = reconstruct(noisy, grid, m)
+            return (
+                volume.data,
+                list(volume.report.get("warnings", ())),
+                _rms(volume.data - reconstruct(clean, grid, m).data),
+            )
+
+        sound[m], texts, noise[m] = pieces(f"sound/{m}", both)
+        usual[m] = {_kind(text) for text in texts}
     clock.lap("sound scan")
     rows = []
     for k, name in enumerate(settings.cases):
         scan = CASES[name].apply(clean, noisy, np.random.default_rng(settings.seed))
         for method in settings.methods:
-            row = _row(scan, grid, method, sound[method], noise[method], usual[method], CASES[name].noise)
+            run = partial(_row, scan, grid, method, sound[method], noise[method], usual[method], CASES[name].noise)
+            row = pieces(f"{name}/{method}", run)
             rows.append({"case": name, "title": CASES[name].title, "method": method, **row})
         progress("cases", (k + 1) / len(settings.cases))
     clock.lap("cases")

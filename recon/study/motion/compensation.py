@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from torch import Tensor
@@ -13,6 +14,7 @@ from recon.pwls.inset_problem import InsetProblem, reconstruct_pwls
 from recon.study.motion.observed import Observed, Reference, observe
 from recon.study.motion.settings import Settings
 from recon.study.paper.plaque_scan import REFERENCE_KERNEL
+from recon.study.store import Pieces
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
 
@@ -35,12 +37,13 @@ def reconstruct_fbp(scan: Scan, grid: VolumeGrid, motion: Any = None) -> Tensor:
 
 
 def compensate(
-    s: Settings, still: Scan, moving: Scan, reference: Reference, progress: Callable[[float], None]
+    s: Settings, still: Scan, moving: Scan, reference: Reference, pieces: Pieces, progress: Callable[[float], None]
 ) -> dict[Key, list[Observed]]:
     """Reconstruct the noise-free scans of the still and of the moving vessel and their noisy realisations.
 
     PWLS, whose solution is to be certified by exact projections, is run without noise and for the first noise
-    realisation, at rest and with the true motion; FBP and MBIR with every estimate of the motion.
+    realisation, at rest and with the true motion; FBP and MBIR with every estimate of the motion. Every volume is kept
+    in ``pieces``.
 
     Returns:
         One entry per realisation.
@@ -74,7 +77,8 @@ def compensate(
             for error in estimates:
                 if method == "pwls" and (k > 1 or error):
                     continue
-                volume = reconstruct(method, scans[error is not None], error)
+                run = partial(reconstruct, method, scans[error is not None], error)
+                volume = pieces(f"{method}_{error}_{seed}", run)
                 if seed is None and error is None:
                     rest[method] = volume
                 found.setdefault((method, error, seed is not None), []).append(observe(volume, reference, rest[method]))

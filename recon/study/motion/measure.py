@@ -16,6 +16,7 @@ from recon.study.motion.observed import Observed, Reference, observe
 from recon.study.motion.settings import Settings
 from recon.study.paper import facts as paper
 from recon.study.paper.plaque_scan import SCANNERS, duty, inset_grid
+from recon.study.store import Pieces
 from recon.study.study import Clock, Progress, silent
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.scan import Scan
@@ -53,22 +54,24 @@ class Measured:
 
 
 def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
-    """Simulate and reconstruct residual motion in both scanners, and compensate the PCCT's; keeps no pieces."""
-    clock = Clock()
+    """Simulate and reconstruct residual motion in both scanners, and compensate the PCCT's, in resumable pieces."""
+    clock, pieces = Clock(), Pieces(folder, settings)
     m = Measured(settings, seconds=clock.seconds)
     scene, plaque = plaque_scene()
     reference = Reference.of(scene, plaque, inset_grid(plaque, settings.voxel_mm))
     for name in SCANNERS:
         with clock.step(f"{name}, residual motion"):
-            still, moving = _residual(m, name, reference, progress)
+            still, moving = _residual(m, name, reference, pieces.within(name), progress)
         if name == "PCCT":
             m.plan = dict(moving.info["plan"])
             with clock.step("compensation"):
-                m.compensated = compensate(settings, still, moving, reference, partial(progress, "compensation"))
+                m.compensated = compensate(
+                    settings, still, moving, reference, pieces.within("compensation"), partial(progress, "compensation")
+                )
     return m
 
 
-def _residual(m: Measured, name: str, reference: Reference, progress: Progress) -> tuple[Scan, Scan]:
+def _residual(m: Measured, name: str, reference: Reference, pieces: Pieces, progress: Progress) -> tuple[Scan, Scan]:
     """Images with residual motion; returns the scans at rest and of the largest motion."""
     s, grid = m.settings, reference.grid
     scanner = SCANNERS[name](paper.FULL_VIEWS[name] // s.thinning)
@@ -76,7 +79,8 @@ def _residual(m: Measured, name: str, reference: Reference, progress: Progress) 
 
     def simulate(fraction: float) -> Scan:
         scene = plaque_scene(motion=s.motion.scaled(fraction))[0]
-        return acquire(scene, scanner, region=grid, rotation_s=s.rotation_s, duty=on)
+        run = partial(acquire, scene, scanner, region=grid, rotation_s=s.rotation_s, duty=on)
+        return pieces(f"scan_{fraction:g}", run)
 
     still = moving = simulate(0.0)
     rest = reconstruct_fbp(still, grid)

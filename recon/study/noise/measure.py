@@ -25,6 +25,7 @@ from recon.study.paper.plaque_scan import (
     prepare,
     roi_entry,
 )
+from recon.study.store import Pieces
 from recon.study.study import Clock, Progress, silent
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
@@ -36,6 +37,8 @@ __all__ = ["Measured", "measure"]
 _AVERAGED_FROM_MM = 0.30
 """Voxel size from which averaging over the voxel is looked at."""
 
+_BLOCK = 40
+"""Realisations of a piece."""
 _SQUARES = 4
 """Realisations per dose of which every reading's squared deviation is summed: 10⁶ independent readings pin the variance
 of an ROI mean down to some 0.1 %, which a few hundred ROI means do not."""
@@ -97,11 +100,11 @@ class Measured:
 
 
 def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
-    """Simulate, take exact moments, draw realisations, reconstruct a few in full; keeps no pieces."""
-    clock = Clock()
+    """Simulate, take exact moments, draw realisations, reconstruct a few in full, in resumable pieces."""
+    clock, pieces = Clock(), Pieces(folder, settings)
     scene = plaque_scene()
     scanner, full = presets.pcct(views=settings.views), FULL_VIEWS["PCCT"]
-    scanned = prepare(settings.kernels, settings.voxels_mm, scene, scanner, full, partial(progress, "simulate"))
+    scanned = prepare(settings.kernels, settings.voxels_mm, scene, scanner, full, partial(progress, "simulate"), pieces)
     clean = scanned.clean
     clock.lap("simulate")
     fine = InsetFbp(clean, [scanned.fine], [REFERENCE_KERNEL])(clean)[0][0]
@@ -114,12 +117,13 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     near, matrix = clean.crop(adjoints.window), adjoints.matrix
     del adjoints
     clock.lap("exact noise")
-    means, variances = _realisations(settings, near, matrix, expected, progress)
+    means, variances = _realisations(settings, near, matrix, expected, pieces, progress)
     clock.lap("noise realisations")
     sd = np.sqrt(np.diag(covariance) / settings.table_exposure_s).reshape(expected.shape)
-    images, check = _reconstructions(settings, scanned, means[settings.table_exposure_s], sd, progress)
+    full_runs = partial(_reconstructions, settings, scanned, means[settings.table_exposure_s], sd, progress)
+    images, check = pieces("full_reconstructions", full_runs)
     clock.lap("full reconstructions")
-    averaging = _averaging(scanned, settings.kernels)
+    averaging = pieces("averaging", partial(_averaging, scanned, settings.kernels))
     clock.lap("averaging voxels")
     eid = equal_dose_rows(settings, scene, expected, covariance, progress) if settings.eid else []
     clock.lap("EID-CT")
@@ -130,7 +134,7 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
 
 
 def _realisations(
-    settings: Settings, near: Scan, matrix: Tensor, expected: Any, progress: Progress
+    settings: Settings, near: Scan, matrix: Tensor, expected: Any, pieces: Pieces, progress: Progress
 ) -> tuple[dict[float, Any], dict[float, Any]]:
     """ROI means of every realisation, and their variances from the readings; see :class:`Measured`.
 
@@ -143,17 +147,23 @@ def _realisations(
     means: dict[float, Any] = {}
     variances: dict[float, Any] = {}
     total = len(settings.doses) * settings.realizations
+    n = settings.realizations
     for exposure in settings.doses.values():
-        values = np.empty((settings.realizations, *expected.shape))
-        squares = np.zeros(matrix.shape[0])
-        for i in range(settings.realizations):
-            deviation = near.with_noise(exposure, settings.seed + i).line_integrals().flatten() - quiet
-            values[i] = expected + (matrix @ deviation).double().numpy().reshape(expected.shape)
-            if i < _SQUARES:
-                for row, h in enumerate(matrix):
-                    squares[row] += float((h * deviation).square().sum(dtype=torch.float64)) / _SQUARES
-            progress("noise realisations", (len(means) * settings.realizations + i + 1) / total)
-        means[exposure], variances[exposure] = values, squares
+
+        def block(first: int, exposure: float = exposure) -> tuple[Any, Any]:
+            values, squares = [], np.zeros(matrix.shape[0])
+            for i in range(first, min(first + _BLOCK, n)):
+                deviation = near.with_noise(exposure, settings.seed + i).line_integrals().flatten() - quiet
+                values.append(expected + (matrix @ deviation).double().numpy().reshape(expected.shape))
+                if i < _SQUARES:
+                    for row, h in enumerate(matrix):
+                        squares[row] += float((h * deviation).square().sum(dtype=torch.float64)) / _SQUARES
+                progress("noise realisations", (len(means) * n + i + 1) / total)
+            return np.array(values), squares
+
+        found = [pieces(f"realisations/{exposure:g}s_{k}", partial(block, k)) for k in range(0, n, _BLOCK)]
+        means[exposure] = np.concatenate([values for values, _ in found])
+        variances[exposure] = np.sum([squares for _, squares in found], axis=0)
     return means, variances
 
 

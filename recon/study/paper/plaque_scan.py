@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.fbp.inset import InsetFbp
+from recon.study.store import Pieces
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.placement import RoiPair, place_rois
@@ -119,6 +120,7 @@ def prepare(
     scanner: Scanner,
     full_views: int,
     progress: Callable[[float], None] | None = None,
+    pieces: Pieces | None = None,
 ) -> PlaqueScan:
     """Simulate the noise-free scan of a plaque and place grids and ROIs.
 
@@ -128,6 +130,7 @@ def prepare(
         scanner: with the number of views to simulate.
         full_views: views of the complete scan, see :func:`duty`.
         progress: called with the finished fraction of the simulation.
+        pieces: keep the scan.
 
     Raises:
         ValueError: ROIs that come out empty; an inset outside the field of view.
@@ -137,7 +140,9 @@ def prepare(
     fine = inset_grid(plaque, REFERENCE_VOXEL_MM)
     rois = place_rois(bodies, axial_grid(fine.center))
     region = enclosing([*grids, fine])
-    clean = acquire(bodies, scanner, region=region, duty=duty(scanner, full_views), progress=progress)
+    on = duty(scanner, full_views)
+    keep = pieces or Pieces(None, None)
+    clean = keep("scan", lambda: acquire(bodies, scanner, region=region, duty=on, progress=progress))
     return PlaqueScan(clean, fine, grids, [rois.on(g) for g in grids], rois, InsetFbp(clean, grids, kernels))
 
 

@@ -31,6 +31,7 @@ from recon.study.paper.plaque_scan import (
 from recon.study.resolution.blur import FWHM_PER_SIGMA, Blurred, blur_series
 from recon.study.resolution.settings import Settings
 from recon.study.resolution.wire import SystemWidth, wire_width
+from recon.study.store import Pieces
 from recon.study.study import Clock, Progress, silent
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.geometry import VolumeGrid
@@ -135,30 +136,36 @@ class Measured:
 
 
 def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
-    """Simulate, blur, segment, measure; keeps no pieces."""
-    clock = Clock()
+    """Simulate, blur, segment, measure, in resumable pieces."""
+    clock, pieces = Clock(), Pieces(folder, settings)
     scene, plaque = plaque_scene()
     scanners: dict[str, Imaged] = {}
     for name in SCANNERS:
-        scanners[name] = _image(name, (scene, plaque), settings, partial(progress, name))
+        scanners[name] = _image(name, (scene, plaque), settings, pieces.within(name), partial(progress, name))
         clock.lap(name)
     variants: dict[float, tuple[float, list[Blurred]]] = {}
     bulges = sorted({plaque.bulge, *settings.bulges_mm})
     for bulge in bulges:
-        variants[bulge] = _variant(bulge, settings)
+        variants[bulge] = pieces(f"bulge_{bulge:g}", partial(_variant, bulge, settings))
         progress("variants", len(variants) / len(bulges))
     smoothed = _smooth(scanners["PCCT"], scanners["EID-CT"])
     clock.lap("variants")
     return Measured(settings, plaque, scanners, variants, *smoothed, clock.seconds)
 
 
-def _image(name: str, bodies: tuple[Scene, Plaque], settings: Settings, progress: Callable[[float], None]) -> Imaged:
+def _image(
+    name: str,
+    bodies: tuple[Scene, Plaque],
+    settings: Settings,
+    pieces: Pieces,
+    progress: Callable[[float], None],
+) -> Imaged:
     scene, plaque = bodies
     scanner = SCANNERS[name](FULL_VIEWS[name] // settings.thinning)
     on, exposure_s = duty(scanner, FULL_VIEWS[name]), settings.exposure_s * equal_dose(scanner)
-    scanned = prepare([REFERENCE_KERNEL], [REFERENCE_VOXEL_MM], bodies, scanner, FULL_VIEWS[name], progress)
+    scanned = prepare([REFERENCE_KERNEL], [REFERENCE_VOXEL_MM], bodies, scanner, FULL_VIEWS[name], progress, pieces)
     volume = scanned.fbp(scanned.clean)[0][0]
-    empty = _middle_slices(plaque_scene(core_contrast=0.0)[0], plaque, scanner, on)
+    empty = pieces("empty", lambda: _middle_slices(plaque_scene(core_contrast=0.0)[0], plaque, scanner, on))
     truth = Truth.of(scene, plaque)
     axial = sample_axial(volume.double(), scanned.fine, truth.image)[0]
     return Imaged(
@@ -167,7 +174,7 @@ def _image(name: str, bodies: tuple[Scene, Plaque], settings: Settings, progress
         empty,
         exposure_s,
         _roi_figures(scanned, volume, empty, exposure_s, lambda roi: roi),
-        wire_width(scanner, plaque.position[:2], REFERENCE_KERNEL, duty=on),
+        pieces("wire", lambda: wire_width(scanner, plaque.position[:2], REFERENCE_KERNEL, duty=on)),
         blur_series(axial, truth, settings.sigmas_px if name == "PCCT" else settings.sigmas_px[:1]),
     )
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +24,13 @@ import torch
 from torch import Tensor
 
 from recon.fbp.exact_noise import functional_covariance
-from recon.pwls.basis_problem import DEFAULT_JOINT_PRIOR, BasisProblem
+from recon.pwls.basis_problem import BasisProblem
+from recon.pwls.qggmrf import DEFAULT_PRIOR
 from recon.study.spectral.calibration import calibration_costs
 from recon.study.spectral.scan import SpectralScan, second_order_bound, starved_rays, water_hu
 from recon.study.spectral.settings import Settings
 from recon.study.spectral.tissues import RULES, Tissues
+from recon.study.store import Pieces
 from recon.study.study import Clock, Progress, silent
 from torchpcct.spectral import MMD_TISSUES, VMI_ENERGIES_KEV, VmiCurve, vmi, vmi_curve
 
@@ -75,29 +78,36 @@ class Measured:
 
 
 def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
-    """Scan, decompose, reconstruct, label; nothing is kept in ``folder``."""
+    """Scan, decompose, reconstruct, label, in resumable pieces."""
     s, clock, spent = settings, Clock(), time.process_time()
+    pieces = Pieces(folder, settings)
 
     def done(step: str) -> None:
         clock.lap(step)
         progress(step, 1.0)
 
-    scan = SpectralScan(s, lambda fraction: progress("simulate", fraction))
+    scan = SpectralScan(s, lambda fraction: progress("simulate", fraction), pieces=pieces)
     data: dict[str, Any] = {"plan": scan.clean.info["plan"]}
     done("simulate")
     clean = scan.fbp.images(scan.exact.line_integrals)[0][0]
-    data["second_order_bound"] = second_order_bound(scan, LOW_EXPOSURE_S)
-    data["starved"] = starved_rays(scan, s.starved_rays, s.seed)
-    data["water"] = {k: v.tolist() for k, v in water_hu(VMI_ENERGIES_KEV, s.views).items()}
+    data["second_order_bound"] = pieces("bound", partial(second_order_bound, scan, LOW_EXPOSURE_S))
+    data["starved"] = pieces("starved", partial(starved_rays, scan, s.starved_rays, s.seed))
+    data["water"] = {k: v.tolist() for k, v in pieces("water", partial(water_hu, VMI_ENERGIES_KEV, s.views)).items()}
     done("water and starved rays")
     lines, volumes, data["rays"] = [], [], []
     for k in range(s.realizations):
-        noisy, statistics = scan.noisy(s.exposure_s, s.seed + k)
+
+        def draw(k: int = k) -> tuple[Tensor, list[Tensor], dict[str, Any]]:
+            noisy, statistics = scan.noisy(s.exposure_s, s.seed + k)
+            return scan.fbp.images(noisy)[0][0], [noisy] if k < s.mbir_realizations else [], statistics
+
+        volume, used, statistics = pieces(f"noisy_{k}", draw)
         data["rays"].append(statistics)
-        volumes.append(scan.fbp.images(noisy)[0][0])
-        lines += [noisy] if k < s.mbir_realizations else []
+        volumes.append(volume)
+        lines += used
         progress("decompose noisy scans", (k + 1) / (s.realizations + 1))
-    data["rays"].append(scan.noisy(LOW_EXPOSURE_S, s.seed, _LOW_EXPOSURE_STEP)[1])
+    low = pieces("noisy_low", lambda: scan.noisy(LOW_EXPOSURE_S, s.seed, _LOW_EXPOSURE_STEP)[1])
+    data["rays"].append(low)
     images = Images(clean, torch.stack(volumes))
     done("decompose noisy scans")
     data["vmi"] = _vmi(scan, images)
@@ -111,10 +121,11 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     }
     done("tissue maps")
     if lines:
-        data["mbir"], data["dice"]["joint MBIR"] = _mbir(scan, tissues, lines, images, data["vmi"], progress)
+        data["mbir"], data["dice"]["joint MBIR"] = _mbir(scan, tissues, lines, images, data["vmi"], pieces, progress)
         done("joint MBIR")
     if s.calibration_views:
-        data["calibration"] = calibration_costs(s, tissues, lambda fraction: progress("wrong calibrations", fraction))
+        costs = partial(calibration_costs, s, tissues, lambda fraction: progress("wrong calibrations", fraction))
+        data["calibration"] = pieces("calibration", costs)
         clock.lap("wrong calibrations")
     return Measured(s, data, scan, tissues, images, clock.seconds, time.process_time() - spent)
 
@@ -176,7 +187,7 @@ def _at_energy(scan: SpectralScan, images: Tensor, energy: float) -> dict[str, f
 
 def _mbir(
     scan: SpectralScan, tissues: Tissues, lines: list[Tensor], images: Images, curves: dict[str, Any],
-    progress: Progress,
+    pieces: Pieces, progress: Progress,
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:  # fmt: skip
     """Joint MBIR at every noise level, and its scores; volumes of the first realisation go to ``images``."""
     s = scan.settings
@@ -187,8 +198,10 @@ def _mbir(
     for level in s.noise_levels:
         # Data without noise take the weights of the lowest noise: it is the prior that changes them.
         dose, found = s.exposure_s / (level or lowest) ** 2, []
-        for noisy in lines if level else lines[:1]:
-            volume, report = problem.solve(clean + level * (noisy - clean), scan.window, dose=dose, tolerance=1.0)
+        for k, noisy in enumerate(lines if level else lines[:1]):
+            data = clean + level * (noisy - clean)
+            solve = partial(problem.solve, data, scan.window, dose=dose, tolerance=1.0)
+            volume, report = pieces(f"mbir_{level:g}_{k}", solve)
             found.append(volume)
             reports.append({"noise": level, **report})
             progress("joint MBIR", len(reports) / steps)
@@ -200,7 +213,7 @@ def _mbir(
     return {
         "anisotropy": problem.anisotropy,
         "whitening": problem.whitening.forward.tolist(),
-        "prior": asdict(DEFAULT_JOINT_PRIOR),
+        "prior": asdict(DEFAULT_PRIOR),
         "solves": reports,
         "at_best_energy": values,
     }, scores

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numba
@@ -17,6 +17,7 @@ from torch import Tensor
 from recon.fbp.inset import InsetFbp, static_fbp
 from recon.study.paper.plaque_scan import duty, inset_grid
 from recon.study.spectral.settings import Settings
+from recon.study.store import Pieces
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import VolumeGrid
@@ -70,6 +71,7 @@ class SpectralScan:
         detector: another one than the preset's.
         full_views: of the complete scan that ``settings.views`` stand for, each with its turn of the gantry; None: the
             scan has no more.
+        pieces: keep the noise-free scan and its decomposition.
 
     Attributes:
         scene, plaque, scanner: what is scanned.
@@ -81,13 +83,15 @@ class SpectralScan:
     def __init__(
         self, settings: Settings, progress: Callable[[float], None] | None = None,
         detector: SiliconDetector | None = None, full_views: int | None = None,
+        pieces: Pieces | None = None,
     ) -> None:  # fmt: skip
-        self.settings = settings
+        self.settings, self._pieces = settings, pieces or Pieces(None, None)
         self.scene, self.plaque = plaque_scene()
         self.scanner = presets.pcct(views=settings.views, mode="spectral", detector=detector)
         on = 1.0 if full_views is None else duty(self.scanner, full_views)
         self.grid = inset_grid(self.plaque, settings.voxel_mm)
-        self.clean, self.window = _acquired(self.scene, self.scanner, self.grid, progress, on)
+        run = partial(_acquired, self.scene, self.scanner, self.grid, progress, on)
+        self.clean, self.window = self._pieces("scan", run)
         self.basis = SpectralModel.of(self.scanner, NOISE_FREE_EXPOSURE_S).basis
         self.rois = place_rois(self.scene, axial_grid(self.grid.center))
 
@@ -99,7 +103,8 @@ class SpectralScan:
     def exact(self) -> Decomposition:
         """Decomposition of the expected counts: true line integrals; information of :data:`NOISE_FREE_EXPOSURE_S`."""
         # Newton's method squares the error in every step: after one of 1e-3 standard deviations 1e-6 are left.
-        return decompose_scan(self.clean, self.model(NOISE_FREE_EXPOSURE_S), tolerance=1e-3)
+        run = partial(decompose_scan, self.clean, self.model(NOISE_FREE_EXPOSURE_S), tolerance=1e-3)
+        return self._pieces("exact", run)
 
     @cached_property
     def surround(self) -> Tensor:

@@ -79,3 +79,14 @@ def test_progress_reaches_one(clean, problem):
         progress=seen.append,
     )  # fmt: skip
     assert seen == [pytest.approx(2 / 3), 1.0]
+
+
+def test_the_default_prior_follows_the_noise(clean, problem):
+    """A hundredth of the dose: 10 times the noise; a threshold in HU/mm would let single voxels pass as edges (21)."""
+    found, thresholds = {}, {}
+    for exposure in (2.0, 0.02):
+        volume = reconstruct(clean.with_noise(exposure, 0), GRID, "pwls", problem=problem, tolerance=3.0)
+        found[exposure] = float((volume.data - volume.data.mean()).std())
+        thresholds[exposure] = volume.report["threshold_hu_per_mm"]
+    assert thresholds[0.02] == pytest.approx(10 * thresholds[2.0], rel=1e-3)
+    assert found[0.02] < 14 * found[2.0]

@@ -31,8 +31,8 @@ from recon.study.dose_factor.response import first_order_response
 from recon.study.dose_factor.scene import StudyScene
 from recon.study.dose_factor.seen import Seen
 from recon.study.dose_factor.settings import MAIN_SCENES, ROIS, Settings
-from recon.study.dose_factor.store import Store
 from recon.study.dose_factor.vessels import VesselPlace
+from recon.study.store import Store
 from torchpcct.metrics import RegionNoise
 
 TINY = Settings(**SMALLEST["dose-factor"])

@@ -13,9 +13,9 @@ from recon.study.dose_factor.methods import (
     load_methods,
 )
 from recon.study.dose_factor.settings import METHODS, Settings
-from recon.study.dose_factor.store import Store
 from recon.study.dose_factor.tissue_values import tissue_groups
 from recon.study.dose_factor.variant import Variant
+from recon.study.store import Store
 from torchpcct import VolumeGrid
 
 TINY = Settings(**SMALLEST["dose-factor"])

@@ -1,0 +1,200 @@
+"""Finished pieces of a study on disk: each appears whole or not at all, and is reused by the next run."""
+
+from __future__ import annotations
+
+import copy
+import functools
+import hashlib
+import importlib
+import json
+import logging
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import numpy as np
+import torch
+
+from torchpcct.files import VERSION, written_whole
+
+__all__ = ["Pieces", "Store", "packed", "unpacked"]
+
+log = logging.getLogger(__name__)
+
+
+_MARK = "\nSHA-256 "
+"""Parts the key from the checksum of the arrays. Pieces of earlier versions have none, and are taken as they are."""
+
+
+def _digest(key: str, arrays: Mapping[str, Any]) -> str:
+    total = hashlib.sha256(key.encode())
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        total.update(f"{name} {array.dtype.str} {array.shape};".encode())
+        total.update(array.tobytes())
+    return total.hexdigest()
+
+
+class Store:
+    """A folder of ``.npz`` files, each with the key (settings, parameters) that it was made with.
+
+    Args:
+        folder: made if need be.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def path(self, name: str) -> Path:
+        """A file's path; its folder is made if need be."""
+        path = self.folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path
+
+    def piece(self, name: str, key: str, compute: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        """The arrays of a piece: read if it was finished with the same key, else computed and written.
+
+        Args:
+            name: path in the folder, without ending.
+            key: everything that the piece depends on.
+            compute: gives the arrays.
+        """
+        path = self.path(name + ".npz")
+        if path.exists():
+            try:
+                with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
+                    arrays = {k: file[k] for k in file.files if k != "key"}
+                    found, mark, digest = str(file["key"]).partition(_MARK)
+                if mark and digest != _digest(found, arrays):
+                    raise ValueError("its content does not have its checksum")
+                if found == key:
+                    return arrays
+                log.info("%s was made with other settings: computed again", path)
+            except Exception as error:  # a damaged archive can fail in any way
+                log.warning("%s cannot be read (%s): computed again", path, error)
+        arrays = compute()
+        self.path(name)  # again: computing took long enough for someone to tidy up
+        with written_whole(path) as part:
+            np.savez(part, key=np.array(key + _MARK + _digest(key, arrays)), **arrays)
+        return arrays
+
+
+T = TypeVar("T")
+
+
+class Pieces:
+    """Finished parts of one study, of whatever kind, so that the same command goes on after an interruption.
+
+    A piece is used again only with the same settings and the same source (and weights): a result never mixes two
+    versions of this software. Unlike those of a :class:`Store` that a study fills on purpose, they are of no use once
+    the report stands: :meth:`clear` takes them away.
+
+    Args:
+        folder: of the study's results, where they lie in ``pieces``; None: nothing is kept.
+        settings: of the study, a dataclass.
+    """
+
+    FOLDER = "pieces"
+
+    def __init__(self, folder: str | Path | None, settings: Any) -> None:
+        self._store = None if folder is None else Store(Path(folder) / self.FOLDER)
+        self._key = "" if folder is None else f"{settings!r} {_source()}"
+        self._prefix = ""
+
+    def __call__(self, name: str, compute: Callable[[], T]) -> T:
+        """What ``compute`` gives, or gave before: anything that :func:`packed` takes."""
+        if self._store is None:
+            return compute()
+        found: T = unpacked(self._store.piece(self._prefix + name, self._key, lambda: packed(compute())))
+        return found
+
+    def within(self, prefix: str) -> Pieces:
+        """The same, with names that begin with ``prefix/``."""
+        other = copy.copy(self)
+        other._prefix = f"{self._prefix}{prefix}/"
+        return other
+
+    @classmethod
+    def clear(cls, folder: str | Path) -> None:
+        """Remove the pieces of a finished study."""
+        shutil.rmtree(Path(folder) / cls.FOLDER, ignore_errors=True)
+
+
+@functools.cache
+def _source() -> str:
+    """SHA-256 of this software: sources and weights."""
+    total = hashlib.sha256(VERSION.encode())
+    for package in ("torchpcct", "recon"):
+        root = Path(str(importlib.import_module(package).__file__)).parent
+        for path in sorted(p for ending in ("*.py", "*.safetensors") for p in root.rglob(ending)):
+            total.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
+    return total.hexdigest()
+
+
+def packed(value: Any) -> dict[str, Any]:
+    """Arrays, and under ``tree`` the JSON text of what they make up, for :meth:`Store.piece`.
+
+    Args:
+        value: None, truth values, numbers, texts, arrays, tensors, dataclasses of this software (their fields that are
+            given at construction), and lists, tuples and dictionaries of all these.
+
+    Raises:
+        TypeError: a value of another kind.
+    """
+    arrays: dict[str, Any] = {}
+    return {"tree": np.array(json.dumps(_packed(value, arrays))), **arrays}
+
+
+def _packed(value: Any, arrays: dict[str, Any]) -> Any:
+    if value is None or type(value) in (bool, int, float, str):
+        return value
+    if isinstance(value, np.ndarray | np.generic | torch.Tensor):
+        name = f"a{len(arrays)}"
+        arrays[name] = value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
+        if arrays[name].dtype.hasobject:
+            raise TypeError("a piece of a study cannot hold an array of Python objects")
+        kinds = {torch.Tensor: "tensor", np.ndarray: "array"}
+        return {next((text for kind, text in kinds.items() if isinstance(value, kind)), "scalar"): name}
+    if isinstance(value, list | tuple):
+        return {type(value).__name__ if type(value) in (list, tuple) else "tuple": [_packed(v, arrays) for v in value]}
+    if isinstance(value, Mapping):
+        return {"dict": [[_packed(k, arrays), _packed(v, arrays)] for k, v in value.items()]}
+    kind = type(value)
+    if is_dataclass(kind) and kind.__module__.startswith(("torchpcct.", "recon.")):
+        parts = {f.name: _packed(getattr(value, f.name), arrays) for f in fields(kind) if f.init}
+        return {"made": [kind.__module__, kind.__qualname__, parts]}
+    raise TypeError(f"a piece of a study cannot hold a {kind.__module__}.{kind.__qualname__}")
+
+
+def unpacked(arrays: Mapping[str, Any]) -> Any:
+    """The value of :func:`packed`.
+
+    Raises:
+        ValueError: a dataclass that is not of this software.
+    """
+    return _unpacked(json.loads(str(arrays["tree"])), arrays)
+
+
+def _unpacked(tree: Any, arrays: Mapping[str, Any]) -> Any:
+    if not isinstance(tree, dict):
+        return tree
+    ((kind, of),) = tree.items()
+    if kind == "tensor":
+        return torch.from_numpy(np.array(arrays[of]))
+    if kind in ("array", "scalar"):
+        return arrays[of] if kind == "array" else arrays[of][()]
+    if kind == "list":
+        return [_unpacked(v, arrays) for v in of]
+    if kind == "tuple":
+        return tuple(_unpacked(v, arrays) for v in of)
+    if kind == "dict":
+        return {_unpacked(k, arrays): _unpacked(v, arrays) for k, v in of}
+    module, name, parts = of
+    ours = module.startswith(("torchpcct.", "recon."))
+    made: Any = getattr(importlib.import_module(module), name) if ours else None
+    if made is None or not is_dataclass(made):
+        raise ValueError(f"a piece of a study holds a {module}.{name}, which is no dataclass of this software")
+    return cast(Any, made)(**{k: _unpacked(v, arrays) for k, v in parts.items()})

@@ -1,0 +1,63 @@
+"""Build the wheel, install it into an empty environment, use it there: ``python tests/bench/wheel.py [PIP OPTION …]``.
+
+Nothing of the repository is on the path of that environment: what the wheel lacks (weights, ``py.typed``, a package, a
+dependency) fails here. Options go to ``pip install``, e.g. ``--extra-index-url https://download.pytorch.org/whl/cpu``.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import venv
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+
+SMOKE = """
+import recon, torchpcct, train
+from pathlib import Path
+from recon.mbir.mbir import Mbir
+from torchpcct import VolumeGrid, acquire
+from torchpcct.scanner import presets
+from torchpcct.scene.plaque import plaque_scene
+for package in (recon, torchpcct, train):
+    assert "site-packages" in package.__file__, package.__file__
+assert (Path(torchpcct.__file__).parent / "py.typed").exists()
+assert (Path(recon.__file__).parent / "py.typed").exists()
+Mbir.load()
+scene, plaque = plaque_scene(vessel_length=2.0)
+grid = VolumeGrid((3, 12, 12), 0.5, plaque.position[::-1])
+region = VolumeGrid((1, 1, 1), (2.2, 8.0, 8.0), plaque.position[::-1])
+scan = acquire(scene, presets.pcct(views=60, rows=12), exposure_s=2.0, region=region, sub_rays=16)
+volume = recon.reconstruct(scan, grid, "fbp")
+volume.save("plaque.nii.gz")
+print("reconstructed", tuple(volume.data.shape), f"{float(volume.data.mean()):.0f} HU on average")
+"""
+
+
+def main(options: list[str]) -> int:
+    """0 if the wheel works in an empty environment."""
+    clean = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
+
+    def run(*command: object, folder: Path) -> None:
+        subprocess.run([str(part) for part in command], cwd=folder, env=clean, check=True)
+
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        run(sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", folder, ROOT, folder=folder)
+        (wheel,) = folder.glob("*.whl")
+        venv.create(folder / "empty", with_pip=True)
+        scripts = folder / "empty" / ("Scripts" if os.name == "nt" else "bin")
+        python = scripts / "python"
+        run(python, "-m", "pip", "install", "-q", "-c", ROOT / "constraints.txt", *options, wheel, folder=folder)
+        run(scripts / "torchpcct", "--version", folder=folder)
+        run(scripts / "torchpcct", "study", "phantom", "--quick", "--no-progress", "--out", "out", folder=folder)
+        run(python, "-c", SMOKE, folder=folder)
+    print("the wheel works in an empty environment")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

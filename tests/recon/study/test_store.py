@@ -1,0 +1,174 @@
+"""Pieces of a study: what goes in comes out, kills lose one piece at most, and nothing of another version is used."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tiny_studies import run_tiny
+
+import recon.study.store as store_module
+from recon.study.compare.placements import Placements
+from recon.study.store import Pieces, packed, unpacked
+from recon.study.verify import differences
+from torchpcct import ConeBeam, VolumeGrid, full_turn
+from torchpcct.scan import Scan
+
+
+@dataclass(frozen=True)
+class _Settings:
+    seed: int = 0
+
+
+def _through_disk(value, tmp_path):
+    np.savez(tmp_path / "p.npz", **packed(value))
+    with np.load(tmp_path / "p.npz", allow_pickle=False) as file:
+        return unpacked(dict(file))
+
+
+def test_values_come_back_as_they_were(tmp_path):
+    value = {
+        ("fbp", 0.25): (np.arange(6).reshape(2, 3), [True, None, 1.5, "α"]),
+        0.35: np.float64(2.0),
+        "nested": {"tensor": torch.arange(4.0), "empty": ()},
+        "of this software": [Placements("soft", 0.4, np.ones((2, 2)), np.zeros((2, 2))), VolumeGrid((2, 3, 4), 0.5)],
+    }
+    back = _through_disk(value, tmp_path)
+    assert list(back) == list(value)
+    array, rest = back["fbp", 0.25]
+    np.testing.assert_array_equal(array, value["fbp", 0.25][0])
+    assert rest == [True, None, 1.5, "α"]
+    assert back[0.35] == 2.0
+    assert torch.equal(back["nested"]["tensor"], torch.arange(4.0))
+    assert back["nested"]["empty"] == ()
+    placements, grid = back["of this software"]
+    assert placements.kernel == "soft"
+    np.testing.assert_array_equal(placements.means, np.ones((2, 2)))
+    assert grid == VolumeGrid((2, 3, 4), 0.5)
+
+
+def test_a_scan_comes_back_whole(tmp_path):
+    g = ConeBeam(full_turn(3), 500.0, 900.0, 4, 2, 1.0)
+    scan = Scan.from_counts(torch.full(g.shape, 7.0), g, air=9.0)
+    back = _through_disk(scan, tmp_path)
+    assert back.geometry == g
+    assert torch.equal(back.line_integrals(), scan.line_integrals())
+    assert {f.name for f in fields(back) if getattr(back, f.name) is None} == {
+        f.name for f in fields(scan) if getattr(scan, f.name) is None
+    }
+
+
+def test_what_cannot_be_kept_is_refused():
+    for value in (object(), {1: {2}}, np.array([object()]), _Settings()):
+        with pytest.raises(TypeError, match="a piece of a study cannot hold"):
+            packed(value)
+    foreign = {"tree": np.array(json.dumps({"made": ["os", "path", {}]}))}
+    with pytest.raises(ValueError, match="no dataclass of this software"):
+        unpacked(foreign)
+
+
+def test_finished_pieces_are_used_again_by_the_same_settings_and_source_only(tmp_path, monkeypatch):
+    computed = []
+
+    def run(settings=_Settings(), folder=tmp_path):
+        pieces = Pieces(folder, settings).within("part")
+        return pieces("x", lambda: computed.append(1) or len(computed))
+
+    assert (run(), run()) == (1, 1)
+    assert run(_Settings(seed=1)) == 2
+    monkeypatch.setattr(store_module, "_source", lambda: "another version")
+    assert run(_Settings(seed=1)) == 3
+    assert run(folder=None) == 4
+    Pieces.clear(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+    Pieces.clear(tmp_path)  # nothing there: nothing to do
+
+
+def test_kills_at_random_moments_lose_one_piece_at_most(tmp_path):
+    """A study of 12 pieces is killed (SIGKILL) again and again until it gets through."""
+    rng, log, count = np.random.default_rng(0), tmp_path / "log", 12
+
+    def study():
+        pieces = Pieces(tmp_path, _Settings())
+
+        def compute(k):
+            time.sleep(0.01)
+            with log.open("a") as file:
+                file.write(f"{k}\n")
+            return np.full(1000, k)
+
+        return sum(int(pieces(f"deep/{k}", lambda k=k: compute(k)).sum()) for k in range(count))
+
+    kills = 0
+    while True:
+        child = os.fork()
+        if child == 0:
+            study()
+            os._exit(0)
+        end = time.monotonic() + float(rng.uniform(0.0, 0.12)) * (1 + kills / 20)
+        while time.monotonic() < end and os.waitid(os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None:
+            time.sleep(0.002)
+        os.kill(child, signal.SIGKILL)
+        if os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0:
+            break
+        kills += 1
+        for path in tmp_path.rglob("*.npz"):
+            if ".part." not in path.name:
+                np.load(path, allow_pickle=False).close()  # no damaged file, ever
+    assert study() == 1000 * sum(range(count))
+    assert len(log.read_text().split()) <= count + kills
+    assert kills > 0
+    Pieces.clear(tmp_path)
+    assert [p.name for p in tmp_path.iterdir()] == ["log"]
+
+
+_KILLED = """
+import os, signal, sys
+from pathlib import Path
+from tiny_studies import run_tiny
+from recon.study.store import Pieces
+left, keep = int(sys.argv[2]), Pieces.__call__
+def call(self, name, compute):
+    def dying():
+        global left
+        left -= 1
+        value = compute()
+        if left < 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return value
+    return keep(self, name, dying)
+Pieces.__call__ = call
+run_tiny(sys.argv[1], Path(sys.argv[3]))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name", ["compare", "noise", "motion", "resolution", "hardcases", "detector", "bowtie", "spectral"]
+)
+def test_a_killed_study_goes_on_where_it_was(name, tmp_path, monkeypatch):
+    """Killed at a random piece, again and again: the report is that of a run in one go, and no piece is made twice."""
+    path = os.pathsep.join([str(Path(__file__).parents[2] / "helpers"), *sys.path])
+    kills = np.random.default_rng(0).integers(1, 4, 4)
+    for after in kills:
+        command = [sys.executable, "-c", _KILLED, name, str(after), str(tmp_path / "killed")]
+        run = subprocess.run(command, env={**os.environ, "PYTHONPATH": path}, capture_output=True, check=False)
+        if run.returncode == 0:
+            break
+        assert run.returncode == -signal.SIGKILL, run.stderr.decode()
+    finished = len(list((tmp_path / "killed").rglob("pieces/**/*.npz")))
+    assert finished >= 1
+    made, keep = [], Pieces.__call__
+    monkeypatch.setattr(Pieces, "__call__", lambda self, n, f: keep(self, n, lambda: made.append(n) or f()))
+    resumed = run_tiny(name, tmp_path / "killed")
+    again = len(made)
+    whole = run_tiny(name, tmp_path / "whole")
+    assert len(made) - again == again + finished
+    assert list(differences(json.loads(whole.report.json), json.loads(resumed.report.json))) == []
