@@ -36,6 +36,7 @@ from recon.pwls.field_model import FieldModel
 from recon.pwls.field_problem import FieldProblem, field_prior
 from recon.pwls.memory import require_memory
 from recon.pwls.pwls import pwls
+from recon.pwls.qggmrf import QGGMRF
 from torchpcct.geometry import ConeBeam, VolumeGrid
 from torchpcct.scan import Scan
 from torchpcct.volume import Volume, to_hu
@@ -51,8 +52,11 @@ SOLVES = (16, 10)
 LARGEST_RATIO = 4.0
 """Voxels that rays hardly meet are treated as if their noise were so many times that of the middle."""
 BLOCK, HALO = 64, 16
-SURROUND_STRENGTH, SURROUND_HU, SURROUND_PAIRS = 10.0, 5.0, 60
-"""Of the PWLS that takes off the edges: prior, tolerance, projection pairs."""
+SURROUND_STRENGTH, SURROUND_STEP_HU = 10.0, 75.0
+"""Of the PWLS that takes off the edges: strength over that of the default prior, and the step from voxel to voxel above
+which it is one. A threshold that follows the noise would leave a starved scan the outline of the body."""
+SURROUND_HU, SURROUND_PAIRS = 5.0, 60
+"""Its tolerance, and the most projection pairs."""
 _TOWARDS = 0.1
 _PERIOD = 8
 
@@ -140,11 +144,12 @@ def blockwise(
         return network(estimate, towards, condition((slice(None),) * 3))
     total, weight = torch.zeros_like(estimate), torch.zeros(shape, dtype=estimate.dtype, device=estimate.device)
     for part in _parts(shape, block, halo):
-        out = network(estimate[(..., *part)], towards[(..., *part)], condition(part))
+        here: Any = (..., *part)
+        out = network(estimate[here], towards[here], condition(part))
         fade = torch.ones((), dtype=estimate.dtype, device=estimate.device)
         for axis, (s, n) in enumerate(zip(part, shape, strict=True)):
             fade = fade * _fade(s, n, halo).to(estimate).reshape(-1, *[1] * (2 - axis))
-        total[(..., *part)] += out * fade
+        total[here] += out * fade
         weight[part] += fade
     return total / weight
 
@@ -293,8 +298,9 @@ def _stacked(problem: FieldProblem, volumes: Sequence[Tensor]) -> Tensor:
 
 def _surround(problem: FieldProblem, slices: Sequence[tuple[Tensor, Tensor]]) -> list[Tensor]:
     """The edges of each slice in mm⁻¹: PWLS with :data:`SURROUND_STRENGTH` times the strength of the default prior."""
-    usual = field_prior(problem.work.spacing[-1])
-    prior = replace(usual, strength=SURROUND_STRENGTH * usual.strength)
+    voxel = problem.work.spacing[-1]
+    usual = field_prior(voxel, problem.work.ndim)
+    prior = QGGMRF(SURROUND_STRENGTH * usual.strength, SURROUND_STEP_HU / voxel)
     hu = problem.mu_ref / 1000.0
     found = []
     for y, w in slices:

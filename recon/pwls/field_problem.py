@@ -11,6 +11,7 @@ import math
 import time
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from torch.nn import functional as F
 from recon.fbp.coverage import check_rows
 from recon.fbp.fbp import fbp
 from recon.pwls.pwls import pwls
-from recon.pwls.qggmrf import QGGMRF
+from recon.pwls.qggmrf import DEFAULT_PRIOR, QGGMRF
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid
 from torchpcct.projector import Projector
 from torchpcct.scan import Scan
@@ -34,25 +35,33 @@ __all__ = ["FieldProblem", "field_prior", "is_whole_field", "reconstruct_field",
 
 _LOG = logging.getLogger(__name__)
 
-STRENGTH, THRESHOLD_HU = 0.3, 75.0
 REFERENCE_VOXEL_MM = 0.25
+# Distance from the minimum, beyond the field of view, from which it is named.
+UNDETERMINED_HU = 10.0
 # Readings that miss the grid see something if the mean of a patch of so many cells each way is above this line integral
 # (half a millimetre of water) and this share of the mean of the readings that meet it.
 PATCH = 8
 SEES_SOMETHING = (0.01, 0.03)
 
 
-def field_prior(voxel_mm: float) -> QGGMRF:
+def field_prior(voxel_mm: float, dimensions: int = 3) -> QGGMRF:
     """The default prior of a whole field: the curvatures of data and prior are equal at 0.19 line pairs per voxel.
 
     A picture of an object twice as large on voxels twice as large looks the same, from micro-CT to a clinical scanner.
-    At 0.25 mm it is :data:`recon.pwls.inset_problem.DEFAULT_PRIOR`.
+    At 0.25 mm it is :data:`recon.pwls.qggmrf.DEFAULT_PRIOR`, whose threshold follows the noise.
 
     Args:
         voxel_mm: in-plane voxel size.
+        dimensions: of the volume.
     """
     ratio = voxel_mm / REFERENCE_VOXEL_MM
-    return QGGMRF(strength=STRENGTH * ratio**3, threshold=THRESHOLD_HU / voxel_mm)
+    # The threshold counts in (λ mm³)^(−1/2). With all lengths times m, and the information at 0.5 lp/mm divided by m⁴
+    # (of a plane m³), gradients are divided by m.
+    return replace(
+        DEFAULT_PRIOR,
+        strength=DEFAULT_PRIOR.strength * ratio**3,
+        threshold=DEFAULT_PRIOR.threshold * ratio ** (-dimensions / 2),
+    )
 
 
 def is_whole_field(scan: Scan, grid: VolumeGrid) -> bool:
@@ -215,7 +224,7 @@ def reconstruct_field(
     """
     began = time.perf_counter()
     problem = FieldProblem(scans[0], grid)
-    prior = prior or field_prior(grid.spacing[-1])
+    prior = prior or field_prior(grid.spacing[-1], problem.work.ndim)
     volumes = []
     for i, scan in enumerate(scans):
         slices = problem.slices(scan)
@@ -236,6 +245,12 @@ def reconstruct_field(
         if not report["converged"]:
             found.append(unfinished(report))
             warnings.warn(found[-1], RuntimeWarning, stacklevel=2)
+        if report["undetermined_rmsd_hu"] > UNDETERMINED_HU:
+            found.append(
+                f"{100 * report['undetermined']:.0f} % of the voxels are missed by some views (corners beyond the "
+                "field of view, outer slices): there the volume is "
+                f"{report['undetermined_rmsd_hu']:.0f} HU from the minimum"
+            )
         found += sorted({text for test in tests for text in test.findings})
         if tests:
             report["chi2"] = sum(t.chi2 for t in tests) / len(tests)

@@ -33,7 +33,7 @@ from recon.pwls.qggmrf import QGGMRF, BoundPrior
 from torchpcct.detector_window import shadow
 from torchpcct.validate import number, whole
 
-__all__ = ["PwlsResult", "data_model", "pwls", "solve_normal", "weighted_data"]
+__all__ = ["Approach", "PwlsResult", "data_model", "pwls", "solve_normal", "weighted_data"]
 
 _LOG = logging.getLogger(__name__)
 

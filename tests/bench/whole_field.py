@@ -2,7 +2,7 @@
 
     python tests/bench/whole_field.py {parallel,cone,large} [--threads 1] [--out tests/bench/whole_field.json]
 
-``parallel``: 416², 181 views; ``cone``: 64³, 180 × 96² readings; ``large``: 128³, 360 × 192², ours
+``parallel``: 416², 181 views; ``cone``: 48³, 120 × 72² readings; ``large``: 128³, 360 × 192², ours
 alone, to its own stop.
 Seconds are those of the processor (``time.process_time``), so that what else the machine does counts little; with one
 thread they are those of an idle machine. The reference is the float64 minimum. FISTA: Beck and Teboulle 2009 with the
@@ -37,7 +37,7 @@ PRIOR = QGGMRF(0.3, 300.0)
 PHOTONS = 1e5
 SETUPS: dict[str, tuple[Any, VolumeGrid]] = {
     "parallel": (ParallelBeam(np.arange(181) * math.pi / 181, 416, 0.5), VolumeGrid((416, 416), 0.5)),
-    "cone": (ConeBeam(full_turn(180), 400.0, 700.0, 96, 96, 1.1), VolumeGrid((64, 64, 64), 0.8)),
+    "cone": (ConeBeam(full_turn(120), 400.0, 700.0, 72, 72, 1.1), VolumeGrid((48, 48, 48), 0.8)),
     "large": (ConeBeam(full_turn(360), 400.0, 700.0, 192, 192, 1.1), VolumeGrid((128, 128, 128), 0.8)),
 }
 SUBSETS = 20

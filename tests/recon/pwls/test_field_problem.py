@@ -8,7 +8,7 @@ import torch
 
 from recon import reconstruct
 from recon.pwls.field_problem import FieldProblem, field_prior, larger_grid
-from recon.pwls.inset_problem import DEFAULT_PRIOR
+from recon.pwls.qggmrf import DEFAULT_PRIOR
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Projector, Scan, VolumeGrid, full_turn
 
 MU = 0.02
@@ -74,7 +74,7 @@ def test_a_body_beyond_the_grid_is_reconstructed_with_it():
     assert problem.work == larger_grid(small, geometry)
     assert problem.work.extent[0] > 30
     assert FieldProblem(scan, grid).work == grid
-    prior = field_prior(1.0)
+    prior = field_prior(1.0, 2)
     part = reconstruct(scan, small, "pwls", prior=prior, tolerance=0.3).data
     whole = reconstruct(scan, grid, "pwls", prior=prior, tolerance=0.3).data
     first = [round(s[0] - w[0]) for s, w in zip(small.axes, grid.axes, strict=True)]

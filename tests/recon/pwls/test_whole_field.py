@@ -9,7 +9,7 @@ from inset_operators import HU, problem
 
 from recon.gram.gram import Gram
 from recon.pwls.field_model import FieldModel
-from recon.pwls.pwls import data_model, pwls
+from recon.pwls.pwls import Approach, data_model, pwls
 from recon.pwls.qggmrf import QGGMRF, quadratic
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Projector, VolumeGrid, full_turn
 
@@ -178,3 +178,33 @@ def test_rays_that_miss_the_grid_are_refused():
     A = Projector(ParallelBeam([0.0, 1.0], 8, 1.0, 500.0), VolumeGrid((4, 4), 1.0))
     with pytest.raises(ValueError, match="no ray of positive weight"):
         pwls(A, torch.zeros(A.range_shape), torch.ones(A.range_shape), EDGE)
+
+
+def test_the_distance_to_the_limit_of_a_geometric_approach():
+    """Known exactly: x_k = 1 − 0.9ᵏ is 0.9ᵏ from its limit; an estimate may be high, by what the lag costs, not low."""
+    where = torch.arange(500) < 400
+    start = torch.zeros(2, 500)
+    seen, beyond = Approach(start, where), Approach(start, ~where)
+    scale = torch.tensor([[1.0], [0.5]])
+    for k in range(1, 61):
+        x = scale * torch.full((2, 500), 1 - 0.9**k)
+        x[:, ~where] *= 7
+        for approach in (seen, beyond):
+            approach.add(x)
+        if k >= 24:
+            for approach, most in ((seen, 1.0), (beyond, 7.0)):
+                assert most * 0.9**k <= approach.remaining() <= 6 * most * 0.9**k
+    assert not Approach(start).known
+    assert Approach(start, torch.zeros(500, dtype=torch.bool)).remaining() == 0.0
+
+
+def test_corners_do_not_hold_the_stop_and_are_reported():
+    A = Projector(ParallelBeam(torch.arange(40).numpy() * math.pi / 40, 26, 1.0), VolumeGrid((26, 26), 1.0))
+    r = torch.hypot(*torch.meshgrid(*[torch.from_numpy(a) for a in A.grid.axes], indexing="ij"))
+    w = 4e4 * torch.ones(A.range_shape)
+    model = FieldModel(A, w)
+    assert bool(model.determined[r < 12].all())
+    assert not bool(model.determined[r > 15].any())
+    report = pwls(A, A((0.02 * (r < 10)).float()), w, EDGE, hu=HU, tolerance=1.0, gram=model).report
+    assert report["undetermined"] == pytest.approx(1 - float(model.determined.float().mean()))
+    assert report["undetermined_rmsd_hu"] > 0
