@@ -70,6 +70,19 @@ def test_first_scan_runs(tmp_path):
 
 
 @pytest.mark.slow
+def test_your_own_data_runs(tmp_path):
+    pytest.importorskip("algotom")
+    notebook = run("your_own_data.ipynb", tmp_path, 1800)
+    assert len(pictures(notebook)) == 2
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["your_own_data.ipynb"]  # it cleans up behind itself
+    texts = [o.data["text/markdown"] for o in outputs(notebook) if "text/markdown" in o.get("data", {})]
+    quieter = {row.split(" | ")[0]: float(row.split(" | ")[-1].rstrip(" |")) for row in texts[2].splitlines()[2:]}
+    assert quieter["| FBP, ram-lak"] == 1.0
+    assert abs(quieter["| FBP, soft"] - 1.0) < 0.1  # a blur of the reference
+    assert quieter["| PWLS, 0.03"] > 1.5
+
+
+@pytest.mark.slow
 @needs_weights
 def test_benchmark_runs(tmp_path):
     notebook = run("fbp_vs_mbir.ipynb", tmp_path, 3600)

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchpcct.geometry import ConeBeam, Geometry
+from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam
 from torchpcct.validate import number, whole
 
-__all__ = ["VectorGeometry", "helical_motion"]
+__all__ = ["VectorGeometry", "check_motion", "helical_motion", "to_vectors"]
 
 Floats = NDArray[np.float64]
 
@@ -114,10 +114,8 @@ class VectorGeometry(Geometry):
             ValueError: a curved detector, a motion of the wrong shape.
             TypeError: not a geometry.
         """
-        from torchpcct.projector.vectors import to_vectors
-
         rows = geometry.rows if isinstance(geometry, ConeBeam) else None
-        parallel = type(geometry).__name__ == "ParallelBeam"
+        parallel = isinstance(geometry, ParallelBeam)
         return cls(to_vectors(geometry, motion), geometry.columns, rows, parallel)
 
     def select(self, views: Any) -> VectorGeometry:
@@ -164,8 +162,6 @@ class VectorGeometry(Geometry):
         Raises:
             ValueError: a motion of the wrong shape.
         """
-        from torchpcct.projector.rays import check_motion
-
         axes = 2 if self.rows is None else 3
         back = np.zeros((self.views, 3))
         back[:, :axes] = check_motion(motion, self.views, axes)[:, ::-1]
@@ -180,6 +176,61 @@ class VectorGeometry(Geometry):
                 poses[:, place] = value
         flat = poses.reshape(-1, 12) if self.rows is not None else poses[:, :3, :2].reshape(-1, 6)
         return replace(self, vectors=flat)
+
+
+def to_vectors(geometry: Geometry, motion: Any = None) -> Floats:
+    """ASTRA's vectors of a scan with a flat detector, ``(views, 6)`` or, for a cone beam, ``(views, 12)`` float64.
+
+    Args:
+        geometry: the scan.
+        motion: displacement of the grid per view as for ``Projector``, or None: source and detector are moved the
+            other way, so that ASTRA's volume may stand still.
+
+    Raises:
+        ValueError: a curved detector, which ASTRA's vectors cannot describe; a motion of the wrong shape.
+        TypeError: not a geometry.
+    """
+    if not isinstance(geometry, ParallelBeam | FanBeam | ConeBeam):
+        raise TypeError(f"geometry must be ParallelBeam, FanBeam or ConeBeam, got {type(geometry).__name__}")
+    if motion is not None:
+        axes = 3 if isinstance(geometry, ConeBeam) else 2
+        back = check_motion(motion, geometry.views, axes)[:, ::-1]
+        vectors = to_vectors(geometry)
+        if not isinstance(geometry, ParallelBeam):
+            vectors[:, :axes] -= back
+        vectors[:, axes : 2 * axes] -= back
+        return vectors
+    radial = np.stack([np.cos(geometry.angles), np.sin(geometry.angles)], axis=1)
+    tangent = np.stack([-radial[:, 1], radial[:, 0]], axis=1)
+    if isinstance(geometry, ParallelBeam):
+        return np.concatenate([-radial, geometry.offset * tangent, geometry.pitch * tangent], axis=1)
+    if geometry.detector == "curved":
+        raise ValueError("ASTRA's vectors describe flat detectors only, this one is curved: use detector='flat'")
+    source, foot = geometry.sod * radial, (geometry.sod - geometry.sdd) * radial
+    if isinstance(geometry, FanBeam):
+        return np.concatenate([source, foot + geometry.offset * tangent, geometry.pitch * tangent], axis=1)
+    zero = np.zeros((geometry.views, 1))
+    return np.concatenate(
+        [
+            source, zero, foot + geometry.offset[1] * tangent, zero + geometry.offset[0],
+            geometry.pitch[1] * tangent, zero, zero, zero, zero + geometry.pitch[0],
+        ],
+        axis=1,
+    )  # fmt: skip
+
+
+def check_motion(motion: Any, views: int, axes: int) -> Floats:
+    """Displacements of the grid per view as ``(views, axes)`` float64.
+
+    Raises:
+        ValueError: a wrong shape, values that are not finite.
+    """
+    shift = np.array(motion, dtype=np.float64)
+    if shift.shape != (views, axes):
+        raise ValueError(f"motion needs the shape ({views}, {axes}): views and the grid's axes, got {shift.shape}")
+    if not np.isfinite(shift).all():
+        raise ValueError("motion has values that are not finite")
+    return shift
 
 
 def helical_motion(geometry: ConeBeam, feed: float, start: float = 0.0) -> Floats:

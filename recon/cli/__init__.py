@@ -1,7 +1,8 @@
 """Command line: ``torchpcct compare | dose-factor | hardcases | study | simulate | reconstruct | info | …``.
 
-Here stand the studies and :func:`main`; :mod:`~recon.cli.scans` has the commands of one scan, :mod:`~recon.cli.plaque`
-reads tissues, :mod:`~recon.cli.config` reads what ``simulate`` is told, :mod:`~recon.cli.parsing` is what all share.
+Here stand the studies and :func:`main`; :mod:`~recon.cli.scans` has the commands that make scans and volumes,
+:mod:`~recon.cli.looking` those that show files, :mod:`~recon.cli.plaque` reads tissues, :mod:`~recon.cli.config` reads
+what ``simulate`` is told, :mod:`~recon.cli.parsing` is what all share.
 """
 
 from __future__ import annotations
@@ -17,11 +18,12 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from recon.cli.looking import add_info, add_view
 from recon.cli.parsing import Commands, command
 
 # What loads torch or numba is imported by the commands: help and refusals come at once.
 from recon.cli.plaque import add_plaque
-from recon.cli.scans import add_info, add_reconstruct, add_show_config, add_simulate, add_view
+from recon.cli.scans import add_reconstruct, add_show_config, add_simulate
 from recon.study import registry
 from torchpcct import __version__
 from torchpcct.files import require_writable, written_whole

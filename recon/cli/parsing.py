@@ -10,7 +10,9 @@ from typing import Any
 
 from torchpcct.files import written_whole
 
-__all__ = ["Commands", "command", "tell"]
+__all__ = ["SCAN_ENDINGS", "Commands", "check_ending", "command", "tell", "without_ending"]
+
+SCAN_ENDINGS = (".h5", ".hdf5")
 
 Commands = Any
 """What ``add_subparsers`` gives; argparse does not publish its type."""
@@ -40,3 +42,15 @@ def tell(arguments: argparse.Namespace, short: str, config: dict[str, Any], **su
         with written_whole(file.with_name(file.name + ending)) as part:
             part.write_text(content.rstrip() + "\n", encoding="utf-8")
     print(text if arguments.json else f"{file}: {short}")
+
+
+def check_ending(path: Path, endings: tuple[str, ...]) -> None:
+    """Refuse a name with another ending (ValueError)."""
+    if path.suffix.lower() not in endings:
+        raise ValueError(f"unknown ending of {path.name!r}: use {', '.join(endings)}")
+
+
+def without_ending(path: Path) -> str:
+    """The name of a scan, a volume or a folder without what says its format."""
+    name = path.resolve().name
+    return name[: -len(".nii.gz")] if name.endswith(".nii.gz") else name if path.is_dir() else Path(name).stem

@@ -1,4 +1,4 @@
-"""The commands of one scan: ``simulate``, ``show-config``, ``reconstruct``, ``info``, ``view``."""
+"""The commands that make files: ``simulate``, ``show-config``, ``reconstruct``."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 # What loads torch or numba is imported by the commands: help and refusals come at once.
-from recon.cli.parsing import Commands, command, tell
+from recon.cli.parsing import SCAN_ENDINGS, Commands, check_ending, command, tell, without_ending
 from torchpcct import VolumeGrid
-from torchpcct.files import require_folder, written_whole
+from torchpcct.files import require_folder
 from torchpcct.formats.volume_files import check_volume_name
 from torchpcct.validate import choice, number, numbers, whole
 
@@ -20,19 +20,13 @@ if TYPE_CHECKING:
     from recon.study.study import ProgressBars
     from torchpcct.scan import Scan
 
-__all__ = ["add_info", "add_reconstruct", "add_show_config", "add_simulate", "add_view"]
+__all__ = ["add_reconstruct", "add_show_config", "add_simulate"]
 
-_SCAN_ENDINGS, _PICTURE_ENDINGS = (".h5", ".hdf5"), (".png", ".pdf", ".svg")
 _PAPER_VIEWS = 1968
 MOST_VOXELS = 2**31
 """Of a volume, 8 GiB: what is asked for beyond is a slip of the voxel size."""
 _FBP_RATE = 1e8
 """Voxel updates of the backprojection a second on one core, for a rough estimate."""
-
-
-def _ending(path: Path, endings: tuple[str, ...]) -> None:
-    if path.suffix.lower() not in endings:
-        raise ValueError(f"unknown ending of {path.name!r}: use {', '.join(endings)}")
 
 
 # --- simulate -----------------------------------------------------------------------------------------------------
@@ -63,7 +57,7 @@ def _paper(arguments: argparse.Namespace) -> SimulationConfig:
 
 
 def _simulate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
-    _ending(arguments.out, _SCAN_ENDINGS)
+    check_ending(arguments.out, SCAN_ENDINGS)
     require_folder(arguments.out)
     whole("--seed", arguments.seed, low=0)
     if arguments.views is not None:
@@ -210,6 +204,8 @@ def _require_voxels(shape: tuple[int, ...]) -> None:
 
 
 def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
+    if arguments.out is None:
+        arguments.out = Path(f"{without_ending(arguments.scan)}_{arguments.method}.nii.gz")
     require_folder(arguments.out)
     check_volume_name(arguments.out)
     if arguments.voxel is not None:
@@ -250,8 +246,13 @@ def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     if arguments.dry_run:
         bytes_ = 4 * (3 * scan.counts.numel() + 2 * grid.voxels)
         seconds = grid.voxels * scan.geometry.views / _FBP_RATE
+        if arguments.json:
+            estimate = {"file": str(arguments.out), "gib": bytes_ / 2**30, "fbp_seconds": seconds}
+            print(json.dumps({**config, "estimate": estimate}, indent=1))
+            return
         print(yaml.safe_dump(config, sort_keys=False, allow_unicode=True))
         print(
+            f"{arguments.out}: "
             f"about {bytes_ / 2**30:.2f} GiB; FBP about {seconds:.1f} s on one core, iterative methods many times that"
         )
         return
@@ -275,7 +276,7 @@ def add_reconstruct(commands: Commands) -> None:
     parser = command(
         commands, "reconstruct", _reconstruct, "reconstruct a scan file to a volume",
         "Reconstruct a scan, ours or a foreign one, and write the volume, with what was done beside (.json, .yaml).",
-        "volume to write: .nii, .nii.gz, .mha, .h5, or no ending for a DICOM series", required=True,
+        "volume to write: .nii, .nii.gz, .mha, .h5, or no ending for a DICOM series (default SCAN_METHOD.nii.gz)",
     )  # fmt: skip
     axes = ("Z", "Y", "X")
     parser.add_argument("scan", type=Path, help=".h5 (ours or Data Exchange), .yaml stack, CatSim, DICOM-CT-PD folder")
@@ -295,100 +296,3 @@ def add_reconstruct(commands: Commands) -> None:
     parser.add_argument("--photons", type=float, metavar="N", help="of an unattenuated reading (line integrals)")
     parser.add_argument("--slices", metavar="A:B", help="rows to read (Data Exchange)")
     _add_output(parser)
-
-
-# --- info, view ---------------------------------------------------------------------------------------------------
-
-
-def _is_volume(path: Path) -> bool:
-    if path.suffix.lower() in _SCAN_ENDINGS:
-        import h5py
-
-        from torchpcct.formats.damage import reading
-
-        with reading(path, "HDF5"), h5py.File(path, "r") as file:
-            return str(file.attrs.get("format")) == "torchpcct-volume"
-    return str(path).endswith((".nii", ".nii.gz", ".mha"))
-
-
-def _info(arguments: argparse.Namespace, progress: ProgressBars) -> None:
-    import yaml
-
-    from torchpcct.formats.geometry_yaml import geometry_values
-    from torchpcct.formats.scans import open_scan
-    from torchpcct.volume import Volume
-
-    path: Path = arguments.file
-    if _is_volume(path):
-        volume = Volume.load(path)
-        values = volume.data.double()
-        about: dict[str, Any] = {
-            "kind": "volume", "shape": list(volume.grid.shape), "spacing_mm": list(volume.grid.spacing),
-            "center_mm": list(volume.grid.center), "unit": volume.unit, "lowest": float(values.min()),
-            "mean": float(values.mean()), "highest": float(values.max()), "report": dict(volume.report),
-        }  # fmt: skip
-    else:
-        scan = open_scan(path)
-        about = {
-            "kind": "scan", "readings": list(scan.counts.shape), "geometry": geometry_values(scan.geometry),
-            "exposure_s": scan.exposure_s, "seed": scan.seed, "counting": scan.counting, "unit": scan.unit,
-            "windowed": scan.window is not None, "mean": float(scan.counts.mean()), "zero_share": scan.zero_fraction,
-            "dead_readings": 0 if scan.dead is None else int(scan.dead.sum()), "info": dict(scan.info),
-        }  # fmt: skip
-    if arguments.json:
-        print(json.dumps({"file": str(path), **about}, indent=1, default=str))
-        return
-    for key in ("report", "info"):
-        about.pop(key, None)
-    print(yaml.safe_dump({"file": str(path), **about}, sort_keys=False, allow_unicode=True), end="")
-
-
-def add_info(commands: Commands) -> None:
-    parser = commands.add_parser("info", help="what a scan or volume file holds", description="What a file holds.")
-    parser.set_defaults(run=_info, device="cpu", no_progress=True, verbose=False)
-    parser.add_argument("file", type=Path, help="scan or volume")
-    parser.add_argument("--json", action="store_true", help="everything, as JSON")
-
-
-def _view(arguments: argparse.Namespace, progress: ProgressBars) -> None:
-    _ending(arguments.out, _PICTURE_ENDINGS)
-    require_folder(arguments.out)
-    width = number("--window", arguments.window, positive=True)
-    import numpy as np
-    from matplotlib.figure import Figure
-
-    from torchpcct.volume import Volume
-
-    volume = Volume.load(arguments.file)
-    data = volume.data if volume.data.ndim == 3 else volume.data[None]
-    axis = "zyx".index(arguments.plane)
-    index = data.shape[axis] // 2 if arguments.slice is None else arguments.slice
-    if not 0 <= index < data.shape[axis]:
-        raise ValueError(f"--slice must lie in 0 … {data.shape[axis] - 1} along {arguments.plane}, got {index}")
-    image = data.select(axis, index).numpy()
-    axes = volume.grid.axes if volume.grid.ndim == 3 else (np.zeros(1), *volume.grid.axes)
-    names = [n for n in (0, 1, 2) if n != axis]
-    across, up = axes[names[1]], axes[names[0]]
-    figure = Figure(figsize=(6.4, 6.0), dpi=120, layout="constrained")
-    panel = figure.subplots()
-    low, high = arguments.level - width / 2, arguments.level + width / 2
-    step = [float(a[1] - a[0]) if a.size > 1 else 1.0 for a in (across, up)]
-    extent = (across[0] - step[0] / 2, across[-1] + step[0] / 2, up[0] - step[1] / 2, up[-1] + step[1] / 2)
-    shown = panel.imshow(image, cmap="gray", vmin=low, vmax=high, origin="lower", extent=extent)
-    panel.set(xlabel=f"{'zyx'[names[1]]} / mm", ylabel=f"{'zyx'[names[0]]} / mm",
-              title=f"{arguments.plane} = {axes[axis][index]:.2f} mm")  # fmt: skip
-    figure.colorbar(shown, ax=panel, label=volume.unit)
-    with written_whole(arguments.out) as part:
-        figure.savefig(part)
-    print(f"{arguments.out}: slice {index} along {arguments.plane}, level {arguments.level:g}, window {width:g}")
-
-
-def add_view(commands: Commands) -> None:
-    parser = commands.add_parser("view", help="a slice of a volume as a picture", description="Draw a slice.")
-    parser.set_defaults(run=_view, device="cpu", no_progress=True, verbose=False)
-    parser.add_argument("file", type=Path, help="volume: .nii, .nii.gz, .mha, .h5 or a folder of a DICOM series")
-    parser.add_argument("--out", type=Path, required=True, metavar="PATH", help="picture: .png, .pdf or .svg")
-    parser.add_argument("--plane", choices=("z", "y", "x"), default="z", help="axis across the slice (default z)")
-    parser.add_argument("--slice", type=int, metavar="K", help="index along it (default: the middle)")
-    parser.add_argument("--level", type=float, default=40.0, help="centre of the grey scale (default 40)")
-    parser.add_argument("--window", type=float, default=400.0, help="its width (default 400)")

@@ -9,7 +9,6 @@ filtered backprojection gets: an orbit that climbs (a helix) is refused.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,11 +17,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.fbp.backproject import check_data
-from recon.fbp.fbp import fbp
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
 from torchpcct.validate import whole
 
-__all__ = ["Straightened", "fbp_of_vectors", "straighten"]
+__all__ = ["Straightened", "at_slices", "straighten"]
 
 Floats = NDArray[np.float64]
 
@@ -87,32 +85,13 @@ def straighten(sinogram: Tensor, vectors: Any, *, parallel: bool = False) -> Str
     return Straightened(out, geometry, motion, slices)
 
 
-def fbp_of_vectors(
-    sinogram: Tensor,
-    vectors: Any,
-    grid: VolumeGrid,
-    kernel: str | Sequence[str] = "standard",
-    *,
-    parallel: bool = False,
-    weights: Any = None,
-    outside: float | None = None,
-) -> Tensor:
-    """Filtered backprojection of a scan that is given by its vectors; see :func:`straighten` and :func:`recon.fbp.fbp`.
-
-    Args:
-        sinogram, vectors, parallel: of :func:`straighten`.
-        grid: 2-D without rows, else 3-D; of parallel rays its z axis is interpolated from the slices.
-        kernel, weights, outside: of :func:`recon.fbp.fbp.fbp`.
-
-    Returns:
-        ``(..., *grid.shape)`` mm⁻¹; with a sequence of kernels a leading axis of kernels.
+def at_slices(s: Straightened, grid: VolumeGrid) -> Tensor:
+    """Sinograms ``(..., z, views, columns)`` of a grid's slices, interpolated between the rows of parallel rays.
 
     Raises:
-        ValueError, TypeError: as both.
+        ValueError: a grid without z axis, or beyond the rows.
     """
-    s = straighten(sinogram, vectors, parallel=parallel)
-    if s.slices is None:
-        return fbp(s.sinogram, s.geometry, grid, kernel, weights=weights, motion=s.motion, outside=outside)
+    assert s.slices is not None
     if grid.ndim != 3:
         raise ValueError(f"parallel rays with rows need a 3-D grid, got shape {grid.shape}")
     place = np.interp(grid.axes[0], s.slices, np.arange(s.slices.size))
@@ -121,8 +100,7 @@ def fbp_of_vectors(
     below = np.minimum(place.astype(int), max(s.slices.size - 2, 0))
     share = torch.from_numpy(place - below).to(s.sinogram)[:, None, None]
     above = torch.from_numpy(np.minimum(below + 1, s.slices.size - 1))
-    lines = torch.lerp(s.sinogram[..., torch.from_numpy(below), :, :], s.sinogram[..., above, :, :], share)
-    return fbp(lines, s.geometry, grid.slice, kernel, weights=weights, outside=outside)
+    return torch.lerp(s.sinogram[..., torch.from_numpy(below), :, :], s.sinogram[..., above, :, :], share)
 
 
 def _axis_of(low: float, high: float, pitch: float) -> tuple[int, float]:

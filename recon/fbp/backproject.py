@@ -14,7 +14,7 @@ from torch import Tensor
 from recon.linear_operator import apply_linear
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
-from torchpcct.projector.rays import check_motion
+from torchpcct.vector_geometry import check_motion
 
 __all__ = ["BackprojectionPlan", "backproject", "check_data", "data_shape"]
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.fbp.angular_weights import angular_weights, view_steps
+from recon.fbp.any_orbit import at_slices, straighten
 from recon.fbp.backproject import BackprojectionPlan, backproject, check_data, data_shape
 from recon.fbp.coverage import check_rows, refuse_helix
 from recon.fbp.detector_edges import Rows, continued, cut_off, mirrored
@@ -235,15 +236,13 @@ def fbp(
             dead; a negative ``outside``.
     """
     if isinstance(geometry, VectorGeometry):
-        from recon.fbp.any_orbit import fbp_of_vectors  # which resamples to a circle, and calls this function
-
         if window is not None:
             raise ValueError("a window belongs to a circular scan: leave it out for a VectorGeometry")
         check_data("sinogram", sinogram, geometry.shape)
         seen = geometry if motion is None else geometry.moved(motion)
-        return fbp_of_vectors(
-            sinogram, seen.vectors, grid, kernel, parallel=seen.parallel, weights=weights, outside=outside
-        )
+        s = straighten(sinogram, seen.vectors, parallel=seen.parallel)
+        lines, plane = (s.sinogram, grid) if s.slices is None else (at_slices(s, grid), grid.slice)
+        return fbp(lines, s.geometry, plane, kernel, weights=weights, motion=s.motion, outside=outside)
     check_data("sinogram", sinogram, data_shape(geometry, DetectorWindow.full(geometry)))
     refuse_helix(geometry, motion)
     for text in check_rows(geometry, grid, motion):

@@ -11,7 +11,7 @@ from analytic import Ellipsoid, line_integrals
 
 from recon.cli import main
 from recon.cli.config import read_config
-from torchpcct import ParallelBeam, Scan, Volume
+from torchpcct import ParallelBeam, Scan, Volume, VolumeGrid
 
 
 def test_command_line_simulate_and_reconstruct(tmp_path, capsys):
@@ -89,6 +89,30 @@ def test_a_foreign_scan_in_one_command(tmp_path):
     assert volume.grid.shape[0] == 1
     y, x = (np.abs(a - c).argmin() for a, c in zip(volume.grid.axes[1:], (0.0, -6.0), strict=True))
     assert float(volume.data[0, y - 2 : y + 3, x - 2 : x + 3].mean()) == pytest.approx(0.0, abs=15)
+
+
+def test_names_and_grey_scale_of_their_own(tmp_path, capsys, monkeypatch):
+    """Without --out in the working directory; a volume in mm⁻¹ is not drawn black; a scan is no volume."""
+    monkeypatch.chdir(tmp_path)
+    geometry = ParallelBeam(np.arange(8) * np.pi / 8, 12, 1.0)
+    Scan.from_line_integrals(np.full(geometry.shape, 0.3), geometry, photons=1e4).save("lines.h5")
+    assert main(["reconstruct", "lines.h5", "--dry-run", "--json"]) == 0
+    plan = json.loads(capsys.readouterr().out)
+    assert plan["estimate"]["file"] == "lines_fbp.nii.gz"
+    assert plan["geometry"]["kind"] == "parallel"
+    assert main(["view", "lines.h5"]) == 2
+    assert "is a scan, no volume" in capsys.readouterr().err
+    ramp = torch.linspace(0.0, 0.2, 48).reshape(3, 4, 4)
+    Volume(ramp, VolumeGrid((3, 4, 4), 1.0), unit="mm^-1").save("small.nii.gz")
+    assert main(["view", "small.nii.gz"]) == 0
+    said = capsys.readouterr().out
+    assert "level 0.1, window 0.19" in said
+    Volume(10000 * ramp - 1000, VolumeGrid((3, 4, 4), 1.0)).save("series")
+    assert main(["view", "series"]) == 0
+    assert "level 40, window 400" in capsys.readouterr().out
+    assert main(["info", "series"]) == 0
+    assert "kind: volume" in capsys.readouterr().out
+    assert sorted(p.name for p in tmp_path.glob("*.png")) == ["series.png", "small.png"]
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ from torchpcct.formats.damage import check_size, needed, reading
 from torchpcct.geometry import ConeBeam
 from torchpcct.scan import Scan
 
-__all__ = ["ClinicalProjections", "read_dicom_ct_pd"]
+__all__ = ["ClinicalProjections", "holds_projections", "read_dicom_ct_pd"]
 
 _TAGS = {
     "spacing": 0x70291002, "row_spacing": 0x70291006, "shape": 0x7029100B, "rows": 0x70291010, "columns": 0x70291011,
@@ -91,6 +91,26 @@ def _value(file: Any, name: str, default: Any = None) -> Any:
     return np.atleast_1d(np.asarray(value, dtype=np.float64))
 
 
+def holds_projections(folder: str | os.PathLike[str]) -> bool:
+    """Whether the first DICOM file of a folder is a projection (tag of the detector's rows), not an image.
+
+    Raises:
+        FileNotFoundError: no DICOM files. ValueError: a damaged one. ImportError: pydicom is not installed.
+    """
+    pydicom = needed("pydicom")
+    path = _files(folder)[0]
+    with reading(path, "DICOM"):
+        return _TAGS["rows"] in pydicom.dcmread(path, stop_before_pixels=True)
+
+
+def _files(folder: str | os.PathLike[str]) -> list[Path]:
+    found = Path(folder).iterdir() if Path(folder).is_dir() else ()
+    paths = sorted(p for p in found if p.suffix.lower() in (".dcm", ".ima"))
+    if not paths:
+        raise FileNotFoundError(f"no .dcm files in {folder}")
+    return paths
+
+
 def read_dicom_ct_pd(folder: str | os.PathLike[str], *, ignore_flying_spot: bool = False) -> ClinicalProjections:
     """Read a folder of DICOM-CT-PD files.
 
@@ -104,13 +124,7 @@ def read_dicom_ct_pd(folder: str | os.PathLike[str], *, ignore_flying_spot: bool
         ImportError: pydicom is not installed.
     """
     pydicom = needed("pydicom")
-    paths = (
-        sorted(p for p in Path(folder).iterdir() if p.suffix.lower() in (".dcm", ".ima"))
-        if Path(folder).is_dir()
-        else []
-    )
-    if not paths:
-        raise FileNotFoundError(f"no .dcm files in {folder}")
+    paths = _files(folder)
     views: list[tuple[int, float, float, float, Any]] = []
     first: dict[str, Any] = {}
     for path in paths:

@@ -7,6 +7,7 @@ so the same point carries the opposite sign there; every reader shows the same v
 from __future__ import annotations
 
 import os
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -133,6 +134,7 @@ def read_meta_image(path: str | os.PathLike[str]) -> tuple[Any, VolumeGrid]:
         check_size(reader.GetSize(), "the volume")
         if reader.GetDimension() != 3 or reader.GetNumberOfComponents() != 1:
             raise ValueError(f"it has {reader.GetDimension()} axes of {reader.GetNumberOfComponents()} components")
+        _check_compressed(Path(path).read_bytes())
         image = sitk.DICOMOrient(reader.Execute(), "RAS")
         direction = np.array(image.GetDirection()).reshape(3, 3)
         if np.abs(direction - np.diag([-1.0, -1.0, 1.0])).max() > _STRAIGHT:
@@ -140,6 +142,21 @@ def read_meta_image(path: str | os.PathLike[str]) -> tuple[Any, VolumeGrid]:
         data = sitk.GetArrayFromImage(image).astype(np.float32)
         x, y, z = image.GetOrigin()
         return data, _grid(data.shape, image.GetSpacing(), (-x, -y, z))
+
+
+def _check_compressed(content: bytes) -> None:
+    """Raise where the compressed voxels of a MetaImage are damaged: ITK fills what it cannot unpack with anything."""
+    mark = b"ElementDataFile = LOCAL\n"
+    header, found, packed = content.partition(mark)
+    if not found or b"CompressedData = True" not in header:
+        return
+    unpack = zlib.decompressobj()
+    while packed and not unpack.eof:
+        unpack.decompress(packed, 2**24)  # bit by bit: a damaged stream may ask for any memory
+        packed = unpack.unconsumed_tail
+    unpack.flush()
+    if not unpack.eof:
+        raise ValueError("its compressed voxels end too early")
 
 
 def write_dicom(folder: str | os.PathLike[str], data: Any, grid: VolumeGrid, unit: str) -> None:

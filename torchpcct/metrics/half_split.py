@@ -98,11 +98,24 @@ class HalfSplit:
         size = min(a.shape[-2:]) * grid_spacing
         rings = max(1, round(reference.resolution(grid_spacing) * size))
         shown, given = (np.convolve(part.numpy(), np.ones(3), "same")[:rings] for part in (cross, own))
-        return (np.arange(rings) + 1.0) / size, shown / np.maximum(given, 1e-300)
+        frequency: Floats = (np.arange(rings, dtype=np.float64) + 1.0) / size
+        return frequency, np.asarray(shown / np.maximum(given, 1e-300), dtype=np.float64)
 
     def f50(self, reference: HalfSplit, grid_spacing: float) -> float:
         """Frequency at which :meth:`transfer` falls to ½, line pairs per mm; inf if it does not as far as is known."""
         return first_below(*self.transfer(reference, grid_spacing), 0.5, math.inf)
+
+    def within(self, rows: slice, columns: slice) -> HalfSplit:
+        """A rectangle of every slice, for the frequencies of what lies in it alone: its mean taken off, and faded to 0
+        at its border (Hann), so that the cut shows no edges. A strong edge elsewhere would speak for the whole image.
+        """
+
+        def part(volume: Tensor) -> Tensor:
+            cut = volume[..., rows, columns].double()
+            fade = [torch.hann_window(n, periodic=True, dtype=torch.float64) for n in cut.shape[-2:]]
+            return (cut - cut.mean((-2, -1), keepdim=True)) * fade[0][:, None] * fade[1]
+
+        return HalfSplit(part(self.first), part(self.second))
 
     def blurred(self, f50: float, grid_spacing: float) -> HalfSplit:
         """Both halves with a Gaussian in the plane whose transfer is ½ at ``f50``: equally sharp, to compare noise.

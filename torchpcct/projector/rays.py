@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
 
-__all__ = ["Rays", "Segments", "check_motion", "check_pair", "check_source", "rays_of", "slab_lattice", "split"]
+__all__ = ["Rays", "Segments", "check_pair", "check_source", "rays_of", "slab_lattice", "split"]
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -112,20 +112,6 @@ def check_pair(geometry: Any, grid: Any, window: Any) -> None:
             f"window reaches row {window.first_row + window.rows - 1}, the detector has rows 0…{rows - 1}: "
             "reduce first_row or rows"
         )
-
-
-def check_motion(motion: Any, views: int, axes: int) -> Floats:
-    """Displacements of the grid per view as ``(views, axes)`` float64.
-
-    Raises:
-        ValueError: a wrong shape, values that are not finite.
-    """
-    shift = np.array(motion, dtype=np.float64)
-    if shift.shape != (views, axes):
-        raise ValueError(f"motion needs the shape ({views}, {axes}): views and the grid's axes, got {shift.shape}")
-    if not np.isfinite(shift).all():
-        raise ValueError("motion has values that are not finite")
-    return shift
 
 
 def rays_of(geometry: Geometry, window: DetectorWindow | None = None) -> Rays:

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import Geometry, VolumeGrid
-from torchpcct.projector.rays import Segments, check_motion, check_pair, check_source, rays_of, slab_lattice, split
-from torchpcct.vector_geometry import VectorGeometry
+from torchpcct.projector.rays import Segments, check_pair, check_source, rays_of, slab_lattice, split
+from torchpcct.vector_geometry import VectorGeometry, check_motion
 
 __all__ = ["Tables", "VectorTables", "check_memory", "layer_spacing"]
 

@@ -14,51 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam
-from torchpcct.projector.rays import check_motion
-from torchpcct.vector_geometry import VectorGeometry
+from torchpcct.vector_geometry import VectorGeometry, to_vectors
 
 __all__ = ["as_circular", "from_moving_vectors", "from_vectors", "to_vectors"]
-
-
-def to_vectors(geometry: Geometry, motion: Any = None) -> NDArray[np.float64]:
-    """ASTRA's vectors of a scan with a flat detector, ``(views, 6)`` or, for a cone beam, ``(views, 12)`` float64.
-
-    Args:
-        geometry: the scan.
-        motion: displacement of the grid per view as for ``Projector``, or None: source and detector are moved the
-            other way, so that ASTRA's volume may stand still.
-
-    Raises:
-        ValueError: a curved detector, which ASTRA's vectors cannot describe; a motion of the wrong shape.
-        TypeError: not a geometry.
-    """
-    if not isinstance(geometry, ParallelBeam | FanBeam | ConeBeam):
-        raise TypeError(f"geometry must be ParallelBeam, FanBeam or ConeBeam, got {type(geometry).__name__}")
-    if motion is not None:
-        axes = 3 if isinstance(geometry, ConeBeam) else 2
-        back = check_motion(motion, geometry.views, axes)[:, ::-1]
-        vectors = to_vectors(geometry)
-        if not isinstance(geometry, ParallelBeam):
-            vectors[:, :axes] -= back
-        vectors[:, axes : 2 * axes] -= back
-        return vectors
-    radial = np.stack([np.cos(geometry.angles), np.sin(geometry.angles)], axis=1)
-    tangent = np.stack([-radial[:, 1], radial[:, 0]], axis=1)
-    if isinstance(geometry, ParallelBeam):
-        return np.concatenate([-radial, geometry.offset * tangent, geometry.pitch * tangent], axis=1)
-    if geometry.detector == "curved":
-        raise ValueError("ASTRA's vectors describe flat detectors only, this one is curved: use detector='flat'")
-    source, foot = geometry.sod * radial, (geometry.sod - geometry.sdd) * radial
-    if isinstance(geometry, FanBeam):
-        return np.concatenate([source, foot + geometry.offset * tangent, geometry.pitch * tangent], axis=1)
-    zero = np.zeros((geometry.views, 1))
-    return np.concatenate(
-        [
-            source, zero, foot + geometry.offset[1] * tangent, zero + geometry.offset[0],
-            geometry.pitch[1] * tangent, zero, zero, zero, zero + geometry.pitch[0],
-        ],
-        axis=1,
-    )  # fmt: skip
 
 
 def from_vectors(vectors: Any, columns: int, rows: int | None = None) -> FanBeam | ConeBeam:

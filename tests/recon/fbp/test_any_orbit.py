@@ -9,7 +9,7 @@ import pytest
 import torch
 from analytic import Ellipsoid, Gaussian
 
-from recon.fbp.any_orbit import fbp_of_vectors, straighten
+from recon.fbp.any_orbit import straighten
 from recon.fbp.fbp import fbp
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
@@ -73,7 +73,7 @@ def test_wobbling_cone_beam():
     assert worst(fbp(data, geometry, grid, outside=0.0), grid) < 0.02
     with pytest.raises(ValueError, match="window belongs to a circular scan"):
         fbp(data, geometry, grid, window=DetectorWindow.full(CONE))
-    with pytest.raises(ValueError, match="sinogram must have shape"):
+    with pytest.raises(ValueError, match="sinogram must have the shape"):
         fbp(data[:, :-1], geometry, grid)
     assert worst(fbp(data, CONE, grid, outside=0.0), grid) > 0.1
 
@@ -92,7 +92,7 @@ def test_mirrored_axes_and_other_pitches_of_a_fan():
     v[:, 4:] *= -1.0  # columns counted the other way
     v[::2, 4:] *= 0.98  # two detectors
     v[:, 2:4] += np.random.default_rng(1).uniform(-1, 1, (len(v), 2))
-    assert worst(fbp_of_vectors(lines(v, FAN.columns), v, GRID, outside=0.0), GRID) < 0.015
+    assert worst(fbp(lines(v, FAN.columns), VectorGeometry(v, FAN.columns), GRID, outside=0.0), GRID) < 0.015
 
 
 def test_parallel_vectors_with_roll_and_jitter():
@@ -105,7 +105,7 @@ def test_parallel_vectors_with_roll_and_jitter():
     centre = np.concatenate([flat[:, 2:4] + rng.uniform(-2, 2, (n, 1)) * flat[:, 4:], rng.uniform(-1, 1, (n, 1))], 1)
     v = np.concatenate([flat[:, :2], zero, centre, u, up], 1)
     grid = VolumeGrid((3, 48, 48), (1.0, 2.0, 2.0))
-    image = fbp_of_vectors(lines(v, 100, 9, parallel=True), v, grid, parallel=True, outside=0.0)
+    image = fbp(lines(v, 100, 9, parallel=True), VectorGeometry(v, 100, 9, True), grid, outside=0.0)
     assert image.shape == grid.shape
     assert worst(image, grid) < 0.015
 

@@ -80,6 +80,13 @@ def test_the_transfer_is_the_blur_whatever_the_noise():
     assert blurred.f50(reference, 0.5) == pytest.approx(0.24, rel=0.02)
     assert blurred.noise() < 0.5 * reference.noise()
     torch.testing.assert_close(reference.blurred(math.inf, 0.5).first, reference.first)
+    # A sharp edge elsewhere speaks for the whole image, but not for the part beside it.
+    step = torch.zeros(96, 96, dtype=torch.float64)
+    step[:30, :30] = 100.0
+    edge = [HalfSplit(pair.first + step, pair.second + step) for pair in (method, reference)]
+    assert edge[0].f50(edge[1], 0.5) > 0.3
+    beside = [pair.within(slice(32, 96), slice(32, 96)) for pair in edge]
+    assert beside[0].f50(beside[1], 0.5) == pytest.approx(0.24, rel=0.08)
     with pytest.raises(ValueError, match="f50 must be greater than 0"):
         reference.blurred(0.0, 0.5)
     with pytest.raises(ValueError, match="reference has the shape"):

@@ -1,0 +1,257 @@
+"""Files that went wrong: cut off, bits flipped, sections swapped or zeroed; and what a reader makes of them.
+
+As a program it reads damaged copies of one file in a process of its own, so that a crash or a hang is seen from
+outside: ``python damage.py READER FOLDER COPIES`` prints a JSON object of outcomes.
+"""
+
+from __future__ import annotations
+
+import collections
+import json
+import math
+import shutil
+import signal
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+SECONDS = 60
+"""For one copy; a reader that takes longer hangs."""
+
+
+def damaged(content: bytes, copies: int, seed: int = 0) -> Iterator[bytes]:
+    """Copies of a file, in turn: cut off; bits flipped in the first kilobyte; bits flipped anywhere; two sections
+    swapped; a section of zeros."""
+    rng, n = np.random.default_rng(seed), len(content)
+    for k in range(copies):
+        broken = bytearray(content)
+        size = int(rng.integers(1, max(2, n // 4)))
+        a, b = np.sort(rng.integers(0, n - size + 1, 2))
+        match k % 5:
+            case 0:
+                broken = broken[: int(rng.integers(0, n))]
+            case 1 | 2:
+                for at in rng.integers(0, min(1024, n) if k % 5 == 1 else n, 8):
+                    broken[at] ^= 1 << int(rng.integers(0, 8))
+            case 3:
+                size = min(size, int(b - a))
+                broken[a : a + size], broken[b : b + size] = content[b : b + size], content[a : a + size]
+            case _:
+                broken[a : a + size] = bytes(size)
+        yield bytes(broken)
+
+
+def _volume(ending: str) -> Callable[[Path], tuple[Path, Callable[[], Any]]]:
+    def make(folder: Path) -> tuple[Path, Callable[[], Any]]:
+        import torch
+
+        from torchpcct import Volume, VolumeGrid
+
+        target = folder / f"v{ending}"
+        data = torch.round(300 * torch.randn((4, 12, 10), generator=torch.Generator().manual_seed(0)))
+        Volume(data, VolumeGrid((4, 12, 10), (1.5, 0.5, 0.25), (3.0, -7.0, 11.0))).save(target)
+
+        def read() -> list[Any]:
+            volume = Volume.load(target)
+            return [volume.data.numpy(), volume.grid]
+
+        return (sorted(target.iterdir())[1] if target.is_dir() else target), read
+
+    return make
+
+
+def _lines() -> tuple[Any, Any]:
+    from torchpcct import ConeBeam, full_turn
+
+    cone = ConeBeam(full_turn(12), 300.0, 500.0, 24, 3, (1.5, 1.7), (0.25, 0.6), "curved")
+    return cone, 0.5 + 0.1 * np.random.default_rng(0).standard_normal(cone.shape)
+
+
+def _own(folder: Path) -> tuple[Path, Callable[[], Any]]:
+    from torchpcct import Scan
+
+    cone, lines = _lines()
+    Scan.from_line_integrals(lines, cone, photons=1e4).save(folder / "own.h5")
+    return folder / "own.h5", lambda: _scan(Scan.load(folder / "own.h5"))
+
+
+def _scan(scan: Any) -> list[Any]:
+    return [scan.counts.numpy(), scan.air.numpy(), scan.geometry]
+
+
+def _data_exchange(folder: Path) -> tuple[Path, Callable[[], Any]]:
+    import h5py
+
+    from torchpcct.formats.scans import open_scan
+
+    path, rng = folder / "beamline.h5", np.random.default_rng(0)
+    with h5py.File(path, "w") as file:
+        file.create_dataset("exchange/data", data=rng.integers(900, 40000, (20, 3, 24)).astype(np.uint16),
+                            chunks=(5, 3, 24), compression="gzip")  # fmt: skip
+        file["exchange/data_white"] = rng.integers(39000, 41000, (4, 3, 24)).astype(np.uint16)
+        file["exchange/data_dark"] = rng.integers(99, 102, (2, 3, 24)).astype(np.uint16)
+        file["exchange/theta"] = np.linspace(0, 180, 20)
+        file["measurement/instrument/detector/pixel_size"] = 40.0
+        file["measurement/instrument/detector/pixel_size"].attrs["units"] = "um"
+    return path, lambda: _scan(open_scan(path))
+
+
+def _stack(part: str) -> Callable[[Path], tuple[Path, Callable[[], Any]]]:
+    def make(folder: Path) -> tuple[Path, Callable[[], Any]]:
+        import tifffile
+        import yaml
+
+        from torchpcct.formats.geometry_yaml import geometry_values
+        from torchpcct.formats.scans import open_scan
+
+        cone, lines = _lines()
+        values = (5e4 * np.exp(-lines)).astype(np.float32)
+        if part == "npy":
+            np.save(folder / "all.npy", values)
+        else:
+            tifffile.imwrite(folder / "all.tif", values, compression="zlib" if part == "zlib" else None)
+        text = {"readings": "all.npy" if part == "npy" else "all.tif", "kind": "counts", "air": 5e4,
+                "geometry": geometry_values(cone)}  # fmt: skip
+        (folder / "scan.yaml").write_text(yaml.safe_dump(text), encoding="utf-8")
+        path = folder / ("scan.yaml" if part == "yaml" else text["readings"])
+        return path, lambda: _scan(open_scan(folder / "scan.yaml"))
+
+    return make
+
+
+def _catsim(folder: Path) -> tuple[Path, Callable[[], Any]]:
+    from torchpcct.formats.scans import open_scan
+
+    cone, lines = _lines()
+    lines.astype("<f4").tofile(folder / "a.prep")
+    return folder / "a.prep", lambda: _scan(open_scan(folder / "a.prep", cone))
+
+
+def _clinical(folder: Path) -> tuple[Path, Callable[[], Any]]:
+    import pydicom
+    from pydicom.dataset import FileMetaDataset
+    from pydicom.uid import ExplicitVRLittleEndian, generate_uid
+
+    from torchpcct.formats.scans import open_scan
+
+    cone, lines = _lines()
+    where = folder / "projections"
+    where.mkdir()
+    for k, view in enumerate(lines):
+        d = pydicom.Dataset()
+        d.file_meta = FileMetaDataset()
+        d.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
+        d.file_meta.MediaStorageSOPClassUID = d.SOPClassUID = "1.2.840.10008.5.1.4.1.1.66"
+        d.file_meta.MediaStorageSOPInstanceUID = d.SOPInstanceUID = generate_uid()
+        d.InstanceNumber, d.Rows, d.Columns = k + 1, cone.columns, cone.rows
+        d.SamplesPerPixel, d.PhotometricInterpretation, d.PixelRepresentation = 1, "MONOCHROME2", 0
+        d.BitsAllocated, d.BitsStored, d.HighBit = 16, 16, 15
+        d.RescaleSlope, d.RescaleIntercept = "0.0001", "-0.1"
+        for group in (0x7029, 0x7031, 0x7033, 0x7041):
+            d.add_new((group, 0x10), "LO", "DICOM-CT-PD")
+        for tag, vr, value in (
+            (0x70291002, "FL", 1.7), (0x70291006, "FL", 1.5), (0x7029100B, "CS", "CYLINDRICAL"),
+            (0x70291010, "US", cone.rows), (0x70291011, "US", cone.columns),
+            (0x70311001, "FL", cone.angles[k] - math.pi / 2), (0x70311002, "FL", 0.0), (0x70311003, "FL", 300.0),
+            (0x70311031, "FL", 500.0), (0x70311033, "FL", [12.5, 2.0]), (0x7033100E, "CS", "FFSNONE"),
+            (0x70411001, "DS", "0.02"),
+        ):  # fmt: skip
+            d.add_new(tag, vr, value)
+        d.PixelData = np.rint((view.T + 0.1) / 0.0001).astype("<u2").tobytes()
+        d.save_as(where / f"{k:03d}.dcm", enforce_file_format=True)
+    return where / "003.dcm", lambda: _scan(open_scan(where))
+
+
+def _rtk(folder: Path) -> tuple[Path, Callable[[], Any]]:
+    from torchpcct.formats.rtk import read_rtk
+
+    parts = []
+    for angle in np.linspace(0, 2 * math.pi, 12, endpoint=False):
+        c, s = math.cos(angle), math.sin(angle)
+        turn = np.array([[c, 0, -s, 0], [0, 1, 0, 0], [s, 0, c, -300.0], [0, 0, 0, 1]])
+        matrix = np.array([[-500.0, 0, 0, 0], [0, -500.0, 0, 0], [0, 0, 1, 0]]) @ turn
+        parts.append(f"<Projection><Matrix>{' '.join(map(str, matrix.ravel()))}</Matrix></Projection>")
+    path = folder / "geometry.xml"
+    path.write_text(
+        f"<RTKGeometry><SourceToDetectorDistance>500</SourceToDetectorDistance>{''.join(parts)}</RTKGeometry>"
+    )
+    return path, lambda: [read_rtk(path, 24, 3, 1.5)]
+
+
+def _weights(folder: Path) -> tuple[Path, Callable[[], Any]]:
+    import torch
+
+    from recon.mbir.weights_io import read_tensors, write_tensors
+
+    path = folder / "w.safetensors"
+    write_tensors(path, "test weights", {"a": torch.arange(300.0), "b": torch.ones(2, 3)}, {"network": {"width": 3}})
+
+    def read() -> list[Any]:
+        tensors, config = read_tensors(path, "test weights")
+        return [tensors["a"].numpy(), tensors["b"].numpy(), config]
+
+    return path, read
+
+
+READERS: dict[str, Callable[[Path], tuple[Path, Callable[[], Any]]]] = {
+    "scan": _own, "data exchange": _data_exchange, "npy": _stack("npy"), "tiff": _stack("tiff"),
+    "tiff zlib": _stack("zlib"), "yaml": _stack("yaml"), "catsim": _catsim, "ct-pd": _clinical, "rtk": _rtk,
+    "weights": _weights, "h5": _volume(".h5"), "nii": _volume(".nii"), "nii.gz": _volume(".nii.gz"),
+    "mha": _volume(".mha"), "dicom": _volume(""),
+}  # fmt: skip
+"""File to damage and how it is read, made in a folder."""
+SEALED = ("scan", "weights", "h5")
+"""Our own formats, which carry a checksum: what they give is what was written."""
+
+
+def _same(a: Any, b: Any) -> bool:
+    return len(a) == len(b) and all(
+        x.shape == y.shape and x.dtype == y.dtype and x.tobytes() == y.tobytes()
+        if isinstance(x, np.ndarray)
+        else x == y
+        for x, y in zip(a, b, strict=True)
+    )
+
+
+class _Slow(Exception):
+    pass
+
+
+def _hang(*_: Any) -> None:
+    raise _Slow
+
+
+def outcomes(name: str, folder: Path, copies: int, seed: int = 0) -> dict[str, int]:
+    """How often each of ``same``, ``other`` (data that a format without checksum cannot tell from true ones),
+    ``refused`` (a clear error) and anything worse, by its name."""
+    path, read = READERS[name](folder)
+    content, truth = path.read_bytes(), read()
+    found: collections.Counter[str] = collections.Counter()
+    signal.signal(signal.SIGALRM, _hang)
+    for broken in damaged(content, copies, seed):
+        path.write_bytes(broken)
+        signal.alarm(SECONDS)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                found["same" if _same(truth, read()) else "other"] += 1
+        except (ValueError, TypeError, FileNotFoundError) as error:
+            found["refused" if len(str(error)) > 10 else f"says nothing: {error!r}"] += 1
+        except Exception as error:
+            found[f"{type(error).__name__}: {str(error)[:200]}"] += 1
+        finally:
+            signal.alarm(0)
+    path.write_bytes(content)
+    return dict(found)
+
+
+if __name__ == "__main__":
+    reader, where, number = sys.argv[1:]
+    made = Path(where)
+    shutil.rmtree(made, ignore_errors=True)
+    made.mkdir(parents=True)
+    print(json.dumps(outcomes(reader, made, int(number))))
