@@ -113,7 +113,8 @@ def _add_compare(commands: Commands) -> None:
     parser = command(
         commands, "compare", _own_study, registry.STUDIES["compare"],
         "Simulate the paper's plaque scan at full size, reconstruct it by FBP (kernels × voxel sizes), PWLS and MBIR "
-        "at 1×, 2×, 5.7× and 8× dose, and print what dose MBIR saves and the paper's tables beside its numbers.",
+        "at 1×, 2×, 5.7× and 8× dose, and print what dose MBIR saves and the paper's tables beside its numbers. "
+        "After an interruption the same command goes on.",
         "folder for report.json, report.md and compare.png (default out/compare)",
     )  # fmt: skip
     parser.add_argument("--realizations", type=int, metavar="N", help="per dose (default 10)")
@@ -161,7 +162,8 @@ def _add_hardcases(commands: Commands) -> None:
 def _add_study(commands: Commands) -> None:
     parser = command(
         commands, "study", _study, "one of the paper's studies; torchpcct study --help lists them",
-        "Run a study of the paper at full scale and print its figures beside the published ones.",
+        "Run a study of the paper at full scale and print its figures beside the published ones. After an interruption "
+        "the same command goes on.",
         "folder for report.json, report.md and the figures (default out/NAME)",
     )  # fmt: skip
     parser.formatter_class = argparse.RawDescriptionHelpFormatter

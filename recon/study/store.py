@@ -103,9 +103,17 @@ class Pieces:
         self._store = None if folder is None else Store(Path(folder) / self.FOLDER)
         self._key = "" if folder is None else f"{settings!r} {_source()}"
         self._prefix = ""
+        self._asked: set[str] = set()
 
     def __call__(self, name: str, compute: Callable[[], T]) -> T:
-        """What ``compute`` gives, or gave before: anything that :func:`packed` takes."""
+        """What ``compute`` gives, or gave before: anything that :func:`packed` takes.
+
+        Raises:
+            ValueError: a name that was asked for already, which would give the other piece.
+        """
+        if self._prefix + name in self._asked:
+            raise ValueError(f"two pieces of a study have the name {self._prefix + name!r}: name one of them otherwise")
+        self._asked.add(self._prefix + name)
         if self._store is None:
             return compute()
         found: T = unpacked(self._store.piece(self._prefix + name, self._key, lambda: packed(compute())))

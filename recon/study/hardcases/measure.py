@@ -101,7 +101,7 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
         scan = CASES[name].apply(clean, noisy, np.random.default_rng(settings.seed))
         for method in settings.methods:
             run = partial(_row, scan, grid, method, sound[method], noise[method], usual[method], CASES[name].noise)
-            row = pieces(f"{name}/{method}", run)
+            row = pieces(f"case_{name}/{method}", run)
             rows.append({"case": name, "title": CASES[name].title, "method": method, **row})
         progress("cases", (k + 1) / len(settings.cases))
     clock.lap("cases")

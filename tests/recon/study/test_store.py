@@ -91,6 +91,15 @@ def test_finished_pieces_are_used_again_by_the_same_settings_and_source_only(tmp
     Pieces.clear(tmp_path)  # nothing there: nothing to do
 
 
+def test_one_name_is_one_piece(tmp_path):
+    for folder in (tmp_path, None):
+        pieces = Pieces(folder, _Settings())
+        pieces("x", lambda: 1)
+        pieces.within("part")("x", lambda: 2)
+        with pytest.raises(ValueError, match="two pieces of a study have the name 'part/x'"):
+            pieces.within("part")("x", lambda: 3)
+
+
 def test_kills_at_random_moments_lose_one_piece_at_most(tmp_path):
     """A study of 12 pieces is killed (SIGKILL) again and again until it gets through."""
     rng, log, count = np.random.default_rng(0), tmp_path / "log", 12

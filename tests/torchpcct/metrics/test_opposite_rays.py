@@ -59,6 +59,13 @@ def test_a_wrong_centre_is_found_and_measured(kind, columns):
     assert right.findings == ()
 
 
+def test_an_error_within_the_tolerance_is_measured_but_no_finding():
+    g = GEOMETRIES["fan"]
+    found = centre_test(_lines(g), _moved(g, 0.7 * CENTRE_TOLERANCE))
+    assert found.columns == pytest.approx(0.7 * CENTRE_TOLERANCE, rel=0.3)
+    assert found.findings == ()
+
+
 def test_the_order_of_the_views_does_not_matter():
     g = _moved(GEOMETRIES["fan"], 0.5)
     order = np.random.default_rng(0).permutation(VIEWS)
