@@ -40,11 +40,11 @@ def fbp_deviations(scan: Scan, grid: VolumeGrid, regions: Mapping[str, Any], ker
     fbp = InsetFbp(scan, [grid], [kernel])
     slope = scan.linearisation.slope(scan.air.log() - scan.surround.log())
     variance = slope.square() / scan.surround
-    pair = [n for n in ("fibrous", "core") if n in masks]
-    groups = [pair] if pair else []
+    pair = [n for n in masks if n in ("fibrous", "core")]
+    # The vectors are large: no more than two at a time.
+    groups: list[list[str]] = [pair] if pair else []
     groups += [[n] for n in masks if n not in pair]
     found: dict[str, float] = {}
-    # The vectors are large: no more than two at a time.
     for names in groups:
         adjoints = roi_adjoints(scan, fbp, [[RoiMean(grid, grid, masks[n]) for n in names]])
         noise = adjoints.window.take(variance)
