@@ -22,6 +22,7 @@ __all__ = ["add_plaque"]
 def _plaque(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     voxel = number("--voxel", arguments.voxel, positive=True, unit="mm")
     from recon import reconstruct
+    from recon.plaque.beside import fbp_deviations
     from recon.plaque.data import TissueData
     from recon.plaque.reading import read_plaque
     from recon.plaque.report import save, table
@@ -45,8 +46,11 @@ def _plaque(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     for method in arguments.beside:
         others[method.upper()] = reconstruct(scan, grid, method, progress=progress.of(method)).data
     progress.close()
-    files = save(reading, arguments.out or Path("out") / "plaque", others)
-    print(table(reading, others))
+    deviations = {}
+    if scan.window is not None and scan.surround is not None:
+        deviations["soft FBP"] = fbp_deviations(scan, grid, reading.regions)
+    files = save(reading, arguments.out or Path("out") / "plaque", others, deviations)
+    print(table(reading, others, deviations))
     print(f"{seconds}. Written: {', '.join(map(str, files))}")
 
 

@@ -8,8 +8,8 @@ data: :mod:`~recon.plaque.data` and :mod:`~recon.plaque.stationary` (statistic a
 :mod:`~recon.plaque.start` and :mod:`~recon.plaque.centreline` (where the vessel is), :mod:`~recon.plaque.outline` and
 :mod:`~recon.plaque.vessel` (its model and fit), :mod:`~recon.plaque.core` and :mod:`~recon.plaque.particles` (plaque
 bodies), :mod:`~recon.plaque.figures` (draws of what is reported), :mod:`~recon.plaque.quality` (misfit, texture),
-:mod:`~recon.plaque.report` (text, files, picture). What makes it fast: :mod:`~recon.plaque.local_gram` and
-:mod:`~recon.plaque.kernels`.
+:mod:`~recon.plaque.beside` (FBP's noise over the same regions), :mod:`~recon.plaque.report` (text, files, picture).
+What makes it fast: :mod:`~recon.plaque.local_gram` and :mod:`~recon.plaque.kernels`.
 """
 
 from recon.plaque.data import TissueData

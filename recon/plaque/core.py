@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from recon.plaque.kernels import core_fractions
+from recon.plaque.local_gram import LocalGram
 from recon.plaque.vessel import BLUR, BLUR_UNIT, Fit, Vessel
 
 __all__ = ["CorePrior", "CoreSpace", "Evidence"]
@@ -39,8 +41,8 @@ class CorePrior:
     """
 
     contrast_sd: float = 100.0
-    semi_axes: tuple[float, float, float] = (0.45, 0.8, 0.9)
-    axes_log_sd: float = 0.4
+    semi_axes: tuple[float, float, float] = (0.5, 0.85, 0.9)
+    axes_log_sd: float = 0.5
     turn_sd: float = 0.25
     cap: float = 0.12
     cap_log_sd: float = 0.7
@@ -88,7 +90,6 @@ class CoreSpace:
         self.chosen = np.flatnonzero(inside)
         # Where a centre may lie: in the layer, with some of it on both sides.
         deep = (drawing.inner_distance < -0.1) & (drawing.lumen_distance > 0.1) & (layer > 0.3)
-        self.gram = vessel.gram.part(self.chosen)
         self.points = np.ascontiguousarray(vessel.points[self.chosen])
         self.inner = np.ascontiguousarray(drawing.shares[1][self.chosen])
         self.lumen = np.ascontiguousarray(drawing.lumen_distance[self.chosen])
@@ -113,7 +114,6 @@ class CoreSpace:
             gradient, hessian = gradient[kept], hessian[np.ix_(kept, kept)]
         self.kept = kept
         self.residual = residual[self.chosen].astype(np.float32)
-        self.curved = np.ascontiguousarray(fit.curved[self.chosen][:, kept])
         self.lower = np.linalg.cholesky(hessian)
         self.gradient = gradient
         self.pull = solve_triangular(self.lower, gradient, lower=True)
@@ -122,6 +122,16 @@ class CoreSpace:
         # about the core, but is as large as what does.
         self.none = -energy + 0.5 * float(self.pull @ self.pull)
         self.against = self.none if against is None else against
+
+    @cached_property
+    def gram(self) -> LocalGram:
+        """Between the chosen voxels."""
+        return self.vessel.gram.part(self.chosen)
+
+    @cached_property
+    def curved(self) -> NDArray[np.float32]:
+        """``(chosen, p)``: G times the Jacobian of the vessel's parameters."""
+        return np.ascontiguousarray(self.fit.curved[self.chosen][:, self.kept])
 
     # -- shapes --------------------------------------------------------------------------------------------------
 
@@ -189,13 +199,14 @@ class CoreSpace:
 
     def evidence(self, shares: NDArray[np.float32]) -> Evidence:
         """Of bodies ``(m, n)``."""
-        curved = self.gram.apply(np.ascontiguousarray(shares.T)).T
-        own = np.einsum("mn,mn->m", shares, curved, dtype=np.float64)
-        mixed = (shares @ self.curved).astype(np.float64)
+        own = self.gram.energies(shares)
+        touched = np.flatnonzero(shares.any(0))
+        near = shares[:, touched]
+        mixed = (near @ self.curved[touched]).astype(np.float64)
         white = solve_triangular(self.lower, mixed.T, lower=True)
         precision = np.maximum(own - (white**2).sum(0), 1e-3 * own) + self.prior.contrast_sd**-2.0
         # The vessel's parameters follow what the body takes, and what was left of the gradient.
-        pull = shares.astype(np.float64) @ self.residual - self.pull @ white
+        pull = near @ self.residual[touched] - self.pull @ white
         mean = pull / precision
         log = 0.5 * pull * mean - 0.5 * np.log(precision * self.prior.contrast_sd**2)
         shift = solve_triangular(self.lower, white, lower=True, trans="T").T

@@ -6,7 +6,7 @@ import math
 
 from numba import njit, prange
 
-__all__ = ["core_fractions", "gather_block", "plane_fractions"]
+__all__ = ["core_fractions", "gather_block", "outline_radius", "outline_spread", "plane_fractions", "symmetric_step"]
 
 _LEAST = 0.04
 """Smallest share of a voxel's edge that an outline's normal sees; the exact formula divides by it."""
@@ -164,3 +164,52 @@ def gather_block(kernel, polynomials, there, runs, out):
                 other = polynomials[c, v, u : u + count]
                 for j in range(count):
                     row[j] += half * (own + other[j]) * k[j]
+
+
+@njit(cache=True)
+def outline_radius(first, spline, spline_slope, wave, wave_slope, shape, r, turn, slope):
+    """Radius of an outline and its derivatives, see :class:`recon.plaque.outline.OutlineAt`.
+
+    Args:
+        first: ``(n,)``; spline, spline_slope: ``(n, 4)``; wave, wave_slope: ``(n, orders)``.
+        shape: ``(splines, orders)``.
+        r, turn, slope: ``(n,)`` radius, its derivatives by θ and s, filled.
+    """
+    for i in range(first.size):
+        radius, around, along = 0.0, 0.0, 0.0
+        for a in range(4):
+            value, value_slope, lift = 0.0, 0.0, shape[first[i] + a]
+            for k in range(lift.size):
+                value += lift[k] * wave[i, k]
+                value_slope += lift[k] * wave_slope[i, k]
+            radius += spline[i, a] * value
+            around += spline[i, a] * value_slope
+            along += spline_slope[i, a] * value
+        r[i], turn[i], slope[i] = radius, around, along
+
+
+@njit(cache=True)
+def outline_spread(change, first, spline, wave, out):
+    """Add change · dr/d(coefficients) to ``out`` ``(n, splines · orders)``; arguments as in :func:`outline_radius`."""
+    orders = wave.shape[1]
+    for i in range(first.size):
+        if change[i] != 0.0:
+            for a in range(4):
+                factor, column = change[i] * spline[i, a], (first[i] + a) * orders
+                for k in range(orders):
+                    out[i, column + k] += factor * wave[i, k]
+
+
+@njit(cache=True, fastmath={"contract", "reassoc", "nsz"})
+def symmetric_step(block, here, there, out_here, out_there):
+    """Add ``block @ here`` to ``out_there`` and its transpose times ``there`` to ``out_here``, reading it once.
+
+    Args:
+        block: ``(n, m)``; here, out_here: ``(m,)``; there, out_there: ``(n,)``.
+    """
+    for i in range(block.shape[0]):
+        row, factor, total = block[i], there[i], block.dtype.type(0.0)
+        for j in range(row.size):
+            total += row[j] * here[j]
+            out_here[j] += row[j] * factor
+        out_there[i] += total

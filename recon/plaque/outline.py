@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.plaque.centreline import Coordinates
+from recon.plaque.kernels import outline_radius, outline_spread
 
 __all__ = ["ORDERS", "Outline", "OutlineAt"]
 
@@ -42,18 +44,14 @@ class OutlineAt:
 
     def radius(self, shape: Floats) -> tuple[Floats, Floats, Floats]:
         """r, dr/dθ and dr/ds at the points for coefficients ``(splines, 2·ORDERS + 1)``."""
-        near = shape[self.first[:, None] + np.arange(4)]
-        along = np.einsum("ni,nik->nk", self.spline, near)
-        r, turn = np.einsum("nk,nk->n", along, self.wave), np.einsum("nk,nk->n", along, self.wave_slope)
-        return r, turn, np.einsum("ni,nik,nk->n", self.spline_slope, near, self.wave)
+        found = np.empty((3, len(self.first)))
+        parts = (self.first, self.spline, self.spline_slope, self.wave, self.wave_slope)
+        outline_radius(*parts, np.ascontiguousarray(shape), *found)
+        return found[0], found[1], found[2]
 
-    def spread(self, slope: Floats, out: Floats) -> None:
-        """Add slope · dr/d(coefficients) to ``out`` ``(n, splines · (2·ORDERS + 1))``, points with slope 0 left out."""
-        at = np.flatnonzero(slope)
-        waves = self.wave.shape[1]
-        for i in range(4):
-            columns = (self.first[at] + i)[:, None] * waves + np.arange(waves)
-            out[at[:, None], columns] += (slope[at] * self.spline[at, i])[:, None] * self.wave[at]
+    def spread(self, slope: Floats, out: Any) -> None:
+        """Add slope · dr/d(coefficients) to ``out`` ``(n, splines · (2·ORDERS + 1))``, of any float type."""
+        outline_spread(slope, self.first, self.spline, self.wave, out)
 
 
 @dataclass(frozen=True)
@@ -101,10 +99,10 @@ class Outline:
         shape[:, 0] = (weight @ radius) / weight.sum(1)
         return shape
 
-    def precision(self) -> Floats:
-        """Prior inverse covariance of all coefficients, mm⁻²."""
+    def precision(self, least_order: int = 0) -> Floats:
+        """Prior inverse covariance of all coefficients, mm⁻²; 0 for those of a smaller Fourier order."""
         centres = np.arange(self.splines) * _KNOT_MM
         lag = math.sqrt(5.0) * np.abs(centres[:, None] - centres) / _CORRELATION_MM
         k = (1 + lag + lag**2 / 3) * np.exp(-lag)
         order = np.concatenate([[0], np.arange(1, ORDERS + 1), np.arange(1, ORDERS + 1)])
-        return np.kron(np.linalg.inv(k), np.diag(1.0 / np.array(_SD_MM)[order] ** 2))
+        return np.kron(np.linalg.inv(k), np.diag((order >= least_order) / np.array(_SD_MM)[order] ** 2))

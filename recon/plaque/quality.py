@@ -65,8 +65,8 @@ def misfit(vessel: Vessel, fit: Fit) -> tuple[float, float]:
     scale = kept / np.sqrt(variance)
     z = fit.residual * scale
     # What the fit takes away: Gram times Jacobian, in the metric of the covariance.
-    taken = np.einsum("np,pq,nq->", fit.curved * scale[:, None], fit.covariance, fit.curved * scale[:, None],
-                      optimize=True)  # fmt: skip
+    white = fit.curved * scale[:, None].astype(np.float32)
+    taken = np.sum(fit.covariance * (white.T @ white))
     total = 0.0
     for (k, b), block in vessel.gram.blocks.items():
         here, there = slice(at[k], at[k + 1]), slice(at[k + b], at[k + b + 1])
@@ -106,9 +106,9 @@ def texture(vessel: Vessel, fit: Fit, rng: np.random.Generator) -> Texture:
 
     signs = rng.integers(0, 2, (len(soft), _PROBES)) * 2.0 - 1.0
     probes = soft[:, None] * smooth(signs)
-    curved = vessel.gram.apply(probes.astype(np.float32)).astype(np.float64)
-    taken = fit.curved.T.astype(np.float64) @ probes
-    left = curved - fit.curved @ (fit.covariance @ taken)
+    single = probes.astype(np.float32)
+    taken = fit.curved.T @ single
+    left = vessel.gram.apply(single).astype(np.float64) - fit.curved @ (fit.covariance @ taken).astype(np.float32)
     trace = float((probes * left).sum() / _PROBES)
     back = smooth(soft[:, None] * left)
     square = float((back**2).sum() / _PROBES)
@@ -130,6 +130,6 @@ def texture(vessel: Vessel, fit: Fit, rng: np.random.Generator) -> Texture:
         for k, factor in wanted.items():
             v[k] = factor
         # An estimate is wᵀb with w = J C v; an image t adds (G w)ᵀ t.
-        response = fit.curved @ (fit.covariance @ v)
+        response = fit.curved @ (fit.covariance @ v).astype(np.float32)
         responses[name] = float(np.linalg.norm(smooth((soft * response)[:, None])))
     return Texture(max(float(mean), 0.0), max(float(top), 0.0), responses)

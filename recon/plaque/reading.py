@@ -20,7 +20,7 @@ from recon.plaque.vessel import FAT, FIBROUS, Fit, Vessel
 from torchpcct.geometry import VolumeGrid
 from torchpcct.validate import number, numbers, whole
 
-__all__ = ["CERTAIN", "PlaqueReading", "read_plaque"]
+__all__ = ["CERTAIN", "PlaqueReading", "core_regions", "read_plaque", "read_regions"]
 
 Floats = NDArray[np.float64]
 
@@ -93,19 +93,36 @@ class PlaqueReading:
         Raises:
             ValueError: another shape.
         """
-        values = np.asarray(volume, dtype=np.float64)
-        if values.shape != tuple(self.grid.shape):
-            raise ValueError(f"volume must have the reading's shape {tuple(self.grid.shape)}, got {values.shape}")
-        found = {}
-        for name, share in self.regions.items():
-            inside = share > _PURE
-            if inside.sum() < _FEW:
-                inside = share > _LESS_PURE
-            if inside.any():
-                found[name] = float(values[inside].mean())
-        if "core" in found and "fibrous" in found:
-            found["contrast"] = found["fibrous"] - found["core"]
-        return found
+        return read_regions(self.regions, volume)
+
+
+def core_regions(regions: Mapping[str, Any]) -> dict[str, NDArray[np.bool_]]:
+    """Voxels wholly inside of each region, from the shares of its voxels; regions without such voxels are left out."""
+    found = {}
+    for name, share in regions.items():
+        inside = np.asarray(share) > _PURE
+        if inside.sum() < _FEW:
+            inside = np.asarray(share) > _LESS_PURE
+        if inside.any():
+            found[name] = inside
+    return found
+
+
+def read_regions(regions: Mapping[str, Any], volume: Any) -> dict[str, float]:
+    """See :meth:`PlaqueReading.read`.
+
+    Args:
+        regions: name → shares of the voxels.
+        volume: of the same shape, HU.
+    """
+    values = np.asarray(volume, dtype=np.float64)
+    for share in regions.values():
+        if values.shape != share.shape:
+            raise ValueError(f"volume must have the reading's shape {share.shape}, got {values.shape}")
+    found = {name: float(values[inside].mean()) for name, inside in core_regions(regions).items()}
+    if "core" in found and "fibrous" in found:
+        found["contrast"] = found["fibrous"] - found["core"]
+    return found
 
 
 def read_plaque(
@@ -188,6 +205,11 @@ def _read(
     cloud = lead(space.draw_prior(particles, rng), space.nothing, space.target, rng)
     first = cloud.log_evidence
     seen = space.evidence(space.shares(cloud.points))
+    if seen.mean.mean() > 0.5 * CALCIFIED_HU and calcifications < _MOST_BODIES:
+        # The search with few trial bodies had missed it.
+        other = _with_body(vessel, fit, space, cloud, float(seen.mean.mean()), expected=True)
+        if other.parameters[-1] > CALCIFIED_HU:
+            return _read(vessel, other, prior_of_core, particles, prior, rng, seed)
     # The vessel was fitted without a core, its tissues as expected. Now they are free: without a core, for comparison;
     # with the one that was found; and then the core again.
     without = CoreSpace(vessel, vessel.fit(fit.parameters, fit.bodies), prior_of_core)

@@ -20,13 +20,19 @@ __all__ = ["picture", "save", "table"]
 _COLOURS = {"lumen": "tab:red", "fibrous": "tab:orange", "wall": "tab:blue", "core": "lime", "calcification": "white"}
 
 
-def table(reading: PlaqueReading, others: Mapping[str, Any] | None = None) -> str:
+Deviations = Mapping[str, Mapping[str, float]]
+"""Volume → region → standard deviation of its mean, HU."""
+
+
+def table(reading: PlaqueReading, others: Mapping[str, Any] | None = None, deviations: Deviations | None = None) -> str:
     """Markdown: every figure with its 95 % interval, and what other volumes read over the same regions.
 
     Args:
         reading: to tell.
         others: name → volume in HU on the reading's grid.
+        deviations: of their means, where they are known (:func:`recon.plaque.beside.fbp_deviations`).
     """
+    sd = deviations or {}
     read = {name: reading.read(volume) for name, volume in (others or {}).items()}
     lines = [
         f"Plaque body: P = {reading.presence:.3f}"
@@ -39,7 +45,11 @@ def table(reading: PlaqueReading, others: Mapping[str, Any] | None = None) -> st
     for name, e in reading.figures.items():
         digits = 1 if e.unit == "HU" else 2
         cells = [f"{e.value:.{digits}f} [{e.low:.{digits}f}, {e.high:.{digits}f}] {e.unit}"]
-        cells += [f"{r[name]:.{digits}f}" if name in r else "–" for r in read.values()]
+        for other, r in read.items():
+            error = sd.get(other, {}).get(name)
+            cells.append(
+                "–" if name not in r else f"{r[name]:.{digits}f}" + ("" if error is None else f" ± {error:.1f}")
+            )
         lines.append(" | ".join([f"| {name}", *cells]) + " |")
     for name, why in reading.refused.items():
         lines.append(" | ".join([f"| {name}", f"refused: {why}", *("–" for _ in read)]) + " |")
@@ -73,7 +83,12 @@ def picture(reading: PlaqueReading, others: Mapping[str, Any] | None = None) -> 
     return panels(rows, ("axial", "coronal"), title=f"plaque body: P = {reading.presence:.2f}")
 
 
-def save(reading: PlaqueReading, folder: Path, others: Mapping[str, Any] | None = None) -> list[Path]:
+def save(
+    reading: PlaqueReading,
+    folder: Path,
+    others: Mapping[str, Any] | None = None,
+    deviations: Deviations | None = None,
+) -> list[Path]:
     """Write ``report.md``, ``report.json``, ``tissues.nii.gz`` (labels), ``image.nii.gz`` and ``plaque.png``.
 
     Labels: 0 fat, 1 wall, 2 fibrous, 3 lumen, 4 core, 5 calcification; the core only where it is certain.
@@ -81,7 +96,7 @@ def save(reading: PlaqueReading, folder: Path, others: Mapping[str, Any] | None 
     Args:
         reading: to write.
         folder: made if it does not exist.
-        others: as for :func:`table`.
+        others, deviations: as for :func:`table`.
     """
     folder.mkdir(parents=True, exist_ok=True)
     names = ["fat", "wall", "fibrous", "lumen", "core", "calcification"]
@@ -95,6 +110,7 @@ def save(reading: PlaqueReading, folder: Path, others: Mapping[str, Any] | None 
         "figures": {n: e.as_dict() for n, e in reading.figures.items()},
         "refused": dict(reading.refused),
         "same_regions": {name: reading.read(volume) for name, volume in (others or {}).items()},
+        "same_regions_sd": {name: dict(v) for name, v in (deviations or {}).items()},
         "chi2": reading.chi2,
         "chi2_sd": reading.chi2_sd,
         "texture_hu": reading.texture_hu,
@@ -103,7 +119,10 @@ def save(reading: PlaqueReading, folder: Path, others: Mapping[str, Any] | None 
         "labels": {n: k for k, n in enumerate(names)},
         "info": dict(reading.info),
     }
-    for name, text in (("report.md", table(reading, others)), ("report.json", json.dumps(data, indent=1) + "\n")):
+    for name, text in (
+        ("report.md", table(reading, others, deviations)),
+        ("report.json", json.dumps(data, indent=1) + "\n"),
+    ):
         with written_whole(folder / name) as part:
             part.write_text(text, encoding="utf-8")
     Volume(torch.from_numpy(labels), reading.grid).save(folder / "tissues.nii.gz")

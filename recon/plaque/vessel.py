@@ -37,6 +37,9 @@ each end (position and tilts of a plane); then the lumen's and the outer outline
 _VALUE_SD = (100.0, 25.0, 60.0, 300.0)
 _EXPECTED_SD = (10.0, 15.0)
 """Of wall and fibrous tissue, HU, in a fit that expects them to be what they usually are."""
+_EXPECTED_ROUND = 4.0
+"""So much less than else the outlines leave an ellipse in such a fit: a calcification beside the lumen would otherwise
+be taken for a bulge of it, and leave no trace."""
 _VALUE_MEAN = (-90.0, 50.0, 95.0)
 """Prior of fat, wall and fibrous tissue, HU; the lumen's mean is what the start reads."""
 _WALL_MM, _WALL_LOG_SD = 0.2, 0.2
@@ -45,8 +48,12 @@ _BLUR, _BLUR_SD, BLUR_UNIT = 0.2, 1.0, 0.01
 _DIFFERENCE = 0.02
 """Of the blur, for its derivative."""
 _END_SD_MM = (1.0, 0.1, 0.1)
-_FAR = 30.0
-"""A step that promises more gain of the log posterior than this makes the curvature worth computing again."""
+_FAR = 15.0
+"""A step that gains more of the log posterior than this makes the curvature worth computing again."""
+_SHORTER = 3
+"""Lengths of a step that are tried: the noise of single voxels bends the energy more than its linear model says."""
+_DAMPING = 0.03
+"""First share of the Hessian's diagonal that is added where no length of a step leads down."""
 _MARGIN_MM = 0.6
 """Voxels so far outside of the outer wall's start may still become vessel."""
 _BODY_SD = 300.0
@@ -100,26 +107,29 @@ class Fit:
         drawing: there.
         energy: ½ xᵀGx − bᵀx − log prior, without constants.
         residual: ``(n,)`` b − Gx on the voxels, HU⁻¹.
-        curved: ``(n, p)`` float32, G times the Jacobian (that of fat: of the whole volume).
         gradient: ``(p,)`` of −energy, about 0.
         hessian: ``(p, p)``; factor: its Cholesky factor.
         bodies: shares of the fibrous layer, ``(k, n)``.
+        vessel: that was fitted.
     """
 
     parameters: Floats
     drawing: Drawing
     energy: float
     residual: Floats
-    curved: NDArray[np.float32]
     gradient: Floats
     hessian: Floats
     factor: Any
     bodies: Floats
+    vessel: Vessel
 
     @cached_property
-    def log_determinant(self) -> float:
-        """Of the Hessian."""
-        return float(2 * np.log(np.diag(self.factor[0])).sum())
+    def curved(self) -> NDArray[np.float32]:
+        """``(n, p)``, G times the Jacobian (that of fat: of the whole volume)."""
+        assert self.drawing.jacobian is not None
+        curved: NDArray[np.float32] = self.vessel.gram.apply(self.drawing.jacobian)
+        curved[:, FAT] += self.vessel.ones.astype(np.float32)
+        return curved
 
     @cached_property
     def covariance(self) -> Floats:
@@ -260,21 +270,20 @@ class Vessel:
         shares = share * inside
         single = None
         if jacobian:
-            found = np.zeros((n, self.size + len(contrasts)))
-            found[:, FAT] = -shares[0]
-            found[:, WALL] = shares[0] - shares[1]
-            found[:, FIBROUS] = shares[1] - shares[2]
-            found[:, LUMEN] = shares[2]
-            found[:, THICKNESS] = -inside * steps[1] * slope[1] * thickness
-            found[:, BLUR] = inside * (steps * (softer - share)).sum(0) / _DIFFERENCE
-            found[:, ENDS : ENDS + 3] = (-whole * end_slope[0] * end_share[1])[:, None] * self._planes
-            found[:, ENDS + 3 : ENDS + 6] = (whole * end_slope[1] * end_share[0])[:, None] * self._planes
-            self._lumen.spread(inside * steps[2] * slope[2] * lumen_rate, found[:, self.lumen_part])
+            single = np.zeros((n, self.size + len(contrasts)), np.float32)
+            single[:, FAT] = -shares[0]
+            single[:, WALL] = shares[0] - shares[1]
+            single[:, FIBROUS] = shares[1] - shares[2]
+            single[:, LUMEN] = shares[2]
+            single[:, THICKNESS] = -inside * steps[1] * slope[1] * thickness
+            single[:, BLUR] = inside * (steps * (softer - share)).sum(0) / _DIFFERENCE
+            single[:, ENDS : ENDS + 3] = (-whole * end_slope[0] * end_share[1])[:, None] * self._planes
+            single[:, ENDS + 3 : ENDS + 6] = (whole * end_slope[1] * end_share[0])[:, None] * self._planes
+            self._lumen.spread(inside * steps[2] * slope[2] * lumen_rate, single[:, self.lumen_part])
             outward = inside * (steps[0] * slope[0] + steps[1] * slope[1]) * outer_rate
-            self._outer.spread(outward, found[:, self.outer_part])
+            self._outer.spread(outward, single[:, self.outer_part])
             for k, body in enumerate(bodies):
-                found[:, self.size + k] = body * (shares[1] - shares[2])
-            single = found.astype(np.float32)
+                single[:, self.size + k] = body * (shares[1] - shares[2])
         return Drawing(image, shares, single, lumen_d, outer_d + thickness, lumen_w)
 
     # -- fitting -------------------------------------------------------------------------------------------------
@@ -285,6 +294,8 @@ class Vessel:
         precision[: self.size, : self.size] = self._prior
         if expected:
             precision[[WALL, FIBROUS], [WALL, FIBROUS]] = np.array(_EXPECTED_SD) ** -2.0
+            for part, outline in ((self.lumen_part, self.lumen_outline), (self.outer_part, self.outer_outline)):
+                precision[part, part] += (_EXPECTED_ROUND**2 - 1) * outline.precision(least_order=3)
         precision[range(self.size, self.size + k), range(self.size, self.size + k)] = _BODY_SD**-2.0
         return np.concatenate([self._prior_mean, np.zeros(k)]), precision
 
@@ -303,52 +314,54 @@ class Vessel:
         *,
         expected: bool = False,
         steps: int = 12,
-        tolerance: float = 0.1,
+        tolerance: float = 0.3,
     ) -> Fit:
-        """Levenberg–Marquardt from given parameters to the mode.
+        """Gauss and Newton's steps, shortened or damped where they lead up, from given parameters to the mode.
 
         Args:
             parameters: where to begin, ``(size + k,)``.
             bodies: shares of the fibrous layer, ``(k, n)``.
-            expected: wall and fibrous tissue hardly leave their prior's mean. A core that the model does not have yet
-                would otherwise pull the fibrous value to its own, and make wall of the fibrous tissue.
+            expected: wall and fibrous tissue hardly leave their prior's mean, the outlines hardly an ellipse. A core
+                that the model does not have yet would otherwise pull the fibrous value to its own, and make wall of
+                the fibrous tissue.
             steps: largest number of them.
-            tolerance: stop when a step promises less than this gain of the log posterior.
+            tolerance: stop when a step gains less than this of the log posterior.
         """
         bodies = np.zeros((0, len(self.index))) if bodies is None else bodies
         mean, precision = self._prior_with(bodies, expected)
         theta = np.concatenate([parameters, np.zeros(len(mean) - len(parameters))])
         drawing = self.draw(theta, bodies)
         energy, curved_image = self._energy(theta, drawing, mean, precision)
-        damping, stale = 1e-4, False
-        curved, hessian = self._expand(drawing, precision)
+        hessian = self._hessian(drawing, precision)
+        stale, damping = False, 0.0
         for _ in range(steps):
             gradient = self._gradient(theta, drawing, curved_image, mean, precision)
             step = cho_solve(cho_factor(hessian + damping * np.diag(np.diag(hessian)), lower=True), gradient)
-            promised = float(gradient @ step - 0.5 * step @ hessian @ step)
-            tried = theta + step
-            other = self.draw(tried, bodies)
-            lower, curved_other = self._energy(tried, other, mean, precision)
-            # Single precision cannot tell energies closer than the tolerance: the last small step is taken unseen.
-            if lower > energy + tolerance:
-                damping *= 10
-                if stale:
-                    curved, hessian = self._expand(drawing, precision)
-                    stale = False
+            along, share = float(gradient @ step), 1.0
+            for _ in range(_SHORTER):
+                tried = theta + share * step
+                other = self.draw(tried, bodies)
+                lower, curved_other = self._energy(tried, other, mean, precision)
+                gain = energy - lower
+                if gain > 0.0:
+                    break
+                # The top of the parabola through the slope and both ends.
+                share *= min(max(0.5 * share * along / (share * along - gain), 0.1), 0.5)
+            else:
+                damping = max(10.0 * damping, _DAMPING)
                 continue
-            theta, drawing, energy, curved_image = tried, other, lower, curved_other
-            damping, stale = damping / 10, True
-            if promised < tolerance:
+            damping *= 0.1
+            theta, drawing, energy, curved_image, stale = tried, other, lower, curved_other, True
+            if gain < tolerance:
                 break
-            if promised > _FAR:
-                curved, hessian = self._expand(drawing, precision)
-                stale = False
+            if gain > _FAR:
+                hessian, stale = self._hessian(drawing, precision), False
         if stale:
-            curved, hessian = self._expand(drawing, precision)
+            hessian = self._hessian(drawing, precision)
         gradient = self._gradient(theta, drawing, curved_image, mean, precision)
         residual = self.b - theta[FAT] * self.ones - curved_image
         factor = cho_factor(hessian, lower=True)
-        return Fit(theta, drawing, energy, residual, curved, gradient, hessian, factor, bodies)
+        return Fit(theta, drawing, energy, residual, gradient, hessian, factor, bodies, self)
 
     def _gradient(
         self, theta: Floats, drawing: Drawing, curved_image: Floats, mean: Floats, precision: Floats
@@ -356,20 +369,17 @@ class Vessel:
         """Of −energy."""
         assert drawing.jacobian is not None
         residual = self.b - theta[FAT] * self.ones - curved_image
-        gradient: Floats = drawing.jacobian.T @ residual - precision @ (theta - mean)
+        gradient: Floats = drawing.jacobian.T @ residual.astype(np.float32) - precision @ (theta - mean)
         # Fat fills the whole volume, beside what it leaves to the vessel.
         gradient[FAT] += self.b_sum - theta[FAT] * self.ones_energy - self.ones @ drawing.image
         return gradient
 
-    def _expand(self, drawing: Drawing, precision: Floats) -> tuple[NDArray[np.float32], Floats]:
-        """G J, and the Gauss–Newton Hessian."""
-        jacobian = drawing.jacobian
-        assert jacobian is not None
-        curved = self.gram.apply(jacobian)
-        hessian = (jacobian.T @ curved).astype(np.float64)
-        across = self.ones @ jacobian
+    def _hessian(self, drawing: Drawing, precision: Floats) -> Floats:
+        """Gauss and Newton's, with the prior's."""
+        assert drawing.jacobian is not None
+        hessian: Floats = self.gram.curvature(drawing.jacobian)
+        across = self.ones.astype(np.float32) @ drawing.jacobian
         hessian[FAT] += across
         hessian[:, FAT] += across
         hessian[FAT, FAT] += self.ones_energy
-        curved[:, FAT] += self.ones.astype(np.float32)
-        return curved, 0.5 * (hessian + hessian.T) + precision
+        return 0.5 * (hessian + hessian.T) + precision

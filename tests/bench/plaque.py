@@ -1,13 +1,14 @@
 """Readings of the paper's plaque from noisy scans: bias, spread, coverage, presence, beside FBP over the same regions.
 
-    python tests/bench/plaque.py [--n 48] [--work out/bench-plaque] [--out tests/bench]
+    python tests/bench/plaque.py [--n 48] [--work out/bench-plaque] [--out notebooks/plaque] [--mbir] [--summary]
 
 Every draw is a noisy scan of the paper's scene (1968 views, drawn readings), read blind or from a point that misses the
 core's centre by 0.4 mm (standard deviation, each axis); the scene without its core is read blind. FBP is that of the
-same readings. The held-out plaques of training (``train.scenes.held_out``) are drawn through the same operator, without
-readings. Finished draws in the work folder are kept: after an interruption the same command goes on, and
-``--summary`` tells what there is. True values are those of rods of each tissue at the plaque's place
-(``torchpcct dose-factor``), areas and volumes those of the scene.
+same readings. What the model does not have (texture, soft edges, a calcification) and the held-out plaques of training
+(``train.scenes.held_out``) are drawn through the operator, without readings. Finished draws in the work folder are
+kept: after an interruption the same command goes on; ``--summary`` tells what there is, ``--mbir`` reads MBIR of the
+package's weights over the regions of the finished draws. True values are those of rods of each tissue at the plaque's
+place (``torchpcct dose-factor``), areas and volumes those of the scene.
 """
 
 from __future__ import annotations
@@ -15,42 +16,69 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from scipy.stats import chi2
+from scipy import ndimage
+from scipy.stats import beta, chi2
 
 from recon.fbp.inset import InsetFbp
+from recon.mbir.mbir import Mbir
 from recon.plaque import TissueData, read_plaque
+from recon.plaque.reading import CERTAIN, read_regions
 from recon.pwls.inset_problem import InsetProblem
 from recon.study.paper.plaque_scan import inset_grid
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.files import written_whole
+from torchpcct.geometry import VolumeGrid
+from torchpcct.metrics.plaque_measures import cap_on_line, lumen_area
 from torchpcct.scan import Scan
 from torchpcct.scanner import presets
 from torchpcct.scene.plaque import plaque_scene, plaque_variant
 from train.scenes.held_out import validation_scenes
 
+
+@dataclass(frozen=True)
+class Case:
+    """What is drawn: scene, exposure in s, whether a reader's point is given, and of how many draws one is read."""
+
+    scene: str
+    exposure_s: float
+    pointed: bool
+    every: int = 1
+
+
 CASES = {
-    "2.0 s, blind": ("paper", 2.0, False),
-    "2.0 s, with a point": ("paper", 2.0, True),
-    "2.0 s, no core, blind": ("absent_core", 2.0, False),
-    "0.35 s, with a point": ("paper", 0.35, True),
-    "2.0 s, held-out plaques, with a point": ("held out", 2.0, True),
+    "2.0 s, blind": Case("paper", 2.0, False),
+    "2.0 s, with a point": Case("paper", 2.0, True),
+    "2.0 s, no core, blind": Case("absent_core", 2.0, False),
+    "0.35 s, with a point": Case("paper", 0.35, True),
+    "2.0 s, held-out plaques, with a point": Case("held out", 2.0, True),
+    "2.0 s, texture of 10 HU, with a point": Case("texture", 2.0, True, 4),
+    "2.0 s, soft edges, with a point": Case("soft edges", 2.0, True, 4),
+    "2.0 s, calcification, with a point": Case("calcification", 2.0, True, 4),
+    "2.0 s, half contrast, with a point": Case("half contrast", 2.0, True, 4),
 }
 POINT_SD_MM = 0.4
 TISSUES_HU = {"fat": -92.65, "wall": 63.53, "fibrous": 103.22, "lumen": 479.97, "core": 41.07, "contrast": 62.15}
 """By rods (``notebooks/dose_factor``)."""
+TEXTURE_HU, TEXTURE_MM, SOFT_MM, CALCIFICATION_HU = 10.0, 0.3, 0.12, 1500.0
+_FINE = 5
+"""Points along each edge of a voxel, where a scene is drawn through the operator."""
+PLAQUE_ONLY = ("core", "contrast", "core volume", "cap thickness")
+FBP_PAPER_SD_HU = 28.2
+"""Of soft FBP's contrast in the paper's ROIs at 2.0 s, exact (``notebooks/dose_factor``)."""
 
 
-def truth() -> dict[str, float]:
+def truth(**changed: float) -> dict[str, float]:
     """Of every figure, in its unit."""
     _, plaque = plaque_scene()
     volume = 4 / 3 * np.pi * float(np.prod(plaque.core.semi_axes))
     return {**TISSUES_HU, "wall thickness": plaque.wall_thickness, "lumen area": float(plaque.area("lumen", 0.0)),
-            "core volume": volume, "cap thickness": plaque.cap_thickness}  # fmt: skip
+            "core volume": volume, "cap thickness": plaque.cap_thickness, **changed}  # fmt: skip
 
 
 class Draws:
@@ -62,9 +90,17 @@ class Draws:
         self._clean: dict[str, Scan] = {}
         self._problem: InsetProblem | None = None
         self._fbp: InsetFbp | None = None
+        self._tissues: dict[str, Any] = {}
+
+    @property
+    def problem(self) -> InsetProblem:
+        """What all scans share."""
+        if self._problem is None:
+            self._problem = InsetProblem(self.clean("paper"), self.grid)
+        return self._problem
 
     def clean(self, name: str) -> Scan:
-        """The noise-free scan, from the folder of the dose-factor study or simulated."""
+        """The noise-free scan, from a folder or simulated."""
         if name not in self._clean:
             path = None if self.scans is None else self.scans / f"{name}_1968.h5"
             known = path is not None and path.exists()
@@ -73,25 +109,44 @@ class Draws:
             )  # fmt: skip
         return self._clean[name]
 
+    def drawn(self, name: str, exposure_s: float, k: int) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """Statistic AᵀW y and soft FBP of a noisy scan; of what is drawn through the operator, no FBP."""
+        path = self.work / "statistics" / f"{name.replace(' ', '_')}_{exposure_s:g}s_{k}.npz"
+        if path.exists():
+            with np.load(path) as kept:
+                return torch.from_numpy(kept["b"]), torch.from_numpy(kept["fbp"]) if "fbp" in kept else None
+        if name in ("paper", "absent_core"):
+            scan = self.clean(name).with_noise(exposure_s, k)
+            if self._fbp is None:
+                self._fbp = InsetFbp(self.clean("paper"), [self.grid], ["soft"])
+            b = self.problem.statistic(scan).b
+            found = {"b": b.numpy(), "fbp": self._fbp(scan)[0][0].numpy()}
+        else:
+            image = self._held_out(k)[0] if name == "held out" else self._image(name, k)
+            gram, hu = self.problem.gram.scaled(exposure_s), self.problem.mu_ref / 1000.0
+            above = image * hu + self.problem.mu_ref - self.problem.level
+            b = gram.apply(above) + gram.noise(generator=torch.Generator().manual_seed(k))
+            found = {"b": b.numpy()}
+        with written_whole(path) as part, part.open("wb") as file:
+            np.savez(file, **found)
+        return torch.from_numpy(found["b"]), torch.from_numpy(found["fbp"]) if "fbp" in found else None
+
     def read(self, case: str, k: int) -> None:
         """One reading, unless it is on disk."""
-        name, dose, pointed = CASES[case]
-        path = self.work / f"{case.replace(' ', '_').replace(',', '')}_{k}.json"
-        if path.exists():
+        what = CASES[case]
+        path = self.work / f"{_stem(case)}_{k}.json"
+        if path.exists() or k % what.every:
             return
-        if self._problem is None:
-            self._problem = InsetProblem(self.clean("paper"), self.grid)
-            self._fbp = InsetFbp(self.clean("paper"), [self.grid], ["soft"])
-        assert self._fbp is not None
-        if name == "held out":
-            data, centre, true, fbp = self._held_out(k, dose)
-        else:
-            scan, true = self.clean(name).with_noise(dose, k), truth()
-            fbp = self._fbp(scan)[0][0]
-            data = TissueData.of_scan(scan, self._problem)
-            plaque = plaque_scene()[1]
-            centre = np.array(plaque.to_scanner(plaque.core_center))[::-1]
-        point = centre + POINT_SD_MM * np.random.default_rng(k).standard_normal(3) if pointed else None
+        b, fbp = self.drawn(what.scene, what.exposure_s, k)
+        data = TissueData.of_statistic(b, self.problem, what.exposure_s)
+        plaque = plaque_scene()[1]
+        seeds = np.array(plaque.to_scanner([plaque.section("lumen", 0.0)[0], 0.0, 0.0]))[::-1]
+        centre, true = np.array(plaque.to_scanner(plaque.core_center))[::-1], truth()
+        if what.scene == "held out":
+            _, centre, true = self._held_out(k)
+        elif what.scene == "half contrast":
+            true = truth(contrast=31.08, core=72.14)
+        point = centre + POINT_SD_MM * np.random.default_rng(k).standard_normal(3) if what.pointed else None
         start, cpu = time.perf_counter(), time.process_time()
         try:
             reading = read_plaque(data, point, point_sd=POINT_SD_MM, seed=k)
@@ -102,23 +157,44 @@ class Draws:
                 "presence": reading.presence,
                 "figures": {n: e.as_dict() for n, e in {**reading.figures, **reading.given_core}.items()},
                 "truth": true,
-                "fbp": {} if fbp is None else reading.read(fbp),
+                "calcifications": reading.calcifications,
+                "warnings": len(reading.warnings),
                 "chi2": reading.chi2,
                 "chi2_sd": reading.chi2_sd,
                 "texture_hu": reading.texture_hu,
                 "log_evidence": reading.info["log_evidence"],
             }
+            if fbp is not None:
+                found["fbp"] = reading.read(fbp)
+                if what.scene == "paper":
+                    found["fbp_thresholds"] = _thresholds(fbp, self.grid, seeds, centre)
+            shares = {n: np.round(255 * v).astype(np.uint8) for n, v in reading.regions.items()}
+            with written_whole(path.with_suffix(".npz")) as part, part.open("wb") as file:
+                np.savez_compressed(file, **shares)
         found |= {"seconds": time.perf_counter() - start, "cpu_seconds": time.process_time() - cpu}
         with written_whole(path) as part:
             part.write_text(json.dumps(found), encoding="utf-8")
 
-    def _held_out(self, k: int, dose: float) -> tuple[TissueData, Any, dict[str, float], None]:
-        """The k-th plaque of the family, its core's centre and true values; noise of the operator."""
-        assert self._problem is not None
+    def beside(self, case: str, k: int, network: Mbir) -> None:
+        """MBIR over the regions of a finished reading."""
+        what, path = CASES[case], self.work / f"{_stem(case)}_{k}.json"
+        if not path.with_suffix(".npz").exists() or what.scene not in ("paper", "absent_core"):
+            return
+        found = json.loads(path.read_text(encoding="utf-8"))
+        if "presence" not in found or "mbir" in found:
+            return
+        with torch.no_grad():
+            b, _ = self.drawn(what.scene, what.exposure_s, k)
+            volume = network(self.problem, b[None], what.exposure_s)[0]
+        with np.load(path.with_suffix(".npz")) as shares:
+            found["mbir"] = read_regions({n: shares[n] / 255.0 for n in shares.files}, volume)
+        with written_whole(path) as part:
+            part.write_text(json.dumps(found), encoding="utf-8")
+
+    def _held_out(self, k: int) -> tuple[torch.Tensor, Any, dict[str, float]]:
+        """The k-th plaque of the family, its core's centre and true values."""
         scenes = validation_scenes(self.grid.shape, self.grid.spacing, seed=k // 8, contrasts=(-60.0,))
         image, core, vessel = scenes.image[k % 8, 0], scenes.core[k % 8].double(), scenes.scenes[k % 8].vessels[0]
-        gram, hu = self._problem.gram.scaled(dose), self._problem.mu_ref / 1000.0
-        b = gram.apply(image * hu) + gram.noise(generator=torch.Generator().manual_seed(k))
         axes = [torch.from_numpy(a) for a in self.grid.axes]
         total = float(core.sum())
         centre = [float((core.sum([i for i in range(3) if i != d]) * axes[d]).sum()) / total for d in range(3)]
@@ -126,44 +202,103 @@ class Draws:
                 "lumen": vessel.lumen_hu, "core": vessel.fibrous_hu - 60.0, "contrast": 60.0,
                 "wall thickness": vessel.wall, "lumen area": np.pi * vessel.lumen_radius**2 * vessel.lumen_aspect,
                 "core volume": total * float(np.prod(self.grid.spacing))}  # fmt: skip
-        return TissueData(b * hu, gram, hu * hu, "statistic drawn from the operator"), np.array(centre), true, None
+        return image, np.array(centre), true
+
+    def _image(self, name: str, k: int) -> torch.Tensor:
+        """The paper's plaque with what the model does not have, HU averaged over voxels."""
+        if not self._tissues:
+            scene, plaque = plaque_scene()
+            fine = VolumeGrid(tuple(_FINE * n for n in self.grid.shape),
+                              tuple(s / _FINE for s in self.grid.spacing), self.grid.center)  # fmt: skip
+            labels = np.asarray(scene.labels(fine))
+            values = np.full(labels.shape, TISSUES_HU["fat"], np.float32)
+            for tissue in ("wall", "fibrous", "lumen", "core"):
+                values[labels == scene.index(tissue)] = TISSUES_HU[tissue]
+            hard = values.copy()
+            z, y, x = np.meshgrid(*(a for a in fine.axes), indexing="ij", sparse=True)
+            at = np.array(plaque.to_scanner((0.75, 1.1, 0.0)))[::-1]
+            body = sum(((v - c) / s) ** 2 for v, c, s in zip((z, y, x), at, (0.6, 0.2, 0.25), strict=True)) < 1
+            hard[body & (labels == scene.index("fibrous"))] = CALCIFICATION_HU
+            half = values.copy()
+            half[labels == scene.index("core")] += TISSUES_HU["contrast"] / 2
+            sd = [SOFT_MM / s for s in fine.spacing]
+            soft = ndimage.gaussian_filter(values, sd, mode="nearest")
+            shape = [n for size in self.grid.shape for n in (size, _FINE)]
+            tissue = (labels == scene.index("wall")) | (labels == scene.index("fibrous"))
+            tissue |= labels == scene.index("core")
+            named = {"calcification": hard, "half contrast": half, "soft edges": soft, "texture": values,
+                     "tissue": tissue.astype(np.float32)}  # fmt: skip
+            self._tissues = {n: torch.from_numpy(v.reshape(shape).mean((1, 3, 5))) for n, v in named.items()}
+        if name != "texture":
+            return self._tissues[name].float()
+        sd = [TEXTURE_MM / np.sqrt(2) / s for s in self.grid.spacing]
+        rough = ndimage.gaussian_filter(np.random.default_rng(k).standard_normal(self.grid.shape), sd, mode="wrap")
+        rough *= TEXTURE_HU / rough.std()
+        return (self._tissues["texture"] + torch.from_numpy(rough) * self._tissues["tissue"]).float()
+
+
+def _thresholds(fbp: torch.Tensor, grid: VolumeGrid, lumen: Any, core: Any) -> dict[str, float]:
+    """Lumen area and cap by thresholds on the middle slice, the true centres given."""
+    image, plane = fbp[grid.shape[0] // 2], VolumeGrid(grid.shape[1:], grid.spacing[1:], grid.center[1:])
+    return {"lumen area": lumen_area(image, plane, tuple(lumen[1:])),
+            "cap thickness": cap_on_line(image, plane, tuple(lumen[1:]), tuple(core[1:]))}  # fmt: skip
+
+
+def _stem(case: str) -> str:
+    return case.replace(" ", "_").replace(",", "")
 
 
 def summary(work: Path) -> dict[str, Any]:
     """Figures of all finished draws."""
     cases = {}
-    for case in CASES:
-        stem = case.replace(" ", "_").replace(",", "")
-        draws = [json.loads(p.read_text(encoding="utf-8")) for p in sorted(work.glob(f"{stem}_*.json"))]
+    for case, what in CASES.items():
+        draws = [json.loads(p.read_text(encoding="utf-8")) for p in sorted(work.glob(f"{_stem(case)}_*.json"))]
         read = [d for d in draws if "presence" in d]
         if not read:
             continue
         presence = np.array([d["presence"] for d in read])
+        claimed = int((presence >= CERTAIN).sum())
         entry: dict[str, Any] = {
+            "case": case,
             "n": len(draws),
             "failed": len(draws) - len(read),
-            "claimed": int((presence >= 0.95).sum()),
+            "claimed": claimed,
+            "claimed_share": _share(claimed, len(draws)),
             "median_presence": float(np.median(presence)),
+            "least_presence": float(presence.min()),
+            "warned": sum(bool(d.get("warnings")) for d in read),
+            "calcified": sum(d.get("calcifications", 0) > 0 for d in read),
             "chi2": float(np.mean([d["chi2"] for d in read])),
             "texture_hu": float(np.mean([d["texture_hu"] for d in read])),
             "cpu_seconds": float(np.median([d["cpu_seconds"] for d in read])),
             "figures": {},
         }
-        absent, true = CASES[case][0] == "absent_core", read[0].get("truth", truth())
+        absent, true = what.scene == "absent_core", read[0]["truth"]
         for name in true:
-            if absent and name in ("core", "contrast", "core volume", "cap thickness"):
+            if absent and name in PLAQUE_ONLY:
                 continue
-            exact = np.array([d.get("truth", true)[name] for d in read])
+            exact = np.array([d["truth"][name] for d in read])
             values = np.array([d["figures"][name]["value"] for d in read])
-            inside = [
+            inside = sum(
                 d["figures"][name]["low"] <= t <= d["figures"][name]["high"] for d, t in zip(read, exact, strict=True)
-            ]
-            entry["figures"][name] = _spread(values, exact) | {"coverage": float(np.mean(inside))}
-            beside = [(d["fbp"][name], t) for d, t in zip(read, exact, strict=True) if name in d["fbp"]]
-            if len(beside) > 1:
-                entry["figures"][name]["fbp_same_regions"] = _spread(*np.array(beside).T)
-        cases[case] = entry
+            )
+            told = float(np.mean([d["figures"][name]["sd"] for d in read]))
+            entry["figures"][name] = _spread(values, exact) | {"coverage": _share(inside, len(read)), "told_sd": told}
+            for other in ("fbp", "mbir", "fbp_thresholds"):
+                beside = [(d[other][name], t) for d, t in zip(read, exact, strict=True) if name in d.get(other, {})]
+                if len(beside) > 1:
+                    entry["figures"][name][other] = _spread(*np.array(beside).T)
+        if absent:
+            entry["contrast_if_there"] = float(np.mean([d["figures"]["contrast"]["value"] for d in read]))
+        cases[_stem(case)] = entry
     return {"command": "python tests/bench/plaque.py", "point_sd_mm": POINT_SD_MM, "cases": cases}
+
+
+def _share(found: int, n: int) -> dict[str, float]:
+    """k of n, and Clopper and Pearson's 95 % interval."""
+    low = float(beta.ppf(0.025, found, n - found + 1)) if found else 0.0
+    high = float(beta.ppf(0.975, found + 1, n - found)) if found < n else 1.0
+    return {"value": found / n, "low": low, "high": high}
 
 
 def _spread(values: Any, true: Any) -> dict[str, Any]:
@@ -176,28 +311,73 @@ def _spread(values: Any, true: Any) -> dict[str, Any]:
 
 def text(result: dict[str, Any]) -> str:
     """Markdown."""
-    lines = ["# Reading the paper's plaque by its tissues", "", f"`{result['command']}`", ""]
-    for case, entry in result["cases"].items():
+    lines = ["# Reading the paper's plaque by its tissues", "", f"`{result['command']}`", "",
+             "Bias and SD of the posterior mean over the draws; coverage: of the 95 % intervals; told: mean posterior "
+             "SD. Beside them what other volumes of the same scans read over the same regions, and by thresholds "
+             "(FBP, middle slice, true centres given).", ""]  # fmt: skip
+    for entry in result["cases"].values():
+        share = entry["claimed_share"]
         lines += [
-            f"## {case}: n = {entry['n']}",
+            f"## {entry['case']}: n = {entry['n']}",
             "",
-            f"Claimed (P ≥ 0.95): {entry['claimed']} of {entry['n']}; median P {entry['median_presence']:.3f}; "
-            f"not read {entry['failed']}; residual {entry['chi2']:.3f}; texture {entry['texture_hu']:.1f} HU; "
-            f"{entry['cpu_seconds']:.1f} CPU s a reading (loaded machine).",
+            f"Claimed (P ≥ {CERTAIN}): {entry['claimed']} of {entry['n']} "
+            f"[{share['low']:.2f}, {share['high']:.2f}]; "
+            f"median P {entry['median_presence']:.3f}, least {entry['least_presence']:.3f}; "
+            f"not read {entry['failed']}; "
+            f"calcified {entry['calcified']}; warned {entry['warned']}; residual {entry['chi2']:.3f}; texture "
+            f"{entry['texture_hu']:.1f} HU; {entry['cpu_seconds']:.1f} CPU s a reading (loaded machine).",
             "",
-            "| | true | mean | bias | SD [95 %] | RMSE | coverage | soft FBP, same regions: mean, SD |",
-            "|---|---|---|---|---|---|---|---|",
+            "| | true | mean | bias | SD [95 %] | told | RMSE | coverage | soft FBP: mean, SD | MBIR: mean, SD | "
+            "FBP by thresholds: bias, RMSE |",
+            "|---" * 11 + "|",
         ]
         for name, f in entry["figures"].items():
             d = 1 if abs(f["true"]) > 20 else 2
-            fbp = f.get("fbp_same_regions")
-            beside = f"{fbp['mean']:.{d}f}, {fbp['sd']:.{d}f}" if fbp else "–"
-            lines.append(
-                f"| {name} | {f['true']:.{d}f} | {f['mean']:.{d}f} | {f['bias']:+.{d}f} | {f['sd']:.{d}f} "
-                f"[{f['sd_low']:.{d}f}, {f['sd_high']:.{d}f}] | {f['rmse']:.{d}f} | {f['coverage']:.2f} | {beside} |"
-            )
+            cells = [f"{f['true']:.{d}f}", f"{f['mean']:.{d}f}", f"{f['bias']:+.{d}f}",
+                     f"{f['sd']:.{d}f} [{f['sd_low']:.{d}f}, {f['sd_high']:.{d}f}]", f"{f['told_sd']:.{d}f}",
+                     f"{f['rmse']:.{d}f}",
+                     "{value:.2f} [{low:.2f}, {high:.2f}]".format(**f["coverage"])]  # fmt: skip
+            for other, keys in (
+                ("fbp", ("mean", "sd")),
+                ("mbir", ("mean", "sd")),
+                ("fbp_thresholds", ("bias", "rmse")),
+            ):
+                cells.append(", ".join(f"{f[other][key]:.{d}f}" for key in keys) if other in f else "–")
+            lines.append(f"| {name} | " + " | ".join(cells) + " |")
         lines.append("")
     return "\n".join(lines)
+
+
+def picture(result: dict[str, Any]) -> Any:
+    """Error of the contrast, by case: mean and standard deviation of the readings and of FBP over the same regions."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 5), layout="constrained")
+    axes = figure.subplots(1, 2, width_ratios=(3, 2))
+    cases = [c for c in result["cases"].values() if "contrast" in c["figures"]]
+    for row, entry in enumerate(cases):
+        f = entry["figures"]["contrast"]
+        for shift, key, colour in ((0.0, None, "tab:blue"), (0.2, "fbp", "tab:orange"), (0.4, "mbir", "tab:green")):
+            g = f if key is None else f.get(key)
+            if g is not None:
+                axes[0].errorbar(g["bias"], row + shift, xerr=g["sd"], fmt="o", color=colour, capsize=3)
+        cover = f["coverage"]
+        axes[1].errorbar(cover["value"], row, fmt="o", color="tab:blue", capsize=3,
+                         xerr=[[cover["value"] - cover["low"]], [cover["high"] - cover["value"]]])  # fmt: skip
+    for colour, name in (("tab:blue", "tissues as unknowns"), ("tab:orange", "soft FBP, same regions"),
+                         ("tab:green", "MBIR, same regions")):  # fmt: skip
+        if name.startswith(("tissues", "soft")) or any("mbir" in c["figures"]["contrast"] for c in cases):
+            axes[0].plot([], [], "o", color=colour, label=name)
+    axes[0].axvline(0.0, color="0.6", lw=0.8)
+    axes[0].set_yticks(range(len(cases)), [f"{c['case']} ({c['n']})" for c in cases])
+    axes[0].set_xlabel("contrast, error in HU: bias ± SD")
+    axes[0].legend(fontsize=8)
+    axes[1].axvline(0.95, color="0.6", lw=0.8)
+    axes[1].set_yticks([])
+    axes[1].set_xlabel("coverage of the contrast's 95 % interval [95 %]")
+    for ax in axes:
+        ax.invert_yaxis()
+    return figure
 
 
 def main() -> None:
@@ -205,20 +385,29 @@ def main() -> None:
     parser.add_argument("--n", type=int, default=48, help="draws of every case")
     parser.add_argument("--work", type=Path, default=Path("out/bench-plaque"), help="folder for finished draws")
     parser.add_argument("--scans", type=Path, help="folder scans/ of the dose-factor study, to save the simulation")
-    parser.add_argument("--out", type=Path, default=Path("tests/bench"), help="folder for plaque.json and plaque.md")
+    parser.add_argument("--out", type=Path, default=Path("notebooks/plaque"), help="folder for the report")
     parser.add_argument("--cases", nargs="+", default=list(CASES), choices=list(CASES))
+    parser.add_argument("--mbir", action="store_true", help="read MBIR over the regions of finished draws")
     parser.add_argument("--summary", action="store_true", help="only tell what is finished")
     options = parser.parse_args()
-    options.work.mkdir(parents=True, exist_ok=True)
+    (options.work / "statistics").mkdir(parents=True, exist_ok=True)
+    options.out.mkdir(parents=True, exist_ok=True)
     if not options.summary:
         draws = Draws(options.work, options.scans)
+        network = Mbir.load() if options.mbir else None
         for k in range(options.n):
             for case in options.cases:
-                draws.read(case, k)
+                if network is None:
+                    draws.read(case, k)
+                else:
+                    draws.beside(case, k, network)
     result = summary(options.work)
-    for name, content in (("plaque.json", json.dumps(result, indent=1) + "\n"), ("plaque.md", text(result))):
+    result |= {"seeds": f"0 … {options.n - 1}, the same of scan, point and Monte Carlo", "torch": torch.__version__}
+    for name, content in (("report.json", json.dumps(result, indent=1) + "\n"), ("report.md", text(result))):
         with written_whole(options.out / name) as part:
             part.write_text(content, encoding="utf-8")
+    with written_whole(options.out / "plaque.png") as part:
+        picture(result).savefig(part, dpi=120)
     print(text(result))
 
 

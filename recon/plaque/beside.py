@@ -1,0 +1,58 @@
+"""What the noise of a scan does to FBP's means over a reading's regions: the other half of an honest comparison."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from recon.fbp.exact_noise import roi_adjoints
+from recon.fbp.inset import InsetFbp
+from recon.plaque.reading import core_regions
+from torchpcct.geometry import VolumeGrid
+from torchpcct.metrics.roi import RoiMean
+from torchpcct.scan import Scan
+
+__all__ = ["fbp_deviations"]
+
+
+def fbp_deviations(scan: Scan, grid: VolumeGrid, regions: Mapping[str, Any], kernel: str = "soft") -> dict[str, float]:
+    """Standard deviation in HU of FBP's mean over each region, and of the contrast, of the noise alone.
+
+    One adjoint pass a region (:mod:`recon.fbp.exact_noise`), with the variance of the readings that is expected behind
+    the known surround: what the inset adds to the attenuation, a few per cent of the counts, is left out, and so is
+    that the regions were found in the same noise.
+
+    Args:
+        scan: windowed, its surround known, noisy or noise free (then of the exposure its readings stand for).
+        grid: of the regions.
+        regions: name → shares of the voxels, as :attr:`recon.plaque.reading.PlaqueReading.regions`.
+        kernel: of FBP.
+
+    Raises:
+        ValueError: a scan of the whole detector, or of an unknown surround.
+    """
+    if scan.window is None or scan.surround is None:
+        raise ValueError("the noise of regions needs a scan whose surround is known: acquire it with region=")
+    masks = core_regions(regions)
+    fbp = InsetFbp(scan, [grid], [kernel])
+    slope = scan.linearisation.slope(scan.air.log() - scan.surround.log())
+    variance = slope.square() / scan.surround
+    pair = [n for n in masks if n in ("fibrous", "core")]
+    # The vectors are large: no more than two at a time.
+    groups: list[list[str]] = [pair] if pair else []
+    groups += [[n] for n in masks if n not in pair]
+    found: dict[str, float] = {}
+    for names in groups:
+        adjoints = roi_adjoints(scan, fbp, [[RoiMean(grid, grid, masks[n]) for n in names]])
+        noise = adjoints.window.take(variance)
+        covariance = np.zeros((len(names), len(names)))
+        for view in range(len(noise)):
+            h = adjoints.vectors[0][0][:, view].flatten(1).double()
+            covariance += ((h * noise[view].flatten().double()) @ h.T).numpy()
+        found |= {n: math.sqrt(covariance[k, k]) for k, n in enumerate(names)}
+        if len(names) == 2:
+            found["contrast"] = math.sqrt(covariance[0, 0] + covariance[1, 1] - 2.0 * covariance[0, 1])
+    return found
