@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from torchpcct.acquisition.acquire import acquire
     from torchpcct.projector import Projector
     from torchpcct.scan import Scan
+    from torchpcct.vector_geometry import VectorGeometry
     from torchpcct.volume import Volume
 
 __version__ = VERSION
@@ -24,6 +25,7 @@ __all__ = [
     "ParallelBeam",
     "Projector",
     "Scan",
+    "VectorGeometry",
     "Volume",
     "VolumeGrid",
     "acquire",
@@ -33,6 +35,7 @@ __all__ = [
 _LAZY = {
     "Projector": "torchpcct.projector",
     "Scan": "torchpcct.scan",
+    "VectorGeometry": "torchpcct.vector_geometry",
     "Volume": "torchpcct.volume",
     "acquire": "torchpcct.acquisition.acquire",
 }

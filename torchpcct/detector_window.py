@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
 from torchpcct.validate import whole
+from torchpcct.vector_geometry import VectorGeometry
 
 __all__ = ["DetectorWindow", "shadow"]
 
@@ -162,8 +163,10 @@ def shadow(geometry: Geometry, grid: VolumeGrid, margin: int = 0, motion: Any = 
 
     Raises:
         ValueError: a motion of the wrong shape, the grid leaves the field of view, no row sees it, or the source's
-            orbit crosses it.
+            orbit crosses it; a geometry given by vectors.
     """
+    if isinstance(geometry, VectorGeometry):
+        raise ValueError("a scan given view by view has no windows: use all of its detector")
     gz = grid.extent[0] / 2 if grid.ndim == 3 else 0.0
     cy, cx = grid.center[-2:]
     hy, hx = grid.extent[-2] / 2, grid.extent[-1] / 2

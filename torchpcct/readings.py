@@ -23,6 +23,8 @@ _PSEUDO_WATER = 0.02
 """Attenuation in mm⁻¹ that stands for water where a scan is not in HU: it sets the scale of priors, nothing else."""
 _SILENT_VIEWS = 8
 """Cells that read nothing in so many views, or more, are dead."""
+_DARK = 1e-3
+"""Cells that read no more in air than this share of the median cell are dead."""
 _TRANSFER_FRAMES = 4
 """Air frames that a photon transfer needs at least."""
 _MAD = 1.4826
@@ -91,7 +93,8 @@ def _views(cells: Tensor, geometry: Geometry) -> Tensor:
 def _dead(mask: Any, readings: Tensor, air: Tensor, geometry: Geometry) -> Tensor:
     """Dead readings, ``readings.shape`` or the shape of one frame with an axis of views of length 1."""
     cells = tuple(air.shape)
-    dead = _views(~(air > 0) | ~torch.isfinite(air), geometry)
+    # Of a cell without signal the mean over frames is noise about 0, not 0.
+    dead = _views(~(air > _DARK * air.nanmedian().clamp(min=0.0)) | ~torch.isfinite(air), geometry)
     if geometry.views >= _SILENT_VIEWS:
         dead = dead | (readings == 0).all(-len(geometry.shape), keepdim=True)
     if mask is not None:

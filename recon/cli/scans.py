@@ -235,13 +235,17 @@ def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         from torchpcct.formats.preprocess import centred  # algotom
 
         scan = centred(scan)
+    if arguments.clean:
+        from torchpcct.formats.preprocess import cleaned
+
+        scan = cleaned(scan)
     grid = _grid(scan, arguments)
     _require_voxels(grid.shape)
     options = {} if arguments.kernel is None else {"kernel": arguments.kernel}
     config = {
         "scan": str(arguments.scan), "geometry": geometry_values(scan.geometry), "method": arguments.method,
         "grid": {"shape": list(grid.shape), "spacing": list(grid.spacing), "center": list(grid.center)},
-        "unit": scan.unit, **options,
+        "unit": scan.unit, "clean": arguments.clean, **options,
     }  # fmt: skip
     if arguments.dry_run:
         bytes_ = 4 * (3 * scan.counts.numel() + 2 * grid.voxels)
@@ -286,6 +290,7 @@ def add_reconstruct(commands: Commands) -> None:
     parser.add_argument("--mu-water", type=float, metavar="MM⁻¹", help="attenuation of water: result in HU")
     parser.add_argument("--axis", type=float, metavar="COLUMN", help="rotation axis (Data Exchange)")
     parser.add_argument("--find-axis", action="store_true", help="search the rotation axis (parallel beams)")
+    parser.add_argument("--clean", action="store_true", help="take out stripes and outliers (parallel and fan beams)")
     parser.add_argument("--pitch", type=float, metavar="MM", help="cell width (Data Exchange without pixel size)")
     parser.add_argument("--photons", type=float, metavar="N", help="of an unattenuated reading (line integrals)")
     parser.add_argument("--slices", metavar="A:B", help="rows to read (Data Exchange)")

@@ -161,8 +161,7 @@ def _divergent(poses: Floats, rows: int, columns: int, cone: bool) -> tuple[Geom
         if climb > CLIMB * height:
             raise ValueError(
                 f"the source climbs by {climb:.2f} mm, the rows cover {height:.2f} mm at the axis: filtered "
-                "backprojection of a helix is not provided. Use recon.pwls with Projector(geometry, grid, motion=) of "
-                "torchpcct.projector.vectors.from_moving_vectors"
+                "backprojection of a helix is not provided. Use recon.pwls with Projector(VectorGeometry(…), grid)"
             )
         number, middle_row = _axis_of(float(w.min()), float(w.max()), row_pitch)
         geometry: Any = ConeBeam(beta, sod, sdd, count, number, (row_pitch, pitch), (middle_row, offset))

@@ -12,13 +12,38 @@ from torchpcct.detector_window import shadow
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid, view_step
 from torchpcct.scan import Scan
 
-__all__ = ["centre_warnings", "check_rows", "sampling_warnings"]
+__all__ = ["centre_warnings", "check_rows", "refuse_helix", "sampling_warnings"]
 
 STREAK_CELLS = 10.0
 """Distance between the paths of neighbouring views at the border of the field of view, in cells at the axis, from which
 streaks of an object at the border are wider than what the kernels smooth. 1968 views of the paper's scanner: 1.6."""
 _CENTRE_MARGIN = 8
 """Columns beside a grid's shadow that the test of the rotation centre looks at."""
+
+
+_STEADY, _TRAVEL = 0.98, 0.25
+"""A motion along z that a straight line explains to this share of its variance, by more than this share of the height
+that the rows cover at the axis, is a table's travel."""
+
+
+def refuse_helix(geometry: Geometry, motion: Any) -> None:
+    """Raise ``ValueError`` for a motion that makes a cone beam's circle a helix, which FDK cannot reconstruct.
+
+    Args:
+        geometry: of the scan.
+        motion: ``(views, 3)`` z, y, x mm, or None.
+    """
+    if motion is None or not isinstance(geometry, ConeBeam) or geometry.views < 3:
+        return
+    z = np.asarray(motion, dtype=np.float64).reshape(-1, 3)[:, 0]
+    height = geometry.rows * geometry.pitch[0] / geometry.magnification
+    if z.size != geometry.views or np.ptp(z) <= _TRAVEL * height:
+        return
+    if np.corrcoef(z, geometry.angles)[0, 1] ** 2 > _STEADY:
+        raise ValueError(
+            f"the table travels by {np.ptp(z):.2f} mm, the rows cover {height:.2f} mm at the axis: filtered "
+            "backprojection of a helix is not provided. Use recon.pwls with Projector(geometry, grid, motion=motion)"
+        )
 
 
 def check_rows(geometry: Geometry, grid: VolumeGrid, motion: Any = None) -> list[str]:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from recon.fbp.angular_weights import angular_weights, view_steps
 from recon.fbp.backproject import BackprojectionPlan, backproject, check_data, data_shape
-from recon.fbp.coverage import check_rows
+from recon.fbp.coverage import check_rows, refuse_helix
 from recon.fbp.detector_edges import Rows, continued, cut_off, mirrored
 from recon.fbp.filter_plan import FilterPlan, kernel_names
 from recon.linear_operator import apply_linear
@@ -24,6 +24,7 @@ from torchpcct.dead_cells import bridge
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid, view_step
 from torchpcct.validate import number
+from torchpcct.vector_geometry import VectorGeometry
 
 __all__ = ["backproject", "fbp", "filter_sinogram", "filter_windowed", "interleave"]
 
@@ -214,7 +215,8 @@ def fbp(
         sinogram: line integrals ``(..., views, [rows,] columns)``, float32 or float64. NaN and Inf are dead readings:
             they are bridged by their neighbours (:func:`torchpcct.dead_cells.bridge`) with a warning.
         geometry: parallel, fan or cone beam; a closed circle, a short scan (at least π plus the fan angle), views in
-            any order, irregularly spaced or repeated.
+            any order, irregularly spaced or repeated; or a :class:`~torchpcct.vector_geometry.VectorGeometry` that is
+            nearly so (:mod:`recon.fbp.any_orbit`).
         grid: voxels to reconstruct, 2-D for parallel and fan beams, 3-D for cone beams.
         kernel: reconstruction kernel ``"soft"``, ``"standard"``, ``"detail"``, ``"bone"``, ``"ram-lak"``, or several.
         window: readings to filter and backproject; default: the grid's shadow.
@@ -232,7 +234,18 @@ def fbp(
         ValueError, TypeError: as :func:`filter_sinogram` and :func:`backproject`; views of which more than a quarter is
             dead; a negative ``outside``.
     """
+    if isinstance(geometry, VectorGeometry):
+        from recon.fbp.any_orbit import fbp_of_vectors  # which resamples to a circle, and calls this function
+
+        if window is not None:
+            raise ValueError("a window belongs to a circular scan: leave it out for a VectorGeometry")
+        check_data("sinogram", sinogram, geometry.shape)
+        seen = geometry if motion is None else geometry.moved(motion)
+        return fbp_of_vectors(
+            sinogram, seen.vectors, grid, kernel, parallel=seen.parallel, weights=weights, outside=outside
+        )
     check_data("sinogram", sinogram, data_shape(geometry, DetectorWindow.full(geometry)))
+    refuse_helix(geometry, motion)
     for text in check_rows(geometry, grid, motion):
         _LOG.warning("%s", text)
     sinogram = _without_dead(sinogram, geometry)

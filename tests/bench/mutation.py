@@ -160,8 +160,8 @@ FAULTS = (
     Fault("pieces of another version", "recon/study/store.py", 'f"{settings!r} {_source()}"', 'f"{settings!r}"', _SAME),
     Fault("pieces written in place", "recon/study/store.py", "with written_whole(path) as part:", "for part in [path]:",
           _P + "test_kills_at_random_moments_lose_one_piece_at_most"),
-    Fault("starved scans keep the usual threshold", "recon/pwls/inset_problem.py", "if least <= DEFAULT_PRIOR.threshold:", "if True:",
-          "tests/recon/pwls/test_inset_problem.py::test_the_default_prior_follows_the_noise_of_starved_scans"),
+    Fault("a threshold that ignores the noise", "recon/pwls/qggmrf.py", "threshold=16.0, relative=True)",
+          "threshold=300.0)", "tests/recon/pwls/test_inset_problem.py::test_the_default_prior_follows_the_noise"),
     Fault("any number of voxels", "recon/cli/scans.py", "MOST_VOXELS = 2**31", "MOST_VOXELS = 2**200",
           _C + "test_refusals_name_value_and_remedy_and_leave_nothing"),
 )  # fmt: skip

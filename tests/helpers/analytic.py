@@ -20,8 +20,9 @@ from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import Geometry, VolumeGrid
 from torchpcct.projector.rays import rays_of
 from torchpcct.validate import number, per_axis
+from torchpcct.vector_geometry import VectorGeometry
 
-__all__ = ["Ellipsoid", "Gaussian", "line_integrals", "rasterize"]
+__all__ = ["Ellipsoid", "Gaussian", "line_integrals", "rasterize", "vector_lines"]
 
 Floats = NDArray[np.float64]
 
@@ -164,6 +165,22 @@ def line_integrals(
         total = sum(body.along(point, direction) for body in bodies)
         out[view] = np.asarray(total).reshape(rows, sub_rows, columns, per[1]).mean(axis=(1, 3))
     return out[:, 0] if plane else out
+
+
+def vector_lines(geometry: VectorGeometry, bodies: Sequence[_Body], sub: int = 4) -> Floats:
+    """The same along the rays that a scan's vectors describe; ``(views, [rows,] columns)`` float64."""
+    poses, rows = geometry.poses, geometry.rows or 1
+    offset = (np.arange(sub) - (sub - 1) / 2) / sub
+    columns = ((np.arange(geometry.columns) - (geometry.columns - 1) / 2)[:, None] + offset).ravel()
+    heights = np.zeros(1) if geometry.rows is None else ((np.arange(rows) - (rows - 1) / 2)[:, None] + offset).ravel()
+    out = np.empty((geometry.views, heights.size, columns.size))
+    for view, (source, centre, u, v) in enumerate(poses):
+        cell = centre + columns[:, None] * u + heights[:, None, None] * v
+        direction = np.broadcast_to(source, cell.shape) if geometry.parallel else cell - source
+        direction = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
+        out[view] = sum(body.along(cell, direction) for body in bodies)
+    out = out.reshape(geometry.views, rows, -1, geometry.columns, sub).mean((2, 4))
+    return out if geometry.rows else out[:, 0]
 
 
 def rasterize(grid: VolumeGrid, bodies: Sequence[_Body], sub: int = 1) -> Floats:

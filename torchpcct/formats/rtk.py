@@ -1,4 +1,5 @@
-"""Per-view geometry of RTK's ``ThreeDCircularProjectionGeometry`` XML, as the vectors of :mod:`recon.fbp.any_orbit`.
+"""Per-view geometry of RTK's ``ThreeDCircularProjectionGeometry`` XML, as a
+:class:`~torchpcct.vector_geometry.VectorGeometry`.
 
 Each ``<Projection>`` holds a 3 × 4 ``<Matrix>`` that maps points of the world in mm to homogeneous detector coordinates
 in mm. RTK turns about its y axis; here z is the axis, x RTK's z and y RTK's x.
@@ -16,11 +17,17 @@ from numpy.typing import NDArray
 
 from torchpcct.formats.damage import reading
 from torchpcct.validate import number, per_axis, whole
+from torchpcct.vector_geometry import VectorGeometry
 
-__all__ = ["read_rtk_vectors"]
+__all__ = ["read_rtk", "read_rtk_vectors"]
 
 _OURS = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 """RTK's (x, y, z) to ours."""
+
+
+def read_rtk(path: str | os.PathLike[str], columns: int, rows: int, pitch: Any, origin: Any = None) -> VectorGeometry:
+    """The scan of :func:`read_rtk_vectors`, for ``Projector`` and ``recon.fbp.fbp.fbp``; its arguments and errors."""
+    return VectorGeometry(read_rtk_vectors(path, columns, rows, pitch, origin), columns, rows)
 
 
 def read_rtk_vectors(

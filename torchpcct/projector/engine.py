@@ -17,7 +17,7 @@ from torch import Tensor
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
 from torchpcct.projector.compiling import announce_compilation, refuse_after_fork
 from torchpcct.projector.cuda import passes as cuda
-from torchpcct.projector.tables import Tables
+from torchpcct.projector.tables import Tables, VectorTables
 
 __all__ = ["Engine"]
 
@@ -48,13 +48,17 @@ class _CpuPasses(Protocol):
 class Engine:
     """Forward and adjoint passes of one scan on tensors with any number of leading batch axes."""
 
-    def __init__(self, tables: Tables) -> None:
+    def __init__(self, tables: Tables | VectorTables) -> None:
         self.tables = tables
         self._devices: dict[torch.device, cuda.GpuPasses] = {}
 
     @cached_property
     def cpu(self) -> _CpuPasses:
         # The numba kernels are imported when first needed: importing the package stays quick.
+        if isinstance(self.tables, VectorTables):
+            from torchpcct.projector.cpu.vector_passes import VectorPasses
+
+            return VectorPasses(self.tables)
         if self.tables.grid.ndim == 3:
             from torchpcct.projector.cpu.cone_passes import ConePasses
 
@@ -65,6 +69,7 @@ class Engine:
 
     def on(self, device: torch.device) -> cuda.GpuPasses:
         """The Triton passes, with their tables on ``device``."""
+        assert isinstance(self.tables, Tables)
         if device not in self._devices:
             from torchpcct.projector.cpu.cone_kernels import MAX_LAYERS_PER_SLAB, NEAREST
 
@@ -81,7 +86,8 @@ class Engine:
         if batch == 0:
             return x.new_zeros((*lead, *outer))
         flat = x.detach().reshape(batch, *inner)
-        if x.device.type == "cuda" and cuda.available() and self._trusted(x.device, x.dtype):
+        own = isinstance(self.tables, Tables)  # vectors have CPU passes only
+        if own and x.device.type == "cuda" and cuda.available() and self._trusted(x.device, x.dtype):
             passes = self.on(x.device)
             return (passes.adjoint(flat) if transposed else passes.forward(flat)).reshape(*lead, *outer)
         return self._on_cpu(flat, transposed).reshape(*lead, *outer).to(x.device)
@@ -101,7 +107,9 @@ class Engine:
 
     def workspace(self, batch: int, itemsize: int, device: str) -> int:
         """Bytes that one pass holds besides its input and output (the larger of the two directions)."""
-        return self.cpu.workspace(batch, itemsize) if device == "cpu" else cuda.workspace(self.tables, batch, itemsize)
+        if device == "cpu" or isinstance(self.tables, VectorTables):
+            return self.cpu.workspace(batch, itemsize)
+        return cuda.workspace(self.tables, batch, itemsize)
 
     def agrees(self, device: torch.device, dtype: torch.dtype) -> bool:
         """True if the device's kernels reproduce the CPU's on random data of this scan, both ways; warns if not."""

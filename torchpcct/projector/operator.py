@@ -12,7 +12,9 @@ from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import Geometry, VolumeGrid
 from torchpcct.projector.engine import Engine
 from torchpcct.projector.manners import Operator
-from torchpcct.projector.tables import Tables
+from torchpcct.projector.tables import Tables, VectorTables
+from torchpcct.projector.vectors import as_circular
+from torchpcct.vector_geometry import VectorGeometry
 
 __all__ = ["Projector"]
 
@@ -70,7 +72,9 @@ class Projector(Operator):
     first-use check against the CPU passes; otherwise the data travel to the CPU and back.
 
     Args:
-        geometry: ``ParallelBeam`` or ``FanBeam`` with a 2-D grid, ``ConeBeam`` with a 3-D grid.
+        geometry: ``ParallelBeam`` or ``FanBeam`` with a 2-D grid, ``ConeBeam`` with a 3-D grid; or a
+            :class:`~torchpcct.vector_geometry.VectorGeometry`: what is a circular scan, at rest or moving (a helix),
+            takes the passes of one, anything else general ones on the CPU, several times slower.
         grid: the voxel grid.
         window: the part of the detector to compute (``torchpcct.detector_window.shadow``), or None for all of it.
         motion: displacement of the grid in every view, ``(views, 2)`` (y, x) or ``(views, 3)`` (z, y, x) mm, or None:
@@ -97,7 +101,7 @@ class Projector(Operator):
         self.geometry = geometry
         self.grid = grid
         self.window = window
-        self._engine = Engine(Tables(geometry, grid, window, motion, memory))
+        self._engine = Engine(_tables(geometry, grid, window, motion, memory))
         self._adjoint: list[_Adjoint] = []  # in a list: a submodule that holds its parent would recurse
 
     @property
@@ -174,6 +178,19 @@ class _Adjoint(Operator):
 
     def extra_repr(self) -> str:
         return f"{type(self.T.geometry).__name__}, {self.domain_shape} -> {self.range_shape}"
+
+
+def _tables(geometry: Any, grid: Any, window: Any, motion: Any, memory: int | None) -> Tables | VectorTables:
+    if not isinstance(geometry, VectorGeometry):
+        return Tables(geometry, grid, window, motion, memory)
+    if window is not None:
+        raise ValueError("a window belongs to a circular scan; of a VectorGeometry select the views, or use all of it")
+    if motion is not None:
+        geometry = geometry.moved(motion)
+    circular = as_circular(geometry)
+    return VectorTables(geometry, grid, memory) if circular is None else Tables(
+        circular[0], grid, None, circular[1], memory
+    )  # fmt: skip
 
 
 def _checked(x: Any, inner: tuple[int, ...], name: str, operator: str) -> Tensor:

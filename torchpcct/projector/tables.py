@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import Geometry, VolumeGrid
 from torchpcct.projector.rays import Segments, check_motion, check_pair, check_source, rays_of, slab_lattice, split
+from torchpcct.vector_geometry import VectorGeometry
 
-__all__ = ["Tables", "layer_spacing"]
+__all__ = ["Tables", "VectorTables", "check_memory", "layer_spacing"]
 
 # Row edges may move by this part of the blur between two depth layers (see layer_spacing).
 LAYER_SHIFT = 0.04
@@ -38,9 +39,7 @@ class Tables:
         memory: int | None = None,
     ) -> None:
         check_pair(geometry, grid, window)
-        if memory is not None and (isinstance(memory, bool) or not isinstance(memory, int) or memory < 1):
-            raise ValueError(f"memory must be a number of bytes ≥ 1 or None, got {memory!r}")
-        self.memory = memory
+        self.memory = check_memory(memory)
         # Symmetric views share their work only if all of the detector is read and nothing moves.
         self.geometry, self.grid, self.windowed = geometry, grid, window is not None or motion is not None
         self.rays = rays_of(geometry, window)
@@ -79,6 +78,52 @@ class Tables:
         # Of all rows, whichever the window keeps: a reading must not depend on what else is read.
         rows = self.geometry.shape[1]
         return layer_spacing(self.pose, self.grid, self.rays.row_edge, self.rays.row_pitch, rows)
+
+
+class VectorTables:
+    """The same of a scan given by vectors that no circular scan describes; its passes need no tables.
+
+    Args:
+        geometry, grid, memory: as for ``Projector``.
+
+    Raises:
+        TypeError: an argument of the wrong kind.
+        ValueError: a grid of other axes than the detector needs, a source inside the grid.
+    """
+
+    def __init__(self, geometry: VectorGeometry, grid: VolumeGrid, memory: int | None = None) -> None:
+        if not isinstance(grid, VolumeGrid):
+            raise TypeError(f"grid must be a VolumeGrid, got {type(grid).__name__}")
+        axes = 2 if geometry.rows is None else 3
+        if grid.ndim != axes:
+            raise ValueError(f"vectors of {len(geometry.vectors[0])} numbers need a {axes}-D grid, got {grid.shape}")
+        self.memory = check_memory(memory)
+        self.geometry, self.grid = geometry, grid
+        if geometry.parallel:
+            return
+        place = geometry.poses[:, 0, :axes][:, ::-1]
+        inside = (np.abs(place - np.array(grid.center)) <= np.array(grid.extent) / 2).all(1)
+        if inside.any():
+            view = int(inside.argmax())
+            raise ValueError(
+                f"the source of view {view} at {', '.join(f'{x:.1f}' for x in place[view, ::-1])} mm lies inside the "
+                "grid: shrink or move the grid"
+            )
+
+    @property
+    def domain_shape(self) -> tuple[int, ...]:
+        return tuple(self.grid.shape)
+
+    @property
+    def range_shape(self) -> tuple[int, ...]:
+        return self.geometry.shape
+
+
+def check_memory(memory: Any) -> int | None:
+    """Bytes, or None; ``ValueError`` for anything else."""
+    if memory is not None and (isinstance(memory, bool) or not isinstance(memory, int) or memory < 1):
+        raise ValueError(f"memory must be a number of bytes ≥ 1 or None, got {memory!r}")
+    return memory
 
 
 def layer_spacing(pose: NDArray[np.float64], grid: VolumeGrid, row0: float, row_pitch: float, rows: int) -> float:

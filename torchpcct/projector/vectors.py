@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam
 from torchpcct.projector.rays import check_motion
+from torchpcct.vector_geometry import VectorGeometry
 
-__all__ = ["from_moving_vectors", "from_vectors", "to_vectors"]
+__all__ = ["as_circular", "from_moving_vectors", "from_vectors", "to_vectors"]
 
 
 def to_vectors(geometry: Geometry, motion: Any = None) -> NDArray[np.float64]:
@@ -123,6 +124,40 @@ def from_moving_vectors(
     geometry = _scan(angles, radius, sdd, columns, rows, mean)
     axes = 2 if rows is None else 3
     back = to_vectors(geometry)[:, :axes] - v[:, :axes]
+    return geometry, np.ascontiguousarray(back[:, ::-1])
+
+
+def as_circular(geometry: VectorGeometry) -> tuple[Geometry, NDArray[np.float64] | None] | None:
+    """The circular scan, and the motion of the grid or None, that a scan given by vectors is, to 1e-9; else None."""
+    v = np.asarray(geometry.vectors)
+    scale = float(np.abs(v).max())
+    found: Geometry
+    try:
+        if not geometry.parallel:
+            found, motion = from_moving_vectors(v, geometry.columns, geometry.rows)
+        elif geometry.rows is None:
+            found, motion = _moving_parallel(v, geometry.columns)
+        else:
+            return None  # no parallel beam with rows is one of ours
+    except ValueError:
+        return None
+    again = to_vectors(found, motion)
+    if isinstance(found, ParallelBeam):  # a ray's direction has no length, and its line no sense
+        v = v.copy()
+        v[:, :2] *= (np.sign((v[:, :2] * again[:, :2]).sum(1)) / np.linalg.norm(v[:, :2], axis=1))[:, None]
+    if np.abs(again - v).max() > 1e-9 * scale:
+        return None
+    return found, None if np.abs(motion).max() <= 1e-9 * scale else motion
+
+
+def _moving_parallel(v: NDArray[np.float64], columns: int) -> tuple[ParallelBeam, NDArray[np.float64]]:
+    angles = np.arctan2(-v[:, 4], v[:, 5])
+    tangent = np.stack([-np.sin(angles), np.cos(angles)], axis=1)
+    place = (v[:, 2:4] * tangent).sum(1)
+    offset = float(place.mean())
+    # What the centre is off along the rays does not matter, but belongs to the vectors.
+    back = offset * tangent - v[:, 2:4]
+    geometry = ParallelBeam(angles, columns, float(np.linalg.norm(v[:, 4:], axis=1).mean()), offset)
     return geometry, np.ascontiguousarray(back[:, ::-1])
 
 

@@ -71,7 +71,7 @@ def reconstruct_draws(
         noisy: ``(n, z, y, x)`` b of the draws.
         change: ``(z, y, x)`` what taking the core away adds to the noise-free b.
         exposure_s: in s.
-        control: of :func:`recon.study.dose_factor.response.first_order_response`.
+        control: of :func:`recon.study.dose_factor.response.linear_response`.
         progress: called with the finished fraction.
     """
     where = torch.from_numpy(fat)

@@ -24,7 +24,7 @@ from recon.study.compare.placements import Placements, vary_placement
 from recon.study.compare.reference import Reference, exact_reference
 from recon.study.compare.regions import Regions
 from recon.study.compare.settings import Settings
-from recon.study.dose_factor.response import first_order_response
+from recon.study.dose_factor.response import RESPONSE_DRAWS, linear_response
 from recon.study.paper import facts as paper
 from recon.study.paper.plaque_scan import (
     REFERENCE_KERNEL,
@@ -298,7 +298,9 @@ class _MbirRun:
             control = None
             if m.settings.control:
                 self.progress("control of MBIR", 0.0)
-                control = first_order_response(self.network, self.problem, self.weights, clean, exposure, self.clean)
+                control = linear_response(
+                    self.network, self.problem, self.weights, clean, exposure, self.clean, RESPONSE_DRAWS
+                )
                 self.clock.lap("control of MBIR")
             return reconstruct_draws(
                 self.network, self.problem, self.rois, self.fat, noisy, self.change * exposure, exposure, control,

@@ -114,7 +114,7 @@ def _exact_noise(row: Floats, spacing: float, shape: tuple[int, int]) -> RegionN
 def drawn_figures(m: Measured, method: str, dose: float, truth: dict[str, Floats]) -> Figures:
     """Figures of a method that is not linear, each with all that the linear controls of the same draws tell."""
     samples = {name: m.samples[method, name, dose] for name in MAIN_SCENES}
-    control = _Control(m, dose)
+    control = _Control(m, method, dose)
     means, logs = {}, {}
     for name in MAIN_SCENES[:2]:
         found = samples[name]
@@ -152,16 +152,19 @@ def drawn_figures(m: Measured, method: str, dose: float, truth: dict[str, Floats
 
 
 class _Control:
-    """The linear controls of one exposure. All scenes have the same noise, so their deviations are those of one."""
+    """The linear controls of a method at one exposure: its own response if it is known, else the study's.
 
-    def __init__(self, m: Measured, dose: float) -> None:
-        c = m.controls[dose]
+    All scenes have the same noise, so their deviations are those of one.
+    """
+
+    def __init__(self, m: Measured, method: str, dose: float) -> None:
+        c = m.responses.get((method, dose), m.controls[dose])
         self.count = len(c["covariance"]) // (2 * len(ROIS) + len(OBSERVERS) * _CHANNELS)
         shape = (-1, self.count, c["covariance"].shape[0] // self.count)
         self.mean_readings = c["mean"].reshape(shape)  # (scenes, controls, rows)
         covariance = c["covariance"].reshape(shape[1], shape[2], shape[1], shape[2])
         self.known = Controls(c["readings"].reshape(shape), self.mean_readings[0], covariance)
-        self.fbp, self.exact_fbp = c.get("fbp"), m.fbp[_base()]
+        self.fbp, self.exact_fbp = m.controls[dose].get("fbp"), m.fbp[_base()]
         self.dose = dose
 
     def mean(self, readings: Floats, h: Floats) -> Jackknifed:

@@ -35,12 +35,14 @@ from recon.study.dose_factor.methods import Method, fingerprint, load_methods
 from recon.study.dose_factor.places import Place, Places, ScenePlace
 from recon.study.dose_factor.readings import Readings
 from recon.study.dose_factor.realisations import NOISY_SCENE, Realisations, joined
+from recon.study.dose_factor.response import RESPONSE_DRAWS, linear_response
 from recon.study.dose_factor.scene import SceneFacts, StudyScene
 from recon.study.dose_factor.settings import (
     FBP_BASE,
     IMAGE_METHODS,
     LINEAR_METHODS,
     MAIN_SCENES,
+    SLOW_METHODS,
     Settings,
     fbp_label,
     with_twin,
@@ -72,6 +74,8 @@ class Measured:
         linear: (method, dose) → :func:`recon.study.dose_factor.exact_figures.linear_figures`, without its adjoints.
         controls: dose → ``readings (n, 2 · rows)`` of the linear controls in the paper's scene, their exact
             ``mean (scenes, 2 · rows)`` and ``covariance``; ``fbp (n, channels)`` of FBP of the same readings.
+        responses: (method, dose) → the same of the method's own linear response
+            (:mod:`recon.study.dose_factor.response`), a better control; of methods with all realisations.
         samples: (method, scene, dose) → ``readings (n, rows)``, with and without the core ``plane`` and ``z``
             ``(n, bins)``; of the paper's scene also ``fat``, ``square`` and ``shape``.
         extra, vessels: (method, scene or vessel, dose) → :meth:`recon.study.dose_factor.places.Places.found`.
@@ -91,6 +95,7 @@ class Measured:
     fbp: dict[str, dict[str, Any]] = field(default_factory=dict)
     linear: dict[tuple[str, float], dict[str, Any]] = field(default_factory=dict)
     controls: dict[float, dict[str, Any]] = field(default_factory=dict)
+    responses: dict[tuple[str, float], dict[str, Any]] = field(default_factory=dict)
     samples: dict[tuple[str, str, float], dict[str, Any]] = field(default_factory=dict)
     extra: dict[tuple[str, str, float], dict[str, Any]] = field(default_factory=dict)
     vessels: dict[tuple[str, str, float], dict[str, Any]] = field(default_factory=dict)
@@ -284,6 +289,33 @@ class _Study:
                 m.volumes[key] = m.samples[key].pop("first")
             spent += sum(float(p["seconds"]) for p in pieces)
         m.seconds[method.name] = spent / (sum(count.values()) * len(s.doses))
+        if s.responses and method.name not in SLOW_METHODS:
+            for k, dose in enumerate(s.doses):
+                self.report(f"{method.name}: its own control", k / len(s.doses))
+                found = self._response(method, dose)
+                if found is not None:
+                    m.responses[method.name, dose] = found
+
+    def _response(self, method: Method, dose: float) -> dict[str, Any] | None:
+        """A method's linear response in the paper's scene, as :meth:`_controls`; None: autograd does not see it."""
+        s, scene, rows = self.settings, self.scene("paper"), self._readings("method").weights
+
+        def compute() -> dict[str, Any]:
+            b = torch.from_numpy(scene.facts.statistic) * dose
+            clean = None if s.fast_noise else scene.clean
+            found = linear_response(method, scene.problem, rows, b, dose, clean, RESPONSE_DRAWS)
+            if found is None:
+                return {"seen": np.array(False)}
+            main = torch.stack([torch.from_numpy(self.scene(n).facts.statistic) for n in MAIN_SCENES]) * dose
+            readings = [found.of(self.noise.statistic("paper", dose, block)) for block in s.blocks(s.n)]
+            return {
+                "seen": np.array(True), "covariance": found.covariance, "mean": found.of(main),
+                "readings": np.concatenate(readings),
+            }  # fmt: skip
+
+        key = f"{self.noise.key} {fingerprint(method)} {s.n}"
+        found = self.store.piece(f"controls/{method.name}_{dose:g}s", key, compute)
+        return found if bool(found["seen"]) else None
 
     def _method_piece(self, method: Method, name: str, dose: float, block: range) -> dict[str, Any]:
         scene = self.scene(name)

@@ -28,7 +28,7 @@ from recon.pwls.inset_problem import InsetProblem
 from recon.study.dose_factor.exact_linear import exact_linear, statistic_covariance
 from recon.study.dose_factor.methods import Method, fingerprint, load_methods
 from recon.study.dose_factor.realisations import Realisations, joined
-from recon.study.dose_factor.response import first_order_response
+from recon.study.dose_factor.response import linear_response
 from recon.study.dose_factor.settings import LINEAR_METHODS, TWIN_REALIZATIONS
 from recon.study.paper.plaque_scan import Functional
 from torchpcct.scan import Scan
@@ -174,7 +174,7 @@ class Places:
     def _control(self, method: Method, place: Place, dose: float) -> dict[str, Any]:
         """The linear functionals that control a method, and their exact moments."""
         b, scan, weights = place.statistics[0] * dose, self._drawn_from(place), place.weights
-        response = first_order_response(method, place.problem, weights, b, dose, scan)
+        response = linear_response(method, place.problem, weights, b, dose, scan)
         if response is not None:
             g, offset = response.adjoints, np.zeros(len(weights))
             mean, covariance = response.mean, response.covariance

@@ -144,6 +144,7 @@ class Settings(StudySettings):
             outlines that are only roughly known.
         controls: linear methods of the same draws that the figures of all nonlinear methods are controlled by, of
             :data:`LINEAR_METHODS`.
+        responses: control methods with all ``n`` realisations by their own linear response instead.
         fast_noise: draw b = AᵀW y from the Gram's covariance instead of drawing the readings. The further scenes
             always do. There are no FBP realisations then; FBP's exact figures stay.
         block: realisations in one piece.
@@ -167,6 +168,7 @@ class Settings(StudySettings):
     kernels: tuple[str, ...] = paper.KERNELS
     bounds: bool = True
     controls: tuple[str, ...] = ("linear", "linear_z_added")
+    responses: bool = True
     fast_noise: bool = False
     block: int = 8
 
@@ -174,7 +176,7 @@ class Settings(StudySettings):
     QUICK: ClassVar[Mapping[str, Any]] = {
         "n": 12, "slow_n": 5, "scene_n": 8, "doses": (2.0,), "scene_doses": (2.0,), "views": 164, "fast_noise": True,
         "methods": ("linear", "mbir"), "scenes": (), "controls": ("linear",),
-        "kernels": ("soft",), "bounds": False, "block": 12, "vessels": (),
+        "responses": False, "kernels": ("soft",), "bounds": False, "block": 12, "vessels": (),
     }  # fmt: skip
 
     def __post_init__(self) -> None:

@@ -11,8 +11,10 @@ from analytic import Ellipsoid, Gaussian
 
 from recon.fbp.any_orbit import fbp_of_vectors, straighten
 from recon.fbp.fbp import fbp
+from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
 from torchpcct.projector.vectors import to_vectors
+from torchpcct.vector_geometry import VectorGeometry, helical_motion
 
 MU = 0.02
 BODY = (Ellipsoid((4.0, -6.0), (30.0, 36.0), value=MU), Gaussian((10.0, 12.0), 5.0, value=0.3 * MU))
@@ -67,7 +69,12 @@ def test_wobbling_cone_beam():
     """3° of roll, 4° of tilt, four columns aside, a cell of jitter: 2 % of the truth; ignored, more than 10 %."""
     v, grid = wobbling(), VolumeGrid((2, 48, 48), (1.0, 2.0, 2.0))
     data = lines(v, CONE.columns, CONE.rows)
-    assert worst(fbp_of_vectors(data, v, grid, outside=0.0), grid) < 0.02
+    geometry = VectorGeometry(v, CONE.columns, CONE.rows)
+    assert worst(fbp(data, geometry, grid, outside=0.0), grid) < 0.02
+    with pytest.raises(ValueError, match="window belongs to a circular scan"):
+        fbp(data, geometry, grid, window=DetectorWindow.full(CONE))
+    with pytest.raises(ValueError, match="sinogram must have shape"):
+        fbp(data[:, :-1], geometry, grid)
     assert worst(fbp(data, CONE, grid, outside=0.0), grid) > 0.1
 
 
@@ -110,6 +117,8 @@ def test_what_fbp_cannot_do_is_refused():
     helix[:, [2, 5]] += np.linspace(-10, 10, len(v))[:, None]
     with pytest.raises(ValueError, match=r"climbs by 20\.00 mm.*of a helix is not provided.*recon\.pwls"):
         straighten(data, helix)
+    with pytest.raises(ValueError, match=r"table travels by 20\.00 mm.*recon\.pwls"):
+        fbp(data, CONE, VolumeGrid((2, 8, 8), 2.0), motion=helical_motion(CONE, 20.0 * 180 / 179))
     with pytest.raises(ValueError, match="does not stand behind the axis"):
         straighten(data, np.concatenate([v[:, :3], 1.5 * v[:, :3], v[:, 6:]], 1))
     tilted = np.concatenate([-v[:, :3], v[:, 3:]], 1)

@@ -19,7 +19,7 @@ from recon.study.compare.regions import Regions
 from recon.study.compare.settings import Settings
 from recon.study.compare.tables import tables
 from recon.study.dose_factor.methods import LinearFilter
-from recon.study.dose_factor.response import Response, first_order_response
+from recon.study.dose_factor.response import Response, linear_response
 from recon.study.paper import facts as paper
 from recon.study.paper.plaque_scan import inset_grid, prepare
 from recon.study.report import markdown_table
@@ -112,7 +112,7 @@ def test_control_of_a_linear_method_is_the_method(scanned):
     rois = regions.on(grid)
     clean = problem.statistic(scan.clean).b * exposure
     weights = torch.stack([r.weights for r in rois])
-    control = first_order_response(method, problem, weights, clean, exposure, scan.clean)
+    control = linear_response(method, problem, weights, clean, exposure, scan.clean)
     noisy = torch.stack([problem.statistic(scan.clean.with_noise(exposure, seed)).b for seed in range(6)])
     change = 0.1 * clean
     draws = reconstruct_draws(method, problem, rois, regions.fat(grid), noisy, change, exposure, control)
@@ -127,7 +127,7 @@ def test_control_of_a_linear_method_is_the_method(scanned):
     z = np.linalg.solve(np.linalg.cholesky(control.covariance), (draws.controls - control.mean).T)
     assert np.square(z).sum() == pytest.approx(24, abs=4 * np.sqrt(2 * 24))
     assert draws.fat.shape == (6,)
-    assert first_order_response(torch.no_grad()(method), problem, weights, clean, exposure, scan.clean) is None
+    assert linear_response(torch.no_grad()(method), problem, weights, clean, exposure, scan.clean) is None
 
 
 def test_placements_start_with_the_nominal_one(scanned):

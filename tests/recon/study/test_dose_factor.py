@@ -27,7 +27,7 @@ from recon.study.dose_factor.methods import (
 from recon.study.dose_factor.places import Places
 from recon.study.dose_factor.readings import Readings, true_volume
 from recon.study.dose_factor.realisations import Realisations
-from recon.study.dose_factor.response import first_order_response
+from recon.study.dose_factor.response import linear_response
 from recon.study.dose_factor.scene import StudyScene
 from recon.study.dose_factor.seen import Seen
 from recon.study.dose_factor.settings import MAIN_SCENES, ROIS, Settings
@@ -254,7 +254,11 @@ def test_at_a_place_a_linear_method_in_disguise_has_its_exact_figures(scene, fol
         assert found.auc(1.0)["value"] == pytest.approx(known.auc(1.0)["value"], abs=1e-3)
         assert found.log_fat.value == pytest.approx(known.log_fat, abs=0.2)
     # The moments are those of the readings' noise, not of the Gram operator's.
-    response = first_order_response(LinearFilter(), place.problem, place.weights, place.statistics[0] * 2, 2.0, None)
+    given = (LinearFilter(), place.problem, place.weights, place.statistics[0] * 2, 2.0, None)
+    response, averaged = (linear_response(*given, draws=k) for k in (0, 2))
+    torch.testing.assert_close(
+        averaged.adjoints, response.adjoints, rtol=1e-3, atol=1e-3 * response.adjoints.abs().max()
+    )
     ratio = np.diag(exact["covariance"]) / np.diag(response.covariance)
     assert (np.abs(ratio - 1) < 0.1).all()
     assert (np.abs(ratio - 1) > 1e-4).all()
@@ -286,6 +290,24 @@ def test_a_linear_method_in_disguise_has_its_exact_figures(measured):
         assert drawn.log_detectability[observer].value == pytest.approx(value, abs=1e-6)
     for name, value in known.slopes.items():
         assert drawn.slopes[name].value == pytest.approx(value, abs=1e-5)
+
+
+def test_a_method_controlled_by_its_own_response_has_its_exact_figures(measured, folder):
+    run = study._Study(TINY, Store(folder), lambda name, part: None)
+    response = run._response(_Named(True), 2.0)
+    assert run._response(_Named(False), 2.0) is None
+    found = replace(as_if_drawn(measured), responses={("qggmrf", 2.0): response})
+    # The readings of the same draws, seen by the gradient alone; g·b leaves the background out.
+    gap = found.samples["qggmrf", "paper", 2.0]["readings"] - response["readings"]
+    assert gap.std(0).max() < 2e-3 * response["readings"].std(0).max()
+    exact = Exact(measured)
+    drawn, known = drawn_figures(found, "qggmrf", 2.0, exact.truth), exact.figures("linear", 2.0)
+    for key in ("log_core", "log_fibrous", "log_contrast"):
+        for a, b in zip(getattr(drawn, key), getattr(known, key), strict=True):
+            assert a.value == pytest.approx(b, abs=2e-3)
+            assert a.standard_error < 1e-3
+    for observer, value in known.log_detectability.items():
+        assert drawn.log_detectability[observer].value == pytest.approx(value, abs=5e-3)
 
 
 def test_shrunk_contrast_is_corrected_and_bias_is_reported(measured):

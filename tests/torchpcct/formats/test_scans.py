@@ -10,6 +10,7 @@ import numpy as np
 import pydicom
 import pytest
 import tifffile
+import torch
 import yaml
 from analytic import Ellipsoid, line_integrals
 from pydicom.dataset import FileMetaDataset
@@ -19,10 +20,10 @@ from recon import reconstruct
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, VolumeGrid, full_turn
 from torchpcct.formats.dicom_ct_pd import read_dicom_ct_pd
 from torchpcct.formats.geometry_yaml import geometry_of, geometry_values
-from torchpcct.formats.preprocess import centred, find_axis, without_outliers, without_stripes
-from torchpcct.formats.rtk import read_rtk_vectors
+from torchpcct.formats.preprocess import _by_centroid, centred, cleaned, find_axis, without_outliers, without_stripes
+from torchpcct.formats.rtk import read_rtk, read_rtk_vectors
 from torchpcct.formats.scans import open_scan
-from torchpcct.projector.vectors import to_vectors
+from torchpcct.projector.vectors import as_circular, to_vectors
 
 MU = 0.02
 BODY = [Ellipsoid((2.0, -3.0), (14.0, 18.0), value=MU), Ellipsoid((6.0, 5.0), 3.0, value=MU)]
@@ -107,6 +108,39 @@ def test_the_axis_is_found_and_stripes_go(tmp_path):
     assert float((cleaned - lines)[0, 40, 20].abs()) < 0.3
     with pytest.raises(ValueError, match="found from parallel rays, this is a ConeBeam"):
         find_axis(Scan.from_line_integrals(np.zeros(CONE.shape) + 0.1, CONE, photons=1e5))
+
+
+def test_cleaned_keeps_the_scan_and_its_weights(tmp_path):
+    """A cell that changed its gain and a stray gamma; a cell without signal is dead though its mean is not quite 0."""
+    path = data_exchange(tmp_path / "tooth.h5")
+    clean = open_scan(path, slices=slice(0, 2))
+    with h5py.File(path, "a") as file:
+        data, white = file["exchange/data"][:], file["exchange/data_white"][:]
+        data[:, 0, 40] = np.rint(0.97 * data[:, 0, 40])
+        data[50, 0, 20] = 65535
+        data[:, 1, 33], white[:, 1, 33] = 103, 105  # dark: 100 … 104
+        file["exchange/data"][:], file["exchange/data_white"][:] = data, white
+    raw = open_scan(path, slices=slice(0, 2))
+    assert raw.dead is not None
+    assert bool(raw.dead[1, :, 33].all())
+    found = cleaned(raw)
+    wrong = [float((s.line_integrals()[0] - clean.line_integrals()[0])[:, [20, 40]].abs().max()) for s in (raw, found)]
+    assert wrong[0] > 0.5
+    assert wrong[1] < 0.1
+    live = found.weights()[0][:, :30]
+    torch.testing.assert_close(live, clean.weights()[0][:, :30], rtol=0.25, atol=0)
+    with pytest.raises(ValueError, match="stripes are taken from sinograms"):
+        cleaned(Scan.from_line_integrals(np.zeros(CONE.shape) + 0.1, CONE, photons=1e5))
+
+
+def test_the_centroid_refines_the_axis():
+    """To a tenth of a column with noise; not of an object that is cut off."""
+    rng = np.random.default_rng(0)
+    for offset in (-1.3, 0.4, 2.9):
+        g = ParallelBeam(np.arange(91) * math.pi / 90, 64, 1.0, offset)
+        lines = line_integrals(g, BODY, sub=1) + 0.01 * rng.standard_normal(g.shape)
+        assert _by_centroid(lines, g.angles) == pytest.approx(31.5 - offset, abs=0.1)
+    assert _by_centroid(lines[:, 20:], g.angles) is None
 
 
 def test_damaged_data_exchange(tmp_path):
@@ -253,6 +287,10 @@ def test_rtk_matrices(tmp_path):
     path.write_text(f"<RTKThreeDCircularGeometry>{distance}{''.join(parts)}</RTKThreeDCircularGeometry>")
     found = read_rtk_vectors(path, CONE.columns, CONE.rows, CONE.pitch)
     np.testing.assert_allclose(found, to_vectors(CONE), atol=1e-8)
+    geometry = read_rtk(path, CONE.columns, CONE.rows, CONE.pitch)
+    circular = as_circular(geometry)
+    assert circular is not None
+    np.testing.assert_allclose(circular[0].angles % (2 * math.pi), CONE.angles, atol=1e-9)
     survive(path, lambda: read_rtk_vectors(path, CONE.columns, CONE.rows, CONE.pitch))
 
 

@@ -62,6 +62,30 @@ def test_the_resolution_is_where_signal_and_noise_cross():
     assert HalfSplit(*noise).resolution(0.5) < 0.15
 
 
+def test_the_transfer_is_the_blur_whatever_the_noise():
+    """A Gaussian known in advance, and a method that blurs the signal but not its noise; noise power drops out."""
+    generator = torch.Generator().manual_seed(1)
+    square = np.fft.fftfreq(96)[:, None] ** 2 + np.fft.fftfreq(96) ** 2
+    gauss = torch.from_numpy(0.5 ** (square / 0.12**2))
+    signal = torch.randn(8, 96, 96, generator=generator).double()
+    noise = [torch.randn(8, 96, 96, generator=generator).double() for _ in range(4)]
+    reference = HalfSplit(signal + 0.5 * noise[0], signal + 0.5 * noise[1])
+    smooth = torch.fft.ifft2(torch.fft.fft2(signal) * gauss).real
+    method = HalfSplit(smooth + 0.3 * noise[2], smooth + 0.3 * noise[3])
+    assert method.f50(reference, 0.5) == pytest.approx(0.24, rel=0.04)
+    f, t = method.transfer(reference, 0.5)
+    np.testing.assert_allclose(t, 0.5 ** ((f * 0.5 / 0.12) ** 2), atol=0.06)
+    assert reference.f50(reference, 0.5) == math.inf
+    blurred = reference.blurred(0.24, 0.5)
+    assert blurred.f50(reference, 0.5) == pytest.approx(0.24, rel=0.02)
+    assert blurred.noise() < 0.5 * reference.noise()
+    torch.testing.assert_close(reference.blurred(math.inf, 0.5).first, reference.first)
+    with pytest.raises(ValueError, match="f50 must be greater than 0"):
+        reference.blurred(0.0, 0.5)
+    with pytest.raises(ValueError, match="reference has the shape"):
+        HalfSplit(signal[0], signal[1]).transfer(reference, 0.5)
+
+
 def test_what_cannot_be_split_is_refused():
     lines = Scan.from_line_integrals(LINES, GEOMETRY, photons=1e4)
     with pytest.raises(ValueError, match='use how="views"'):

@@ -1,0 +1,218 @@
+"""Per-view geometry: every view has its own source and its own flat detector, wherever they stand.
+
+One concept for detectors that tilt, roll and jitter, sources that wobble, axes counted the other way, helices, tilted
+parallel rays (laminography), and what ASTRA's ``parallel_vec``, ``fanflat_vec``, ``parallel3d_vec`` and ``cone_vec`` or
+RTK's XML say. A view is four vectors in mm: the source (of parallel rays: their direction), the detector's centre,
+``u``, the step to the next column, and ``v``, the step to the next row. Cell ``(i, j)`` of ``rows × columns`` stands at
+``centre + (j − (columns − 1) / 2) u + (i − (rows − 1) / 2) v``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchpcct.geometry import ConeBeam, Geometry
+from torchpcct.validate import number, whole
+
+__all__ = ["VectorGeometry", "helical_motion"]
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class VectorGeometry(Geometry):
+    """A scan that is given view by view.
+
+    Args:
+        vectors: ``(views, 6)`` without rows: source x, y, centre x, y, u x, y; ``(views, 12)`` with rows: source
+            x, y, z, centre, u, v; mm. ASTRA's, whose order and directions these are.
+        columns: detector columns.
+        rows: detector rows, None without.
+        parallel: parallel rays; then the first entries are the rays' direction, of any length.
+
+    Raises:
+        ValueError: a wrong shape, values that are not finite, rays of no direction, a detector without area or that
+            its rays meet edge on.
+        TypeError: a value of the wrong kind.
+    """
+
+    vectors: Any
+    columns: int
+    rows: int | None = None
+    parallel: bool = False
+
+    def __post_init__(self) -> None:
+        set_ = object.__setattr__
+        v = np.array(self.vectors, dtype=np.float64)
+        width = 6 if self.rows is None else 12
+        if v.ndim != 2 or v.shape[1] not in (6, 12) or not len(v):
+            raise ValueError(f"vectors must have shape (views, 6) or (views, 12), got {v.shape}")
+        if v.shape[1] != width:
+            raise ValueError(
+                f"{v.shape[1]} numbers per view need rows {'= None' if v.shape[1] == 6 else '≥ 1'}, got {self.rows!r}"
+            )
+        if not np.isfinite(v).all():
+            view = int(np.argmin(np.isfinite(v).all(1)))
+            raise ValueError(f"vectors must be finite, but those of view {view} are not")
+        if not isinstance(self.parallel, bool):
+            raise TypeError(f"parallel must be True or False, got {self.parallel!r}")
+        v.setflags(write=False)
+        set_(self, "vectors", v)
+        set_(self, "columns", whole("columns", self.columns))
+        set_(self, "rows", None if self.rows is None else whole("rows", self.rows))
+        ray, _, u, up = self.poses.transpose(1, 0, 2)
+        if not self.parallel:
+            ray = self.poses[:, 1] - ray
+        sizes = [np.linalg.norm(x, axis=1) for x in (ray, u, up)]
+        volume = np.abs((np.cross(u, up) * ray).sum(1))
+        bad = volume <= 1e-9 * sizes[0] * sizes[1] * sizes[2]
+        if bad.any():
+            raise ValueError(
+                f"the rays of view {int(bad.argmax())} do not meet their detector, or meet it edge on: are its vectors "
+                "in the order source, centre, u, v?"
+            )
+
+    @property
+    def poses(self) -> Floats:
+        """``(views, 4, 3)`` source (or direction), centre, u, v; without rows in the plane z = 0, v along z, 1 mm."""
+        if self.rows is not None:
+            return np.asarray(self.vectors).reshape(-1, 4, 3)
+        out = np.zeros((len(self.vectors), 4, 3))
+        out[:, :3, :2] = np.asarray(self.vectors).reshape(-1, 3, 2)
+        out[:, 3, 2] = 1.0
+        return out
+
+    @property
+    def angles(self) -> Floats:  # type: ignore[override]
+        """Direction from the axis to the source, or against parallel rays, ``(views,)`` rad."""
+        sign = -1.0 if self.parallel else 1.0
+        return np.arctan2(sign * self.poses[:, 0, 1], sign * self.poses[:, 0, 0])
+
+    @property
+    def views(self) -> int:
+        return len(self.vectors)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return (self.views, self.columns) if self.rows is None else (self.views, self.rows, self.columns)
+
+    @classmethod
+    def of(cls, geometry: Geometry, motion: Any = None) -> VectorGeometry:
+        """A circular scan with a flat detector, view by view.
+
+        Args:
+            geometry: parallel, fan or cone beam.
+            motion: displacement of the grid in every view as for ``Projector``, or None: source and detector move the
+                other way.
+
+        Raises:
+            ValueError: a curved detector, a motion of the wrong shape.
+            TypeError: not a geometry.
+        """
+        from torchpcct.projector.vectors import to_vectors
+
+        rows = geometry.rows if isinstance(geometry, ConeBeam) else None
+        parallel = type(geometry).__name__ == "ParallelBeam"
+        return cls(to_vectors(geometry, motion), geometry.columns, rows, parallel)
+
+    def select(self, views: Any) -> VectorGeometry:
+        """The same scan with a subset (or reordering) of the views: an index array, mask or slice."""
+        return replace(self, vectors=self.vectors[views])
+
+    def flipped(self, *, columns: bool = False, rows: bool = False) -> VectorGeometry:
+        """The same detector with columns or rows counted the other way."""
+        return self._with(2, -self.poses[:, 2] if columns else None, 3, -self.poses[:, 3] if rows else None)
+
+    def shifted(self, columns: Any = 0.0, rows: Any = 0.0) -> VectorGeometry:
+        """The detector displaced in its own plane, by parts of a cell: ``centre + columns · u + rows · v``.
+
+        Args:
+            columns, rows: numbers, or ``(views,)``: jitter.
+        """
+        c, r = (_per_view(n, x, self.views) for n, x in (("columns", columns), ("rows", rows)))
+        poses = self.poses
+        return self._with(1, poses[:, 1] + c * poses[:, 2] + r * poses[:, 3])
+
+    def turned(self, roll: Any = 0.0, tilt: Any = 0.0, slant: Any = 0.0) -> VectorGeometry:
+        """The detector turned about its own centre: first slant, then tilt, then roll.
+
+        Args:
+            roll: about its normal u × v, rad, one number or ``(views,)``.
+            tilt: about u.
+            slant: about v.
+
+        Raises:
+            ValueError: roll or tilt of a detector without rows.
+        """
+        if self.rows is None and (np.any(roll) or np.any(tilt)):
+            raise ValueError("a detector without rows can only be slanted: roll and tilt would leave the plane")
+        roll, tilt, slant = (_per_view(n, x, self.views) for n, x in (("roll", roll), ("tilt", tilt), ("slant", slant)))
+        u, v = self.poses[:, 2], self.poses[:, 3]
+        u = _rotated(u, v, slant)
+        v = _rotated(v, u, tilt)
+        normal = np.cross(u, v)
+        return self._with(2, _rotated(u, normal, roll), 3, _rotated(v, normal, roll))
+
+    def moved(self, motion: Any) -> VectorGeometry:
+        """The scan as seen from a grid that is displaced by ``motion``, as for ``Projector``.
+
+        Raises:
+            ValueError: a motion of the wrong shape.
+        """
+        from torchpcct.projector.rays import check_motion
+
+        axes = 2 if self.rows is None else 3
+        back = np.zeros((self.views, 3))
+        back[:, :axes] = check_motion(motion, self.views, axes)[:, ::-1]
+        poses = self.poses
+        return self._with(1, poses[:, 1] - back, 0, None if self.parallel else poses[:, 0] - back)
+
+    def _with(self, *parts: Any) -> VectorGeometry:
+        """Other vectors: place, ``(views, 3)`` or None (unchanged), in turn."""
+        poses = self.poses.copy()
+        for place, value in zip(parts[::2], parts[1::2], strict=True):
+            if value is not None:
+                poses[:, place] = value
+        flat = poses.reshape(-1, 12) if self.rows is not None else poses[:, :3, :2].reshape(-1, 6)
+        return replace(self, vectors=flat)
+
+
+def helical_motion(geometry: ConeBeam, feed: float, start: float = 0.0) -> Floats:
+    """The table's travel as a displacement of the grid, ``(views, 3)`` z, y, x mm, for ``Projector(…, motion=…)``.
+
+    The source stands ``feed · (β − β₀) / 2π`` above ``start`` in the view of the angle β; angles go on beyond 2π.
+
+    Args:
+        geometry: cone beam, flat or curved.
+        feed: travel of the source along +z in a turn, mm.
+        start: height of the source in the first view, mm.
+
+    Raises:
+        TypeError: not a cone beam. ValueError: numbers that are not finite.
+    """
+    if not isinstance(geometry, ConeBeam):
+        raise TypeError(f"a helix needs a ConeBeam, got {type(geometry).__name__}")
+    height = number("start", start) + number("feed", feed) * (geometry.angles - geometry.angles[0]) / (2 * math.pi)
+    out = np.zeros((geometry.views, 3))
+    out[:, 0] = -height
+    return out
+
+
+def _per_view(name: str, value: Any, views: int) -> Floats:
+    """``(views, 1)`` of one number or one per view."""
+    given = np.asarray(value, dtype=np.float64)
+    if given.shape not in ((), (views,)) or not np.isfinite(given).all():
+        raise ValueError(f"{name} must be one finite number or one per view, ({views},), got shape {given.shape}")
+    return np.broadcast_to(given, (views,))[:, None]
+
+
+def _rotated(x: Floats, axis: Floats, angle: Floats) -> Floats:
+    """Rodrigues' rotation of ``(views, 3)`` about axes of any length by ``(views, 1)`` rad."""
+    axis = axis / np.linalg.norm(axis, axis=1, keepdims=True)
+    c, s = np.cos(angle), np.sin(angle)
+    return np.asarray(x * c + np.cross(axis, x) * s + axis * (axis * x).sum(1, keepdims=True) * (1 - c))
