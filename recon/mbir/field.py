@@ -37,7 +37,7 @@ from recon.pwls.field_problem import FieldProblem, field_prior
 from recon.pwls.memory import require_memory
 from recon.pwls.pwls import pwls
 from recon.pwls.qggmrf import QGGMRF
-from torchpcct.geometry import ConeBeam, VolumeGrid
+from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
 from torchpcct.volume import Volume, to_hu
 
@@ -115,7 +115,14 @@ def trained_grid(grid: VolumeGrid, geometry: Any) -> VolumeGrid:
     Args:
         grid: ``(y, x)`` or ``(z, y, x)``; the z axis of slices does not matter.
         geometry: of the scan.
+
+    Raises:
+        ValueError: a geometry that is given view by view, whose cells may differ.
     """
+    if not hasattr(geometry, "pitch"):
+        raise ValueError(
+            f'MBIR knows its voxels by the detector cell of a circular scan, got {type(geometry).__name__}: use "pwls"'
+        )
     pitch = geometry.pitch[1] if isinstance(geometry.pitch, tuple) else geometry.pitch
     cell = pitch / getattr(geometry, "magnification", 1.0)
     h = grid.spacing[-1]
@@ -196,7 +203,7 @@ def reconstruct_field_mbir(
             detector resolves.
     """
     began = time.perf_counter()
-    flat = not isinstance(scans[0].geometry, ConeBeam)
+    flat = len(scans[0].geometry.shape) == 2
     asked = grid.slice if flat and grid.ndim == 3 else grid
     work = trained_grid(asked, scans[0].geometry)
     fine, cell = grid.spacing[-1], work.spacing[-1]

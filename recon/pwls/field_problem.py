@@ -93,7 +93,7 @@ class FieldProblem:
 
     def __init__(self, scan: Scan, grid: VolumeGrid) -> None:
         geometry = scan.geometry
-        self.plane = not isinstance(geometry, ConeBeam)
+        self.plane = len(geometry.shape) == 2
         if not self.plane and scan.counts.ndim != 3:
             raise ValueError("PWLS in HU needs a counting-mode scan; decompose or sum the energy bins before")
         if self.plane and tuple(grid.shape[:-2]) != tuple(scan.counts.shape[:-2]):

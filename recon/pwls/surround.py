@@ -108,14 +108,15 @@ class UnknownSurround:
         """The whole field without the inset's details, ``coarse.shape`` mm⁻¹, from line integrals of all cells.
 
         Coarse voxels and joined rows would smear the details beyond the inset, and they would be taken off its own
-        readings: a fine FBP of the inset, less its mean, is taken off first.
+        readings: a fine FBP of the inset, less the mean along its sides, is taken off first. (Less its own mean, the
+        step that is left at its sides would be smeared: 2.4 HU of a ball in fat.)
         """
         fine = fbp(lines, self._shadow.geometry, self.grid)
         around = lines.clone()
         w = self.window
         columns = torch.from_numpy(w.column_indices)[:, None].expand(w.shape)
         rows = around[:, w.first_row : w.first_row + w.rows]
-        rows.scatter_add_(-1, columns, -self.projector(fine - fine.mean()))
+        rows.scatter_add_(-1, columns, -self.projector(fine - _sides(fine).mean()))
         data = self.joined(around)
         x = self._field(data)
         return x + self._field(data - self._whole(x))
@@ -151,3 +152,9 @@ class UnknownSurround:
         volume = self.volume(lines)
         kept = self._all.crop(lines, self.window)
         return kept - self._shadow(volume) + self.projector(self.inside(volume) - level)
+
+
+def _sides(volume: Tensor) -> Tensor:
+    """The outermost rows and columns of all slices of ``(z, y, x)``, ``(z, n)``."""
+    inner = volume[:, 1:-1]
+    return torch.cat([volume[:, 0], volume[:, -1], inner[..., 0], inner[..., -1]], 1)

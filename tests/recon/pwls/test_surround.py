@@ -31,3 +31,17 @@ def test_nothing_is_left_of_a_uniform_inset(lines):
     assert left.shape == window.shape
     assert float(lines.max()) > 2.0
     assert float(left.mean((0, 2)).abs().max()) < 2e-4
+
+
+def test_what_the_inset_holds_stays_its_own(lines):
+    """A ball in it: its readings are left, and nothing of it is taken for surround (once 12 % were)."""
+    window = shadow(GEOMETRY, GRID, margin=1)
+    projector = Projector(GEOMETRY, GRID, window)
+    z, y, x = np.meshgrid(*GRID.axes, indexing="ij")
+    ball = torch.from_numpy(0.02 * (np.hypot(np.hypot(y - 12.0, x + 15.0), z) < 1.8)).float()
+    around = UnknownSurround(GEOMETRY, GRID, window, projector)
+    whole = Projector(GEOMETRY, GRID)
+    plain, holding = (around.take_off(v, 0.02) for v in (lines, lines + whole(ball)))
+    own = projector(ball)
+    error = holding - plain - own
+    assert abs(float(error.mean())) < 0.03 * float(own.mean())
