@@ -217,7 +217,7 @@ def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     if arguments.voxel is not None:
         _require_voxels(tuple(math.ceil(e / arguments.voxel) for e in arguments.extent or (1.0, 1.0, 1.0)))
     if not arguments.scan.exists():
-        raise FileNotFoundError(f"{arguments.scan} does not exist: make it with torchpcct simulate")
+        raise FileNotFoundError(f"{arguments.scan} does not exist (torchpcct simulate makes scans)")
     import yaml
 
     from recon.api import METHODS, reconstruct

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 import threading
 import warnings
+import weakref
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -19,7 +21,7 @@ from torchpcct.projector.compiling import announce_compilation, refuse_after_for
 from torchpcct.projector.cuda import passes as cuda
 from torchpcct.projector.tables import Tables, VectorTables
 
-__all__ = ["Engine"]
+__all__ = ["ENGINES", "Engine"]
 
 # numba's fallback threading layer must not be entered from two threads at once.
 _LAUNCH = threading.Lock()
@@ -37,6 +39,11 @@ _TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-10}
 _CHECKED: dict[tuple[str, torch.dtype], bool] = {}
 
 
+ENGINES: weakref.WeakValueDictionary[int, Engine] = weakref.WeakValueDictionary()
+"""Engines by their handles: what a traced graph can hold, which holds tensors and numbers only."""
+_HANDLES = itertools.count()
+
+
 class _CpuPasses(Protocol):
     def forward(self, x: NDArray) -> NDArray: ...
 
@@ -51,6 +58,16 @@ class Engine:
     def __init__(self, tables: Tables | VectorTables) -> None:
         self.tables = tables
         self._devices: dict[torch.device, cuda.GpuPasses] = {}
+        self._enter()
+
+    def _enter(self) -> None:
+        self.handle = next(_HANDLES)
+        ENGINES[self.handle] = self
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Of a copy, or in another process: a handle of its own."""
+        self.__dict__.update(state)
+        self._enter()
 
     @cached_property
     def cpu(self) -> _CpuPasses:

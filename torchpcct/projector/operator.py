@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import Geometry, VolumeGrid
-from torchpcct.projector.engine import Engine
+from torchpcct.projector.engine import ENGINES, Engine
 from torchpcct.projector.manners import Operator
 from torchpcct.projector.tables import Tables, VectorTables
 from torchpcct.projector.vectors import as_circular
@@ -47,7 +47,38 @@ class _Pass(torch.autograd.Function):
         return _apply(x.movedim(in_dims[0], 0), engine, transposed), 0
 
 
+# torch.compile and torch.export cannot look into numba kernels; to them a pass is one operation. An exported program
+# holds the handle of its engine: it runs in the process that exported it, while the projector lives.
+@torch.library.custom_op(
+    "torchpcct::project", mutates_args=(), schema="(Tensor x, int engine, bool transposed) -> Tensor"
+)
+def _traced(x: Tensor, engine: int, transposed: bool) -> Tensor:
+    return ENGINES[engine].apply(x, transposed)
+
+
+@_traced.register_fake
+def _shape(x: Tensor, engine: int, transposed: bool) -> Tensor:
+    tables = ENGINES[engine].tables
+    inner, outer = tables.domain_shape, tables.range_shape
+    if transposed:
+        inner, outer = outer, inner
+    return x.new_empty((*x.shape[: x.dim() - len(inner)], *outer))
+
+
+def _note(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    _, ctx.engine, ctx.transposed = inputs
+
+
+def _back(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+    return _traced(gradient, ctx.engine, not ctx.transposed), None, None
+
+
+_traced.register_autograd(_back, setup_context=_note)
+
+
 def _apply(x: Tensor, engine: Engine, transposed: bool) -> Tensor:
+    if torch.compiler.is_compiling():
+        return cast(Tensor, _traced(x, engine.handle, transposed))
     return cast(Tensor, _Pass.apply(x, engine, transposed))
 
 
@@ -68,8 +99,9 @@ class Projector(Operator):
     (``as_scipy``, ``as_pylops``, ``as_deepinv``) come from :class:`torchpcct.projector.manners.Operator`. Units: ``x``
     in mm⁻¹ gives line integrals without unit. Both directions are differentiable any number of times and work under
     ``torch.func``. NaN and Inf in the input reach the output (a NaN may also reach readings that share a grid line with
-    it). The module has no parameters and no state. On CUDA the Triton kernels are used if Triton is installed and their
-    first-use check against the CPU passes; otherwise the data travel to the CPU and back.
+    it). ``torch.compile`` and, within the process, ``torch.export`` take a pass as one operation. The module has no
+    parameters and no state. On CUDA the Triton kernels are used if Triton is installed and their first-use check
+    against the CPU passes; otherwise the data travel to the CPU and back.
 
     Args:
         geometry: ``ParallelBeam`` or ``FanBeam`` with a 2-D grid, ``ConeBeam`` with a 3-D grid; or a

@@ -1,5 +1,6 @@
 """Operators in the manners of other libraries, narrow dtypes, forks and the notice of compilation."""
 
+import copy
 import logging
 import os
 import subprocess
@@ -106,6 +107,34 @@ def test_autocast(A):
     assert y.dtype == torch.float32
     y.square().sum().backward()
     assert torch.isfinite(layer.weight.grad).all()
+
+
+class _Step(torch.nn.Module):
+    def __init__(self, A):
+        super().__init__()
+        self.A = A
+        self.scale = torch.nn.Parameter(torch.tensor(0.5))
+
+    def forward(self, x):
+        return x - self.scale * self.A.T(self.A(x))
+
+
+@pytest.mark.slow  # the tracer takes seconds to load
+def test_compiled_and_exported(A):
+    """To the tracer a pass is one operation, in a whole graph, with its gradient; a copy has a handle of its own."""
+    step, x = _Step(A), torch.rand(2, *A.domain_shape)
+    expected = step(x)
+    compiled = torch.compile(step, backend="aot_eager", fullgraph=True)
+    torch.testing.assert_close(compiled(x), expected)
+    compiled(x).square().sum().backward()
+    found, step.scale.grad = step.scale.grad, None
+    step(x).square().sum().backward()
+    torch.testing.assert_close(found, step.scale.grad)
+    program = torch.export.export(step, (x,))
+    torch.testing.assert_close(program.module()(x), expected)
+    twin = copy.deepcopy(A)
+    assert twin._engine.handle != A._engine.handle
+    assert torch.equal(twin(x), A(x))
 
 
 CHILD = """
