@@ -151,7 +151,7 @@ FAULTS = (
     Fault("the centre's error upside down", _OPP, "-difference * (smooth", "difference * (smooth",
           _O + "test_a_wrong_centre_is_found_and_measured"),
     Fault("every pair counts twice", _OPP, "(gamma > 0) & close", "(gamma != 0) & close",
-          _O + "test_a_window_that_follows_an_inset"),
+          _O + "test_each_pair_of_rays_counts_once"),
     Fault("no tolerance of the centre", _OPP, "CENTRE_TOLERANCE = 0.1", "CENTRE_TOLERANCE = 0.0",
           _O + "test_an_error_within_the_tolerance_is_measured_but_no_finding"),
     Fault("centre untested", "recon/api.py", "found = centre_warnings(s, grid)", "found: list[str] = []",

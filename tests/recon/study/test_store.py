@@ -1,5 +1,6 @@
 """Pieces of a study: what goes in comes out, kills lose one piece at most, and nothing of another version is used."""
 
+import io
 import json
 import os
 import signal
@@ -100,8 +101,18 @@ def test_one_name_is_one_piece(tmp_path):
             pieces.within("part")("x", lambda: 3)
 
 
-def test_kills_at_random_moments_lose_one_piece_at_most(tmp_path):
-    """A study of 12 pieces is killed (SIGKILL) again and again until it gets through."""
+def test_kills_at_random_moments_lose_one_piece_at_most(tmp_path, monkeypatch):
+    """A study of 12 pieces is killed (SIGKILL) again and again until it gets through; many kills hit a write."""
+
+    def slowly(path, savez=np.savez, **arrays):
+        savez(whole := io.BytesIO(), **arrays)
+        with Path(path).open("wb") as file:
+            for half in (whole.getvalue()[:500], whole.getvalue()[500:]):
+                file.write(half)
+                file.flush()
+                time.sleep(0.01)
+
+    monkeypatch.setattr(np, "savez", slowly)
     rng, log, count = np.random.default_rng(0), tmp_path / "log", 12
 
     def study():

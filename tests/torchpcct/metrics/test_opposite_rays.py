@@ -9,7 +9,7 @@ import torch
 
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, full_turn
 from torchpcct.detector_window import DetectorWindow
-from torchpcct.metrics.opposite_rays import CENTRE_TOLERANCE, FALSE_ALARMS, centre_test
+from torchpcct.metrics.opposite_rays import CENTRE_TOLERANCE, FALSE_ALARMS, _Rays, centre_test
 
 VIEWS, RODS = 180, ((12.0, -7.0, 6.0, 0.02), (12.0, -7.0, 3.0, 0.01), (-20.0, 15.0, 9.0, 0.015))
 """Rods along z: x, y, radius in mm, attenuation in mm⁻¹."""
@@ -71,6 +71,14 @@ def test_the_order_of_the_views_does_not_matter():
     order = np.random.default_rng(0).permutation(VIEWS)
     expected, shuffled = centre_test(_lines(g), g), centre_test(_lines(g)[order], g.select(order))
     assert shuffled.columns == pytest.approx(expected.columns, abs=1e-6)
+
+
+def test_each_pair_of_rays_counts_once():
+    """Twice, the stated error would be too small by √2."""
+    g = GEOMETRIES["flat"]  # no offset: the opposite of a column is its mirror image
+    _, known = _Rays(g, DetectorWindow.full(g), (0.0, 0.0)).opposite(torch.zeros(VIEWS, 1, 128), np.arange(VIEWS))
+    assert bool((known | known.flip(-1)).all())
+    assert not bool((known & known.flip(-1)).any())
 
 
 def test_a_window_that_follows_an_inset():
