@@ -374,7 +374,7 @@ def picture(result: dict[str, Any]) -> Any:
     axes[0].legend(fontsize=8)
     axes[1].axvline(0.95, color="0.6", lw=0.8)
     axes[1].set_yticks([])
-    axes[1].set_xlabel("coverage of the contrast's 95 % interval [95 %]")
+    axes[1].set_xlabel("contrast: coverage of 95 % intervals")
     for ax in axes:
         ax.invert_yaxis()
     return figure
