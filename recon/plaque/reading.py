@@ -196,6 +196,19 @@ def _with_body(
     return vessel.fit(np.append(fit.parameters, contrast), np.concatenate([fit.bodies, body]), expected=expected)
 
 
+def _doubt(presence: float, contrast: Estimate) -> str:
+    """Why the figures of a core must not be given; empty: they may.
+
+    Where two explanations are about as likely (which tissue is the core), the presence is certain and the contrast is
+    not: its interval holds 0.
+    """
+    if presence < CERTAIN:
+        return f"a core is there with a probability of {presence:.2f} only"
+    if contrast.low <= 0.0 <= contrast.high:
+        return f"the contrast lies between {contrast.low:.0f} and {contrast.high:.0f} HU: several explanations fit"
+    return ""
+
+
 def _read(
     vessel: Vessel, fit: Fit, prior_of_core: CorePrior, particles: int, prior: float, rng: np.random.Generator,
     seed: int,
@@ -225,13 +238,11 @@ def _read(
     names = {"fat": "HU", "wall": "HU", "fibrous": "HU", "lumen": "HU", "wall thickness": "mm", "lumen area": "mm²",
              "least lumen area": "mm²"}  # fmt: skip
     plaque = {"contrast": "HU", "core": "HU", "core volume": "mm³", "cap thickness": "mm"}
-    refused = {}
     given = {n: estimate(draws[n], unit) for n, unit in plaque.items()}
     figures = {n: estimate(draws[n], unit) for n, unit in names.items() if n in draws}
-    if presence >= CERTAIN:
-        figures |= given
-    else:
-        refused = {n: f"a core is there with a probability of {presence:.2f} only" for n in plaque}
+    refused = dict.fromkeys(plaque, _doubt(presence, given["contrast"]))
+    if not any(refused.values()):
+        figures, refused = figures | given, {}
     if calcifications:
         index = [vessel.size + k for k in range(calcifications)]
         for k, i in enumerate(index):

@@ -8,6 +8,8 @@ import pytest
 from drawn_vessel import VALUES
 
 from recon.plaque import TissueData, read_plaque
+from recon.plaque.figures import Estimate
+from recon.plaque.reading import _doubt
 from recon.plaque.report import save, table
 
 POINT_OFF = (0.0, 0.0, drawn_vessel.CORE_OFF)
@@ -90,3 +92,13 @@ def test_refusals(gram):
         TissueData(data.b * float("nan"), gram, 1.0)
     with pytest.raises(ValueError, match="one \\(z, y, x\\) grid"):
         TissueData(data.b[1:], gram, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("presence", "low", "high", "why"),
+    [(0.94, 20.0, 80.0, "probability of 0.94"), (0.99, -130.0, 160.0, "several explanations"), (0.99, 20.0, 80.0, "")],
+)
+def test_doubt_has_a_reason(presence, low, high, why):
+    found = _doubt(presence, Estimate((low + high) / 2, low, high, (high - low) / 4, "HU"))
+    assert why in found
+    assert bool(found) == bool(why)
