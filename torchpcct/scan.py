@@ -217,6 +217,7 @@ class Scan:
             self,
             counts=self.window.crop(self.counts, window),
             quantum=None if self.quantum is None else self.window.crop(self.quantum, window),
+            dead=None if self.dead is None else self.window.crop(self.dead.expand(self.counts.shape), window),
             window=window,
         )
 

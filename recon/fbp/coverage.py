@@ -125,11 +125,13 @@ def centre_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
     """
     from torchpcct.metrics.opposite_rays import centre_test  # loads scipy.stats
 
-    lines, window, about = scan.line_integrals(), scan.window, (0.0, 0.0)
+    window, about = scan.window, (0.0, 0.0)
+    if window is not None:
+        window, about = shadow(scan.geometry, grid, margin=_CENTRE_MARGIN).within(window), tuple(grid.center[-2:])
+        scan = scan.crop(window)
+    lines = scan.line_integrals()
     if lines.ndim > len(scan.geometry.shape):
         lines = lines[lines.shape[0] // 2]
     if window is not None:
-        part = shadow(scan.geometry, grid, margin=_CENTRE_MARGIN).within(window)
-        lines = window.crop(lines - window.take(scan.surround_line_integrals()), part)
-        window, about = part, (grid.center[-2], grid.center[-1])
+        lines = lines - window.take(scan.surround_line_integrals())
     return list(centre_test(lines, scan.geometry, window, about).findings)

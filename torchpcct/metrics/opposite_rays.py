@@ -7,6 +7,10 @@ along the columns, r = −2 ε t + noise. The slopes of the two rays have indepe
 smoothed, and the other's, raw, neither shrinks nor stretches the estimate (instrumental variables, Durbin 1954, Rev.
 Int. Stat. Inst. 22:23). Its error is that of the sums
 over blocks of views, which knows nothing of how noisy a reading is: the test statistic is Student's.
+
+An object that moves during the turn stands elsewhere when the opposite ray comes: ε then changes with β. Of a movement
+c(β) along the columns, opposite rays show c(β) + c(β + π), so once in a turn looks like an object that stands elsewhere
+and is none of our business; twice in a turn is what is tested, a wave cos 2β, sin 2β of ε.
 """
 
 from __future__ import annotations
@@ -36,8 +40,8 @@ _BLOCKS = 24
 _MOST = 1_000_000
 # Views beside an opposite angle that are farther apart than so many usual steps do not stand for it.
 _GAP_STEPS = 3.0
-_ROWS, _COLUMNS = 9, 5
-"""Readings over which the slope is smoothed."""
+_ROWS, _COLUMNS = 9, (5, 25)
+"""Readings over which the slope is smoothed: a few columns for small errors, many for those of several columns."""
 
 Floats = NDArray[np.float64]
 
@@ -49,17 +53,20 @@ class CentreTest:
     Attributes:
         columns: how many columns too high the described positions of the columns are; NaN: not known.
         error: its standard error.
-        p_value: probability that noise alone looks like an error beyond :data:`CENTRE_TOLERANCE` at least so much.
+        swing: amplitude in columns by which it changes twice in a turn; NaN: not known.
+        p_value: probability that noise alone looks like an error (or swing) beyond :data:`CENTRE_TOLERANCE` at least so
+            much.
         findings: what was found, in words; empty: nothing at the stated rate of false alarms.
     """
 
     columns: float
     error: float
+    swing: float
     p_value: float
     findings: tuple[str, ...]
 
 
-_UNKNOWN = CentreTest(math.nan, math.inf, 1.0, ())
+_UNKNOWN = CentreTest(math.nan, math.inf, math.nan, 1.0, ())
 
 
 def centre_test(
@@ -103,16 +110,21 @@ def centre_test(
     here = values[torch.from_numpy(base)]
     opposite, known = rays.opposite(values, base)
     difference = here - opposite
-    smooth, raw = ([_slope(v, *size) for v in (here, opposite)] for size in ((_ROWS, _COLUMNS), (1, 1)))
-    # A slope reaches over neighbours: all of them must have an opposite.
-    known = -F.max_pool2d((-known.float())[:, None], (1, 2 * _COLUMNS + 1), 1, (0, _COLUMNS))[:, 0] > 0.5
-    score = torch.where(known, -difference * (smooth[0] + smooth[1]) / 2, 0.0).double().sum((1, 2)).numpy()
-    power = torch.where(known, smooth[0] * raw[1] + smooth[1] * raw[0], 0.0).double().sum((1, 2)).numpy()
-    used = np.flatnonzero(known.flatten(1).any(1).numpy())
-    if used.size < _BLOCKS:
-        return _UNKNOWN
-    sums = [np.array([v[b].sum() for b in np.array_split(used, _BLOCKS)]) for v in (score, power)]
-    return _tested(sums[0], sums[1], false_alarms)
+    turn = 2.0 * geometry.angles[base]
+    found = []
+    for columns in _COLUMNS:
+        smooth, raw = ([_slope(v, *size) for v in (here, opposite)] for size in ((_ROWS, columns), (1, columns // 5)))
+        # A slope reaches over neighbours: all of them must have an opposite.
+        whole = -F.max_pool2d((-known.float())[:, None], (1, 2 * columns + 1), 1, (0, columns))[:, 0] > 0.5
+        score = torch.where(whole, -difference * (smooth[0] + smooth[1]) / 2, 0.0).double().sum((1, 2)).numpy()
+        power = torch.where(whole, smooth[0] * raw[1] + smooth[1] * raw[0], 0.0).double().sum((1, 2)).numpy()
+        used = np.flatnonzero(whole.flatten(1).any(1).numpy())
+        if used.size < _BLOCKS:
+            continue
+        parts = (score, power, power * np.cos(turn), power * np.sin(turn))
+        sums = [np.array([v[b].sum() for b in np.array_split(used, _BLOCKS)]) for v in parts]
+        found.append(_tested(sums[0], sums[1], np.stack(sums[1:], 1), false_alarms / len(_COLUMNS)))
+    return next((f for f in found if f.findings), found[0] if found else _UNKNOWN)
 
 
 def _flat_part(geometry: ConeBeam, window: DetectorWindow, values: Tensor) -> tuple[DetectorWindow, Tensor]:
@@ -127,7 +139,7 @@ def _flat_part(geometry: ConeBeam, window: DetectorWindow, values: Tensor) -> tu
     return window.with_rows(window.first_row + first, count), values[:, first : first + count]
 
 
-def _tested(score: Floats, power: Floats, false_alarms: float) -> CentreTest:
+def _tested(score: Floats, power: Floats, waves: Floats, false_alarms: float) -> CentreTest:
     from scipy import stats
 
     if power.sum() <= 0.0:
@@ -142,15 +154,42 @@ def _tested(score: Floats, power: Floats, false_alarms: float) -> CentreTest:
     error = deviation(size)[1] / float(power.sum())
     total, spread = deviation(math.copysign(CENTRE_TOLERANCE, size))
     beyond = max(math.copysign(1.0, size) * total / spread, 0.0)
-    p_value = float(min(1.0, 2.0 * stats.t.sf(beyond, score.size - 1)))
-    findings: tuple[str, ...] = ()
-    if p_value < false_alarms and abs(size) > CENTRE_TOLERANCE:
-        findings = (
+    centre = float(min(1.0, 2.0 * stats.t.sf(beyond, score.size - 1)))
+    swing, swinging = _swing(score, waves)
+    findings = []
+    if centre < false_alarms / 2 and abs(size) > CENTRE_TOLERANCE:
+        findings.append(
             f"opposite rays disagree: the geometry puts the columns about {abs(size):.2f} ± {error:.2g} columns too "
             f"{'high' if size > 0 else 'low'}: the rotation centre (the detector's column offset) is wrong, or the "
-            "object moved",
+            "object moved"
         )
-    return CentreTest(size, error, p_value, findings)
+    if swinging < false_alarms / 2:
+        findings.append(
+            f"opposite rays disagree by {swing:.2f} columns to either side in the course of a turn: the object moved, "
+            "or the angles of the views are wrong"
+        )
+    return CentreTest(size, error, swing, min(1.0, 2.0 * min(centre, swinging)), tuple(findings))
+
+
+def _swing(score: Floats, waves: Floats) -> tuple[float, float]:
+    """Amplitude of the second and third of ``waves`` ``(blocks, 3)`` in the scores, and its p-value.
+
+    Blocks enter with the same weight but for their power: what noise leaves has the variance of the residuals.
+    """
+    from scipy import stats
+
+    scale = np.abs(waves[:, :1]).mean()
+    design, y = waves / scale, score / scale
+    if np.linalg.cond(design) > 20.0:
+        return math.nan, 1.0  # a part of the turn: the wave is not told from the constant
+    found, left = np.linalg.lstsq(design, y, rcond=None)[:2]
+    count = y.size - 3
+    covariance = np.linalg.inv(design.T @ design)[1:, 1:] * max(float(left.sum()) / count, np.finfo(np.float64).tiny)
+    amplitude = float(np.hypot(*found[1:]))
+    if amplitude <= CENTRE_TOLERANCE:
+        return amplitude, 1.0
+    rest = found[1:] * (1.0 - CENTRE_TOLERANCE / amplitude)
+    return amplitude, float(stats.f.sf(rest @ np.linalg.solve(covariance, rest) / 2.0, 2, count))
 
 
 def _slope(values: Tensor, rows: int, columns: int) -> Tensor:

@@ -112,10 +112,11 @@ def _bowtie(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
 
 
 def _moving(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
-    """Everything but its surround swings by six columns (1.2 mm) to either side, once in a turn."""
+    """Everything but its surround swings along x by six columns (1.2 mm) to either side, once in a turn."""
     assert scan.surround is not None
     still = scan._at_window(scan.surround)
-    shifts = np.round(6 * np.sin(scan.geometry.angles)).astype(int).tolist()
+    turn = scan.geometry.angles
+    shifts = np.round(-6 * np.cos(turn + 0.7) * np.sin(turn)).astype(int).tolist()
     moved = torch.stack([ratio.roll(k, -1) for ratio, k in zip(scan.counts / still, shifts, strict=True)])
     return replace(scan, counts=torch.round(moved * still))
 
