@@ -12,7 +12,7 @@ import torch
 
 from recon.fbp.coverage import centre_warnings, sampling_warnings
 from recon.fbp.inset import InsetFbp
-from recon.mbir.mbir import reconstruct_mbir
+from recon.mbir.reconstruct import reconstruct_mbir
 from recon.pwls.inset_problem import reconstruct_pwls
 from torchpcct.defects import mended
 from torchpcct.geometry import ConeBeam, VolumeGrid
@@ -57,7 +57,7 @@ def reconstruct(
             prior, of an inset or a whole field; options of :func:`recon.pwls.inset_problem.reconstruct_pwls`; a volume
             that did not converge carries ``warnings`` in its report) or ``"mbir"`` (unrolled steps with the learned
             prior that ships with the package, of an inset or a whole field; options of
-            :func:`recon.mbir.mbir.reconstruct_mbir`; what the training has not seen is named in ``warnings``).
+            :func:`recon.mbir.reconstruct.reconstruct_mbir`; what the training has not seen is named in ``warnings``).
         progress: called with the finished fraction, 0…1.
         device: where the returned volumes lie.
         options: of the method.

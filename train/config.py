@@ -86,7 +86,7 @@ class DataConfig:
 
     Args:
         shape: voxels of the training inset (z, y, x).
-        voxel_mm: voxel size; 0.2 is the one that :func:`recon.mbir.mbir.reconstruct_mbir` works at.
+        voxel_mm: voxel size; 0.2 is the one that :func:`recon.mbir.reconstruct.reconstruct_mbir` works at.
         exposure_s: range of the exposure, log-uniform.
         views: views of the scans whose Gram operators are taken (their exposure is that of the whole scan).
         situations: one Gram operator each; one is drawn per step.

@@ -1,7 +1,7 @@
 """Model-based reconstruction with a learned prior.
 
-Read :mod:`~recon.mbir.mbir` (from a scan to HU; whole fields of any scanner: :mod:`~recon.mbir.field`), then
-:mod:`~recon.mbir.problem` (the data in noise units), :mod:`~recon.mbir.unrolled` (data steps and network in turn) and
-:mod:`~recon.mbir.network` (the learned prior). Weights and their training card lie in ``weights``;
-:mod:`~recon.mbir.weights_io` reads them.
+Read :mod:`~recon.mbir.reconstruct` (from a scan to HU; whole fields of any scanner: :mod:`~recon.mbir.field`), then
+:mod:`~recon.mbir.mbir` (from AᵀW y to HU, with the shipped weights), :mod:`~recon.mbir.problem` (the data in noise
+units), :mod:`~recon.mbir.unrolled` (data steps and network in turn) and :mod:`~recon.mbir.network` (the learned prior).
+Weights and their training card lie in ``weights``; :mod:`~recon.mbir.weights_io` reads them.
 """

@@ -195,8 +195,8 @@ def reconstruct_field_mbir(
         memory: bytes that may be used; None: what the machine has left.
 
     Returns:
-        Volumes in HU with the report of :func:`recon.mbir.mbir.reconstruct_mbir`, and ``noise_scale_hu`` (10 and 90 %
-        of the voxels), ``voxel_mm`` (of the grid that was worked on).
+        Volumes in HU with the report of :func:`recon.mbir.reconstruct.reconstruct_mbir`, and ``noise_scale_hu`` (10 and
+        90 % of the voxels), ``voxel_mm`` (of the grid that was worked on).
 
     Raises:
         ValueError: see :class:`recon.pwls.field_problem.FieldProblem`; too little memory; voxels finer than what the

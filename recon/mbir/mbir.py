@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import logging
 import math
-import time
-from collections.abc import Callable, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -21,15 +19,13 @@ from torch import Tensor
 
 from recon.mbir.network import NetworkConfig
 from recon.mbir.problem import NormalisedProblem
-from recon.mbir.unrolled import DEFAULT_LOOK, Unrolled, look_frequency, low_residual
+from recon.mbir.unrolled import DEFAULT_LOOK, Unrolled, look_frequency
 from recon.mbir.weights_io import read_tensors
-from recon.pwls.field_problem import is_whole_field
 from recon.pwls.inset_problem import InsetProblem
 from torchpcct.geometry import VolumeGrid
-from torchpcct.scan import Scan
-from torchpcct.volume import Volume, to_hu
+from torchpcct.volume import to_hu
 
-__all__ = ["Mbir", "average_onto", "reconstruct_mbir", "working_grid"]
+__all__ = ["Mbir", "average_onto", "working_grid"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -175,92 +171,3 @@ def _overlap(source: Any, step: float, target: Any, width: float) -> np.ndarray[
     shared = np.minimum(high, source + step / 2) - np.maximum(low, source - step / 2)
     shared = np.clip(shared, 0.0, None)
     return shared / shared.sum(axis=1, keepdims=True)
-
-
-def reconstruct_mbir(
-    scans: Sequence[Scan],
-    grid: VolumeGrid,
-    *,
-    progress: Callable[[float], None] | None = None,
-    network: Mbir | None = None,
-    problem: InsetProblem | None = None,
-    batch: int = 4,
-    look: float | None = None,
-    noise_map: bool = False,
-) -> list[Volume]:
-    """Unrolled MBIR with the learned prior, of an inset or of a whole field (:mod:`recon.mbir.field`).
-
-    Args:
-        scans: realisations of one scan.
-        grid: the inset, or the field.
-        progress: called with the finished fraction.
-        network: with its weights; None: those of the package.
-        problem: kept from an earlier call with the same scan and (working) grid; None: made here.
-        batch: volumes at a time.
-        look: 0, quiet images for viewing, … 1, for measuring: ROI means at nearly full contrast
-            (:mod:`recon.mbir.unrolled`); None: that of ``network``, which is 0.5 unless it was loaded with another.
-        noise_map: add an estimate of each voxel's standard deviation, ``report["noise_sd_hu"]``.
-
-    Returns:
-        Volumes in HU. Report: ``iterations``, ``look``, ``residual`` (what is left of the data at the low frequencies
-        that are the data's own, over what there was, :func:`recon.mbir.unrolled.low_residual`), ``chi2`` (weighted
-        squared residual per reading), of noisy scans ``residual_p`` (:mod:`torchpcct.metrics.residual_test`: does the
-        volume explain its data?), ``warnings``, ``seconds``.
-
-    Raises:
-        ValueError, TypeError: see :class:`recon.pwls.inset_problem.InsetProblem`; a problem that was made for another
-        grid; a look outside of 0 … 1.
-        FileNotFoundError: the package has no weights.
-    """
-    start = time.perf_counter()
-    network = network or Mbir.load()
-    if look is not None:
-        network = Mbir(network.model, look, **network.parts)
-    if problem is None and is_whole_field(scans[0], grid):
-        from recon.mbir.field import reconstruct_field_mbir  # it imports this module
-
-        if noise_map:
-            raise ValueError("noise_map needs the FFT model of a small inset: ask for a smaller grid")
-        return reconstruct_field_mbir(scans, grid, network=network, progress=progress)
-    work = working_grid(grid, network.voxel_mm)
-    problem = problem or InsetProblem(scans[0], work)
-    if problem.grid != work:
-        raise ValueError(f"the problem was made for another grid: make it on {work} (recon.mbir.working_grid)")
-    volumes: list[Volume] = []
-    for i in range(0, len(scans), batch):
-        part = scans[i : i + batch]
-        exposure = problem.exposure(part)
-        data = [problem.data(s) for s in part]
-        statistics = [problem.statistic(s, y) for s, y in zip(part, data, strict=True)]
-        b = torch.stack([s.b for s in statistics])
-        normal = network.problem(problem, b, exposure)
-        with torch.no_grad():
-            u = network.model(normal, network.look, **network.parts)
-            left = normal.beta - normal.apply(u)
-            residuals = low_residual(normal, left, network.look).tolist()
-            # ‖y − A u‖²_W less ‖y‖²_W = uᵀ H u − 2 βᵀ u
-            misfit = -(u * (left + normal.beta)).sum(dim=(1, 2, 3), dtype=torch.float64)
-            hu = network.in_hu(problem, u, normal)
-        seconds = (time.perf_counter() - start) / len(part)
-        for k, (volume, statistic) in enumerate(zip(hu, statistics, strict=True)):
-            chi2 = (statistic.energy + float(misfit[k])) / statistic.readings
-            info: dict[str, Any] = {
-                "method": "mbir", "iterations": network.model.steps, "look": network.look, "residual": residuals[k],
-                "chi2": chi2, "seconds": round(seconds, 3),
-            }  # fmt: skip
-            info["warnings"] = network.check(float(normal.scale_hu[k]), float(volume.max()))
-            if not part[k].noise_free:
-                tested = problem.residual_test(part[k], volume, data[k])
-                info["residual_p"] = dict(tested.p_values)
-                info["warnings"] += tested.findings
-            for text in info["warnings"]:
-                _LOG.warning("%s", text)
-            if noise_map:
-                sd = network.noise_map(problem, statistic.b, exposure)
-                info["noise_sd_hu"] = sd if work is grid else average_onto(sd, work, grid)
-            averaged = volume if work is grid else average_onto(volume, work, grid)
-            volumes.append(Volume(averaged.to(torch.float32), grid, info))
-        start = time.perf_counter()
-        if progress is not None:
-            progress(min(i + batch, len(scans)) / len(scans))
-    return volumes

@@ -8,8 +8,9 @@ import torch
 from inset_operators import HU, problem
 
 from recon.gram.gram import Gram
+from recon.pwls.approach import Approach
 from recon.pwls.field_model import FieldModel
-from recon.pwls.pwls import Approach, data_model, pwls
+from recon.pwls.pwls import data_model, pwls
 from recon.pwls.qggmrf import QGGMRF, quadratic
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Projector, VolumeGrid, full_turn
 
