@@ -24,7 +24,7 @@ from recon.study.compare.placements import Placements, vary_placement
 from recon.study.compare.reference import Reference, exact_reference
 from recon.study.compare.regions import Regions
 from recon.study.compare.settings import Settings
-from recon.study.dose_factor.response import RESPONSE_DRAWS, linear_response
+from recon.study.dose_factor.response import linear_response
 from recon.study.paper import facts as paper
 from recon.study.paper.plaque_scan import (
     REFERENCE_KERNEL,
@@ -299,7 +299,13 @@ class _MbirRun:
             if m.settings.control:
                 self.progress("control of MBIR", 0.0)
                 control = linear_response(
-                    self.network, self.problem, self.weights, clean, exposure, self.clean, RESPONSE_DRAWS
+                    self.network,
+                    self.problem,
+                    self.weights,
+                    clean,
+                    exposure,
+                    self.clean,
+                    m.settings.response_draws,
                 )
                 self.clock.lap("control of MBIR")
             return reconstruct_draws(

@@ -27,6 +27,7 @@ class Settings(StudySettings):
             most there. The tables have the first ``realizations``.
         control: whether MBIR's figures are controlled by a linear functional of the same noise, which is worth its time
             from 8 realisations.
+        response_draws: of noise that this functional is averaged over (:mod:`recon.study.dose_factor.response`).
         placements: whether the checks outside their tolerance are computed again with ROIs and grid moved.
 
     Raises:
@@ -45,6 +46,7 @@ class Settings(StudySettings):
     mbir_s: tuple[float, ...] = (0.35, 0.70, 2.00)
     low_dose_draws: int = 20
     control: bool = True
+    response_draws: int = 4
     placements: bool = True
 
     # An eighth of the views, two kernels, two voxel sizes, two doses, 8 realisations, no PWLS: ≤ 45 s.
@@ -57,11 +59,12 @@ class Settings(StudySettings):
         "pwls": False,
         "mbir_s": (0.35, 2.00),
         "low_dose_draws": 8,
+        "response_draws": 0,
         "placements": False,
     }
 
     def __post_init__(self) -> None:
-        self.check_whole(realizations=3, low_dose_draws=0, seed=0, views=8)
+        self.check_whole(realizations=3, low_dose_draws=0, response_draws=0, seed=0, views=8)
         least = (8 if self.control else 5) if self.mbir else 3
         if self.realizations < least:
             raise ValueError(
