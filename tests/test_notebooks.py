@@ -88,6 +88,6 @@ def test_benchmark_runs(tmp_path):
     notebook = run("fbp_vs_mbir.ipynb", tmp_path, 3600)
     assert len(pictures(notebook)) == 4
     text = "\n".join(o.data.get("text/markdown", "") for o in outputs(notebook) if "data" in o)
-    assert "MBIR is worth" in text
+    assert "draws put MBIR at" in text
     # Away from the repository there is no full study to quote.
     assert "There is no `notebooks/dose_factor/report.json` here" in text
