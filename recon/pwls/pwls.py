@@ -227,10 +227,10 @@ def _solve(
     hu: float,
     spacing: tuple[float, ...],
     channels: bool = False,
-    start: Tensor | None = None,
-    tolerance: float = 0.2,
-    max_exact: int = 200,
-    callback: Callable[[dict[str, Any]], None] | None = None,
+    start: Tensor | None,
+    tolerance: float,
+    max_exact: int,
+    callback: Callable[[dict[str, Any]], None] | None,
 ) -> tuple[PwlsResult, Tensor]:
     """:func:`solve_normal`, and ½ xᵀHx − bᵀx of each volume, ``(batch,)`` float64."""
     started = time.perf_counter()

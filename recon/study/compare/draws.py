@@ -2,7 +2,7 @@
 
 The twin without core has the SAME noise: its b is that of the plaque plus the difference of the two noise-free ones.
 
-The control is the method's own first-order response (:mod:`recon.study.dose_factor.response`).
+The control is the method's own linear response (:mod:`recon.study.dose_factor.response`).
 """
 
 from __future__ import annotations

@@ -73,6 +73,8 @@ def _intro(data: dict[str, Any]) -> str:
         else "Noise is drawn in the readings of the paper's scan; the other main scenes carry the same noise; further "
         "scenes draw the noise of b = AᵀW y from its covariance."
     )
+    own = "MBIR's own mean response, for rows of fewer draws " if s["responses"] else ""
+    controls = f"{own}linear filters"
     tissues = ", ".join(f"{k} {v:.1f}" for k, v in t["tissues_hu"].items())
     rois = ", ".join(f"{k} {r['foreground_mm2']:.2f} / {r['background_mm2']:.2f}" for k, r in data["rois"].items())
     return (
@@ -81,8 +83,9 @@ def _intro(data: dict[str, Any]) -> str:
         f"ROIs, core / fibrous, mm² over all slices: {rois}. True tissue values, HU, by rods of each tissue at the "
         f"plaque's place: {tissues}; noise-free FBP standard 0.10 mm reads {t['reference_hu'][0]:.1f} / "
         f"{t['reference_hu'][1]:.1f} in the paper's ROIs.\n\n"
-        "Behind ±: half of the 95 % interval (jackknife over realisations, regression on linear filters of the same "
-        "draws whose mean and covariance are exact). n “exact”: FBP and linear methods, without realisations. NMR, "
+        "Behind ±: half of the 95 % interval (jackknife over realisations, regression on linear functionals of "
+        f"the same draws whose mean and covariance are exact: {controls}). n “exact”: FBP and linear methods, without "
+        "realisations. NMR, "
         "CFR: noise magnitude and central frequency in fat over FBP's. d′: Hotelling observer on the core's shape and "
         "difference-of-Gaussians channels, the same channels and estimate for all; with and without core the draws are "
         "the same, which counts as n draws. RMSE against the true volume. The limit is the best unbiased estimate with "
