@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import math
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ from recon.pwls.inset_problem import InsetProblem
 from torchpcct.geometry import VolumeGrid
 from torchpcct.volume import to_hu
 
-__all__ = ["Mbir", "average_onto", "working_grid"]
+__all__ = ["Mbir", "Solution", "average_onto", "working_grid"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -33,6 +34,21 @@ SHIPPED = "mbir.safetensors"
 WEIGHTS_FORMAT = "torchpcct unrolled weights 2"
 LARGEST_HU = 2000.0
 """Above the densest calcification of the training, 1800 HU: what reads more is metal."""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Reconstructions of a batch.
+
+    Attributes:
+        normal: the normalised problem.
+        u: ``(batch, z, y, x)`` in its units.
+        notes: for each volume, what its report shall hold beside; under ``warnings`` a list of texts.
+    """
+
+    normal: NormalisedProblem
+    u: Tensor
+    notes: list[dict[str, Any]]
 
 
 class Mbir:
@@ -101,8 +117,13 @@ class Mbir:
             b: ``(batch, z, y, x)``, :meth:`recon.pwls.inset_problem.InsetProblem.statistic` of each scan.
             exposure_s: of the scans.
         """
+        found = self.solved(problem, b, exposure_s)
+        return self.in_hu(problem, found.u, found.normal)
+
+    def solved(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> Solution:
+        """The same with what it was made of."""
         normal = self.problem(problem, b, exposure_s)
-        return self.in_hu(problem, self.model(normal, self.look, **self.parts), normal)
+        return Solution(normal, self.model(normal, self.look, **self.parts), [{} for _ in range(b.shape[0])])
 
     @staticmethod
     def in_hu(problem: InsetProblem, u: Tensor, normal: NormalisedProblem) -> Tensor:

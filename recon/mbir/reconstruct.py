@@ -11,6 +11,7 @@ import torch
 
 from recon.mbir.field import reconstruct_field_mbir
 from recon.mbir.mbir import Mbir, average_onto, working_grid
+from recon.mbir.tissues import TissueMbir
 from recon.mbir.unrolled import low_residual
 from recon.pwls.field_problem import is_whole_field
 from recon.pwls.inset_problem import InsetProblem
@@ -33,6 +34,8 @@ def reconstruct_mbir(
     batch: int = 4,
     look: float | None = None,
     noise_map: bool = False,
+    tissues: bool = False,
+    point: Any = None,
 ) -> list[Volume]:
     """Unrolled MBIR with the learned prior, of an inset or of a whole field (:mod:`recon.mbir.field`).
 
@@ -46,12 +49,17 @@ def reconstruct_mbir(
         look: 0, quiet images for viewing, … 1, for measuring: ROI means at nearly full contrast
             (:mod:`recon.mbir.unrolled`); None: that of ``network``, which is 0.5 unless it was loaded with another.
         noise_map: add an estimate of each voxel's standard deviation, ``report["noise_sd_hu"]``.
+        tissues: fit the tissues of a contrast-enhanced vessel first, and let the network reconstruct what they leave
+            (:mod:`recon.mbir.tissues`): sharp outlines, and a core at full contrast where the data prove one; four
+            seconds a volume longer. Where no vessel is found, or its tissues do not explain the data, the volume is
+            the one without, with a warning.
+        point: ``(z, y, x)`` mm where a reader sees the plaque, for ``tissues``; None: in the largest vessel.
 
     Returns:
         Volumes in HU. Report: ``iterations``, ``look``, ``residual`` (what is left of the data at the low frequencies
         that are the data's own, over what there was, :func:`recon.mbir.unrolled.low_residual`), ``chi2`` (weighted
         squared residual per reading), of noisy scans ``residual_p`` (:mod:`torchpcct.metrics.residual_test`: does the
-        volume explain its data?), ``warnings``, ``seconds``.
+        volume explain its data?), ``warnings``, ``seconds``; with ``tissues`` what was read of them, under that name.
 
     Raises:
         ValueError, TypeError: see :class:`recon.pwls.inset_problem.InsetProblem`; a problem that was made for another
@@ -62,9 +70,14 @@ def reconstruct_mbir(
     network = network or Mbir.load()
     if look is not None:
         network = Mbir(network.model, look, **network.parts)
+    if point is not None and not tissues:
+        raise ValueError("point says where a plaque is: give it with tissues=True")
+    if tissues:
+        network = TissueMbir(network, point)
     if problem is None and is_whole_field(scans[0], grid):
-        if noise_map:
-            raise ValueError("noise_map needs the FFT model of a small inset: ask for a smaller grid")
+        for name, asked in (("noise_map", noise_map), ("tissues", tissues)):
+            if asked:
+                raise ValueError(f"{name} needs the FFT model of a small inset: ask for a smaller grid")
         return reconstruct_field_mbir(scans, grid, network=network, progress=progress)
     work = working_grid(grid, network.voxel_mm)
     problem = problem or InsetProblem(scans[0], work)
@@ -77,9 +90,9 @@ def reconstruct_mbir(
         data = [problem.data(s) for s in part]
         statistics = [problem.statistic(s, y) for s, y in zip(part, data, strict=True)]
         b = torch.stack([s.b for s in statistics])
-        normal = network.problem(problem, b, exposure)
         with torch.no_grad():
-            u = network.model(normal, network.look, **network.parts)
+            solution = network.solved(problem, b, exposure)
+            normal, u = solution.normal, solution.u
             left = normal.beta - normal.apply(u)
             residuals = low_residual(normal, left, network.look).tolist()
             # ‖y − A u‖²_W less ‖y‖²_W = uᵀ H u − 2 βᵀ u
@@ -92,7 +105,10 @@ def reconstruct_mbir(
                 "method": "mbir", "iterations": network.model.steps, "look": network.look, "residual": residuals[k],
                 "chi2": chi2, "seconds": round(seconds, 3),
             }  # fmt: skip
-            info["warnings"] = network.check(float(normal.scale_hu[k]), float(volume.max()))
+            info |= solution.notes[k]
+            info["warnings"] = [
+                *info.get("warnings", []), *network.check(float(normal.scale_hu[k]), float(volume.max())),
+            ]  # fmt: skip
             if not part[k].noise_free:
                 tested = problem.residual_test(part[k], volume, data[k])
                 info["residual_p"] = dict(tested.p_values)

@@ -53,6 +53,8 @@ class PlaqueReading:
             quoted where :attr:`presence` is low.
         regions: tissue → ``grid.shape`` float32 share of each voxel (posterior mean; the core's if it is there).
         image: ``grid.shape`` float32 HU, the fitted tissues, the core included.
+        image_without: the same of the vessel fitted without a core.
+        layer: ``grid.shape`` float32, share of each voxel in that vessel's fibrous layer, calcifications left out.
         chi2: mean square of the residual on the vessel's voxels, but for those at its ends inside of the volume, over
             its expectation; chi2_sd: its standard deviation under the model.
         texture_hu: standard deviation of a texture of 0.3 mm that the residual shows; texture_high_hu: its 95 % limit.
@@ -67,6 +69,8 @@ class PlaqueReading:
     given_core: Mapping[str, Estimate]
     regions: Mapping[str, NDArray[np.float32]]
     image: NDArray[np.float32]
+    image_without: NDArray[np.float32]
+    layer: NDArray[np.float32]
     chi2: float
     chi2_sd: float
     texture_hu: float
@@ -214,6 +218,7 @@ def _read(
     seed: int,
 ) -> PlaqueReading:  # fmt: skip
     calcifications = len(fit.bodies)
+    plain = fit
     space = CoreSpace(vessel, fit, prior_of_core)
     cloud = lead(space.draw_prior(particles, rng), space.nothing, space.target, rng)
     first = cloud.log_evidence
@@ -252,8 +257,8 @@ def _read(
     square, spread = misfit(vessel, fit)
     return PlaqueReading(
         vessel.grid, presence, calcifications, figures, refused, given,
-        _regions(vessel, fit, space, shares, calcifications), _image(vessel, fit), square, spread, tau.sd_hu,
-        tau.high_hu,
+        _regions(vessel, fit, space, shares, calcifications), _image(vessel, fit), _image(vessel, plain),
+        _on_grid(vessel, _layer(plain)), square, spread, tau.sd_hu, tau.high_hu,
         {"particles": particles, "seed": seed, "log_evidence": cloud.log_evidence, "log_evidence_first": first,
          "point": prior_of_core.point, "source": vessel.data.source, "voxels": len(vessel.index),
          "core_center_mm": cloud.points[:, :3].mean(0).tolist(), "prior": prior},
@@ -280,6 +285,13 @@ def _regions(
     found = {"fat": _on_grid(vessel, 1.0 - outer, 1.0)}
     found |= {name: _on_grid(vessel, np.clip(part, 0.0, 1.0)) for name, part in parts.items()}
     return found
+
+
+def _layer(fit: Fit) -> Floats:
+    """``(n,)`` share of each voxel in the fibrous layer, less its bodies."""
+    _, inner, lumen = fit.drawing.shares
+    share: Floats = np.clip(inner - lumen, 0.0, 1.0) * np.clip(1.0 - fit.bodies.sum(0), 0.0, 1.0)
+    return share
 
 
 def _image(vessel: Vessel, fit: Fit) -> NDArray[np.float32]:

@@ -18,10 +18,11 @@ from torch import Tensor
 from recon.conjugate_gradient import conjugate_gradient
 from recon.mbir.mbir import Mbir
 from recon.mbir.problem import NormalisedProblem, filtered, squared_frequencies
+from recon.mbir.tissues import TissueMbir
 from recon.pwls.inset_problem import InsetProblem
 from recon.pwls.pwls import solve_normal
 from recon.pwls.qggmrf import DEFAULT_PRIOR, QGGMRF, quadratic
-from recon.study.dose_factor.settings import METHODS
+from recon.study.dose_factor.settings import METHODS, TISSUE_METHODS
 from torchpcct.volume import to_hu
 
 __all__ = ["LinearFilter", "Method", "Misstated", "Penalised", "fingerprint", "load_methods"]
@@ -196,6 +197,8 @@ _TOLD = {"mbir_noise_half": 4.0, "mbir_noise_double": 0.25}
 def _learned(name: str) -> Method:
     shipped = Mbir.load()
     found = Mbir(shipped.model, **{"look": shipped.look, **_PARTS.get(name, {})})
+    if name in TISSUE_METHODS:
+        found = TissueMbir(found)
     if name in _TOLD:
         return Misstated(name, found, _TOLD[name])
     found.name = name

@@ -139,7 +139,7 @@ class Places:
                 method, place, dose, f"{block.start}-{block.stop}",
                 lambda m, p, d, block=block: self._block(m, p, d, block, adjoints, known["control_offset"]),
             )
-            for block in self.settings.blocks(self.settings.scene_n)
+            for block in self.settings.blocks(self.settings.scene_realizations(method.name))
         ]  # fmt: skip
         return {**joined(parts), **known}
 

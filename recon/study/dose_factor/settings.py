@@ -22,6 +22,7 @@ __all__ = [
     "PURPOSES",
     "ROIS",
     "SLOW_METHODS",
+    "TISSUE_METHODS",
     "TWIN_REALIZATIONS",
     "VESSELS",
     "VESSEL_ROIS",
@@ -61,6 +62,7 @@ METHOD_NAMES = {
     "tv": "smoothed TV",
     "fbp_cnn": "FBP + CNN",
     "mbir": "MBIR",
+    "mbir_tissues": "MBIR + tissues",
     "mbir_viewing": "MBIR, look 0",
     "mbir_measuring": "MBIR, look 1",
     "mbir_no_cnn": "MBIR, no CNN",
@@ -70,7 +72,8 @@ METHOD_NAMES = {
     "mbir_noise_double": "MBIR told noise 2×",
 }
 """Methods in the order of the tables, as reports call them. ``linear_z_added`` adds 1.3 times the residual back;
-``fbp_cnn`` is MBIR's network on FBP images. ``mbir_viewing`` and ``mbir_measuring`` have the other looks;
+``fbp_cnn`` is MBIR's network on FBP images. ``mbir_tissues`` fits the vessel's tissues first
+(:mod:`recon.mbir.tissues`); ``mbir_viewing`` and ``mbir_measuring`` have the other looks;
 ``mbir_no_cnn`` is MBIR without its network, linear; ``mbir_one_step`` has one step of it, ``mbir_free`` no data
 consistency at the end; ``mbir_noise_*`` takes the noise for half or twice of what it is."""
 
@@ -83,6 +86,7 @@ PURPOSES = {
     "tv": "quiet, piecewise constant images",
     "fbp_cnn": "the network without the data term",
     "mbir": "quiet images with sharp outlines, ROI means a little shrunk",
+    "mbir_tissues": "plaques in an enhanced vessel: sharp outlines, a core that is certain at full contrast",
     "mbir_viewing": "the quietest images",
     "mbir_measuring": "ROI means at nearly full contrast",
     "mbir_no_cnn": "what the network adds (ablation)",
@@ -107,6 +111,9 @@ SLOW_METHODS = (
 )  # fmt: skip
 """Fewer realisations: iterated to convergence, drawn anew as images, ablations, looks, tests of robustness."""
 
+TISSUE_METHODS = ("mbir_tissues",)
+"""They fit a vessel for every volume: as many realisations as a further scene has; there, as few as its twin."""
+
 TWIN_REALIZATIONS = 16
 """Of a further scene or vessel without its core, in whole blocks. What the core adds hardly changes from draw to draw
 (at 2 s by below 1 % with MBIR), so few say what the slope is."""
@@ -116,7 +123,7 @@ _RESPONSE_VOLUMES = 10
 
 _SECONDS = {"scene": 45.0, "vessel": 8.0, "fbp": 90.0, "data": 3.0, "images": 3.0, "linear": 20.0, "linear_z": 25.0,
             "linear_z_added": 30.0, "quadratic": 90.0, "qggmrf": 5.0, "tv": 10.0, "fbp_cnn": 0.6, "mbir": 0.6,
-            "mbir_viewing": 0.6, "mbir_measuring": 0.6, "mbir_no_cnn": 25.0, "mbir_one_step": 0.5, "mbir_free": 0.6,
+            "mbir_tissues": 4.0, "mbir_viewing": 0.6, "mbir_measuring": 0.6, "mbir_no_cnn": 25.0, "mbir_one_step": 0.5, "mbir_free": 0.6,
             "mbir_noise_half": 0.6, "mbir_noise_double": 0.6}  # fmt: skip
 """Rough cost at all views on two cores: one scene, one vessel, exact FBP noise, one realisation, a linear method at one
 exposure, one volume of each other method."""
@@ -210,7 +217,13 @@ class Settings(StudySettings):
 
     def realizations(self, method: str) -> int:
         """Realisations with and without the core at each dose for a method that is not linear."""
+        if method in TISSUE_METHODS:
+            return min(self.n, self.scene_n)
         return min(self.n, max(self.slow_n, 8)) if method in SLOW_METHODS else self.n
+
+    def scene_realizations(self, method: str) -> int:
+        """The same in a further scene or vessel."""
+        return min(self.scene_n, TWIN_REALIZATIONS) if method in TISSUE_METHODS else self.scene_n
 
     def blocks(self, n: int) -> list[range]:
         """Realisations of every piece."""
@@ -221,7 +234,11 @@ class Settings(StudySettings):
         share = self.views / paper.FULL_VIEWS["PCCT"]
         further = sum(len(with_twin(name)) for name in self.scenes)
         places, twins = len(self.scenes) + len(self.vessels), min(self.scene_n, TWIN_REALIZATIONS)
-        extra = places * len(self.scene_doses) * (self.scene_n + twins + _RESPONSE_VOLUMES)
+        extra = {
+            name: places * len(self.scene_doses) * (self.scene_realizations(name) + twins + _RESPONSE_VOLUMES)
+            for name in self.scene_methods if name not in LINEAR_METHODS
+        }  # fmt: skip
+        controlled = self.responses * len(self.doses) * _RESPONSE_VOLUMES
         drawn = 0 if self.fast_noise else self.n * len(self.doses)
         on_images = bool(set(self.methods) & set(IMAGE_METHODS))
         images = min(self.n, self.slow_n) * len(self.doses) if on_images else 0
@@ -234,9 +251,8 @@ class Settings(StudySettings):
         for name in self.methods:
             scenes = 2 * self.realizations(name) + 2 * min(self.n, self.slow_n)
             volumes = len(self.doses) * (1 if name in LINEAR_METHODS else scenes)
-            parts[name] = (
-                volumes + (extra if name in self.scene_methods and name not in LINEAR_METHODS else 0)
-            ) * _SECONDS[name]
+            own = controlled if self.realizations(name) == self.n and name not in LINEAR_METHODS else 0
+            parts[name] = (volumes + own + extra.get(name, 0)) * _SECONDS[name]
         return parts
 
 
