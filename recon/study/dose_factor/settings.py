@@ -123,8 +123,8 @@ _RESPONSE_VOLUMES = 10
 
 _SECONDS = {"scene": 45.0, "vessel": 8.0, "fbp": 90.0, "data": 3.0, "images": 3.0, "linear": 20.0, "linear_z": 25.0,
             "linear_z_added": 30.0, "quadratic": 90.0, "qggmrf": 5.0, "tv": 10.0, "fbp_cnn": 0.6, "mbir": 0.6,
-            "mbir_tissues": 4.0, "mbir_viewing": 0.6, "mbir_measuring": 0.6, "mbir_no_cnn": 25.0, "mbir_one_step": 0.5, "mbir_free": 0.6,
-            "mbir_noise_half": 0.6, "mbir_noise_double": 0.6}  # fmt: skip
+            "mbir_tissues": 4.0, "mbir_viewing": 0.6, "mbir_measuring": 0.6, "mbir_no_cnn": 25.0,
+            "mbir_one_step": 0.5, "mbir_free": 0.6, "mbir_noise_half": 0.6, "mbir_noise_double": 0.6}  # fmt: skip
 """Rough cost at all views on two cores: one scene, one vessel, exact FBP noise, one realisation, a linear method at one
 exposure, one volume of each other method."""
 
