@@ -203,7 +203,25 @@ def _require_voxels(shape: tuple[int, ...]) -> None:
         )
 
 
+_OPTIONS = {"kernel": "fbp", "look": "mbir", "tissues": "mbir", "point": "mbir"}
+"""Options that one method has."""
+
+
+def _method_options(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Those that were given, for the method.
+
+    Raises:
+        ValueError: an option of another method.
+    """
+    given = {k: getattr(arguments, k) for k in _OPTIONS if getattr(arguments, k) not in (None, False)}
+    for name in given:
+        if arguments.method != _OPTIONS[name]:
+            raise ValueError(f"--{name} is an option of --method {_OPTIONS[name]}, not of {arguments.method}")
+    return given
+
+
 def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
+    _method_options(arguments)
     if arguments.out is None:
         arguments.out = Path(f"{without_ending(arguments.scan)}_{arguments.method}.nii.gz")
     require_folder(arguments.out)
@@ -237,7 +255,7 @@ def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         scan = cleaned(scan)
     grid = _grid(scan, arguments)
     _require_voxels(grid.shape)
-    options = {} if arguments.kernel is None else {"kernel": arguments.kernel}
+    options = _method_options(arguments)
     config = {
         "scan": str(arguments.scan), "geometry": geometry_values(scan.geometry), "method": arguments.method,
         "grid": {"shape": list(grid.shape), "spacing": list(grid.spacing), "center": list(grid.center)},
@@ -282,6 +300,9 @@ def add_reconstruct(commands: Commands) -> None:
     parser.add_argument("scan", type=Path, help=".h5 (ours or Data Exchange), .yaml stack, CatSim, DICOM-CT-PD folder")
     parser.add_argument("--method", default="fbp", help="fbp, pwls or mbir (default fbp)")
     parser.add_argument("--kernel", help="FBP kernel: soft, standard, detail, bone, ram-lak")
+    parser.add_argument("--look", type=float, help="of MBIR: 0, for viewing … 1, for measuring (default 0.5)")
+    parser.add_argument("--tissues", action="store_true", help="MBIR with the tissues of the vessel in the inset")
+    parser.add_argument("--point", type=float, nargs=3, metavar=axes, help="where a reader sees its plaque, mm")
     parser.add_argument("--voxel", type=float, metavar="MM", help="voxel size (default: the detector's; inset: 0.25)")
     parser.add_argument("--center", type=float, nargs=3, metavar=axes, help="centre in mm (default: axis or plaque)")
     parser.add_argument(

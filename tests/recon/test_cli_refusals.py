@@ -29,6 +29,8 @@ ROOT = Path(__file__).parent.parent.parent
         (["reconstruct", "{tmp}/f", "--center", "1", "nan", "1", "--out", "{tmp}/a.h5"], "--center[1] must be finite"),
         (["reconstruct", "{tmp}/f", "--out", "{tmp}/a.h5"], "unknown scan format 'f'"),
         (["reconstruct", "{tmp}/f", "--out", "{tmp}/none/a.h5"], "create it first"),
+        (["reconstruct", "{tmp}/f", "--tissues", "--out", "{tmp}/a.h5"], "--tissues is an option of --method mbir"),
+        (["reconstruct", "{tmp}/f", "--method", "pwls", "--look", "0", "--out", "{tmp}/a.h5"], "not of pwls"),
         (["simulate", "--views", "0", "--out", "{tmp}/a.h5"], "--views must be at least 1"),
         (["simulate", "--exposure", "nan", "--out", "{tmp}/a.h5"], "exposure_s) must be finite"),
         (["simulate", "--exposure", "-1", "--out", "{tmp}/a.h5"], "exposure_s) must be greater than 0"),

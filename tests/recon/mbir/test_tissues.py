@@ -1,0 +1,139 @@
+"""MBIR with the tissues of a vessel: sharper than without where they fit, the same where they do not."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import drawn_vessel
+import numpy as np
+import pytest
+import torch
+from inset_operators import HU
+from small_scan import GRID
+
+from recon import reconstruct
+from recon.mbir import tissues
+from recon.mbir.mbir import Mbir
+from recon.mbir.network import NetworkConfig
+from recon.mbir.tissues import TissueMbir
+from recon.mbir.unrolled import Unrolled
+
+BALL = np.s_[2:5, 2:5, 2:5]
+"""A bright thing in the fat that no tissue of the vessel is."""
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    gram = drawn_vessel.operator()
+    return SimpleNamespace(gram=gram, grid=gram.grid, mu_ref=1000.0 * HU, level=910.0 * HU)
+
+
+@pytest.fixture(scope="module")
+def network():
+    """Untrained: the linear start, and the data's low frequencies."""
+    model = Unrolled(NetworkConfig((6, 8, 8), 0.3), 2)
+    model.seen_scale_hu = torch.tensor([1.0, 5000.0])
+    return Mbir(model)
+
+
+@pytest.fixture(scope="module")
+def truth(drawn):
+    image = drawn_vessel.image(drawn.grid, 100.0)
+    image[BALL] += 300.0
+    return image
+
+
+def statistic(drawn, image, seed):
+    noise = drawn.gram.noise(generator=torch.Generator().manual_seed(seed))
+    return (drawn.gram.apply((image / 1000.0 + 1.0) * drawn.mu_ref - drawn.level) + noise)[None]
+
+
+@pytest.fixture(scope="module")
+def solved(drawn, network, truth):
+    """Without and with tissues, HU, and the notes."""
+    b = statistic(drawn, truth, 1)
+    method = TissueMbir(network)
+    found = method.solved(drawn, b, 1.0)
+    with torch.no_grad():
+        return network(drawn, b, 1.0)[0], method.in_hu(drawn, found.u, found.normal)[0], found.notes[0]
+
+
+def test_the_vessel_is_sharper_and_its_core_at_full_contrast(drawn, solved, truth):
+    plain, found, notes = solved
+    assert notes["tissues"]["used"]
+    assert notes["tissues"]["presence"] > 0.95
+    vessel = truth > -80
+    vessel[BALL] = False
+    error = [float((v - truth)[vessel].square().mean().sqrt()) for v in (plain, found)]
+    assert error[1] < 0.5 * error[0]
+    inside = drawn_vessel.image(drawn.grid, 1000.0) < -880  # voxels wholly in the core
+    assert inside.sum() > 5
+    assert float(found[inside].mean()) == pytest.approx(0.0, abs=30)
+
+
+def test_what_no_tissue_is_comes_from_the_data(solved):
+    plain, found, _ = solved
+    assert float(found[BALL].mean()) == pytest.approx(float(plain[BALL].mean()), abs=15)
+    assert float(plain[BALL].mean()) > drawn_vessel.VALUES["fat"] + 60
+
+
+def test_the_data_are_kept(drawn, network, solved, truth):
+    """The low frequencies of the residual are as small as without tissues, the fit to the data is better."""
+    b = statistic(drawn, truth, 1)
+    normal = network.problem(drawn, b, 1.0)
+    rest = []
+    for volume in solved[:2]:
+        u = volume[None] / normal.scale_hu + (drawn.mu_ref - drawn.level) * 1000.0 / drawn.mu_ref / normal.scale_hu
+        left = normal.beta - normal.apply(u)
+        rest.append(-float((u * (left + normal.beta)).sum(dtype=torch.float64)))
+    assert rest[1] < rest[0]
+
+
+def test_without_a_vessel_it_is_the_plain_reconstruction(drawn, network):
+    b = statistic(drawn, torch.full(drawn.grid.shape, -90.0), 2)
+    found = TissueMbir(network).solved(drawn, b, 1.0)
+    assert torch.equal(found.u, network.solved(drawn, b, 1.0).u.detach())
+    assert not found.notes[0]["tissues"]["used"]
+    assert "no tissues were fitted" in found.notes[0]["warnings"][0]
+
+
+def test_tissues_that_do_not_explain_the_data_are_not_used(drawn, network, truth, monkeypatch):
+    reading = tissues.read_plaque
+    monkeypatch.setattr(tissues, "read_plaque", lambda *a, **k: replace(reading(*a, **k), chi2=2.0))
+    b = statistic(drawn, truth, 1)
+    found = TissueMbir(network).solved(drawn, b, 1.0)
+    assert torch.equal(found.u, network.solved(drawn, b, 1.0).u.detach())
+    assert "residual is 2.00" in found.notes[0]["warnings"][0]
+
+
+def test_what_is_not_proven_is_left_as_the_plain_reconstruction_has_it(solved):
+    plain = solved[0]
+    shape = tuple(plain.shape)
+    layer = np.zeros(shape, np.float32)
+    layer[10] = 0.5
+    reading = SimpleNamespace(
+        presence=0.25, image=np.full(shape, 40.0, np.float32), image_without=np.full(shape, 100.0, np.float32),
+        layer=layer,
+    )  # fmt: skip
+    found = tissues._tissues(reading, plain)
+    assert torch.allclose(found[9], torch.tensor(0.25 * 40.0 + 0.75 * 100.0))
+    assert torch.allclose(found[10], 10.0 + 0.75 * (50.0 + 0.5 * plain[10]))
+
+
+def test_from_a_scan(clean, problem, caplog):
+    """No vessel in this scan: the report says so, and so does the log."""
+    model = Unrolled(NetworkConfig((6, 8, 8), 0.4), 2)
+    model.seen_scale_hu = torch.tensor([1.0, 5000.0])
+    scan = clean.with_noise(1.0, 0)
+    given = {"network": Mbir(model), "problem": problem}
+    volume = reconstruct(scan, GRID, "mbir", tissues=True, **given)
+    assert torch.equal(volume.data, reconstruct(scan, GRID, "mbir", **given).data)
+    assert not volume.report["tissues"]["used"]
+    assert any("no tissues were fitted" in text for text in volume.report["warnings"])
+    assert "no tissues were fitted" in caplog.text
+
+
+def test_refusals(clean, problem):
+    with pytest.raises(ValueError, match="tissues=True"):
+        reconstruct(clean, GRID, "mbir", point=(0, 0, 0))
+    with pytest.raises(ValueError, match="point must be 3 numbers"):
+        reconstruct(clean, GRID, "mbir", tissues=True, point=(0, 0))
