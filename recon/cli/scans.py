@@ -213,7 +213,7 @@ def _method_options(arguments: argparse.Namespace) -> dict[str, Any]:
     Raises:
         ValueError: an option of another method.
     """
-    given = {k: getattr(arguments, k) for k in _OPTIONS if getattr(arguments, k) not in (None, False)}
+    given = {k: v for k, v in vars(arguments).items() if k in _OPTIONS and v is not None and v is not False}
     for name in given:
         if arguments.method != _OPTIONS[name]:
             raise ValueError(f"--{name} is an option of --method {_OPTIONS[name]}, not of {arguments.method}")
