@@ -3,8 +3,8 @@
     python tests/bench/tissues.py [--plaques 32] [--doses 0.35 2.0] [--out notebooks/plaque]
 
 The held-out plaques of training (``train.scenes.held_out``: vessels of 2.6 and 4.4 mm, superquadrics and crescents,
-tilted) with their core (60 HU below the fibrous tissue) and without, drawn through the operator of the paper's scan with
-its noise; a reading is blind. Contrast over the voxels wholly inside; root mean square error in the vessel and beside it.
+tilted), with their core (60 HU below the fibrous tissue) and without it, are drawn through the operator of the paper's
+scan with its noise; a reading is blind. Contrast is that of the voxels wholly inside; errors are root mean squares.
 """
 
 from __future__ import annotations
