@@ -112,7 +112,7 @@ SLOW_METHODS = (
 """Fewer realisations: iterated to convergence, drawn anew as images, ablations, looks, tests of robustness."""
 
 TISSUE_METHODS = ("mbir_tissues",)
-"""They fit a vessel for every volume: as many realisations as a further scene has; there, as few as its twin."""
+"""They fit a vessel for every volume: as many realisations as a further scene has; there, half as many as its twin."""
 
 TWIN_REALIZATIONS = 16
 """Of a further scene or vessel without its core, in whole blocks. What the core adds hardly changes from draw to draw
@@ -223,7 +223,7 @@ class Settings(StudySettings):
 
     def scene_realizations(self, method: str) -> int:
         """The same in a further scene or vessel."""
-        return min(self.scene_n, TWIN_REALIZATIONS) if method in TISSUE_METHODS else self.scene_n
+        return min(self.scene_n, TWIN_REALIZATIONS // 2) if method in TISSUE_METHODS else self.scene_n
 
     def blocks(self, n: int) -> list[range]:
         """Realisations of every piece."""
