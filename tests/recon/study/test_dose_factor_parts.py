@@ -48,7 +48,8 @@ def test_add_back_is_linear_and_restores_contrast():
 
 
 def test_ablations_are_told_apart():
-    names = ["mbir", "mbir_no_cnn", "mbir_one_step", "mbir_free", "mbir_viewing", "mbir_measuring", "mbir_noise_half"]
+    names = ["mbir", "mbir_no_cnn", "mbir_one_step", "mbir_free", "mbir_viewing", "mbir_measuring", "mbir_noise_half",
+             "mbir_tissues"]  # fmt: skip
     found = load_methods(names)
     assert [m.name for m in found] == names
     prints = [fingerprint(m) for m in found]
@@ -57,6 +58,16 @@ def test_ablations_are_told_apart():
     assert found[1].parts == {"steps": 0}
     assert found[3].parts == {"last_word": False}
     assert found[4].look < found[0].look < found[5].look
+
+
+def test_methods_that_fit_tissues_get_fewer_draws_and_the_estimate_knows_it():
+    s = Settings(n=200, scene_n=96, slow_n=16)
+    assert [s.realizations(m) for m in ("mbir", "mbir_tissues", "tv")] == [200, 96, 16]
+    assert [s.scene_realizations(m) for m in ("mbir", "mbir_tissues")] == [96, 8]
+    seconds = s.estimated_seconds()
+    alone = replace(s, scenes=(), vessels=(), responses=False).estimated_seconds()
+    assert seconds["mbir"] > alone["mbir"]  # further scenes, and the control of its own
+    assert seconds["mbir_tissues"] == alone["mbir_tissues"] == 3 * (2 * 96 + 2 * 16) * 4.0
 
 
 def test_missing_weights_leave_mbir_out(monkeypatch, caplog):
