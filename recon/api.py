@@ -15,7 +15,7 @@ from recon.fbp.inset import InsetFbp
 from recon.mbir.reconstruct import reconstruct_mbir
 from recon.pwls.inset_problem import reconstruct_pwls
 from torchpcct.defects import mended
-from torchpcct.geometry import ConeBeam, VolumeGrid
+from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
 from torchpcct.validate import choice
 from torchpcct.volume import Volume, from_hu
@@ -81,7 +81,7 @@ def reconstruct(
     scans = [scan] if isinstance(scan, Scan) else list(scan)
     if not scans or not all(isinstance(s, Scan) for s in scans):
         raise TypeError(f"scan must be a Scan or a non-empty sequence of scans, got {type(scan).__name__}")
-    if not isinstance(grid, VolumeGrid) or (grid.ndim != 3 and isinstance(scans[0].geometry, ConeBeam)):
+    if not isinstance(grid, VolumeGrid) or (grid.ndim != 3 and scans[0].geometry.has_rows):
         raise ValueError(f"grid must be a (z, y, x) VolumeGrid, got {grid!r}")
     for s in scans:
         if s.zero_fraction > _STARVED:
@@ -115,7 +115,7 @@ def _fbp(scans: Sequence[Scan], grid: VolumeGrid, progress: Progress | None, ker
         raise TypeError(f"kernel must be one name, got {kernel!r}; recon.fbp.inset.InsetFbp takes several at once")
     start = time.perf_counter()
     run = InsetFbp(scans[0], [grid], [kernel])
-    warnings = [*run.warnings, *sampling_warnings(run.geometry)]
+    warnings = [*run.warnings, *sampling_warnings(run.circle)]
     for text in warnings:
         _LOG.warning("%s", text)
     volumes = []

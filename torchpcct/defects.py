@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchpcct.detector_window import DetectorWindow
-from torchpcct.geometry import ConeBeam
 from torchpcct.scan import Scan
 
 __all__ = ["Defects", "filled", "find_defects", "mended"]
@@ -218,13 +217,13 @@ def mended(scan: Scan) -> tuple[Scan, list[str]]:
     they stand for.
 
     Args:
-        scan: a noisy cone-beam scan in counting mode; any other is returned as it is.
+        scan: a noisy scan in counting mode by a detector with rows; any other is returned as it is.
 
     Returns:
         The scan (the same object if nothing was found), and one sentence for each finding.
     """
-    cone = isinstance(scan.geometry, ConeBeam)
-    if scan.noise_free or scan.logged or not (scan.counting and cone) or scan.counts.ndim != 3:
+    rows = scan.geometry.has_rows
+    if scan.noise_free or scan.logged or not (scan.counting and rows) or scan.counts.ndim != 3:
         return scan, []
     window = scan.window or DetectorWindow.full(scan.geometry)
     kept = scan.air[window.first_row : window.first_row + window.rows]

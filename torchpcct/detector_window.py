@@ -94,7 +94,7 @@ class DetectorWindow:
     @staticmethod
     def full(geometry: Geometry) -> DetectorWindow:
         """The whole detector of ``geometry``."""
-        rows = geometry.rows if isinstance(geometry, ConeBeam) else 1
+        rows = geometry.shape[1] if geometry.has_rows else 1
         return DetectorWindow(np.zeros(geometry.views, np.int64), geometry.columns, 0, rows)
 
     @staticmethod

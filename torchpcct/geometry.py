@@ -97,6 +97,11 @@ class Geometry:
         """Shape of one sinogram: ``(views, columns)`` or ``(views, rows, columns)``."""
         return (self.views, self.columns)
 
+    @property
+    def has_rows(self) -> bool:
+        """Whether the detector has rows, so that one sinogram makes a volume and not a plane."""
+        return len(self.shape) == 3
+
     def select(self: G, views: Any) -> G:
         """The same scanner with a subset (or reordering) of the views: an index array, mask or slice."""
         return replace(self, angles=self.angles[views])  # type: ignore[type-var]

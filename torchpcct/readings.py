@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpcct.geometry import ConeBeam, Geometry
+from torchpcct.geometry import Geometry
 from torchpcct.scanner.linearisation import WaterLinearisation
 from torchpcct.validate import number
 
@@ -63,7 +63,7 @@ def _shapes(name: str, readings: Tensor, geometry: Geometry) -> tuple[int, ...]:
     """Shape of what all views share, ``(*lead, [rows,] columns)``."""
     axes = len(geometry.shape)
     if tuple(readings.shape[-axes:]) != geometry.shape or readings.ndim not in (axes, axes + 1):
-        expected = "bins" if isinstance(geometry, ConeBeam) else "slices"
+        expected = "bins" if geometry.has_rows else "slices"
         raise ValueError(
             f"{name} have the shape {tuple(readings.shape)}, the geometry needs ([{expected},] "
             f"{', '.join(map(str, geometry.shape))}): views first, columns last"

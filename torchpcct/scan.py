@@ -34,8 +34,8 @@ class Scan:
     """Readings of one scan.
 
     Args:
-        counts: ``(views, rows, columns)``, spectral ``(bins, views, rows, columns)``, float32; of a parallel or fan
-            beam ``(views, columns)`` or, of several slices, ``(slices, views, columns)``. Counts if noisy
+        counts: ``(views, rows, columns)``, spectral ``(bins, views, rows, columns)``, float32; of a detector
+            without rows ``(views, columns)`` or, of several slices, ``(slices, views, columns)``. Counts if noisy
             (``exposure_s`` given); else expected counts for :data:`NOISE_FREE_EXPOSURE_S`. With a window, only its
             cells: ``(..., views, window.rows, window.columns)``.
         air: ``counts`` without the axis of views: expected readings without the object, same exposure.
@@ -112,7 +112,8 @@ class Scan:
 
         Args:
             readings: raw, the shape of ``counts``, any real dtype.
-            geometry: parallel, fan or cone beam.
+            geometry: parallel, fan or cone beam, or view by view
+                (:class:`~torchpcct.vector_geometry.VectorGeometry`).
             air: readings without the object: one frame, the shape of ``readings`` without views, or several
                 ``(frames, …)``, or one number.
             dark: readings without beam, as ``air``.
@@ -151,7 +152,7 @@ class Scan:
 
         Args:
             lines: the shape of ``counts``; NaN and Inf are dead.
-            geometry: parallel, fan or cone beam.
+            geometry: as for :meth:`from_counts`.
             photons: of an unattenuated reading, one number or one per cell; it sets the statistical weights. None:
                 estimated from the noise between neighbouring columns.
             dead, linearisation, mu_water, exposure_s, info: of :meth:`from_counts`.
@@ -251,7 +252,7 @@ class Scan:
     def _first_index(self) -> Any:
         """Global index of the first reading of every detector row held in ``counts``."""
         g, w = self.geometry, self.window or DetectorWindow.full(self.geometry)
-        if not isinstance(g, ConeBeam):
+        if not isinstance(g, ConeBeam):  # all of the detector, cells in the order in memory
             return np.arange(math.prod(self.counts.shape[:-1])) * g.columns
         line = np.arange(g.views)[:, None] * g.rows + w.first_row + np.arange(w.rows)
         index = line * g.columns + w.first_column[:, None]
@@ -277,7 +278,7 @@ class Scan:
             ValueError: a noisy energy-integrating scan that does not hold ``quantum``.
         """
         p = self.linearisation.apply(self._logarithm(), self.window)
-        return p if self.dead is None else bridge(p, self.dead, isinstance(self.geometry, ConeBeam))
+        return p if self.dead is None else bridge(p, self.dead, self.geometry.has_rows)
 
     def _logarithm(self) -> Tensor:
         """``ln(air) − ln(readings)`` before the water correction; dead readings hold anything finite."""
@@ -300,8 +301,8 @@ class Scan:
             ValueError: an energy-integrating scan that does not hold ``quantum``.
         """
         self._require_noise_model()
-        cone = isinstance(self.geometry, ConeBeam)
-        mean = self.counts if self.noise_free or self.window is not None else smoothed(self.counts, self.dead, cone)
+        rows = self.geometry.has_rows
+        mean = self.counts if self.noise_free or self.window is not None else smoothed(self.counts, self.dead, rows)
         quantum = torch.ones(1) if self.quantum is None else self.quantum
         p = (self._at_window(self.air) / torch.maximum(mean, quantum / 2)).log_()
         if self.flux is not None:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchpcct.detector_window import DetectorWindow
-from torchpcct.geometry import Geometry
+from torchpcct.geometry import ConeBeam, Geometry
 from torchpcct.scanner.linearisation import WaterLinearisation
 from torchpcct.validate import choice, number, whole
 
@@ -32,7 +32,7 @@ def check_scan(scan: Any) -> None:
     _check_kinds(scan)
     g, w = scan.geometry, scan.window
     axes = len(g.shape)
-    if w is not None and axes != 3:
+    if w is not None and not isinstance(g, ConeBeam):
         raise TypeError(f"geometry must be a ConeBeam in a scan with a window, got {type(g).__name__}")
     cells = g.shape if w is None else w.shape
     if tuple(scan.counts.shape[-axes:]) != cells or scan.counts.ndim not in (axes, axes + 1):

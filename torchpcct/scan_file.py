@@ -12,12 +12,14 @@ from torchpcct.detector_window import DetectorWindow
 from torchpcct.files import VERSION, write_hdf5
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam
 from torchpcct.scanner.linearisation import WaterLinearisation
+from torchpcct.vector_geometry import VectorGeometry
 
 __all__ = ["read_geometry", "scan_fields", "write_geometry", "write_scan"]
 
-_VERSION = 4
+_VERSION = 5
 """2: energy-integrating scans with their noise model. 3: with a checksum (:func:`torchpcct.files.write_hdf5`). 4:
-parallel and fan beams, flux, dead readings, units; other scans are written as version 3."""
+parallel and fan beams, flux, dead readings, units. 5: geometries given view by view. Each scan is written as the lowest
+version that holds it."""
 # Compress in blocks of whole views: fast to write, and a window of views can be read without the rest.
 _HDF5_COMPRESSION = {"compression": "lzf", "shuffle": True}
 
@@ -27,7 +29,8 @@ def write_scan(scan: Any, path: str | os.PathLike[str]) -> None:
     with write_hdf5(path, "scan") as file:
         foreign = scan.unit != "HU" or scan.logged or not isinstance(scan.geometry, ConeBeam)
         foreign = foreign or scan.flux is not None or scan.dead is not None
-        file.attrs.update(version=4 if foreign else 3, software=f"torchpcct {VERSION}")
+        version = 5 if isinstance(scan.geometry, VectorGeometry) else 4 if foreign else 3
+        file.attrs.update(version=version, software=f"torchpcct {VERSION}")
         file.attrs["counting"] = scan.counting
         file.attrs.update(unit=scan.unit, logged=scan.logged)
         file.attrs["info"] = json.dumps(dict(scan.info), default=str)
@@ -105,10 +108,17 @@ def scan_fields(file: Any, path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def write_geometry(group: Any, geometry: Geometry) -> None:
-    """Write a parallel, fan or cone beam into an HDF5 group (mm, rad)."""
+    """Write a geometry into an HDF5 group (mm, rad)."""
     g: Any = geometry
+    group.attrs.update(kind=type(g).__name__, columns=g.columns)
+    if isinstance(g, VectorGeometry):
+        group["vectors_mm"] = g.vectors
+        group.attrs["parallel"] = g.parallel
+        if g.rows is not None:
+            group.attrs["rows"] = g.rows
+        return
     group["angles_rad"] = g.angles
-    group.attrs.update(kind=type(g).__name__, columns=g.columns, pitch_mm=g.pitch, offset_mm=g.offset)
+    group.attrs.update(pitch_mm=g.pitch, offset_mm=g.offset)
     if not isinstance(g, ParallelBeam):
         group.attrs.update(sod_mm=g.sod, sdd_mm=g.sdd, detector=g.detector)
     if isinstance(g, ConeBeam):
@@ -121,8 +131,13 @@ def read_geometry(group: Any) -> Geometry:
     Raises:
         KeyError: something is missing. ValueError: values that are no geometry, an unknown kind.
     """
-    a, angles = group.attrs, group["angles_rad"][()]
+    a = group.attrs
     kind, columns = str(a.get("kind", "ConeBeam")), int(a["columns"])
+    if kind == "VectorGeometry":
+        return VectorGeometry(
+            group["vectors_mm"][()], columns, int(a["rows"]) if "rows" in a else None, bool(a["parallel"])
+        )
+    angles = group["angles_rad"][()]
     if kind == "ParallelBeam":
         return ParallelBeam(angles, columns, float(a["pitch_mm"]), float(a["offset_mm"]))
     orbit = (angles, float(a["sod_mm"]), float(a["sdd_mm"]), columns)

@@ -118,6 +118,44 @@ class VectorGeometry(Geometry):
         parallel = isinstance(geometry, ParallelBeam)
         return cls(to_vectors(geometry, motion), geometry.columns, rows, parallel)
 
+    def border_rays(self) -> tuple[Floats, Floats, Floats]:
+        """The rays through the outer edge of the detector, each ``(views, rays)``.
+
+        Returns:
+            Distance from the z axis at their closest approach in mm, their height z there in mm, and how much they
+            climb per mm on the way across the axis. Of a detector without rows the heights and climbs are 0.
+
+        Raises:
+            ValueError: rays along z, which have no closest approach.
+        """
+        half_v = (self.rows or 0) / 2
+        across = np.arange(self.columns + 1) - self.columns / 2
+        up = np.arange((self.rows or 0) + 1) - half_v
+        edge = [(c, r) for r in {-half_v, half_v} for c in across] + [
+            (s * self.columns / 2, r) for r in up for s in (-1, 1)
+        ]
+        at, (first, centre, u, v) = np.array(edge), self.poses.transpose(1, 0, 2)
+        point = centre[:, None] + at[:, :1] * u[:, None] + at[:, 1:] * v[:, None]
+        ray = np.broadcast_to(first[:, None], point.shape) if self.parallel else point - first[:, None]
+        flat = np.linalg.norm(ray[..., :2], axis=-1, keepdims=True)
+        if (flat <= 1e-6 * np.linalg.norm(ray, axis=-1, keepdims=True)).any():
+            raise ValueError(f"rays of view {int(flat.min(1).argmin())} run along z: turn the scan so that they do not")
+        ray = ray / flat
+        to_axis = -(point[..., :2] * ray[..., :2]).sum(-1, keepdims=True)
+        nearest = point + to_axis * ray
+        return np.linalg.norm(nearest[..., :2], axis=-1), nearest[..., 2], ray[..., 2]
+
+    @property
+    def cell(self) -> float:
+        """Width of a column where the rays cross the axis, mm: the median over the views."""
+        source, centre, u, _ = self.poses.transpose(1, 0, 2)
+        width = np.linalg.norm(u, axis=1)
+        if not self.parallel:
+            orbit = np.linalg.norm(source[:, :2], axis=1)
+            depth = ((source - centre)[:, :2] * source[:, :2]).sum(1) / np.maximum(orbit, 1e-9)
+            width = width * orbit / np.maximum(np.abs(depth), 1e-9)
+        return float(np.median(width))
+
     def select(self, views: Any) -> VectorGeometry:
         """The same scan with a subset (or reordering) of the views: an index array, mask or slice."""
         return replace(self, vectors=self.vectors[views])

@@ -101,8 +101,8 @@ class Volume:
         form = format_of(path)
         if form != "HDF5":
             read = {"NIfTI": read_nifti, "MetaImage": read_meta_image, "DICOM": read_dicom}[form]
-            values, grid = read(path)
-            return cls(torch.from_numpy(values), grid, {"file": str(path)})
+            values, grid, unit = read(path)
+            return cls(torch.from_numpy(values), grid, {"file": str(path)}, unit)
         with read_hdf5(path, "volume") as file:
             data = torch.from_numpy(file["data"][()])
             grid = VolumeGrid(

@@ -167,6 +167,7 @@ def _grid(scan: Scan, arguments: argparse.Namespace) -> VolumeGrid:
     import numpy as np
 
     from torchpcct.geometry import ConeBeam, ParallelBeam
+    from torchpcct.vector_geometry import VectorGeometry
 
     voxel = arguments.voxel
     if scan.window is not None:
@@ -177,8 +178,11 @@ def _grid(scan: Scan, arguments: argparse.Namespace) -> VolumeGrid:
         shape = tuple(math.ceil(e / voxel - 1e-6) for e in arguments.extent or INSET_MM)
         return VolumeGrid(shape, voxel, tuple(arguments.center or PAPER_POSITION[::-1]))
     g: Any = scan.geometry
-    u = g.column_positions
-    if isinstance(g, ParallelBeam):
+    if isinstance(g, VectorGeometry):
+        distance, heights, _ = g.border_rays()
+        cell, radius = g.cell, float(distance.max())
+    elif isinstance(g, ParallelBeam):
+        u = g.column_positions
         cell, radius = g.pitch, max(-u[0], u[-1])
     else:
         pitch = g.pitch[1] if isinstance(g, ConeBeam) else g.pitch
@@ -188,6 +192,13 @@ def _grid(scan: Scan, arguments: argparse.Namespace) -> VolumeGrid:
     extent = list(arguments.extent or [0.0, side, side])
     center = list(arguments.center or [0.0, 0.0, 0.0])
     plane = [max(1, math.ceil(e / voxel - 1e-6)) for e in extent[1:]]
+    if isinstance(g, VectorGeometry) and g.has_rows:
+        # What views above and below see together: a helix covers more than its rows.
+        low, high = float(heights.min()), float(heights.max())
+        orbit = math.inf if g.parallel else float(np.hypot(*g.poses[:, 0, :2].T).mean())
+        height = extent[0] or high - low - float(np.median(np.ptp(heights, axis=1))) * radius / orbit
+        center[0] = center[0] if arguments.center else 0.5 * (low + high)
+        return VolumeGrid((max(1, math.floor(height / voxel)), *plane), voxel, tuple(center))
     if isinstance(g, ConeBeam):
         height = extent[0] or g.rows * g.pitch[0] / g.magnification * (1.0 - radius / g.sod)
         return VolumeGrid((max(1, math.floor(height / voxel)), *plane), voxel, tuple(center))
@@ -308,7 +319,12 @@ def add_reconstruct(commands: Commands) -> None:
     parser.add_argument(
         "--extent", type=float, nargs=3, metavar=axes, help="edge lengths in mm (default: what is seen)"
     )
-    parser.add_argument("--geometry", type=Path, metavar="YAML", help="geometry of files that do not hold it")
+    parser.add_argument(
+        "--geometry",
+        type=Path,
+        metavar="YAML",
+        help="geometry of files that do not hold it; kind: vectors, rtk, or with pose: in place of the file's own",
+    )
     parser.add_argument("--mu-water", type=float, metavar="MM⁻¹", help="attenuation of water: result in HU")
     parser.add_argument("--axis", type=float, metavar="COLUMN", help="rotation axis (Data Exchange)")
     parser.add_argument("--find-axis", action="store_true", help="search the rotation axis (parallel beams)")

@@ -19,8 +19,9 @@ from torch import Tensor
 from recon.fbp.backproject import check_data
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
 from torchpcct.validate import whole
+from torchpcct.vector_geometry import VectorGeometry
 
-__all__ = ["Straightened", "at_slices", "straighten"]
+__all__ = ["IdealCircle", "Straightened", "at_slices", "ideal_circle", "straighten"]
 
 Floats = NDArray[np.float64]
 
@@ -29,14 +30,31 @@ CLIMB = 0.05
 _TILTED_RAY = 1e-3
 
 
+class IdealCircle(NamedTuple):
+    """The ideal circle next to a scan, and the way there.
+
+    Attributes:
+        geometry: of the circle.
+        motion: displacement of the grid in every view, ``(views, 2)`` (y, x) or ``(views, 3)`` (z, y, x) mm, or None.
+        slices: heights of the slices of a parallel scan with rows in mm, else None.
+        rows: positions of the ideal rows in mm; of a detector without rows 0.
+        maps: ``(views, 3, 3)``: (column position, row position, 1) on the ideal detector in mm to homogeneous
+            (columns, rows, 1) from the centre of the actual one.
+    """
+
+    geometry: Geometry
+    motion: Floats | None
+    slices: Floats | None
+    rows: Floats
+    maps: Floats
+
+
 class Straightened(NamedTuple):
     """A scan on an ideal circle.
 
     Attributes:
         sinogram: ``(..., views, [rows,] columns)``, of parallel rays with rows ``(..., slices, views, columns)``.
-        geometry: of it.
-        motion: displacement of the grid in every view, ``(views, 2)`` (y, x) or ``(views, 3)`` (z, y, x) mm, or None.
-        slices: heights of the slices of a parallel scan in mm, else None.
+        geometry, motion, slices: of :class:`IdealCircle`.
     """
 
     sinogram: Tensor
@@ -45,44 +63,39 @@ class Straightened(NamedTuple):
     slices: Floats | None = None
 
 
-def straighten(sinogram: Tensor, vectors: Any, *, parallel: bool = False) -> Straightened:
+def ideal_circle(geometry: VectorGeometry) -> IdealCircle:
+    """The ideal circle about z that a scan of any flat detectors can be resampled onto.
+
+    Raises:
+        ValueError: an orbit that climbs, parallel rays that leave the plane, a detector before the axis.
+    """
+    work = _parallel if geometry.parallel else _divergent
+    found = work(geometry.poses, geometry.rows or 1, geometry.columns, geometry.rows is not None)
+    far = max(1.0, float(np.abs(geometry.vectors).max()))
+    still = found.motion is None or np.abs(found.motion).max() < 1e-9 * far
+    return found._replace(motion=None) if still else found
+
+
+def straighten(sinogram: Tensor, geometry: VectorGeometry) -> Straightened:
     """Resample a scan of any flat detectors onto an ideal circle about z.
 
     Args:
-        sinogram: line integrals ``(..., views, [rows,] columns)``, float32 or float64.
-        vectors: ASTRA's per view, in mm: ``(views, 6)`` without rows, ``(views, 12)`` with rows
-            (:mod:`torchpcct.projector.vectors`); of parallel rays the ray's direction in place of the source.
-        parallel: whether they are those of parallel rays.
+        sinogram: line integrals ``(..., *geometry.shape)``, float32 or float64.
+        geometry: of the scan.
 
     Raises:
-        ValueError: shapes that do not fit, an orbit that climbs, parallel rays that leave the plane, rays that do not
-            meet their detector, a detector that faces the source with its edge.
+        ValueError: a shape that does not fit; see :func:`ideal_circle`.
         TypeError: data that are not float32 or float64 tensors.
     """
-    v = np.asarray(vectors, dtype=np.float64)
-    if v.ndim != 2 or v.shape[1] not in (6, 12) or not np.isfinite(v).all():
-        raise ValueError(f"vectors must be finite and of shape (views, 6) or (views, 12), got {v.shape}")
-    cone = v.shape[1] == 12
-    if not isinstance(sinogram, Tensor) or sinogram.ndim < (3 if cone else 2):
-        raise ValueError(f"{v.shape[1]} numbers per view need a sinogram (views, {'rows, ' * cone}columns)")
-    shape = tuple(sinogram.shape[-3:] if cone else sinogram.shape[-2:])
-    check_data("sinogram", sinogram, (len(v), *shape[1:]))
-    if not cone:
-        zero = np.zeros((len(v), 1))
-        v = np.concatenate([v[:, :2], zero, v[:, 2:4], zero, v[:, 4:], zero, zero, zero, zero + 1.0], axis=1)
-        sinogram = sinogram.unsqueeze(-2)
-    rows, columns = sinogram.shape[-2:]
-    poses = v.reshape(-1, 4, 3)
-    work = _parallel if parallel else _divergent
-    geometry, motion, positions, slices = work(poses, rows, columns, cone)
-    out = _resampled(sinogram, positions)
-    if not cone:
+    check_data("sinogram", sinogram, geometry.shape)
+    circle: Any = ideal_circle(geometry)
+    flat = geometry.rows is None
+    out = _resampled(sinogram.unsqueeze(-2) if flat else sinogram, circle)
+    if flat:
         out = out.squeeze(-2)
-    elif parallel:
+    elif geometry.parallel:
         out = out.transpose(-3, -2)
-    if motion is not None and np.abs(motion).max() < 1e-9 * max(1.0, float(np.abs(v).max())):
-        motion = None
-    return Straightened(out, geometry, motion, slices)
+    return Straightened(out, circle.geometry, circle.motion, circle.slices)
 
 
 def at_slices(s: Straightened, grid: VolumeGrid) -> Tensor:
@@ -95,7 +108,9 @@ def at_slices(s: Straightened, grid: VolumeGrid) -> Tensor:
     if grid.ndim != 3:
         raise ValueError(f"parallel rays with rows need a 3-D grid, got shape {grid.shape}")
     place = np.interp(grid.axes[0], s.slices, np.arange(s.slices.size))
-    if grid.axes[0][0] < s.slices[0] - 1e-6 or grid.axes[0][-1] > s.slices[-1] + 1e-6:
+    # The outermost rows reach half a row beyond their centres.
+    half = 0.5 * float(s.slices[1] - s.slices[0]) if s.slices.size > 1 else 0.0
+    if grid.axes[0][0] < s.slices[0] - half - 1e-6 or grid.axes[0][-1] > s.slices[-1] + half + 1e-6:
         raise ValueError(f"the grid's slices must lie in the rows' {s.slices[0]:g} … {s.slices[-1]:g} mm")
     below = np.minimum(place.astype(int), max(s.slices.size - 2, 0))
     share = torch.from_numpy(place - below).to(s.sinogram)[:, None, None]
@@ -108,7 +123,7 @@ def _axis_of(low: float, high: float, pitch: float) -> tuple[int, float]:
     return whole("cells", math.ceil((high - low) / pitch - 1e-6) + 1), 0.5 * (low + high)
 
 
-def _divergent(poses: Floats, rows: int, columns: int, cone: bool) -> tuple[Geometry, Floats | None, Floats, None]:
+def _divergent(poses: Floats, rows: int, columns: int, cone: bool) -> IdealCircle:
     source, centre, across, up = poses.transpose(1, 0, 2)
     beta = np.arctan2(source[:, 1], source[:, 0])
     radial = np.stack([np.cos(beta), np.sin(beta), 0 * beta], 1)
@@ -139,36 +154,35 @@ def _divergent(poses: Floats, rows: int, columns: int, cone: bool) -> tuple[Geom
         if climb > CLIMB * height:
             raise ValueError(
                 f"the source climbs by {climb:.2f} mm, the rows cover {height:.2f} mm at the axis: filtered "
-                "backprojection of a helix is not provided. Use recon.pwls with Projector(VectorGeometry(…), grid)"
+                'backprojection of a helix is not provided. Use the method "pwls" (recon.pwls with '
+                "Projector(geometry, grid))"
             )
         number, middle_row = _axis_of(float(w.min()), float(w.max()), row_pitch)
         geometry: Any = ConeBeam(beta, sod, sdd, count, number, (row_pitch, pitch), (middle_row, offset))
         v = geometry.row_positions
     else:
-        if np.abs(source[:, 2]).max() + np.abs(centre[:, 2]).max() > 0:
-            raise ValueError("the vectors of a fan beam lie in the plane z = 0")
         geometry, v = FanBeam(beta, sod, sdd, count, pitch, offset), np.zeros(1)
-    rays = -sdd * radial[:, None, None] + geometry.column_positions[:, None] * tangent[:, None, None]
-    rays = rays + v[:, None, None] * np.array([0.0, 0.0, 1.0])
-    # source + λ ray = centre + a · across + b · up
-    matrix = np.stack([np.broadcast_to(x[:, None, None], rays.shape) for x in (across, up)] + [-rays], axis=-1)
-    if np.abs(np.linalg.det(matrix)).min() < 1e-9 * sdd * pitch:
-        raise ValueError("a detector faces its source with its edge")
-    right = np.broadcast_to((source - centre)[:, None, None], rays.shape)
-    places = np.linalg.solve(matrix, right[..., None])[..., :2, 0]
+    # source + k · ray = centre + a · across + b · up, where the ray goes to a place of the ideal detector.
+    upward = np.broadcast_to([0.0, 0.0, 1.0], radial.shape)
+    actual, wanted = np.stack([across, up, centre - source], -1), np.stack([tangent, upward, -sdd * radial], -1)
+    maps = np.linalg.solve(actual, wanted)
+    ends = np.array([(x, y, 1.0) for x in geometry.column_positions[[0, -1]] for y in v[[0, -1]]])
+    if (maps[:, 2] @ ends.T).min() <= 0:
+        raise ValueError("a detector stands almost edge on to its rays")
     ideal = sod * radial + np.array([0.0, 0.0, level])
     shift = (ideal - source)[:, ::-1]
     shift[:, 0] -= level  # an orbit about another height is a grid that is lower by as much
-    return geometry, np.ascontiguousarray(shift if cone else shift[:, 1:]), places, None
+    return IdealCircle(geometry, np.ascontiguousarray(shift if cone else shift[:, 1:]), None, v, maps)
 
 
-def _parallel(poses: Floats, rows: int, columns: int, cone: bool) -> tuple[Geometry, None, Any, Floats | None]:
+def _parallel(poses: Floats, rows: int, columns: int, cone: bool) -> IdealCircle:
     ray, centre, across, up = poses.transpose(1, 0, 2)
     ray = ray / np.linalg.norm(ray, axis=1, keepdims=True)
     if np.abs(ray[:, 2]).max() > _TILTED_RAY:
         raise ValueError(
             f"the rays leave the plane of rotation by up to {math.degrees(math.asin(np.abs(ray[:, 2]).max())):.2f}°: "
-            "slices cannot be reconstructed one by one; filtered backprojection of tilted rays is not provided"
+            "slices cannot be reconstructed one by one. Filtered backprojection of tilted rays is not provided: use "
+            'the method "pwls" (recon.pwls with Projector(geometry, grid))'
         )
     beta = np.arctan2(-ray[:, 1], -ray[:, 0])
     tangent = np.stack([-np.sin(beta), np.cos(beta), 0 * beta], 1)
@@ -178,8 +192,6 @@ def _parallel(poses: Floats, rows: int, columns: int, cone: bool) -> tuple[Geome
 
     c, a, b = in_plane(centre), in_plane(across), in_plane(up)
     matrix = np.stack([a, b], -1)
-    if np.abs(np.linalg.det(matrix)).min() < 1e-9:
-        raise ValueError("a detector faces its rays with its edge")
     half = np.array([(x * (columns - 1) / 2, y * (rows - 1) / 2) for x in (-1, 1) for y in (-1, 1)])
     corner = c[:, None] + half[:, :1] * a[:, None] + half[:, 1:] * b[:, None]
     pitch = float(np.median(np.linalg.norm(a, axis=1)))
@@ -190,24 +202,30 @@ def _parallel(poses: Floats, rows: int, columns: int, cone: bool) -> tuple[Geome
         row_pitch = float(np.median(np.linalg.norm(b, axis=1)))
         number, middle = _axis_of(float(corner[..., 1].min()), float(corner[..., 1].max()), row_pitch)
         heights = (np.arange(number) - (number - 1) / 2) * row_pitch + middle
-    t, z = np.meshgrid(geometry.column_positions, heights)
-    target = np.stack([t, z], -1)[None] - c[:, None, None]
-    places = np.linalg.solve(np.broadcast_to(matrix[:, None, None], (*target.shape, 2)), target[..., None])[..., 0]
-    return geometry, None, places, heights if cone else None
+    inverse = np.linalg.inv(matrix)
+    maps = np.zeros((len(poses), 3, 3))
+    maps[:, :2, :2], maps[:, :2, 2], maps[:, 2, 2] = inverse, -np.einsum("nij,nj->ni", inverse, c), 1.0
+    return IdealCircle(geometry, None, heights if cone else None, heights, maps)
 
 
-def _resampled(sinogram: Tensor, places: Floats) -> Tensor:
-    """``(..., views, rows, columns)`` at ``places (views, rows', columns', 2)``, in columns and rows from the centre.
+def _resampled(sinogram: Tensor, circle: IdealCircle) -> Tensor:
+    """``(..., views, rows, columns)`` on the ideal detector, view by view.
 
     Cubic interpolation; beyond the edges the outermost reading is repeated.
     """
-    views, rows, columns = sinogram.shape[-3:]
-    lead = sinogram.shape[:-3]
-    scale = np.array([max((columns - 1) / 2, 0.5), max((rows - 1) / 2, 0.5)])
-    grid = torch.from_numpy(places / scale).to(sinogram)
-    flat = sinogram.reshape(-1, views, rows, columns).transpose(0, 1)
-    if rows == 1:  # equal rows make a plane of a line
-        flat = flat.expand(-1, -1, 4, -1)
-        grid = torch.stack([grid[..., 0], torch.zeros_like(grid[..., 0])], -1)
-    out = torch.nn.functional.grid_sample(flat, grid, mode="bicubic", padding_mode="border", align_corners=True)
-    return out.transpose(0, 1).reshape(*lead, *out.shape[:1], *out.shape[2:])
+    rows, columns = sinogram.shape[-2:]
+    positions: Any = circle.geometry
+    u, v = positions.column_positions, circle.rows
+    place = np.stack([np.tile(u, v.size), np.repeat(v, u.size), np.ones(u.size * v.size)])
+    scale = np.array([[max((columns - 1) / 2, 0.5)], [max((rows - 1) / 2, 0.5)]])
+    out = []
+    for view, to_actual in enumerate(circle.maps):
+        at = to_actual @ place
+        grid = torch.from_numpy((at[:2] / at[2] / scale).T.reshape(1, v.size, u.size, 2)).to(sinogram)
+        flat = sinogram[..., view, :, :].reshape(1, -1, rows, columns)
+        if rows == 1:  # equal rows make a plane of a line
+            flat = flat.expand(-1, -1, 4, -1)
+            grid = torch.stack([grid[..., 0], torch.zeros_like(grid[..., 0])], -1)
+        one = torch.nn.functional.grid_sample(flat, grid, mode="bicubic", padding_mode="border", align_corners=True)
+        out.append(one.reshape(*sinogram.shape[:-3], v.size, u.size))
+    return torch.stack(out, -3)

@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from recon.fbp.any_orbit import straighten
 from torchpcct.detector_window import shadow
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid, view_step
 from torchpcct.scan import Scan
+from torchpcct.vector_geometry import VectorGeometry
 
 __all__ = ["centre_warnings", "check_rows", "refuse_helix", "sampling_warnings"]
 
@@ -129,9 +131,14 @@ def centre_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
     if window is not None:
         window, about = shadow(scan.geometry, grid, margin=_CENTRE_MARGIN).within(window), tuple(grid.center[-2:])
         scan = scan.crop(window)
-    lines = scan.line_integrals()
-    if lines.ndim > len(scan.geometry.shape):
+    lines, geometry = scan.line_integrals(), scan.geometry
+    if isinstance(geometry, VectorGeometry):
+        circle = straighten(lines, geometry)
+        if circle.motion is not None:  # of sources beside the circle opposite rays need not meet
+            return []
+        lines, geometry = circle.sinogram, circle.geometry
+    if lines.ndim > len(geometry.shape):
         lines = lines[lines.shape[0] // 2]
     if window is not None:
         lines = lines - window.take(scan.surround_line_integrals())
-    return list(centre_test(lines, scan.geometry, window, about).findings)
+    return list(centre_test(lines, geometry, window, about).findings)

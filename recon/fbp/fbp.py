@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.fbp.angular_weights import angular_weights, view_steps
-from recon.fbp.any_orbit import at_slices, straighten
+from recon.fbp.any_orbit import Straightened, at_slices, straighten
 from recon.fbp.backproject import BackprojectionPlan, backproject, check_data, data_shape
 from recon.fbp.coverage import check_rows, refuse_helix
 from recon.fbp.detector_edges import Rows, continued, cut_off, mirrored
@@ -27,7 +27,7 @@ from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid, vie
 from torchpcct.validate import number
 from torchpcct.vector_geometry import VectorGeometry
 
-__all__ = ["backproject", "fbp", "filter_sinogram", "filter_windowed", "interleave"]
+__all__ = ["backproject", "fbp", "filter_sinogram", "filter_windowed", "interleave", "straightened_fbp"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -238,11 +238,8 @@ def fbp(
     if isinstance(geometry, VectorGeometry):
         if window is not None:
             raise ValueError("a window belongs to a circular scan: leave it out for a VectorGeometry")
-        check_data("sinogram", sinogram, geometry.shape)
-        seen = geometry if motion is None else geometry.moved(motion)
-        s = straighten(sinogram, seen.vectors, parallel=seen.parallel)
-        lines, plane = (s.sinogram, grid) if s.slices is None else (at_slices(s, grid), grid.slice)
-        return fbp(lines, s.geometry, plane, kernel, weights=weights, motion=s.motion, outside=outside)
+        straight = straighten(sinogram, geometry if motion is None else geometry.moved(motion))
+        return straightened_fbp(straight, grid, kernel, weights=weights, outside=outside)
     check_data("sinogram", sinogram, data_shape(geometry, DetectorWindow.full(geometry)))
     refuse_helix(geometry, motion)
     for text in check_rows(geometry, grid, motion):
@@ -270,6 +267,16 @@ def fbp(
     plan = BackprojectionPlan(rows.geometry, grid, window, motion)
     filtered = filter_sinogram(rows.lines, rows.geometry, kernel, window, weights=rows.weights)
     return apply_linear(filtered, plan.forward, plan.transpose)
+
+
+def straightened_fbp(
+    straight: Straightened, grid: VolumeGrid, kernel: str | Sequence[str], *, weights: Any = None, outside: float | None
+) -> Tensor:
+    """:func:`fbp` of a scan that was resampled onto an ideal circle."""
+    lines, plane = straight.sinogram, grid
+    if straight.slices is not None:
+        lines, plane = at_slices(straight, grid), grid.slice
+    return fbp(lines, straight.geometry, plane, kernel, weights=weights, motion=straight.motion, outside=outside)
 
 
 _SIDES = ("first", "last")

@@ -18,15 +18,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.fbp.angular_weights import angular_weights
+from recon.fbp.any_orbit import Straightened, ideal_circle, straighten
 from recon.fbp.backproject import backproject
 from recon.fbp.coverage import check_rows
 from recon.fbp.detector_edges import cut_off
-from recon.fbp.fbp import fbp, filter_sinogram, filter_windowed
+from recon.fbp.fbp import filter_sinogram, filter_windowed, straightened_fbp
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import ConeBeam, Geometry, VolumeGrid
 from torchpcct.scan import Scan
 from torchpcct.scene.motion import SinusoidalMotion
 from torchpcct.validate import number
+from torchpcct.vector_geometry import VectorGeometry
 from torchpcct.volume import to_hu
 
 __all__ = ["InsetFbp", "require_inside", "static_fbp", "view_motion"]
@@ -117,6 +119,9 @@ class InsetFbp:
     of the logarithms is linear in the inset up to beam hardening (the inset is seen through the same fat everywhere)
     and in the surround up to the fat that the inset displaces, which moves with it as part of the difference.
 
+    Attributes:
+        circle: the geometry that is filtered: that of the scan, or the ideal circle next to one given view by view.
+
     Args:
         scan: any scan of the family; its noise does not matter.
         grids: ``(z, y, x)`` grids inside the field of view.
@@ -141,8 +146,7 @@ class InsetFbp:
         surround: Tensor | None = None,
         motion: Any = None,
     ) -> None:
-        plane = not isinstance(scan.geometry, ConeBeam)
-        if surround is None and scan.counts.ndim != 3 and not plane:
+        if surround is None and scan.counts.ndim != 3 and scan.geometry.has_rows:
             raise ValueError("FBP in HU needs a counting-mode scan; decompose or sum the energy bins before")
         self.geometry, self.window, self.linearisation = scan.geometry, scan.window, scan.linearisation
         self.grids, self.kernels = tuple(grids), tuple(kernels)
@@ -151,7 +155,10 @@ class InsetFbp:
         if scan.window is None and surround is not None:
             raise ValueError("a scan of the whole detector has no surround: acquire it with region=")
         self.motion = motion
-        self.warnings = [text for grid in self.grids for text in check_rows(self.geometry, grid, motion)]
+        self.circle, path = self.geometry, motion
+        if isinstance(self.geometry, VectorGeometry):
+            self.circle, path = ideal_circle(self.geometry)[:2]
+        self.warnings = [text for grid in self.grids for text in check_rows(self.circle, grid, path)]
         self._lines: Tensor | None = None
         if scan.window is None:
             self._require_slices(scan)
@@ -172,7 +179,7 @@ class InsetFbp:
         self._surround = _static(self._lines, self.geometry, self.kernels, self.shadow)
 
     def _require_slices(self, scan: Scan) -> None:
-        if isinstance(self.geometry, ConeBeam):
+        if self.geometry.has_rows:
             return
         slices = tuple(scan.counts.shape[:-2])
         for grid in self.grids:
@@ -204,8 +211,7 @@ class InsetFbp:
         """
         g, part = self.geometry, self.shadow
         if self.window is None or self._lines is None:
-            grids = self.grids if isinstance(g, ConeBeam) else [grid.slice for grid in self.grids]
-            return [fbp(lines, g, grid, self.kernels, outside=outside) for grid in grids]
+            return self._whole(self._straight(lines), outside)
         channels = tuple(self._lines.shape[:-2])
         if lines.ndim < 3 or tuple(lines.shape[lines.ndim - 3 - len(channels) : -3]) != channels:
             raise ValueError(f"lines must have the channels {channels} before the views, got {tuple(lines.shape)}")
@@ -216,6 +222,15 @@ class InsetFbp:
             return [backproject(filtered, g, grid, part) for grid in self.grids]
         moving = [backproject(filtered, g, grid, part, motion=self.motion) for grid in self.grids]
         return [self._over_batch(rest, m) + m for rest, m in zip(self._rest, moving, strict=True)]
+
+    def _straight(self, lines: Tensor) -> Straightened:
+        if isinstance(self.geometry, VectorGeometry):
+            return straighten(lines, self.geometry)
+        return Straightened(lines, self.geometry, None)
+
+    def _whole(self, straight: Straightened, outside: float | None) -> list[Tensor]:
+        grids = self.grids if self.geometry.has_rows else [grid.slice for grid in self.grids]
+        return [straightened_fbp(straight, grid, self.kernels, outside=outside) for grid in grids]
 
     @staticmethod
     def _over_batch(surround: Tensor, like: Tensor) -> Tensor:
@@ -231,11 +246,14 @@ class InsetFbp:
         if self._lines is not None and self._of_scan:
             require_same_surround(scan, self._lines)
         lines, water = scan.line_integrals(), self.linearisation.mu_ref
-        if self.window is None and any(cut_off(lines, self.geometry, angular_weights(self.geometry))):
+        if self.window is not None:
+            return [to_hu(v, water) for v in self.images(lines)]
+        straight = self._straight(lines)
+        if any(cut_off(straight.sinogram, self.circle, angular_weights(self.circle))):
             warnings.warn(
                 f"the rows end inside the object: they are continued by a medium of {water:g} mm⁻¹. CT numbers are "
                 "estimates, least certain near the edge of the field of view",
                 UserWarning,
                 stacklevel=3,
             )
-        return [to_hu(v, water) for v in self.images(lines, outside=water)]
+        return [to_hu(v, water) for v in self._whole(straight, water)]

@@ -231,7 +231,9 @@ def information_at_reference(spectra: Tensor, period: tuple[int, int], spacing: 
     """
     hy, hx = spacing[-2:]
     f = torch.hypot(torch.fft.fftfreq(period[0], hy)[:, None], torch.fft.rfftfreq(period[1], hx)[None, :])
-    distance = (f - REFERENCE_FREQUENCY).abs() + torch.where(f == 0, math.inf, 0.0)
+    # Voxels larger than 1 mm do not hold the reference: the corner of their spectrum comes next, and may be negative.
+    wanted = min(REFERENCE_FREQUENCY, 0.5 / max(hy, hx))
+    distance = (f - wanted).abs() + torch.where(f == 0, math.inf, 0.0)
     ring = distance <= max(0.1, float(distance.min()) * 1.001)
     # S ∝ 1/f: refer every frequency of the ring to the reference.
     per_slice = (spectra[:, ring.to(spectra.device)] * (f[ring] / REFERENCE_FREQUENCY).to(spectra)).mean(1)

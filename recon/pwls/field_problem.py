@@ -26,6 +26,7 @@ from recon.pwls.qggmrf import DEFAULT_PRIOR, QGGMRF
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid
 from torchpcct.projector import Projector
 from torchpcct.scan import Scan
+from torchpcct.vector_geometry import VectorGeometry
 from torchpcct.volume import Volume, to_hu
 
 if TYPE_CHECKING:
@@ -70,7 +71,7 @@ def is_whole_field(scan: Scan, grid: VolumeGrid) -> bool:
     if scan.surround is not None:
         return False
     if not isinstance(geometry, ConeBeam):
-        return True
+        return True  # an inset of a scan given view by view is solved on all that its rays cross
     edges = zip(grid.extent[1:], grid.center[1:], strict=True)
     return all(extent / 2 - abs(center) >= geometry.fov_radius / math.sqrt(2) for extent, center in edges)
 
@@ -176,21 +177,31 @@ def larger_grid(grid: VolumeGrid, geometry: Any) -> VolumeGrid:
 
     Args:
         grid: ``(y, x)`` or ``(z, y, x)``.
-        geometry: of another kind than parallel, fan and cone beam: the grid stays as it is.
+        geometry: of the scan.
+
+    Raises:
+        TypeError: an unknown geometry.
     """
+    bottom = top = 0.0
     if isinstance(geometry, ParallelBeam):
         edge = float(np.abs(geometry.column_positions).max()) + geometry.pitch / 2
     elif isinstance(geometry, (FanBeam, ConeBeam)):
         edge = geometry.sod * math.sin(min(float(np.abs(geometry.fan_angles).max()), math.pi / 2))
+        if isinstance(geometry, ConeBeam):
+            rows = float(np.abs(geometry.row_positions).max()) + geometry.pitch[0] / 2
+            top = rows * (geometry.sod + edge) / geometry.sdd
+            bottom = -top
+    elif isinstance(geometry, VectorGeometry):
+        distance, height, climb = geometry.border_rays()
+        edge = float(distance.max())
+        rise = np.abs(climb) * np.sqrt(edge**2 - distance**2)
+        bottom, top = float((height - rise).min()), float((height + rise).max())
     else:
-        return grid
-    reach = [edge] * grid.ndim
-    if isinstance(geometry, ConeBeam):
-        rows = float(np.abs(geometry.row_positions).max()) + geometry.pitch[0] / 2
-        reach[0] = rows * (geometry.sod + edge) / geometry.sdd
+        raise TypeError(f"unknown geometry {type(geometry).__name__}")
+    reach = [(bottom, top), (-edge, edge), (-edge, edge)][-grid.ndim :]
     shape, center = [], []
-    for n, h, c, r in zip(grid.shape, grid.spacing, grid.center, reach, strict=True):
-        low, high = (max(math.ceil((r + side * c) / h - n / 2 - 1e-6), 0) for side in (1, -1))
+    for n, h, c, (first, last) in zip(grid.shape, grid.spacing, grid.center, reach, strict=True):
+        low, high = (max(math.ceil(r / h - n / 2 - 1e-6), 0) for r in (c - first, last - c))
         shape.append(n + low + high)
         center.append(c + (high - low) * h / 2)
     return VolumeGrid(tuple(shape), grid.spacing, tuple(center))

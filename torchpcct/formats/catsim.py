@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from torchpcct.formats.damage import reading
-from torchpcct.geometry import ConeBeam
+from torchpcct.geometry import Geometry
 from torchpcct.scan import Scan
 
 __all__ = ["read_catsim"]
 
 
-def read_catsim(results: str | os.PathLike[str], geometry: ConeBeam, **options: Any) -> Scan:
+def read_catsim(results: str | os.PathLike[str], geometry: Geometry, **options: Any) -> Scan:
     """A scan from CatSim's results.
 
     ``NAME.prep`` holds line integrals; else ``NAME.scan``, ``NAME.air`` and, if there is one, ``NAME.offset`` (dark)

@@ -9,6 +9,25 @@ rows: 64                   # cone only
 pitch: [1.1, 1.0]          # [row, column], or one number
 offset: [0, 0.25]          # optional
 detector: curved           # flat (default) or curved
+pose:                      # optional, flat detectors: numbers, lists or text files with one number a view
+  {roll_deg: 0.3, tilt_deg: 0, slant_deg: 0, columns: jitter.txt, rows: 0.5, feed: 20, start: -30}
+
+``pose`` makes a :class:`~torchpcct.vector_geometry.VectorGeometry`: ``columns`` and ``rows`` displace the detector by
+parts of a cell, along its own axes as they are turned; ``feed`` (mm of the source along z in a turn) and ``start`` (its
+first height, mm) make a helix.
+
+kind: vectors              # every view by itself, ASTRA's vectors
+vectors: poses.npy         # or .txt, or a list: (views, 6) or (views, 12) mm
+columns: 888
+rows: 64                   # with 12 numbers a view
+parallel: false            # optional
+
+kind: rtk                  # ThreeDCircularProjectionGeometry
+file: geometry.xml
+columns: 888
+rows: 64
+pitch: 1.0                 # [row, column], or one number
+origin: [0, 0]             # optional: of the first pixel, mm
 """
 
 from __future__ import annotations
@@ -20,8 +39,11 @@ from typing import Any
 
 import numpy as np
 
+from torchpcct.formats.damage import reading
+from torchpcct.formats.rtk import read_rtk
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam
 from torchpcct.validate import choice, number, whole
+from torchpcct.vector_geometry import VectorGeometry, helical_motion
 
 __all__ = ["geometry_of", "geometry_values"]
 
@@ -31,6 +53,12 @@ _OWN = {
     "cone": {"sod", "sdd", "columns", "rows", "pitch", "offset", "detector"},
 }
 _KINDS: dict[str, Any] = {"parallel": ParallelBeam, "fan": FanBeam, "cone": ConeBeam}
+_VECTORS = {
+    "vectors": {"vectors", "columns", "rows", "parallel"},
+    "rtk": {"file", "columns", "rows", "pitch", "origin"},
+}
+_OPTIONAL = {"offset", "detector", "parallel", "origin"}
+_TURNED, _SHIFTED, _HELIX = ("roll_deg", "tilt_deg", "slant_deg"), ("columns", "rows"), ("feed", "start")
 
 
 def geometry_of(values: Any, folder: Path = Path()) -> Geometry:
@@ -46,18 +74,45 @@ def geometry_of(values: Any, folder: Path = Path()) -> Geometry:
     if not isinstance(values, Mapping):
         raise TypeError(f"geometry must be a mapping with kind, angles_deg, columns, pitch …, got {values!r}")
     given = dict(values)
-    kind = choice("geometry.kind", given.pop("kind", None), tuple(_KINDS))
-    angles = _angles(given.pop("angles_deg", None), folder)
-    unknown = sorted(map(str, set(given) - _OWN[kind]))
+    kind = choice("geometry.kind", given.pop("kind", None), (*_KINDS, *_VECTORS))
+    own = (_OWN | _VECTORS)[kind]
+    pose = given.pop("pose", None) if kind in _KINDS else None
+    angles = _angles(given.pop("angles_deg", None), folder) if kind in _KINDS else None
+    unknown = sorted(map(str, set(given) - own))
     if unknown:
-        raise ValueError(
-            f"unknown in a {kind} geometry: {', '.join(unknown)}; it takes {', '.join(sorted(_OWN[kind]))}"
-        )
-    missing = sorted(_OWN[kind] - {"offset", "detector"} - set(given))
+        raise ValueError(f"unknown in a {kind} geometry: {', '.join(unknown)}; it takes {', '.join(sorted(own))}")
+    missing = sorted(own - _OPTIONAL - ({"rows"} if kind == "vectors" else set()) - set(given))
     if missing:
         raise ValueError(f"geometry needs {', '.join(missing)}")
+    if kind == "rtk":
+        return read_rtk(folder / str(given.pop("file")), **given)
+    if kind == "vectors":
+        return VectorGeometry(_table("vectors", given.pop("vectors"), folder), **given)
     made: Geometry = _KINDS[kind](angles, **given)
-    return made
+    return made if pose is None else _posed(made, pose, folder)
+
+
+def _table(name: str, value: Any, folder: Path) -> Any:
+    """Numbers as they are, or those of a ``.npy`` or text file."""
+    if isinstance(value, str):
+        path = folder / value
+        with reading(path, f"a table of {name}"):
+            return np.load(path, allow_pickle=False) if path.suffix == ".npy" else np.loadtxt(path, dtype=np.float64)
+    return value
+
+
+def _posed(circle: Any, pose: Any, folder: Path) -> VectorGeometry:
+    """A circular scan whose detector is displaced and turned, or whose table travels."""
+    known = (*_TURNED, *_SHIFTED, *_HELIX)
+    if not isinstance(pose, Mapping) or not set(pose) <= set(known):
+        raise ValueError(f"geometry.pose must be a mapping of {', '.join(known)}, got {pose!r}")
+    numbers = {name: _table(f"pose.{name}", value, folder) for name, value in pose.items()}
+    helix = {name: numbers[name] for name in _HELIX if name in numbers}
+    if "start" in helix and "feed" not in helix:
+        raise ValueError("geometry.pose.start is the first height of a helix: give feed, too")
+    found = VectorGeometry.of(circle, helical_motion(circle, **helix) if helix else None)
+    found = found.turned(**{name[:-4]: np.deg2rad(numbers[name]) for name in _TURNED if name in numbers})
+    return found.shifted(**{name: numbers[name] for name in _SHIFTED if name in numbers})
 
 
 def _angles(value: Any, folder: Path) -> Any:
@@ -78,6 +133,10 @@ def _angles(value: Any, folder: Path) -> Any:
 
 def geometry_values(geometry: Any) -> dict[str, Any]:
     """The mapping that :func:`geometry_of` reads; evenly spaced angles as start, step and count."""
+    if isinstance(geometry, VectorGeometry):
+        rows = {} if geometry.rows is None else {"rows": geometry.rows}
+        lists = geometry.vectors.tolist()
+        return {"kind": "vectors", "columns": geometry.columns, **rows, "parallel": geometry.parallel, "vectors": lists}
     kind = next(name for name, made in _KINDS.items() if type(geometry) is made)
     degrees = np.rad2deg(geometry.angles)
     step = float(degrees[1] - degrees[0]) if degrees.size > 1 else 0.0

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchpcct.dead_cells import bridge
 from torchpcct.formats.damage import needed
-from torchpcct.geometry import ConeBeam, ParallelBeam
+from torchpcct.geometry import ParallelBeam
 from torchpcct.scan import Scan
 
 __all__ = ["centred", "cleaned", "find_axis", "without_outliers", "without_stripes"]
@@ -82,7 +82,7 @@ def cleaned(scan: Scan, *, snr: float = 3.0, threshold: float = 0.08) -> Scan:
     Raises:
         ValueError: a cone beam, or a scan of a part of the detector.
     """
-    if isinstance(scan.geometry, ConeBeam) or scan.window is not None:
+    if scan.geometry.has_rows:
         raise ValueError("stripes are taken from sinograms (views, columns): of a parallel or fan beam, without window")
     lines = scan._logarithm()  # before the water correction, which belongs to the true readings
     if scan.dead is not None:

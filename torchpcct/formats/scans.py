@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from torchpcct.formats.dicom_ct_pd import read_dicom_ct_pd
 from torchpcct.formats.stack import read_stack
 from torchpcct.geometry import Geometry
 from torchpcct.scan import Scan
+from torchpcct.vector_geometry import VectorGeometry
 
 __all__ = ["check_scan_name", "open_scan"]
 
@@ -36,7 +38,9 @@ def open_scan(path: str | os.PathLike[str], geometry: Geometry | None = None, **
     Args:
         path: ``.h5`` (torchpcct, or Data Exchange by its contents), ``.yaml``, CatSim's ``.prep`` or ``.scan``, or a
             folder of DICOM-CT-PD files.
-        geometry: CatSim only, whose files do not hold it.
+        geometry: of files that do not hold one (CatSim, a stack without); or, for any file, a
+            :class:`~torchpcct.vector_geometry.VectorGeometry` that takes the place of the nominal one. The slices of a
+            parallel stack are then the detector's rows, if it has rows.
         options: of the format's reader.
 
     Raises:
@@ -48,16 +52,30 @@ def open_scan(path: str | os.PathLike[str], geometry: Geometry | None = None, **
     if name.suffix.lower() in _CATSIM:
         if geometry is None:
             raise ValueError(f"{name.name}: CatSim's files do not hold the geometry, give it")
-        return read_catsim(name, geometry, **options)  # type: ignore[arg-type]
-    if geometry is not None:
-        raise ValueError(f"{name.name} holds its geometry: leave out geometry")
-    if name.is_dir():
-        return read_dicom_ct_pd(name, **options).scan()
+        return read_catsim(name, geometry, **options)
     if name.suffix.lower() in _YAML:
-        return read_stack(name, **options)
-    if _is_own(name):
-        return Scan.load(name, **options)
-    return read_data_exchange(name, **options)
+        return read_stack(name, geometry, **options)
+    if geometry is not None and not isinstance(geometry, VectorGeometry):
+        raise ValueError(
+            f"{name.name} holds its geometry: leave out geometry, or give a VectorGeometry (kind: vectors) in its place"
+        )
+    if name.is_dir():
+        scan = read_dicom_ct_pd(name, **options).scan()
+    else:
+        scan = Scan.load(name, **options) if _is_own(name) else read_data_exchange(name, **options)
+    return scan if geometry is None else _placed(scan, geometry)
+
+
+def _placed(scan: Scan, geometry: VectorGeometry) -> Scan:
+    """The same readings, of a geometry that was measured view by view."""
+    if scan.window is not None:
+        raise ValueError("this scan holds a part of the detector: a VectorGeometry needs all of it")
+    changed: dict[str, Any] = {"geometry": geometry}
+    if geometry.has_rows and not scan.geometry.has_rows and scan.counts.ndim == 3:
+        for name in ("counts", "quantum", "dead"):
+            values = getattr(scan, name)
+            changed[name] = None if values is None else values.movedim(0, 1).contiguous()
+    return replace(scan, **changed)
 
 
 def _is_own(path: Path) -> bool:

@@ -6,7 +6,7 @@ air: flat.tif              # counts only: a file, a pattern or a number
 dark: dark.npy             # optional, as air
 dead: dead.npy             # optional mask
 gain: 1.0                  # optional: gain, electronic_noise, photons, mu_water, linearisation
-geometry: {…}              # see torchpcct.formats.geometry_yaml
+geometry: {…}              # see torchpcct.formats.geometry_yaml; or given to the reader
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ import numpy as np
 
 from torchpcct.formats.damage import check_size, needed, reading
 from torchpcct.formats.geometry_yaml import geometry_of
-from torchpcct.geometry import ConeBeam
+from torchpcct.geometry import Geometry
 from torchpcct.scan import Scan
 from torchpcct.validate import choice
+from torchpcct.vector_geometry import VectorGeometry
 
 __all__ = ["read_array", "read_stack"]
 
@@ -69,8 +70,13 @@ def _one(path: Path) -> Any:
     raise ValueError(f"{path.name}: readings must be .npy, .tif or .tiff")
 
 
-def read_stack(path: str | os.PathLike[str]) -> Scan:
+def read_stack(path: str | os.PathLike[str], geometry: Geometry | None = None) -> Scan:
     """The scan that a YAML file describes; see the module's text.
+
+    Args:
+        path: YAML file.
+        geometry: where the file has none; a :class:`~torchpcct.vector_geometry.VectorGeometry` also in place of the
+            file's.
 
     Raises:
         FileNotFoundError: a file is missing.
@@ -85,7 +91,11 @@ def read_stack(path: str | os.PathLike[str]) -> Scan:
             raise ValueError("it is no mapping with readings, kind and geometry")
         given = dict(text)
         kind = choice("kind", given.pop("kind", None), ("counts", "line_integrals"))
-        geometry = geometry_of(given.pop("geometry", None), folder)
+        described = given.pop("geometry", None)
+        if geometry is None:
+            geometry = geometry_of(described, folder)
+        elif described is not None and not isinstance(geometry, VectorGeometry):
+            raise ValueError("it holds its geometry: leave out geometry, or give a VectorGeometry in its place")
         name = given.pop("readings", None)
         if not isinstance(name, str):
             raise ValueError("readings must name a file or a pattern of files")
@@ -101,7 +111,7 @@ def read_stack(path: str | os.PathLike[str]) -> Scan:
     if "dead" in options:
         options["dead"] = np.asarray(options["dead"]).astype(bool)
     readings = read_array(name, folder)
-    if not isinstance(geometry, ConeBeam) and readings.ndim == 3 and readings.shape[0] == geometry.views:
+    if not geometry.has_rows and readings.ndim == 3 and readings.shape[0] == geometry.views:
         # Images of a camera, view by view: slices first.
         readings = np.moveaxis(readings, 0, 1)
     make = Scan.from_counts if kind == "counts" else Scan.from_line_integrals

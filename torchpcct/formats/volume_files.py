@@ -33,6 +33,7 @@ ENDINGS = {"NIfTI": (".nii", ".nii.gz"), "MetaImage": (".mha",), "HDF5": (".h5",
 """Of files; a name without ending is a folder for a DICOM series."""
 
 _STRAIGHT = 1e-4
+_MADE_BY = "torchpcct, "
 _HU_RANGE = (-32768, 32767)
 
 
@@ -62,8 +63,19 @@ def _three_axes(grid: VolumeGrid, name: str) -> None:
         raise ValueError(f"{name} needs a 3-D volume; save a 2-D image as .h5")
 
 
+def _unit(written: str, name: str) -> str:
+    """The unit that a file of ours names; files of other software (``written`` empty) are in HU.
+
+    Raises:
+        ValueError: another unit.
+    """
+    if written not in ("", "HU", "mm^-1"):
+        raise ValueError(f"its {name} gives the unit {written!r}, expected HU or mm^-1")
+    return written or "HU"
+
+
 def write_nifti(path: str | os.PathLike[str], data: Any, grid: VolumeGrid, unit: str) -> None:
-    """Write NIfTI-1, float32, mm, RAS, with qform and sform (scanner coordinates)."""
+    """Write NIfTI-1, float32, mm, RAS, with qform and sform (scanner coordinates); the unit stands in ``descrip``."""
     import nibabel
 
     _three_axes(grid, "NIfTI")
@@ -74,16 +86,17 @@ def write_nifti(path: str | os.PathLike[str], data: Any, grid: VolumeGrid, unit:
     image.set_qform(affine, code="scanner")
     image.set_sform(affine, code="scanner")
     image.header.set_xyzt_units("mm")
-    image.header["descrip"] = f"torchpcct, {unit}".encode()
+    image.header["descrip"] = (_MADE_BY + unit).encode()
     with written_whole(path) as part:
         nibabel.save(image, part)
 
 
-def read_nifti(path: str | os.PathLike[str]) -> tuple[Any, VolumeGrid]:
-    """Data ``(z, y, x)`` float32 and grid of a NIfTI volume, axes in any order or direction.
+def read_nifti(path: str | os.PathLike[str]) -> tuple[Any, VolumeGrid, str]:
+    """Data ``(z, y, x)`` float32, grid and unit of a NIfTI volume, axes in any order or direction.
 
     Raises:
-        FileNotFoundError: no such file. ValueError: damaged, not 3-D, oblique, or an affine without inverse.
+        FileNotFoundError: no such file. ValueError: damaged, not 3-D, oblique, or an affine without inverse; a volume
+            of ours in an unknown unit.
     """
     import nibabel
 
@@ -99,8 +112,10 @@ def read_nifti(path: str | os.PathLike[str]) -> tuple[Any, VolumeGrid]:
         spacing = np.diag(matrix).copy()
         if (spacing <= 0).any() or np.abs(matrix - np.diag(spacing)).max() > _STRAIGHT * spacing.max():
             raise ValueError("its axes are oblique: resample it to straight axes first")
+        text = bytes(image.header["descrip"]).rstrip(b"\0").decode("ascii", "replace")
+        unit = _unit(text.removeprefix(_MADE_BY) if text.startswith(_MADE_BY) else "", "descrip")
         data = np.asarray(image.dataobj, dtype=np.float32).transpose(2, 1, 0)
-        return np.ascontiguousarray(data), _grid(data.shape, spacing, image.affine[:3, 3])
+        return np.ascontiguousarray(data), _grid(data.shape, spacing, image.affine[:3, 3]), unit
 
 
 def _grid(shape: tuple[int, ...], spacing: Any, first: Any) -> VolumeGrid:
@@ -111,7 +126,7 @@ def _grid(shape: tuple[int, ...], spacing: Any, first: Any) -> VolumeGrid:
 
 
 def write_meta_image(path: str | os.PathLike[str], data: Any, grid: VolumeGrid, unit: str) -> None:
-    """Write a MetaImage (``.mha``, float32) by SimpleITK."""
+    """Write a MetaImage (``.mha``, float32) by SimpleITK; the unit stands in the field ``Unit``."""
     _three_axes(grid, "MetaImage")
     sitk = needed("SimpleITK")
     image = sitk.GetImageFromArray(np.ascontiguousarray(np.asarray(data, dtype=np.float32)))
@@ -124,8 +139,8 @@ def write_meta_image(path: str | os.PathLike[str], data: Any, grid: VolumeGrid, 
         sitk.WriteImage(image, str(part), True)
 
 
-def read_meta_image(path: str | os.PathLike[str]) -> tuple[Any, VolumeGrid]:
-    """Data ``(z, y, x)`` float32 and grid of a MetaImage by SimpleITK; errors as :func:`read_nifti`."""
+def read_meta_image(path: str | os.PathLike[str]) -> tuple[Any, VolumeGrid, str]:
+    """Data ``(z, y, x)`` float32, grid and unit of a MetaImage by SimpleITK; errors as :func:`read_nifti`."""
     sitk = needed("SimpleITK")
     with reading(path, "a MetaImage"):
         reader = sitk.ImageFileReader()
@@ -134,6 +149,7 @@ def read_meta_image(path: str | os.PathLike[str]) -> tuple[Any, VolumeGrid]:
         check_size(reader.GetSize(), "the volume")
         if reader.GetDimension() != 3 or reader.GetNumberOfComponents() != 1:
             raise ValueError(f"it has {reader.GetDimension()} axes of {reader.GetNumberOfComponents()} components")
+        unit = _unit(reader.GetMetaData("Unit").strip() if reader.HasMetaDataKey("Unit") else "", "field Unit")
         _check_compressed(Path(path).read_bytes())
         image = sitk.DICOMOrient(reader.Execute(), "RAS")
         direction = np.array(image.GetDirection()).reshape(3, 3)
@@ -141,7 +157,7 @@ def read_meta_image(path: str | os.PathLike[str]) -> tuple[Any, VolumeGrid]:
             raise ValueError("its axes are oblique: resample it to straight axes first")
         data = sitk.GetArrayFromImage(image).astype(np.float32)
         x, y, z = image.GetOrigin()
-        return data, _grid(data.shape, image.GetSpacing(), (-x, -y, z))
+        return data, _grid(data.shape, image.GetSpacing(), (-x, -y, z)), unit
 
 
 def _check_compressed(content: bytes) -> None:
@@ -215,8 +231,8 @@ def _ds(value: float) -> str:
     return f"{value:.10g}"
 
 
-def read_dicom(folder: str | os.PathLike[str]) -> tuple[Any, VolumeGrid]:
-    """Data ``(z, y, x)`` float32 HU and grid of a DICOM CT series in a folder.
+def read_dicom(folder: str | os.PathLike[str]) -> tuple[Any, VolumeGrid, str]:
+    """Data ``(z, y, x)`` float32, grid and unit (HU) of a DICOM CT series in a folder.
 
     Raises:
         FileNotFoundError: no such folder, or no files in it.
@@ -239,7 +255,7 @@ def read_dicom(folder: str | os.PathLike[str]) -> tuple[Any, VolumeGrid]:
                 np.array([float(v) for v in d.ImagePositionPatient]), tuple(float(v) for v in d.PixelSpacing), pixels,
             ))  # fmt: skip
     with reading(folder, "a DICOM series"):
-        return _joined(slices)
+        return *_joined(slices), "HU"
 
 
 def _joined(slices: list[Any]) -> tuple[Any, VolumeGrid]:

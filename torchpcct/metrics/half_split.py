@@ -15,6 +15,7 @@ from torch import Tensor
 from torchpcct.metrics.resolution import first_below
 from torchpcct.scan import Scan
 from torchpcct.validate import choice, whole
+from torchpcct.vector_geometry import VectorGeometry
 
 __all__ = ["HalfSplit", "half_split", "halves"]
 
@@ -169,7 +170,10 @@ def halves(scan: Scan, how: str = "views", seed: int = 0) -> tuple[Scan, Scan]:
     if scan.window is not None:
         raise ValueError("halves of a windowed scan are not provided: acquire it without region")
     if how == "views":
-        order = np.argsort(scan.geometry.angles, kind="stable")
+        angles = scan.geometry.angles
+        if isinstance(scan.geometry, VectorGeometry):  # known but for whole turns, and those of a helix differ
+            angles = np.unwrap(angles)
+        order = np.argsort(angles, kind="stable")
         if order.size < 2:
             raise ValueError("one view cannot be split")
         return _selected(scan, np.sort(order[::2])), _selected(scan, np.sort(order[1::2]))

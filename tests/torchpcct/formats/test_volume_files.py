@@ -36,6 +36,25 @@ def test_round_trip(tmp_path, name):
     np.testing.assert_allclose([*back.grid.spacing, *back.grid.center], [*GRID.spacing, *GRID.center], atol=1e-5)
 
 
+@pytest.mark.parametrize("name", ["v.nii.gz", "v.mha", "v.h5"])
+@pytest.mark.parametrize("unit", ["HU", "mm^-1"])
+def test_the_unit_comes_back(tmp_path, name, unit):
+    Volume(DATA, GRID, unit=unit).save(tmp_path / name)
+    assert Volume.load(tmp_path / name).unit == unit
+
+
+def test_units_of_other_files(tmp_path):
+    """What other software wrote is in HU; a unit that is named and not known is no HU."""
+    image = SimpleITK.GetImageFromArray(DATA.numpy())
+    SimpleITK.WriteImage(image, str(tmp_path / "foreign.mha"))
+    SimpleITK.WriteImage(image, str(tmp_path / "foreign.nii"))
+    assert [Volume.load(tmp_path / f"foreign.{end}").unit for end in ("mha", "nii")] == ["HU", "HU"]
+    image.SetMetaData("Unit", "Bq/ml")
+    SimpleITK.WriteImage(image, str(tmp_path / "pet.mha"))
+    with pytest.raises(ValueError, match="its field Unit gives the unit 'Bq/ml', expected HU or mm"):
+        Volume.load(tmp_path / "pet.mha")
+
+
 @pytest.mark.parametrize("name", [n for n in NAMES if n != "v.h5"])
 def test_other_software_sees_the_same_place(tmp_path, name):
     """The point (x, y, z) of the scanner is (−x, −y, z) in ITK, in every format, and holds the same value."""
