@@ -13,6 +13,7 @@ import torch
 from recon.fbp.coverage import centre_warnings, sampling_warnings
 from recon.fbp.inset import InsetFbp
 from recon.mbir.reconstruct import reconstruct_mbir
+from recon.metal import metal_warnings
 from recon.pwls.inset_problem import reconstruct_pwls
 from torchpcct.defects import mended
 from torchpcct.geometry import VolumeGrid
@@ -64,7 +65,7 @@ def reconstruct(
 
     Readings that no object can cause (dead or hot cells, dead views, lost readings: :mod:`torchpcct.defects`) are
     interpolated before; the report's ``warnings`` say so. FBP tests whether opposite rays agree, and warns of a wrong
-    rotation centre; PWLS and MBIR test what they leave of the data.
+    rotation centre; PWLS and MBIR test what they leave of the data. Metal is named (:mod:`recon.metal`), not corrected.
 
     The number of threads does not change a bit of an inset's FBP and PWLS. FBP of whole rows and MBIR, where torch's
     matrix products and convolutions decide about the order of sums, agree within 0.01 HU.
@@ -100,12 +101,21 @@ def reconstruct(
         volumes = reconstruct_mbir(scans, grid, progress=progress, **options)
     else:
         volumes = reconstruct_pwls(scans, grid, progress=progress, **options)
+    # MBIR says itself what lies beyond its training.
+    metal = [
+        [] if method == "mbir" or s.unit != "HU" else metal_warnings(v.data)
+        for s, v in zip(scans, volumes, strict=True)
+    ]
+    for text in {text for texts in metal for text in texts}:
+        _LOG.warning("%s", text)
     if scans[0].unit != "HU":
         mu = scans[0].linearisation.mu_ref
         volumes = [replace(v, data=from_hu(v.data, mu), unit=scans[0].unit) for v in volumes]
     volumes = [
-        replace(v, data=v.data.to(device), report={**v.report, "warnings": [*texts, *v.report.get("warnings", [])]})
-        for v, (_, texts) in zip(volumes, whole, strict=True)
+        replace(
+            v, data=v.data.to(device), report={**v.report, "warnings": [*before, *v.report.get("warnings", []), *found]}
+        )
+        for v, (_, before), found in zip(volumes, whole, metal, strict=True)
     ]
     return volumes[0] if isinstance(scan, Scan) else volumes
 

@@ -7,6 +7,8 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parent.parent
 
@@ -53,6 +55,29 @@ def test_the_version_is_the_projects():
 
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert torchpcct.__version__ == project["version"]
+
+
+MODULES = {"yaml": "pyyaml", "skimage": "scikit-image", "PIL": "pillow", "llvmlite": "numba"}
+"""Modules whose package has another name, or comes with one that pins it."""
+
+
+def test_everything_imported_is_declared_with_a_floor_that_the_constraints_keep():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    listed = [*project["dependencies"], *(r for extra in project["optional-dependencies"].values() for r in extra)]
+    requirements = [r for r in map(Requirement, listed) if r.name != "torchpcct"]
+    assert [str(r) for r in requirements if {s.operator for s in r.specifier} != {">="}] == []
+    declared = {canonicalize_name(r.name) for r in requirements}
+    own = {"torchpcct", "recon", "train"}
+    for path in (p for package in own for p in (ROOT / package).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) and node.level == 0 else []
+            for top in {n.partition(".")[0] for n in names} - own - sys.stdlib_module_names:
+                assert canonicalize_name(MODULES.get(top, top)) in declared, f"{path}: {top} is not declared"
+    pins = (Requirement(line) for line in (ROOT / "constraints.txt").read_text().splitlines() if line[:1] not in "# ")
+    tested = {canonicalize_name(r.name): next(iter(r.specifier)).version for r in pins}
+    old = [str(r) for r in requirements if not r.specifier.contains(tested.get(canonicalize_name(r.name), "9999"))]
+    assert old == []
 
 
 def test_continuous_integration_runs_the_readme():

@@ -1,4 +1,4 @@
-"""Cells that read nothing: bridged by their neighbours, so that they do not spread over the image."""
+"""Readings that say nothing: bridged by their neighbours, so that they do not spread over the image."""
 
 from __future__ import annotations
 
@@ -11,52 +11,74 @@ MOST_DEAD = 0.25
 """Largest share of a view's readings that may be dead: beyond it the neighbours say too little."""
 
 
-def bridge(lines: Tensor, dead: Tensor, rows: bool) -> Tensor:
-    """Replace dead readings by linear interpolation between the nearest live columns of the same row.
+def bridge(lines: Tensor, dead: Tensor, rows: bool, most: float = MOST_DEAD) -> Tensor:
+    """Replace dead readings by linear interpolation between the nearest live ones.
 
-    Beyond the outermost live column its value is repeated. A row without any live column is interpolated between the
-    nearest live rows.
+    Along the columns of a row where live readings stand on both sides, else along the rows; beyond the outermost live
+    column (then row) its value is repeated. Views without any live reading are interpolated between the nearest live
+    ones, in the order given.
 
     Args:
         lines: ``(..., views, [rows,] columns)``.
         dead: bool of the same shape, or one that broadcasts to it.
         rows: whether the last axis but one is the detector's rows (cone beams), so that a lost row can be bridged.
+        most: largest share of a view's readings that may be dead; 1: any, as long as a reading is left.
 
     Returns:
         Tensor of the shape and dtype of ``lines``: linear in the live readings, differentiable, and independent of
         what the dead ones hold.
 
     Raises:
-        ValueError: a view of which more than :data:`MOST_DEAD` is dead.
+        ValueError: a view of which more than ``most`` is dead; no live reading at all.
     """
     dead = dead.expand(lines.shape)
     axes = (-2, -1) if rows else (-1,)
     share = dead.float().mean(axes)
-    if float(share.max()) > MOST_DEAD:
+    if float(share.max()) > most:
         worst = torch.unravel_index(share.argmax(), share.shape)
         raise ValueError(
             f"{100 * float(share.max()):.0f} % of the readings of view {int(worst[-1])} are dead (NaN, Inf or masked), "
-            f"at most {100 * MOST_DEAD:.0f} % can be bridged: leave bad views out with geometry.select"
+            f"at most {100 * most:.0f} % can be bridged: leave bad views out with geometry.select"
         )
-    touched = dead.any(-1)
-    filled = lines.clone()
-    filled[touched] = _between(lines[touched], dead[touched], -1)
-    lost = dead.all(-1, keepdim=True)
-    if rows and bool(lost.any()):
-        filled = torch.where(lost, _between(filled, lost.expand(lines.shape), -2), filled)
-    return filled
+    if bool(dead.all()):
+        raise ValueError("no live reading is left: the scan cannot be used")
+    # What a dead cell holds must not reach anything, not as 0 × NaN either.
+    values = torch.where(dead, 0.0, lines)
+    across = ((-1, True), (-2, True), (-1, False), (-2, False)) if rows else ((-1, True), (-1, False))
+    view = -3 if rows else -2
+    for axis, between in (*across, (view, True), (view, False)):
+        if not bool(dead.any()):
+            break
+        values, dead = _bridged(values, dead, axis, between)
+    return values
 
 
-def _between(values: Tensor, dead: Tensor, axis: int) -> Tensor:
-    """Linear interpolation over the dead along one axis; lines without any live value become 0."""
+def _bridged(values: Tensor, dead: Tensor, axis: int, between: bool) -> tuple[Tensor, Tensor]:
+    """Linear interpolation over the dead along one axis, and what stays dead.
+
+    Args:
+        values: any shape, finite.
+        dead: of the same shape.
+        axis: of both.
+        between: only between two live readings; else beyond the outermost live one, too, which is repeated there.
+    """
     n = values.shape[axis]
-    values, dead = values.movedim(axis, -1), dead.movedim(axis, -1)
-    place = torch.arange(n, device=values.device).expand(values.shape)
-    left = torch.where(dead, -1, place).cummax(-1).values
-    right = torch.where(dead, n, place).flip(-1).cummin(-1).values.flip(-1)
-    left, right = torch.where(left < 0, right, left), torch.where(right == n, left, right)
+    values, dead = values.movedim(axis, -1), dead.movedim(axis, -1).clone()
+    touched = dead.any(-1) & ~dead.all(-1)
+    lost = dead[touched]
+    place = torch.arange(n, device=values.device).expand(lost.shape)
+    left = torch.where(lost, -1, place).cummax(-1).values
+    right = torch.where(lost, n, place).flip(-1).cummin(-1).values.flip(-1)
+    if between:
+        reached = lost & (left >= 0) & (right < n)
+        left, right = left.clamp(min=0), right.clamp(max=n - 1)
+    else:
+        reached = lost
+        left, right = torch.where(left < 0, right, left), torch.where(right == n, left, right)
     share = (place - left) / (right - left).clamp(min=1)
-    clean = torch.where(dead, 0.0, values)  # what a dead cell holds must not reach anything, not as 0 × NaN either
-    left, right = left.clamp(0, n - 1), right.clamp(0, n - 1)
-    filled = torch.lerp(clean.gather(-1, left), clean.gather(-1, right), share.to(values.dtype))
-    return torch.where(dead, filled, clean).movedim(-1, axis)
+    old = values[touched]
+    filled = torch.lerp(old.gather(-1, left), old.gather(-1, right), share.to(values.dtype))
+    out = values.clone()
+    out[touched] = torch.where(reached, filled, old)
+    dead[touched] = lost & ~reached
+    return out.movedim(-1, axis), dead.movedim(-1, axis)

@@ -1,4 +1,4 @@
-"""Readings that cannot be: dead and hot cells, dead columns and views, single lost readings; found, masked, filled.
+"""Readings that cannot be: dead and hot cells, dead columns and views, single lost readings; found, masked, bridged.
 
 A reading of 0 where hundreds are expected has the logarithm of a ray through lead, and FBP draws it as a streak or a
 ring of thousands of HU. It cannot be noise: the Poisson probability of 0 at an expectation of 30 is 1e-13. Metal can
@@ -16,10 +16,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchpcct.dead_cells import bridge
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.scan import Scan
 
-__all__ = ["Defects", "filled", "find_defects", "mended"]
+__all__ = ["Defects", "find_defects", "mended"]
 
 BRIGHT = 30.0
 """Expected readings from which 0 cannot be noise (probability 1e-13)."""
@@ -169,47 +170,6 @@ def _isolated(n: NDArray[Any], zero: NDArray[np.bool_], reach: int = 1) -> NDArr
     return out
 
 
-def filled(lines: Tensor, mask: Tensor) -> Tensor:
-    """Line integrals with the masked ones interpolated.
-
-    Linear along the columns of a row where good readings stand on both sides, else along the rows, else along the
-    views (in the order given, around the turn); at an edge the nearest good reading.
-
-    Args:
-        lines: ``(views, rows, columns)``.
-        mask: the same shape, True where a reading is to be replaced.
-
-    Raises:
-        ValueError: shapes that differ; no good reading at all.
-    """
-    if lines.shape != mask.shape or lines.ndim != 3:
-        raise ValueError(f"lines and mask must have one shape, got {tuple(lines.shape)} and {tuple(mask.shape)}")
-    values, bad = lines.detach().cpu().numpy().copy(), mask.cpu().numpy().copy()
-    if bad.all():
-        raise ValueError("no good reading is left: the scan cannot be used")
-    for axis, both in ((2, True), (1, True), (0, True), (2, False), (1, False), (0, False)):
-        if not bad.any():
-            break
-        moved, wrong = np.moveaxis(values, axis, -1), np.moveaxis(bad, axis, -1)
-        touched = np.nonzero(wrong.any(-1) & ~wrong.all(-1))
-        v, w = moved[touched], wrong[touched]
-        place = np.arange(v.shape[-1])
-        before = np.maximum.accumulate(np.where(w, -1, place), -1)
-        after = np.minimum.accumulate(np.where(w, v.shape[-1], place)[:, ::-1], -1)[:, ::-1]
-        if both:
-            usable = w & (before >= 0) & (after < v.shape[-1])
-        else:
-            usable = w
-            before = np.where(before < 0, after, before)
-            after = np.where(after == v.shape[-1], before, after)
-        line, k = np.nonzero(usable)
-        b, a = before[line, k], after[line, k]
-        share = (k - b) / np.maximum(a - b, 1)
-        v[line, k] = (1 - share) * v[line, b] + share * v[line, a]
-        moved[touched], wrong[touched] = v, w & ~usable
-    return torch.from_numpy(values).to(lines)
-
-
 def mended(scan: Scan) -> tuple[Scan, list[str]]:
     """A counting scan whose impossible readings are replaced, and what was done.
 
@@ -232,5 +192,5 @@ def mended(scan: Scan) -> tuple[Scan, list[str]]:
         return scan, []
     air = scan._at_window(scan.air)
     lines = torch.log(air) - torch.log(scan.counts + 0.5)
-    replaced = (air * torch.exp(-filled(lines, found.mask)) - 0.5).clamp_min(0.0)
+    replaced = (air * torch.exp(-bridge(lines, found.mask, rows=True, most=1.0)) - 0.5).clamp_min(0.0)
     return replace(scan, counts=torch.where(found.mask, replaced, scan.counts)), [found.text]

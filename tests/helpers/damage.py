@@ -1,7 +1,8 @@
 """Files that went wrong: cut off, bits flipped, sections swapped or zeroed; and what a reader makes of them.
 
 As a program it reads damaged copies of one file in a process of its own, so that a crash or a hang is seen from
-outside: ``python damage.py READER FOLDER COPIES`` prints a JSON object of outcomes.
+outside: ``python damage.py READER FOLDER COPIES [SECONDS [SEED]]`` prints a JSON object of outcomes. With SECONDS it
+stops when they are over; COPIES is then the largest number.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import math
 import shutil
 import signal
 import sys
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -225,14 +227,17 @@ def _hang(*_: Any) -> None:
     raise _Slow
 
 
-def outcomes(name: str, folder: Path, copies: int, seed: int = 0) -> dict[str, int]:
+def outcomes(name: str, folder: Path, copies: int, seed: int = 0, seconds: float = math.inf) -> dict[str, int]:
     """How often each of ``same``, ``other`` (data that a format without checksum cannot tell from true ones),
-    ``refused`` (a clear error) and anything worse, by its name."""
+    ``refused`` (a clear error) and anything worse, by its name and the number of the copy."""
     path, read = READERS[name](folder)
     content, truth = path.read_bytes(), read()
     found: collections.Counter[str] = collections.Counter()
     signal.signal(signal.SIGALRM, _hang)
-    for broken in damaged(content, copies, seed):
+    end = time.monotonic() + seconds
+    for k, broken in enumerate(damaged(content, copies, seed)):
+        if time.monotonic() > end:
+            break
         path.write_bytes(broken)
         signal.alarm(SECONDS)
         try:
@@ -240,9 +245,9 @@ def outcomes(name: str, folder: Path, copies: int, seed: int = 0) -> dict[str, i
                 warnings.simplefilter("ignore")
                 found["same" if _same(truth, read()) else "other"] += 1
         except (ValueError, TypeError, FileNotFoundError) as error:
-            found["refused" if len(str(error)) > 10 else f"says nothing: {error!r}"] += 1
+            found["refused" if len(str(error)) > 10 else f"copy {k} says nothing: {error!r}"] += 1
         except Exception as error:
-            found[f"{type(error).__name__}: {str(error)[:200]}"] += 1
+            found[f"copy {k}, {type(error).__name__}: {str(error)[:200]}"] += 1
         finally:
             signal.alarm(0)
     path.write_bytes(content)
@@ -250,8 +255,9 @@ def outcomes(name: str, folder: Path, copies: int, seed: int = 0) -> dict[str, i
 
 
 if __name__ == "__main__":
-    reader, where, number = sys.argv[1:]
+    reader, where, number, *limits = sys.argv[1:]
+    limit, first = (float(limits[0]) if limits else math.inf), (int(limits[1]) if limits[1:] else 0)
     made = Path(where)
     shutil.rmtree(made, ignore_errors=True)
     made.mkdir(parents=True)
-    print(json.dumps(outcomes(reader, made, int(number))))
+    print(json.dumps(outcomes(reader, made, int(number), first, limit)))

@@ -24,7 +24,9 @@ TINY: dict[str, dict[str, Any]] = {
         "views": 96, "realizations": 2, "map_mm": 12.0, "cause_views": 24, "histories": 20_000, "plaque_views": 40,
         "plaque_doses": (2.0,), "plaque_realizations": 4,
     },
-    "hardcases": {"views": 120, "cases": ("sound", "dead-column", "centre-2", "three-views"), "methods": ("fbp",)},
+    "hardcases": {
+        "views": 120, "cases": ("sound", "dead-column", "centre-2", "three-views", "metal"), "methods": ("fbp",),
+    },
     "motion": {
         "thinning": 24, "fractions": (0.2, 1.0), "eid_fractions": (0.2,), "errors": (0.2,), "voxel_mm": 0.4,
         "realizations": 1, "exposure_s": 20.0, "methods": ("fbp", "pwls"),

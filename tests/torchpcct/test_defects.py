@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchpcct import ConeBeam, Scan, full_turn
-from torchpcct.defects import filled, find_defects, mended
+from torchpcct.defects import find_defects, mended
 from torchpcct.scanner.linearisation import WaterLinearisation
 
 VIEWS, ROWS, COLUMNS = 90, 6, 60
@@ -86,22 +86,6 @@ def test_cells_are_followed_through_a_window(counts):
     found = find_defects(torch.where(bad, 0.0, part), AIR, first)
     assert torch.equal(found.mask, bad)
     assert (found.dead_cells, found.lost_readings) == (1, 0)
-
-
-def test_filling_is_exact_for_linear_data():
-    v, r, c = np.meshgrid(np.arange(9.0), np.arange(5.0), np.arange(11.0), indexing="ij")
-    lines = torch.from_numpy(1 + 0.1 * v - 0.2 * r + 0.05 * c)
-    mask = torch.zeros(lines.shape, dtype=torch.bool)
-    mask[:, :, 4:6] = mask[3] = mask[:, 2] = True
-    broken = torch.where(mask, 1e9, lines)
-    torch.testing.assert_close(filled(broken, mask), lines)
-    # Nothing on one side: the nearest.
-    mask[:] = False
-    mask[:, :, 0] = mask[0] = True
-    full = filled(torch.where(mask, 1e9, lines), mask)
-    torch.testing.assert_close(full[1:, :, 0], lines[1:, :, 1])
-    with pytest.raises(ValueError, match="no good reading"):
-        filled(lines, torch.ones_like(mask))
 
 
 def test_a_scan_is_mended_and_says_so(counts):

@@ -1,7 +1,8 @@
 """The hard cases: each makes something of a sound scan that happens in practice, and says what a result must be.
 
-A case that leaves the information in the data (some dead cells, a short scan) has a right answer: that of the sound
-scan, up to noise. One that makes the scan's description wrong (centre, gain) has none; it must be noticed.
+Some change the scan, others what is scanned (metal, a calcification, a large patient). A case that leaves the
+information in the data (some dead cells, a short scan) has a right answer: that of the sound scan, up to noise. One
+that makes the scan's description wrong (centre, gain) has none; it must be noticed.
 """
 
 from __future__ import annotations
@@ -11,10 +12,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy import ndimage
 
+from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
+from torchpcct.scene import Body, EllipticCylinder, Scene
+from torchpcct.scene.plaque import Plaque, plaque_scene
+from torchpcct.scene.plaque.variants import calcification_bodies, stent_bodies
 
-__all__ = ["CASES", "Case"]
+__all__ = ["CASES", "Case", "untouched"]
 
 
 @dataclass(frozen=True)
@@ -24,12 +31,35 @@ class Case:
     Args:
         title: what is wrong with the scan, a table's cell.
         apply: the noise-free scan, its noisy realisation and a random generator, to the scan that is reconstructed.
-        noise: the best that any method can do, as noise over that of the sound scan: lost quanta are lost.
+        noise: the best that any method can do, as noise over that of the sound scan: lost quanta are lost. What a
+            larger body takes comes on top of it.
+        scene: the scene around a plaque, if it is another one than the sound scan's; ``apply`` then gets scans of it.
+            What it adds to the plaque's own bodies, and the voxels beside that, are left out of the errors.
     """
 
     title: str
     apply: Callable[[Scan, Scan, np.random.Generator], Scan]
     noise: float = 1.0
+    scene: Callable[[Plaque], Scene] | None = None
+
+
+def untouched(scene: Scene, plaque: Plaque, grid: VolumeGrid) -> NDArray[np.bool_]:
+    """Voxels that no body which ``scene`` has beyond those of the plaque touches, nor a neighbour of theirs.
+
+    Args:
+        scene: of a case.
+        plaque: in it.
+        grid: ``(z, y, x)``.
+
+    Returns:
+        ``grid.shape``, True where the case shows what the sound scan does.
+    """
+    own = set(plaque_scene(plaque)[0].names)
+    added = [k for k, name in enumerate(scene.names) if name not in own]
+    if not added:
+        return np.ones(grid.shape, dtype=bool)
+    share = scene.volume_fractions(grid)[added].sum(0)
+    return ~np.asarray(ndimage.binary_dilation(share > 0, np.ones((3, 3, 3))))
 
 
 def _lost(share: float) -> Case:
@@ -148,6 +178,34 @@ def _without(gaps: tuple[tuple[float, float], ...]) -> Callable[[int], np.ndarra
     return keep
 
 
+def _scanned(title: str, scene: Callable[[Plaque], Scene]) -> Case:
+    return Case(title, lambda clean, scan, rng: scan, scene=scene)
+
+
+def _beside(material: str, diameter: float) -> Callable[[Plaque], Scene]:
+    """A rod of metal along the vessel, 1 mm of fat between the two."""
+
+    def scene(plaque: Plaque) -> Scene:
+        away = (-(plaque.vessel_diameter / 2 + 1.0 + diameter / 2), 0.0, 0.0)
+        place = tuple(plaque.to_scanner(away).tolist())
+        rod = EllipticCylinder(diameter / 2, 0.49 * plaque.vessel_length, position=place)
+        return plaque_scene(plaque, extra=(Body("implant", rod, material, "patient"),))[0]
+
+    return scene
+
+
+def _stented(plaque: Plaque) -> Scene:
+    return plaque_scene(plaque, extra=stent_bodies(plaque, rings=4))[0]
+
+
+def _calcified(plaque: Plaque) -> Scene:
+    return plaque_scene(plaque, extra=calcification_bodies(plaque))[0]
+
+
+def _large(plaque: Plaque) -> Scene:
+    return plaque_scene(plaque, patient_diameter=500.0)[0]
+
+
 CASES: dict[str, Case] = {
     "sound": Case("nothing", lambda clean, scan, rng: scan),
     "dose-100th": Case("1/100 of the dose", _hundredth, 10.0),
@@ -180,5 +238,10 @@ CASES: dict[str, Case] = {
     "bowtie": Case("bowtie 1 mm beside its calibration", _bowtie),
     "truncated": Case("columns cut off inside of the inset's shadow", _narrow),
     "gain-drift": Case("gain drifts by 1 %", _drift),
+    "calcification": _scanned("a calcification of 1500 HU beside the lumen", _calcified),
+    "stent": _scanned("a stent in the lumen", _stented),
+    "metal": _scanned("a titanium rod of 1.2 mm beside the vessel", _beside("titanium", 1.2)),
+    "dynamic-range": _scanned("a tungsten rod of 1.2 mm: readings of 1e-6 of those in air", _beside("tungsten", 1.2)),
+    "large-body": _scanned("a body of 50 cm", _large),
 }
 """Name → case. A new one needs nothing but its entry here."""

@@ -13,7 +13,6 @@ from analytic import Ellipsoid, Gaussian, line_integrals
 from recon.fbp.angular_weights import angular_weights, is_offset, offset_share
 from recon.fbp.detector_edges import Rows, continued, cut_off
 from recon.fbp.fbp import fbp
-from torchpcct.dead_cells import bridge
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
 
 MU = 0.02
@@ -154,20 +153,3 @@ def test_a_dead_column_stays_one_column(bad):
         value, inside = truth_and_inside(GRID)
         rms = np.sqrt(np.mean((image.numpy() - value)[inside] ** 2)) / MU
         assert rms < 0.003
-
-
-def test_bridging_is_linear_and_knows_nothing_of_the_dead():
-    ramp = 2.0 * torch.arange(9.0) + torch.arange(4.0)[:, None] * 5 + torch.arange(3.0)[:, None, None]
-    dead = torch.zeros(3, 4, 9, dtype=torch.bool)
-    dead[1, :, 4:6] = True
-    dead[2, 1] = True  # a whole row
-    broken = torch.where(dead, math.nan, ramp)
-    torch.testing.assert_close(bridge(broken, dead, rows=True), ramp)
-    edge = torch.where(torch.arange(9) < 2, math.inf, ramp[0])
-    torch.testing.assert_close(bridge(edge, torch.arange(9) < 2, rows=True)[:, :2], ramp[0, :, 2:3].expand(-1, 2))
-    x = broken.double().requires_grad_()
-    (gradient,) = torch.autograd.grad(bridge(x, dead, rows=True).sum(), x)
-    assert gradient[dead].abs().max() == 0
-    assert float(gradient.sum()) == dead.numel()
-    with pytest.raises(ValueError, match="100 % of the readings of view 2 are dead"):
-        bridge(ramp, (torch.arange(3) == 2)[:, None, None], rows=True)
