@@ -5,9 +5,10 @@ With P the probability that the core is there, and x₀ the plain reconstruction
 
     T = P · (with the core) + (1 − P) · (without it, but in its fibrous layer x₀)
 
-and the network reconstructs what T leaves of the data: u = T + MBIR(β − H T). So outlines are sharp and a proven core
-has its full contrast; what is not proven stays as the plain reconstruction shows it, and what the model does not have
-(a branch, muscle, texture) comes from the data as ever. The low frequencies are the data's own in both parts.
+and the network reconstructs what T leaves of the data: u = T + MBIR(β − H T). So outlines are sharp, and a proven core
+has its full contrast. The less a core is proven, the more the plain reconstruction stands in the layer; in between the
+contrast is shrunk, as a mean over two explanations is. What the model does not have (a branch, muscle, texture) comes
+from the data as ever, and the low frequencies are the data's own in both parts.
 
 A vessel that the model does not fit (its residual exceeds what noise leaves) is left to the plain reconstruction.
 """
