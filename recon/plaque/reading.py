@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from recon.plaque.core import CorePrior, CoreSpace
 from recon.plaque.data import TissueData
@@ -129,6 +130,8 @@ def read_regions(regions: Mapping[str, Any], volume: Any) -> dict[str, float]:
     return found
 
 
+# Many small matrices: BLAS threads wait for each other three times longer than one thread computes.
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def read_plaque(
     data: TissueData,
     point: Any = None,
