@@ -285,7 +285,8 @@ def summary(work: Path) -> dict[str, Any]:
             told = float(np.mean([d["figures"][name]["sd"] for d in read]))
             entry["figures"][name] = _spread(values, exact) | {"coverage": _share(inside, len(read)), "told_sd": told}
             for other in ("fbp", "mbir", "fbp_thresholds"):
-                beside = [(d[other][name], t) for d, t in zip(read, exact, strict=True) if name in d.get(other, {})]
+                pairs = [(d.get(other, {}).get(name, np.nan), t) for d, t in zip(read, exact, strict=True)]
+                beside = [pair for pair in pairs if np.isfinite(pair[0])]  # thresholds can lose the edges
                 if len(beside) > 1:
                     entry["figures"][name][other] = _spread(*np.array(beside).T)
         if absent:
