@@ -232,7 +232,7 @@ def _method_options(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
-    _method_options(arguments)
+    options = _method_options(arguments)
     if arguments.out is None:
         arguments.out = Path(f"{without_ending(arguments.scan)}_{arguments.method}.nii.gz")
     require_folder(arguments.out)
@@ -266,7 +266,6 @@ def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         scan = cleaned(scan)
     grid = _grid(scan, arguments)
     _require_voxels(grid.shape)
-    options = _method_options(arguments)
     config = {
         "scan": str(arguments.scan), "geometry": geometry_values(scan.geometry), "method": arguments.method,
         "grid": {"shape": list(grid.shape), "spacing": list(grid.spacing), "center": list(grid.center)},

@@ -7,12 +7,13 @@ over the same extent and averaged onto the grid that was asked for. Weights and 
 
 from __future__ import annotations
 
+import copy
 import logging
 import math
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -24,7 +25,7 @@ from recon.mbir.unrolled import DEFAULT_LOOK, Unrolled, look_frequency
 from recon.mbir.weights_io import read_tensors
 from recon.pwls.inset_problem import InsetProblem
 from torchpcct.geometry import VolumeGrid
-from torchpcct.volume import to_hu
+from torchpcct.volume import from_hu, to_hu
 
 __all__ = ["Mbir", "Solution", "average_onto", "working_grid"]
 
@@ -130,6 +131,23 @@ class Mbir:
         """HU of volumes in noise units."""
         scale = normal.scale_hu.reshape(-1, 1, 1, 1) * (problem.mu_ref / 1000.0)
         return to_hu(u * scale + problem.level, problem.mu_ref)
+
+    @staticmethod
+    def in_noise_units(problem: InsetProblem, hu: Tensor, normal: NormalisedProblem) -> Tensor:
+        """The inverse of :meth:`in_hu`."""
+        scale = normal.scale_hu.reshape(-1, 1, 1, 1) * (problem.mu_ref / 1000.0)
+        return (from_hu(hu, problem.mu_ref) - problem.level) / scale
+
+    def looking(self, look: float) -> Self:
+        """The same method with another look.
+
+        Raises:
+            ValueError: a look outside of 0 … 1.
+        """
+        look_frequency(look)
+        other = copy.copy(self)
+        other.look = look
+        return other
 
     @torch.no_grad()
     def noise_map(self, problem: InsetProblem, b: Tensor, exposure_s: float, draws: int = 8, seed: int = 0) -> Tensor:

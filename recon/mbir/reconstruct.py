@@ -69,7 +69,7 @@ def reconstruct_mbir(
     start = time.perf_counter()
     network = network or Mbir.load()
     if look is not None:
-        network = Mbir(network.model, look, **network.parts)
+        network = network.looking(look)
     if point is not None and not tissues:
         raise ValueError("point says where a plaque is: give it with tissues=True")
     if tissues:

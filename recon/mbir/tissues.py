@@ -66,11 +66,10 @@ class TissueMbir(Mbir):
             if reading.warnings:
                 notes.append(_unused(f"the fitted tissues were not used: {reading.warnings[0]}"))
                 continue
-            scale = float(normal.scale_hu[k])
-            image = (_tissues(reading, volumes[k]) / 1000.0 + 1.0) * problem.mu_ref - problem.level
-            drawn = (image * (1000.0 / problem.mu_ref / scale)).to(u)[None]
-            one = replace(normal, scale_hu=normal.scale_hu[k : k + 1], factor=normal.factor[k : k + 1])
-            left = replace(one, beta=normal.beta[k : k + 1] - one.apply(drawn))
+            it = slice(k, k + 1)
+            one = replace(normal, beta=normal.beta[it], scale_hu=normal.scale_hu[it], factor=normal.factor[it])
+            drawn = self.in_noise_units(problem, _tissues(reading, volumes[k])[None], one)
+            left = replace(one, beta=one.beta - one.apply(drawn))
             u[k] = (drawn + self.model(left, self.look, **self.parts))[0]
             notes.append({"tissues": {"used": True, "presence": reading.presence, "chi2": reading.chi2,
                                       "calcifications": reading.calcifications}})  # fmt: skip

@@ -23,7 +23,7 @@ _COLORS = {
     "linear": "tab:brown", "linear_z": "tab:cyan", "linear_z_added": "tab:blue", "quadratic": "tab:olive",
     "qggmrf": "tab:green", "tv": "tab:purple", "fbp_cnn": "tab:pink", "mbir_viewing": "gold", "mbir": "tab:red",
     "mbir_measuring": "tab:orange", "mbir_no_cnn": "black", "mbir_one_step": "tab:gray",
-    "mbir_free": "silver",
+    "mbir_free": "silver", "mbir_tissues": "magenta",
 }  # fmt: skip
 """What is drawn; methods that are told a wrong noise are not."""
 

@@ -42,8 +42,6 @@ from recon.study.dose_factor.settings import (
     IMAGE_METHODS,
     LINEAR_METHODS,
     MAIN_SCENES,
-    SLOW_METHODS,
-    TISSUE_METHODS,
     Settings,
     fbp_label,
     with_twin,
@@ -290,7 +288,7 @@ class _Study:
                 m.volumes[key] = m.samples[key].pop("first")
             spent += sum(float(p["seconds"]) for p in pieces)
         m.seconds[method.name] = spent / (sum(count.values()) * len(s.doses))
-        if s.responses and method.name not in (*SLOW_METHODS, *TISSUE_METHODS):
+        if s.responds(method.name):
             for k, dose in enumerate(s.doses):
                 self.report(f"{method.name}: its own control", k / len(s.doses))
                 found = self._response(method, dose)

@@ -225,6 +225,10 @@ class Settings(StudySettings):
         """The same in a further scene or vessel."""
         return min(self.scene_n, TWIN_REALIZATIONS // 2) if method in TISSUE_METHODS else self.scene_n
 
+    def responds(self, method: str) -> bool:
+        """Whether a method is controlled by its own linear response."""
+        return self.responses and method not in (*LINEAR_METHODS, *SLOW_METHODS, *TISSUE_METHODS)
+
     def blocks(self, n: int) -> list[range]:
         """Realisations of every piece."""
         return [range(k, min(k + self.block, n)) for k in range(0, n, self.block)]
@@ -233,12 +237,9 @@ class Settings(StudySettings):
         """Rough time in s of each part on two idle cores, nothing finished yet."""
         share = self.views / paper.FULL_VIEWS["PCCT"]
         further = sum(len(with_twin(name)) for name in self.scenes)
-        places, twins = len(self.scenes) + len(self.vessels), min(self.scene_n, TWIN_REALIZATIONS)
-        extra = {
-            name: places * len(self.scene_doses) * (self.scene_realizations(name) + twins + _RESPONSE_VOLUMES)
-            for name in self.scene_methods if name not in LINEAR_METHODS
-        }  # fmt: skip
-        controlled = self.responses * len(self.doses) * _RESPONSE_VOLUMES
+        places = (len(self.scenes) + len(self.vessels)) * len(self.scene_doses)
+        here = {name: self.scene_realizations(name) for name in self.scene_methods if name not in LINEAR_METHODS}
+        extra = {name: places * (n + min(n, TWIN_REALIZATIONS) + _RESPONSE_VOLUMES) for name, n in here.items()}
         drawn = 0 if self.fast_noise else self.n * len(self.doses)
         on_images = bool(set(self.methods) & set(IMAGE_METHODS))
         images = min(self.n, self.slow_n) * len(self.doses) if on_images else 0
@@ -251,7 +252,7 @@ class Settings(StudySettings):
         for name in self.methods:
             scenes = 2 * self.realizations(name) + 2 * min(self.n, self.slow_n)
             volumes = len(self.doses) * (1 if name in LINEAR_METHODS else scenes)
-            own = controlled if self.realizations(name) == self.n and name not in LINEAR_METHODS else 0
+            own = len(self.doses) * _RESPONSE_VOLUMES if self.responds(name) else 0
             parts[name] = (volumes + own + extra.get(name, 0)) * _SECONDS[name]
         return parts
 

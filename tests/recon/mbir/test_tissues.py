@@ -132,6 +132,16 @@ def test_from_a_scan(clean, problem, caplog):
     assert "no tissues were fitted" in caplog.text
 
 
+def test_another_look_keeps_the_tissues_and_noise_units_are_the_inverse_of_hu(drawn, network, truth):
+    method = TissueMbir(network, (0.0, 0.0, 1.0)).looking(1.0)
+    assert isinstance(method, TissueMbir)
+    assert (method.look, method.point) == (1.0, (0.0, 0.0, 1.0))
+    assert network.look != 1.0
+    normal = network.problem(drawn, statistic(drawn, truth, 1), 1.0)
+    back = method.in_hu(drawn, method.in_noise_units(drawn, truth[None], normal), normal)
+    assert torch.allclose(back[0], truth, atol=1e-3)
+
+
 def test_refusals(clean, problem):
     with pytest.raises(ValueError, match="tissues=True"):
         reconstruct(clean, GRID, "mbir", point=(0, 0, 0))
