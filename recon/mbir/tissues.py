@@ -2,10 +2,10 @@
 
 The vessel's outlines and tissue values are fitted to the data (:mod:`recon.plaque`), with a plaque's core and without.
 The tissues' image T has the core where the reading claims one: it is there with a probability of
-:data:`recon.plaque.reading.CERTAIN`, and the interval of its contrast does not hold 0. Otherwise T is the vessel without
-a core, and in the fibrous layer it is the plain reconstruction: what is not proven is neither drawn nor wiped out. (The
-mean over both explanations, weighted by their probability, has 4 % less error in the vessel, but shrinks small cores:
-slope .53 instead of .65 on held-out plaques at 0.35 s.) The network reconstructs what T leaves of the data,
+:data:`recon.plaque.reading.CERTAIN`, and the interval of its contrast does not hold 0. Otherwise T is the vessel
+without a core, and in the fibrous layer it is the plain reconstruction: what is not proven is neither drawn nor wiped
+out. (The mean of both explanations, weighted by their probability, has 4 % less error in the vessel, but shrinks small
+cores: slope .53 instead of .65 on held-out plaques at 0.35 s.) The network reconstructs what T leaves of the data,
 u = T + MBIR(β − H T): outlines are sharp, a proven core has its contrast, and what the model does not have (a branch,
 muscle, texture) comes from the data as ever; the low frequencies are the data's own in both parts.
 

@@ -45,3 +45,17 @@ def test_what_the_inset_holds_stays_its_own(lines):
     own = projector(ball)
     error = holding - plain - own
     assert abs(float(error.mean())) < 0.03 * float(own.mean())
+
+
+def test_views_are_joined_where_there_are_enough_of_them():
+    """As many as the voxels of the field need, π R / size; views out of order stay single."""
+    from dataclasses import replace
+
+    from recon.pwls.surround import _joined_views
+
+    dense = ConeBeam(full_turn(1968), 626.0, 1098.0, 1500, 8, (0.5, 0.35), detector="curved")
+    assert dense.fov_radius == pytest.approx(148.2, abs=0.1)
+    assert (_joined_views(dense, 0.6), _joined_views(dense, 1.2)) == (2, 4)
+    assert _joined_views(replace(dense, angles=full_turn(1969)), 0.6) == 1
+    mixed = np.concatenate([full_turn(1968)[::2], full_turn(1968)[1::2]])
+    assert _joined_views(replace(dense, angles=mixed), 0.6) == 1
