@@ -184,7 +184,7 @@ def _joined_views(g: ConeBeam, size: float) -> int:
     steps = np.diff(g.angles)
     if not np.allclose(steps, steps.mean(), rtol=0.0, atol=1e-6):
         return 1
-    needed = math.pi * g.fov_radius / size * (g.angles[-1] - g.angles[0] + steps.mean()) / (2 * math.pi)
+    needed = 0.9 * math.pi * g.fov_radius / size * (g.angles[-1] - g.angles[0] + steps.mean()) / (2 * math.pi)
     most = max(int(g.views / max(abs(needed), 1.0)), 1)
     return max(k for k in range(1, most + 1) if g.views % k == 0)
 

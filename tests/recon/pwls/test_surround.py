@@ -48,7 +48,7 @@ def test_what_the_inset_holds_stays_its_own(lines):
 
 
 def test_views_are_joined_where_there_are_enough_of_them():
-    """As many as the voxels of the field need, π R / size; views out of order stay single."""
+    """About as many as the voxels of the field need, π R / size; views out of order stay single."""
     from dataclasses import replace
 
     from recon.pwls.surround import _joined_views
