@@ -19,13 +19,18 @@ def execute(path: Path, quick: bool, timeout: int = 7200) -> float:
     """Run one notebook in its own folder and write it back whole; returns the time in s.
 
     Raises:
+        ValueError: a full run of a notebook that has no switch ``QUICK``.
         nbclient.exceptions.CellExecutionError: a cell failed; the file is left as it was.
     """
     start = time.perf_counter()
     notebook = nbformat.read(path, as_version=4)
+    found = 0
     for cell in notebook.cells:
-        if "parameters" in cell.metadata.get("tags", ()):
-            cell.source = PARAMETER.sub(f"QUICK = {quick}", cell.source)
+        if cell.cell_type == "code":
+            cell.source, count = PARAMETER.subn(f"QUICK = {quick}", cell.source)
+            found += count
+    if not quick and not found:
+        raise ValueError(f"{path} has no line QUICK = True in a code cell, so there is no full run of it")
     folder = {"metadata": {"path": str(path.resolve().parent)}}
     NotebookClient(notebook, timeout=timeout, kernel_name="python3", resources=folder, record_timing=False).execute()
     # What depends on the machine says nothing to the reader and would change with every run.

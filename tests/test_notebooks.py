@@ -91,3 +91,14 @@ def test_benchmark_runs(tmp_path):
     assert "draws put MBIR at" in text
     # Away from the repository there is no full study to quote.
     assert "There is no `notebooks/dose_factor/report.json` here" in text
+
+
+def test_a_full_run_is_a_full_run(tmp_path):
+    """The switch is found in the cell itself: a tag once was lost, and ``--full`` ran the quick version."""
+    path = tmp_path / "small.ipynb"
+    for source, message in (("QUICK = True\nassert not QUICK", ""), ("quick = True", "no line QUICK = True")):
+        nbformat.write(nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(source)]), path)
+        command = [sys.executable, FOLDER / "execute.py", "--full", path]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+        assert (done.returncode == 0) == (not message), done.stderr
+        assert message in done.stderr
