@@ -372,10 +372,10 @@ def picture(result: dict[str, Any]) -> Any:
     axes[0].axvline(0.0, color="0.6", lw=0.8)
     axes[0].set_yticks(range(len(cases)), [f"{c['case']} ({c['n']})" for c in cases])
     axes[0].set_xlabel("contrast, error in HU: bias ± SD")
-    axes[0].legend(fontsize=8)
+    axes[0].legend(fontsize=8, loc="lower right")
     axes[1].axvline(0.95, color="0.6", lw=0.8)
     axes[1].set_yticks([])
-    axes[1].set_xlabel("contrast: coverage of 95 % intervals")
+    axes[1].set_xlabel("coverage of 95 % intervals")
     for ax in axes:
         ax.invert_yaxis()
     return figure

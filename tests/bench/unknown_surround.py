@@ -159,19 +159,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--draws", type=int, default=8)
     parser.add_argument("--views", type=int, default=1968)
-    parser.add_argument("--patients", nargs="*", metavar="NAME")
+    parser.add_argument("--patients", nargs="*", metavar="NAME", help="only these; the file keeps the others")
     parser.add_argument("--out", type=Path, default=Path("tests/bench/unknown_surround.json"))
     options = parser.parse_args()
     torch.set_num_threads(1)
     logging.disable(logging.WARNING)
-    found: dict[str, Any] = {"views": options.views, "draws": options.draws, "exposure_s": DOSE, "threads": 1}
+    found: dict[str, Any] = json.loads(options.out.read_text(encoding="utf-8")) if options.out.exists() else {}
+    found |= {"exposure_s": DOSE, "threads": 1}
     for name, patient in patients().items():
         if options.patients and name not in options.patients:
             continue
-        found[name] = measured(Ways(*patient, options.views), options.draws)
-        print(name, json.dumps(found[name], indent=1), flush=True)
-    with written_whole(options.out) as part:
-        part.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+        ways = Ways(*patient, options.views)
+        result = {"views": ways.scan.geometry.views, "draws": options.draws, **measured(ways, options.draws)}
+        print(name, json.dumps(result, indent=1), flush=True)
+        found[name] = result
+        with written_whole(options.out) as part:
+            part.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
