@@ -174,7 +174,7 @@ def diagonal(beside: float, n: int = 64) -> Row:
     return {"what": "A near 45°", "beside": beside, **both(A, x), "adjoint": inner}
 
 
-def light_weights(share: float, n: int = 8) -> Row:
+def light_weights(share: float, n: int = 8, tolerance: float = 1e-3) -> Row:
     """PWLS where a third of the readings weigh nearly nothing and hold nonsense, against weights of 0."""
     A, weights, grid = inset(n)
     y = A(body(grid)) + noise(A.range_shape, 4) / weights.sqrt()
@@ -188,12 +188,12 @@ def light_weights(share: float, n: int = 8) -> Row:
     return {"what": "PWLS, nearly zero weights", "share": share, **hu(*found)}
 
 
-def starts(where: str, start: str) -> Row:
+def starts(where: str, start: str, n: int = 8) -> Row:
     """PWLS from another first volume to within 0.2 HU, against the minimum in float64, HU."""
     if where == "inset":
-        A, weights, grid = inset(8)
+        A, weights, grid = inset(n)
     else:
-        geometry, grid = setup("fan", 32)
+        geometry, grid = setup("fan", 4 * n)
         A = Projector(geometry, grid)
         weights = torch.full(A.range_shape, 1e6)
     y = A(body(grid)) + noise(A.range_shape, 4) / weights.sqrt()
