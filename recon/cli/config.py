@@ -17,7 +17,7 @@ from torchpcct.scanner.scanner import Scanner
 from torchpcct.scene.bodies import Box, Ellipsoid, EllipticCylinder
 from torchpcct.scene.scene import Body, Scene
 from torchpcct.scene.voxels import VoxelScene
-from torchpcct.validate import choice
+from torchpcct.validate import choice, number
 from torchpcct.volume import Volume
 
 __all__ = ["EXAMPLE", "SimulationConfig", "read_config"]
@@ -54,6 +54,7 @@ tolerance_hu: 0.5           # effects below it are left out
 
 _SHAPES: dict[str, Any] = {"cylinder": EllipticCylinder, "ellipsoid": Ellipsoid, "box": Box}
 _PRESETS: dict[str, Any] = {"pcct": presets.pcct, "eid": presets.eid}
+_GRID = ("shape", "spacing", "center")
 _KEYS = ("scene", "scanner", "exposure_s", "seed", "region", "tolerance_hu")
 
 
@@ -92,9 +93,9 @@ def read_config(path: Path, **changes: Any) -> SimulationConfig:
     scene, scene_values = _scene(values.get("scene"), folder)
     scanner, scanner_values = _scanner(values.get("scanner"))
     region = values.get("region")
-    grid = None if region is None else VolumeGrid(**_mapping("region", region, ("shape", "spacing", "center")))
+    grid = None if region is None else _made("region", VolumeGrid, _mapping("region", region, _GRID))
     exposure, seed = values.get("exposure_s"), values.get("seed", 0)
-    tolerance = float(values.get("tolerance_hu", 0.5))
+    tolerance = number("tolerance_hu", values.get("tolerance_hu", 0.5), low=0.0, unit="HU")
     resolved = {"scene": scene_values, "scanner": scanner_values, "exposure_s": exposure, "seed": seed,
                 "region": region, "tolerance_hu": tolerance}  # fmt: skip
     return SimulationConfig(scene, scanner, grid, exposure, seed, tolerance, resolved)
@@ -112,6 +113,18 @@ def _mapping(name: str, value: Any, keys: Any) -> dict[str, Any]:
 def _parameters(function: Any) -> dict[str, Any]:
     """Parameters of a function or class with their defaults (none: empty)."""
     return {n: p.default for n, p in inspect.signature(function).parameters.items() if p.kind is not p.VAR_KEYWORD}
+
+
+def _made(name: str, function: Any, given: Mapping[str, Any]) -> Any:
+    """What a function or class makes of the ``given`` parameters.
+
+    Raises:
+        ValueError: one without a default is missing.
+    """
+    missing = [n for n, d in _parameters(function).items() if d is inspect.Parameter.empty and n not in given]
+    if missing:
+        raise ValueError(f"{name} needs {', '.join(missing)}")
+    return function(**given)
 
 
 def _scanner(value: Any) -> tuple[Scanner, dict[str, Any]]:
@@ -138,7 +151,7 @@ def _scene(value: Any, folder: Path) -> tuple[Scene | VoxelScene, dict[str, Any]
 
     make: Any = {"plaque": plaque_scene, "thorax": thorax, "water": water_cylinder}[kind]
     options = _mapping("scene", given, tuple(_parameters(make)))
-    made = make(**options)
+    made = _made("scene", make, options)
     return (made[0] if kind == "plaque" else made), {"kind": kind, **options}
 
 
@@ -150,14 +163,14 @@ def _body(k: int, value: Any) -> Body:
     missing = [n for n in ("name", "material") if n not in common]
     if missing:
         raise ValueError(f"{name} needs {', '.join(missing)}")
-    return Body(common["name"], shape(**_mapping(name, given, tuple(_parameters(shape)))), common["material"],
-                common.get("parent"))  # fmt: skip
+    solid = _made(name, shape, _mapping(name, given, tuple(_parameters(shape))))
+    return Body(common["name"], solid, common["material"], common.get("parent"))
 
 
 def _voxels(given: dict[str, Any], folder: Path) -> tuple[VoxelScene, dict[str, Any]]:
     if "file" not in given:
         raise ValueError("a scene of kind volume needs file, a CT volume in HU")
-    energy = float(given.get("energy_kev", 70.0))
+    energy = number("scene.energy_kev", given.get("energy_kev", 70.0), positive=True, unit="keV")
     volume = Volume.load(folder / given["file"])
     if volume.unit != "HU":
         raise ValueError(f"{given['file']} is in {volume.unit}: a scene is made of a volume in HU")

@@ -48,6 +48,12 @@ _N = "tests/torchpcct/metrics/test_cnr.py::"
 _G = "torchpcct/geometry.py"
 _L = "torchpcct/scanner/linearisation.py"
 _A = "recon/fbp/angular_weights.py"
+_V = "torchpcct/vector_geometry.py"
+_VG = "tests/torchpcct/projector/test_vector_geometry.py::"
+_TISSUE = "recon/mbir/tissues.py"
+_M = "tests/recon/mbir/test_tissues.py::"
+_METAL = "tests/recon/test_metal.py::"
+_F = "tests/test_precision.py::"
 _WATER = _T + "test_a_bad_water_correction_is_refused"
 
 FAULTS = (
@@ -164,6 +170,32 @@ FAULTS = (
           "threshold=300.0)", "tests/recon/pwls/test_inset_problem.py::test_the_default_prior_follows_the_noise"),
     Fault("any number of voxels", "recon/cli/scans.py", "MOST_VOXELS = 2**31", "MOST_VOXELS = 2**200",
           _C + "test_refusals_name_value_and_remedy_and_leave_nothing"),
+    Fault("tissues counted twice", _TISSUE, "beta=one.beta - one.apply(drawn)", "beta=one.beta",
+          _M + "test_the_vessel_is_sharper_and_its_core_at_full_contrast"),
+    Fault("a core drawn that is not proven", _TISSUE, "return reading.presence * with_core", "return 1.0 * with_core",
+          _M + "test_what_is_not_proven_is_left_as_the_plain_reconstruction_has_it"),
+    Fault("tissues that do not fit are used", _TISSUE, "if reading.warnings:", "if False:",
+          _M + "test_tissues_that_do_not_explain_the_data_are_not_used"),
+    Fault("another look forgets the tissues", "recon/mbir/mbir.py", "other = copy.copy(self)",
+          "other: Any = Mbir(self.model, self.look, **self.parts)",
+          _M + "test_another_look_keeps_the_tissues_and_noise_units_are_the_inverse_of_hu"),
+    Fault("many BLAS threads for the tissues", "recon/plaque/reading.py",
+          '@threadpool_limits.wrap(limits=1, user_api="blas")', '@threadpool_limits.wrap(limits=2, user_api="blas")',
+          "tests/recon/plaque/test_reading.py::test_one_blas_thread_reads_the_tissues"),
+    Fault("noise taken for metal", "recon/metal.py", "DENSEST_HU + _SIGMAS * noise", "DENSEST_HU",
+          _METAL + "test_noise_and_bone_are_no_metal"),
+    Fault("metal in other units", "recon/api.py", 'method == "mbir" or s.unit != "HU"', 'method == "mbir"',
+          _METAL + "test_fbp_names_metal_in_hu_and_knows_nothing_of_it_in_other_units"),
+    Fault("rows flipped with the columns", _V, "-self.poses[:, 3] if rows else None", "-self.poses[:, 3]",
+          _VG + "test_flips_and_shifts_are_those_of_the_readings"),
+    Fault("detector shifted the other way", _V, "+ r * poses[:, 3]", "- r * poses[:, 3]",
+          _VG + "test_flips_and_shifts_are_those_of_the_readings"),
+    Fault("a helix downwards", _V, "out[:, 0] = -height", "out[:, 0] = height",
+          _VG + "test_a_helix_takes_the_native_passes"),
+    Fault("a far start keeps its rounding", "recon/pwls/pwls.py", "FAR_START = 2.0", "FAR_START = 1e9",
+          _F + "test_pwls_forgets_a_start_far_away"),
+    Fault("bins of one spectrum pass", "torchpcct/spectral/model.py", "_ALIKE = 1e-7", "_ALIKE = -1.0",
+          _F + "test_what_has_no_answer_is_refused"),
 )  # fmt: skip
 
 

@@ -12,6 +12,8 @@ from analytic import Ellipsoid, line_integrals
 from recon.cli import main
 from recon.cli.config import read_config
 from torchpcct import ParallelBeam, Scan, Volume, VolumeGrid
+from torchpcct.scene.scene import Scene
+from torchpcct.scene.voxels import VoxelScene
 
 
 def test_command_line_simulate_and_reconstruct(tmp_path, capsys):
@@ -72,6 +74,51 @@ def test_the_example_configuration_is_complete(tmp_path, capsys):
     path.write_text(CONFIG.replace("views", "view"), encoding="utf-8")
     with pytest.raises(ValueError, match="scanner: unknown view; it takes views, mode"):
         read_config(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("scene: [", "is no YAML"),
+        ("scene: {kind: water, diameter: 100}\nexposure: 1", "unknown exposure; it takes scene, scanner, exposure_s"),
+        ("- scene", "must be a mapping with scene"),
+        ("scene: water", "scene must be a mapping with kind, got 'water'"),
+        ("scene: {kind: fog}", "scene.kind"),
+        ("scene: {kind: bodies, bodies: [{name: a, shape: box}]}", r"scene.bodies\[0\] needs material"),
+        ("scene: {kind: bodies, bodies: [{name: a, material: water, shape: box}]}", r"scene.bodies\[0\] needs"),
+        ("scene: {kind: bodies, bodies: [{shape: cube}]}", r"scene.bodies\[0\].shape"),
+        ("scene: {kind: volume}", "needs file"),
+        ("scene: {kind: volume, file: v.h5, energy_kev: high}", "scene.energy_kev must be a number in keV, got 'high'"),
+        ("scene: {kind: volume, file: v.h5}", "v.h5 is in mm\\^-1: a scene is made of a volume in HU"),
+        ("scene: {kind: water}\nregion: {shape: [1, 2, 2]}", "region needs spacing"),
+        ("scene: {kind: water}\nscanner: {preset: mri}", "scanner.preset"),
+        ("scene: {kind: water}\ntolerance_hu: small", "tolerance_hu must be a number in HU, got 'small'"),
+        ("scene: {kind: water}\ntolerance_hu: -1", "tolerance_hu must be"),
+    ],
+)
+def test_configurations_that_are_none_are_refused(tmp_path, text, said):
+    Volume(torch.zeros(2, 2, 2), VolumeGrid((2, 2, 2), 1.0), unit="mm^-1").save(tmp_path / "v.h5")
+    (tmp_path / "scene.yaml").write_text(text, encoding="utf-8")
+    with pytest.raises((ValueError, TypeError), match=said):
+        read_config(tmp_path / "scene.yaml")
+
+
+def test_scenes_by_their_kind(tmp_path):
+    """Water, the paper's plaque and a volume in HU, with the defaults in what the scan keeps."""
+    Volume(torch.zeros(2, 2, 2), VolumeGrid((2, 2, 2), 1.0)).save(tmp_path / "v.h5")
+    for text, kind, said in (
+        ("{kind: water}", Scene, {"kind": "water"}),
+        ("{kind: plaque, core_contrast: 0.5}", Scene, {"kind": "plaque", "core_contrast": 0.5}),
+        (
+            "{kind: volume, file: v.h5}",
+            VoxelScene,
+            {"kind": "volume", "file": str(tmp_path / "v.h5"), "energy_kev": 70.0},
+        ),
+    ):
+        (tmp_path / "scene.yaml").write_text(f"scene: {text}", encoding="utf-8")
+        config = read_config(tmp_path / "scene.yaml")
+        assert isinstance(config.scene, kind)
+        assert config.values["scene"] == said
 
 
 def test_a_foreign_scan_in_one_command(tmp_path):

@@ -40,6 +40,8 @@ _NODES = 64
 _LOWEST, _HIGHEST = -4.0, 16.0  # bounds of the estimates as line integrals at 60 keV
 
 _NEGLIGIBLE = 1e-12
+_ALIKE = 1e-7
+"""Spectra of two bins that differ by less are one: their information is singular in float64."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +55,8 @@ class SpectralModel:
         basis: the two materials; default: PE and PVC.
 
     Raises:
-        ValueError: shapes that do not fit, negative or non-finite spectra, a column without counts, fewer than 2 bins.
+        ValueError: shapes that do not fit, negative or non-finite spectra, a column without counts, fewer than 2 bins,
+            a column whose bins all have one spectrum (they cannot tell two materials apart).
     """
 
     energies: Floats
@@ -75,6 +78,11 @@ class SpectralModel:
             )
         if not (np.isfinite(spectra).all() and (spectra >= 0).all() and (spectra.sum((1, 2)) > 0).all()):
             raise ValueError("spectra must be finite, ≥ 0 and not all 0 in any column: leave dead columns out")
+        if (alike := _one_spectrum(spectra)).any():
+            raise ValueError(
+                f"the bins of column {int(alike.argmax())} have one spectrum but for its height, or counts in one bin "
+                "only: they cannot tell two materials apart; set other thresholds, or leave dead columns out"
+            )
         # Energies that no column detects cost time, and where the model is asked for negative lengths they matter.
         share = (spectra / spectra.sum((1, 2), keepdims=True)).max((0, 1))
         kept = share > _NEGLIGIBLE
@@ -263,3 +271,12 @@ class _Expected(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> Any:
         g = (ctx.slopes * grad.reshape(grad.shape[0], -1)).sum(1)
         return g.reshape(ctx.shape).to(grad.dtype), None, None, None
+
+
+def _one_spectrum(spectra: Floats) -> NDArray[np.bool_]:
+    """Which columns have bins that do not differ but in height, ``(columns,)``; ``spectra`` ``(columns, bins, E)``."""
+    heights = spectra.sum(-1, keepdims=True)
+    strongest = np.take_along_axis(spectra, heights.argmax(1)[:, None], axis=1)
+    # With the heights of the bins and not their shapes: a bin that sees next to nothing says next to nothing.
+    apart = np.abs(spectra - strongest * (heights / strongest.sum(-1, keepdims=True))).sum((1, 2))
+    return np.asarray(apart <= _ALIKE * spectra.sum((1, 2)))

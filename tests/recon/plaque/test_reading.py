@@ -6,8 +6,9 @@ import drawn_vessel
 import numpy as np
 import pytest
 from drawn_vessel import VALUES
+from threadpoolctl import threadpool_info, threadpool_limits
 
-from recon.plaque import TissueData, read_plaque
+from recon.plaque import TissueData, read_plaque, reading
 from recon.plaque.figures import Estimate
 from recon.plaque.reading import _doubt
 from recon.plaque.report import save, table
@@ -102,3 +103,20 @@ def test_doubt_has_a_reason(presence, low, high, why):
     found = _doubt(presence, Estimate((low + high) / 2, low, high, (high - low) / 4, "HU"))
     assert why in found
     assert bool(found) == bool(why)
+
+
+def test_one_blas_thread_reads_the_tissues(gram, monkeypatch):
+    """Its matrices are so small that more threads take three times as long, and round in another order."""
+
+    class Seen(Exception):
+        pass
+
+    def look(*_):
+        seen.extend(pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas")
+        raise Seen
+
+    seen: list[int] = []
+    monkeypatch.setattr(reading, "find_vessel", look)
+    with threadpool_limits(4, user_api="blas"), pytest.raises(Seen):
+        read_plaque(drawn_vessel.data(gram, drawn_vessel.image(gram.grid, 0.0)))
+    assert set(seen) == {1}

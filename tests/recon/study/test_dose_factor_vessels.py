@@ -73,7 +73,7 @@ def test_tissues_have_the_volumes_of_the_analytic_plaque(name):
         assert volume["lumen"] == pytest.approx(plaque.lumen.volume, rel=0.01)
         assert volume["wall"] == pytest.approx(plaque.outer.volume - plaque.inner.volume, rel=0.01)
     if name == "straight":
-        painted = shape.painted(VolumeGrid((25, 28, 28), 0.4, CENTER), {"core": 2.0, "lumen": 1.0}, 8).sum() * 0.4**3
+        painted = shape.painted(VolumeGrid((25, 28, 28), 0.4, CENTER), {"core": 2.0, "lumen": 1.0}, 4).sum() * 0.4**3
         assert painted == pytest.approx(2 * plaque.core.volume + plaque.lumen.volume, rel=0.01)
 
 
