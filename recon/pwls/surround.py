@@ -22,6 +22,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from recon.fbp.angular_weights import angular_weights
+from recon.fbp.detector_edges import cut_off
 from recon.fbp.fbp import fbp
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, VolumeGrid
@@ -68,10 +70,18 @@ class UnknownSurround:
         step that is left at its sides would be smeared: 2.4 HU of a ball in fat.)
 
         The last volume is kept: the level of a scan and its own readings need the same.
+
+        Raises:
+            ValueError: the rows end inside the object.
         """
         of = hashlib.blake2b(lines.contiguous().numpy().data).digest()
         if self._last is not None and self._last[0] == of:
             return self._last[1]
+        if any(cut_off(lines, self.geometry, angular_weights(self.geometry))):
+            raise ValueError(
+                "the rows end inside the object: what lies beyond the field of view cannot be taken off the inset's "
+                "readings (250 HU of a thorax were left); use fbp with outside=, or a detector that holds the body"
+            )
         fine = fbp(lines, self.geometry, self.grid)
         around = lines.clone()
         w = self.window

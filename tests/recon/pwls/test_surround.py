@@ -47,6 +47,15 @@ def test_what_the_inset_holds_stays_its_own(lines):
     assert abs(float(error.mean())) < 0.03 * float(own.mean())
 
 
+def test_a_body_beyond_the_detector_is_refused(lines):
+    """Its readings would be left in the inset's: 250 HU of a thorax."""
+    narrow = ConeBeam(full_turn(360), 300.0, 550.0, 120, 8, (1.0, 0.9), detector="curved")
+    window = shadow(narrow, GRID, margin=1)
+    around = UnknownSurround(narrow, GRID, window, Projector(narrow, GRID, window))
+    with pytest.raises(ValueError, match=r"rows end inside the object.*outside="):
+        around.level(lines[..., 90:-90].contiguous())
+
+
 def test_views_are_joined_where_there_are_enough_of_them():
     """About as many as the voxels of the field need, π R / size; views out of order stay single."""
     from dataclasses import replace
