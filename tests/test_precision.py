@@ -56,7 +56,7 @@ def test_footprints_near_45_degrees(beside):
 
 
 def test_weights_that_are_nearly_zero_count_as_zero():
-    assert precision.light_weights(1e-12, 4, tolerance=0.2)["worst"] < 0.01
+    assert precision.light_weights(1e-12, 4)["worst"] < 0.01
 
 
 @pytest.mark.parametrize("where", ["inset", "whole field"])

@@ -263,7 +263,7 @@ def _solve(
         data_gradient = exact(x) - b
         pairs += 1
     far = bool((dot(data_gradient, data_gradient, axes).sqrt() > FAR_START * reference).any())
-    again = False
+    afresh = False
     inner: list[int] = []
     gradients: list[float] = []
     distances: list[float] = []
@@ -287,11 +287,11 @@ def _solve(
                 "outer": len(inner), "exact_pairs": pairs, "gradient": gradients[-1], "rmsd_hu": distances[-1], "x": x,
             })  # fmt: skip
         converged = distances[-1] <= tolerance and (by_model or approach.known or proposed == 0.0)
-        rounded = by_model and count == 0 and previous is not None and not again
-        if converged and (far or rounded) and pairs < max_exact:
+        rounded = by_model and count == 0 and previous is not None
+        if converged and (far or rounded) and not afresh and pairs < max_exact:
             data_gradient = exact(x) - b
             pairs += 1
-            far, again, converged = False, True, False
+            afresh, converged = True, False
             previous, approach = None, Approach(x, determined)
             proposer = ModelSolver(gram, bound, b) if by_model else proposer  # its sense of rounding, too
             continue

@@ -191,6 +191,8 @@ class _Field:
 
 def _joined_views(g: ConeBeam, size: float) -> int:
     """How many neighbouring views are joined: as many as leave those that voxels of ``size`` mm in the field need."""
+    if g.views < 2:
+        return 1
     steps = np.diff(g.angles)
     if not np.allclose(steps, steps.mean(), rtol=0.0, atol=1e-6):
         return 1

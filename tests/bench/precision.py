@@ -120,11 +120,11 @@ def methods(n: int, tolerance: float = 1e-3) -> Iterator[Row]:
     network = Mbir.load()
     b = A.T(weights * y)[None]
     volumes = []
-    for network_, gram, dtype in ((network.model, model, torch.float32), (None, exact, torch.float64)):
-        unrolled = network_ or Mbir.load().model.double()
+    for gram, dtype in ((model, torch.float32), (exact, torch.float64)):
         normal = NormalisedProblem.from_statistic(gram, b.to(dtype), torch.ones(1), HU, network.voxel_mm)
         with torch.no_grad():
-            volumes.append((unrolled(normal, 0.5) * normal.scale_hu.reshape(-1, 1, 1, 1)).double())
+            u = network.model.to(dtype)(normal, 0.5)
+        volumes.append((u * normal.scale_hu.reshape(-1, 1, 1, 1)).double())
     yield {"what": "MBIR, HU", **about, **hu(*volumes)}
 
 
@@ -174,7 +174,7 @@ def diagonal(beside: float, n: int = 64) -> Row:
     return {"what": "A near 45°", "beside": beside, **both(A, x), "adjoint": inner}
 
 
-def light_weights(share: float, n: int = 8, tolerance: float = 1e-3) -> Row:
+def light_weights(share: float, n: int = 8) -> Row:
     """PWLS where a third of the readings weigh nearly nothing and hold nonsense, against weights of 0."""
     A, weights, grid = inset(n)
     y = A(body(grid)) + noise(A.range_shape, 4) / weights.sqrt()

@@ -1,10 +1,12 @@
 """An unknown surround, found by a coarse FBP of the whole field."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
-from recon.pwls.surround import UnknownSurround
+from recon.pwls.surround import UnknownSurround, _joined_views
 from torchpcct import ConeBeam, Projector, VolumeGrid, full_turn
 from torchpcct.detector_window import shadow
 
@@ -58,13 +60,10 @@ def test_a_body_beyond_the_detector_is_refused(lines):
 
 def test_views_are_joined_where_there_are_enough_of_them():
     """About as many as the voxels of the field need, π R / size; views out of order stay single."""
-    from dataclasses import replace
-
-    from recon.pwls.surround import _joined_views
-
     dense = ConeBeam(full_turn(1968), 626.0, 1098.0, 1500, 8, (0.5, 0.35), detector="curved")
     assert dense.fov_radius == pytest.approx(148.2, abs=0.1)
     assert (_joined_views(dense, 0.6), _joined_views(dense, 1.2)) == (2, 4)
     assert _joined_views(replace(dense, angles=full_turn(1969)), 0.6) == 1
+    assert _joined_views(replace(dense, angles=full_turn(1)), 0.6) == 1
     mixed = np.concatenate([full_turn(1968)[::2], full_turn(1968)[1::2]])
     assert _joined_views(replace(dense, angles=mixed), 0.6) == 1
