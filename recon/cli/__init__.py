@@ -133,6 +133,7 @@ def _add_dose_factor(commands: Commands) -> None:
     )  # fmt: skip
     parser.add_argument("--n", type=int, help="paired realisations per dose and scene (default 200)")
     parser.add_argument("--slow-n", type=int, help="the same for the slow baselines (default 48)")
+    parser.add_argument("--tissue-n", type=int, help="realisations of MBIR + tissues (default 100)")
     parser.add_argument("--scene-n", type=int, help="realisations of each further scene and vessel (default 100)")
     parser.add_argument("--doses", type=float, nargs="+", metavar="S", help="exposures in s")
     parser.add_argument("--scene-doses", type=float, nargs="+", metavar="S", help="of further scenes")

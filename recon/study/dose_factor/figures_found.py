@@ -13,7 +13,7 @@ from recon.study.dose_factor.measure import Measured
 from recon.study.dose_factor.measures import DOG_CHANNELS, OBSERVERS
 from recon.study.dose_factor.merit import Figures
 from recon.study.dose_factor.readings import BIN_MM, DIRECTIONS, REACH_MM
-from recon.study.dose_factor.settings import FBP_BASE, MAIN_SCENES, ROIS
+from recon.study.dose_factor.settings import FBP_BASE, MAIN_SCENES, RELATIVES, ROIS
 from torchpcct.metrics import (
     Jackknifed,
     NoisePower,
@@ -152,13 +152,14 @@ def drawn_figures(m: Measured, method: str, dose: float, truth: dict[str, Floats
 
 
 class _Control:
-    """The linear controls of a method at one exposure: its own response if it is known, else the study's.
+    """The linear controls of a method at one exposure: its own response or a relative's if known, else the study's.
 
     All scenes have the same noise, so their deviations are those of one.
     """
 
     def __init__(self, m: Measured, method: str, dose: float) -> None:
-        c = m.responses.get((method, dose), m.controls[dose])
+        own = "mbir" if method in RELATIVES else method
+        c = m.responses.get((own, dose), m.controls[dose])
         self.count = len(c["covariance"]) // (2 * len(ROIS) + len(OBSERVERS) * _CHANNELS)
         shape = (-1, self.count, c["covariance"].shape[0] // self.count)
         self.mean_readings = c["mean"].reshape(shape)  # (scenes, controls, rows)

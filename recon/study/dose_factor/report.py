@@ -73,7 +73,7 @@ def _intro(data: dict[str, Any]) -> str:
         else "Noise is drawn in the readings of the paper's scan; the other main scenes carry the same noise; further "
         "scenes draw the noise of b = AᵀW y from its covariance."
     )
-    own = "MBIR's own mean response, for rows of fewer draws " if s["responses"] else ""
+    own = "MBIR's own mean response for all rows with its network, for others " if s["responses"] else ""
     controls = f"{own}linear filters"
     tissues = ", ".join(f"{k} {v:.1f}" for k, v in t["tissues_hu"].items())
     rois = ", ".join(f"{k} {r['foreground_mm2']:.2f} / {r['background_mm2']:.2f}" for k, r in data["rois"].items())

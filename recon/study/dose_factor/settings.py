@@ -112,7 +112,12 @@ SLOW_METHODS = (
 """Fewer realisations: iterated to convergence, drawn anew as images, ablations, looks, tests of robustness."""
 
 TISSUE_METHODS = ("mbir_tissues",)
-"""They fit a vessel for every volume: as many realisations as a further scene has; there, half as many as its twin."""
+"""They fit a vessel for every volume, which costs several times more: they have realisations of their own number, and
+in a further scene half as many as its twin."""
+
+RELATIVES = ("mbir_tissues", "mbir_viewing", "mbir_measuring", "mbir_one_step", "mbir_free", "fbp_cnn")
+"""Methods with MBIR's network. Where they have no control of their own, MBIR's response follows their contrast more
+closely than linear filters do."""
 
 TWIN_REALIZATIONS = 16
 """Of a further scene or vessel without its core, in whole blocks. What the core adds hardly changes from draw to draw
@@ -136,6 +141,7 @@ class Settings(StudySettings):
     Args:
         n: paired realisations of each main scene and dose; claims need ≥ 200.
         slow_n: realisations for :data:`SLOW_METHODS`, and of half and flipped contrast; at most ``n``.
+        tissue_n: realisations for :data:`TISSUE_METHODS`; at most ``n``.
         scene_n: realisations of each further scene, vessel and dose, for methods that are not linear.
         doses: exposures in s.
         scene_doses: exposures of the further scenes.
@@ -151,7 +157,8 @@ class Settings(StudySettings):
             outlines that are only roughly known.
         controls: linear methods of the same draws that the figures of all nonlinear methods are controlled by, of
             :data:`LINEAR_METHODS`.
-        responses: control methods with all ``n`` realisations by their own linear response instead.
+        responses: control methods with all ``n`` realisations by their own linear response instead, and the rest of
+            :data:`RELATIVES` by MBIR's, if MBIR is run.
         fast_noise: draw b = AᵀW y from the Gram's covariance instead of drawing the readings. The further scenes
             always do. There are no FBP realisations then; FBP's exact figures stay.
         block: realisations in one piece.
@@ -162,6 +169,7 @@ class Settings(StudySettings):
 
     n: int = 200
     slow_n: int = 48
+    tissue_n: int = 100
     scene_n: int = 100
     doses: tuple[float, ...] = (0.35, 0.70, 2.00)
     scene_doses: tuple[float, ...] = (0.35, 2.00)
@@ -187,7 +195,7 @@ class Settings(StudySettings):
     }  # fmt: skip
 
     def __post_init__(self) -> None:
-        self.check_whole(n=8, slow_n=5, scene_n=8, seed=0, views=8, block=1)
+        self.check_whole(n=8, slow_n=5, tissue_n=8, scene_n=8, seed=0, views=8, block=1)
         for name in ("doses", "scene_doses"):
             values = tuple(float(v) for v in getattr(self, name))
             object.__setattr__(self, name, values)
@@ -218,7 +226,7 @@ class Settings(StudySettings):
     def realizations(self, method: str) -> int:
         """Realisations with and without the core at each dose for a method that is not linear."""
         if method in TISSUE_METHODS:
-            return min(self.n, self.scene_n)
+            return min(self.n, self.tissue_n)
         return min(self.n, max(self.slow_n, 8)) if method in SLOW_METHODS else self.n
 
     def scene_realizations(self, method: str) -> int:

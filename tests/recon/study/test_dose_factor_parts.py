@@ -61,13 +61,13 @@ def test_ablations_are_told_apart():
 
 
 def test_methods_that_fit_tissues_get_fewer_draws_and_the_estimate_knows_it():
-    s = Settings(n=200, scene_n=96, slow_n=16)
-    assert [s.realizations(m) for m in ("mbir", "mbir_tissues", "tv")] == [200, 96, 16]
+    s = Settings(n=200, tissue_n=104, scene_n=96, slow_n=16)
+    assert [s.realizations(m) for m in ("mbir", "mbir_tissues", "tv")] == [200, 104, 16]
     assert [s.scene_realizations(m) for m in ("mbir", "mbir_tissues")] == [96, 8]
     seconds = s.estimated_seconds()
     alone = replace(s, scenes=(), vessels=(), responses=False).estimated_seconds()
     assert seconds["mbir"] > alone["mbir"]  # further scenes, and the control of its own
-    assert seconds["mbir_tissues"] == alone["mbir_tissues"] == 3 * (2 * 96 + 2 * 16) * 4.0
+    assert seconds["mbir_tissues"] == alone["mbir_tissues"] == 3 * (2 * 104 + 2 * 16) * 4.0
 
 
 def test_missing_weights_leave_mbir_out(monkeypatch, caplog):
