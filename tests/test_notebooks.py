@@ -64,6 +64,7 @@ def test_first_scan_is_short():
     assert len(code_lines(nbformat.read(FOLDER / "first_scan.ipynb", as_version=4))) < 15
 
 
+@pytest.mark.slow
 @needs_weights
 def test_first_scan_runs(tmp_path):
     assert len(pictures(run("first_scan.ipynb", tmp_path, 600))) == 1

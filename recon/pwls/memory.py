@@ -16,8 +16,8 @@ from torchpcct.validate import whole
 __all__ = ["available_bytes", "gram_bytes", "pwls_bytes", "require_memory"]
 
 # Arrays of one volume's size that live at once: statistic, volume, gradients, two steps with their images, the prior's
-# and the transform's temporaries.
-VOLUMES = 18
+# and the transform's temporaries, the spectra of a whole field.
+VOLUMES = 21
 # Arrays of the data's size besides the arguments: weighted data, projection, their product.
 SINOGRAMS = 3
 

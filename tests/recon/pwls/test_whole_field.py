@@ -8,11 +8,13 @@ import torch
 from inset_operators import HU, problem
 
 from recon.gram.gram import Gram
+from recon.pwls import field_model
 from recon.pwls.approach import Approach
 from recon.pwls.field_model import FieldModel
 from recon.pwls.pwls import data_model, pwls
 from recon.pwls.qggmrf import QGGMRF, quadratic
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Projector, VolumeGrid, full_turn
+from torchpcct.vector_geometry import VectorGeometry
 
 EDGE = QGGMRF(0.3, 4.0, relative=True)
 # Nearly flat where noise makes gradients of thousands of HU/mm: converges slowly.
@@ -148,6 +150,42 @@ def test_a_flat_prior_is_not_called_converged_before_it_is(scan):
     for pairs in (20, 60):
         found = pwls(A, y, w, bound, hu=HU, tolerance=1.0, max_exact=pairs)
         assert found.report["rmsd_hu"][-1] > hu_rms(found.x, exact) / 3
+
+
+@pytest.fixture(scope="module")
+def flat_faces():
+    """A disc across the axis of a cone beam: off the middle slice no ray runs along its faces."""
+    A = Projector(ConeBeam(full_turn(48), 100.0, 160.0, 48, 48, 1.2), VolumeGrid((24, 24, 24), 1.1))
+    z, y, x = torch.meshgrid(*[torch.from_numpy(a) for a in A.grid.axes], indexing="ij")
+    lines = A((0.02 * ((torch.hypot(y, x) < 10) & (z.abs() < 8))).float())
+    w = 1e5 * torch.exp(-lines)
+    return A, lines + torch.randn(lines.shape, generator=torch.Generator().manual_seed(0)) / w.sqrt(), w
+
+
+def test_flat_faces_in_a_cone_beam_need_a_spectrum_of_their_own_slice(flat_faces, monkeypatch):
+    A, y, w = flat_faces
+    prior = QGGMRF(2.0, 4.0, relative=True)
+    many = pwls(A, y, w, prior, hu=HU, tolerance=0.1)
+    monkeypatch.setattr(field_model, "FACTOR", math.inf)
+    one = pwls(A, y, w, prior, hu=HU, tolerance=0.1)
+    assert many.report["converged"]
+    assert one.report["converged"]
+    assert many.report["exact_pairs"] < 0.6 * one.report["exact_pairs"]
+    assert hu_rms(many.x, one.x) < 0.5
+
+
+def test_slices_share_the_field(flat_faces):
+    A, _, w = flat_faces
+    model = FieldModel(A, w)
+    assert len(model.nodes) == field_model.NODES
+    assert float(sum(s.square() for _, s in model.nodes).sub(1).abs().max()) < 1e-6
+    # By symmetry the slices above the middle see what those below see; the further out, the less along z.
+    along = [float(k[:, 0, 0].log().mean()) for k, _ in model.nodes]
+    assert along == pytest.approx(along[::-1], abs=0.1)
+    assert along[0] < along[1] < along[2]
+    parallel = VectorGeometry.of(ConeBeam(full_turn(48), 1e5, 1.6e5, 48, 48, 1.2))
+    A = Projector(parallel, A.grid)
+    assert len(FieldModel(A, torch.ones(A.range_shape)).nodes) == 1
 
 
 def test_model_is_chosen_by_the_grid_and_dropped_by_its_misfit():
