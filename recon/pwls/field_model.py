@@ -1,6 +1,6 @@
 """A model of AᵀWA for whole fields of view, of any geometry, made from a few exact projection pairs.
 
-    AᵀWA ≈ Σ_c D s_c F⁻¹ K_c F s_c D,        D² = AᵀW 1 at each voxel, Σ_c s_c² = 1,
+    AᵀWA ≈ Σ_c D s_c F⁻¹ K_c F s_c D,        D² = AᵀW 1 at each voxel that enough rays meet, Σ_c s_c² = 1,
 
 K_c the spectrum of the impulse response in the middle of slice c, s_c the share of a slice in it (Fessler and Booth
 1999, IEEE Trans. Image Process. 8:688, with one K). It is too rough to solve with, because the weights of the
@@ -36,8 +36,9 @@ LEAST = 0.02
 NODES, FACTOR = 5, 3.0
 # Voxels that fewer rays meet than this share of those through the middle are not determined by the data.
 DETERMINED = 0.75
-# Voxels that the rays hardly meet are scaled as if they met this share of what the best seen voxel has.
-LEAST_SEEN = 1e-4
+# Voxels that fewer rays meet are scaled as if it were this share, of the same mean weight: scaled by themselves, slices
+# beyond the rows of a cone beam hang on the prior alone and spoil the condition number.
+LEAST_MET = 0.5
 
 
 class FieldModel:
@@ -49,6 +50,7 @@ class FieldModel:
 
     Attributes:
         seen: AᵀW 1, ``domain_shape``: 0 where no ray of positive weight passes.
+        scale: D².
         spectrum: K in the middle, ``rfftn`` layout, > 0.
         determined: bool, ``domain_shape``: voxels that (nearly) all views see. Beyond, in the corners of a grid that is
             wider than the field of view and in slices that some views miss, directions are left to the prior alone.
@@ -65,7 +67,10 @@ class FieldModel:
             raise ValueError("no ray of positive weight meets the grid: check its centre, in mm, and the geometry")
         self.at = _central(self.seen)
         met = projector.T((weights > 0).to(weights.dtype))
-        self.determined: Tensor = met >= DETERMINED * met[self.at]
+        met = met / met[self.at]
+        self.determined: Tensor = met >= DETERMINED
+        unseen = LEAST_MET * self.seen[self.determined].median()
+        self.scale = torch.where(met > 0, self.seen * (LEAST_MET / met).clamp_min(1.0), unseen)
         # One impulse after the other: a batch would need twice the memory.
         self._response = lambda impulse: projector.T(weights * projector(impulse))
         column = torch.zeros_like(self.seen)
@@ -121,7 +126,8 @@ class FieldModel:
         other = object.__new__(FieldModel)
         other.grid, other.at, other.spectrum = self.grid, self.at, self.spectrum
         other.determined, other.nodes = self.determined, self.nodes
-        other.seen, other._column = self.seen * factor, self._column * factor
+        other.seen, other.scale = self.seen * factor, self.scale * factor
+        other._column = self._column * factor
         return other
 
 
@@ -132,7 +138,7 @@ class GradientStep:
         nodes: K_c, ``rfftn`` layout of the grid, > 0, with s_c, broadcast to the grid; of a single one None: 1.
         prior: its curvature at gradient 0 is R.
         x: volumes ``(batch, *shape)``; only their shape, dtype and device matter.
-        seen: D², the shape of the grid; None: 1.
+        scale: D² > 0, the shape of the grid; None: 1.
     """
 
     def __init__(
@@ -140,7 +146,7 @@ class GradientStep:
         nodes: Sequence[tuple[Tensor, Tensor | None]],
         prior: BoundPrior,
         x: Tensor,
-        seen: Tensor | None = None,
+        scale: Tensor | None = None,
     ) -> None:
         self.prior = prior
         self._grid = tuple(x.shape[-len(prior.spacing) :])
@@ -148,16 +154,15 @@ class GradientStep:
         self._steps, self._share = 0, 1.0
         self._scale: Tensor | None = None
         inverse = torch.ones((), dtype=x.dtype, device=x.device)
-        if seen is not None:
-            bounded = seen.to(x).clamp_min(LEAST_SEEN * float(seen.max()))
-            self._scale, inverse = bounded.rsqrt(), bounded.reciprocal()
+        if scale is not None:
+            self._scale, inverse = scale.to(x).rsqrt(), scale.to(x).reciprocal()
         # In units of D² the prior weighs more where fewer rays pass: η_c is its mean over the slices of c.
         self._nodes = [(k.to(x), None if s is None else s.to(x), _mean(inverse, s)) for k, s in nodes]
 
     @classmethod
     def of(cls, model: FieldModel, prior: BoundPrior, x: Tensor) -> GradientStep:
         """For a whole field."""
-        return cls(model.nodes, prior, x, model.seen)
+        return cls(model.nodes, prior, x, model.scale)
 
     def step(self, x: Tensor, data_gradient: Tensor) -> tuple[Tensor, int]:
         """The direction of descent, ``(batch, *shape)``, and 0: no iteration of a model."""
