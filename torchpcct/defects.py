@@ -96,11 +96,11 @@ def find_defects(counts: Tensor, air: Tensor, first_column: Any = None) -> Defec
     if view_dead.all():
         view_dead[:] = False
     parts = [np.s_[:, c : c + columns] for c in first]
+    from torchpcct.defects_kernels import bends, levels  # numba loads with its first use
+
+    alive = np.flatnonzero(~view_dead)
     seen, dark, bright = (np.zeros((rows, air.shape[1])) for _ in range(3))
-    for v in np.flatnonzero(~view_dead).tolist():
-        seen[parts[v]] += 1
-        dark[parts[v]] += zero[v]
-        bright[parts[v]] += n[v]
+    levels(n, first, alive, seen, dark, bright)
     used = seen > 0
     level = bright / np.maximum(seen, 1)
     dead = used & (dark > 0.75 * seen)
@@ -109,13 +109,10 @@ def find_defects(counts: Tensor, air: Tensor, first_column: Any = None) -> Defec
     dead &= np.fmax(_beside(good_level), _beside(good_level.T).T) > BRIGHT
     # How far a cell's log signal lies above the mean of its neighbours', over the views in which both are good.
     above, times = np.zeros_like(seen), np.zeros_like(seen)
-    for v in np.flatnonzero(~view_dead).tolist():
-        good = ~(zero[v] | dead[parts[v]])
-        both = good[:, 1:-1] & good[:, :-2] & good[:, 2:]
-        log = np.log(n[v] + 0.5) - reference[parts[v]]
-        inner = np.s_[:, first[v] + 1 : first[v] + columns - 1]
-        above[inner] += np.where(both, log[:, 1:-1] - (log[:, :-2] + log[:, 2:]) / 2, 0.0)
-        times[inner] += both
+    bends(n, first, alive, dead, above, times)
+    # The air's own share, which no view changes.
+    expected = reference[:, 1:-1] - (reference[:, :-2] + reference[:, 2:]) / 2
+    above[:, 1:-1] -= np.where(times[:, 1:-1] > 0, times[:, 1:-1] * expected, 0.0)
     hot = np.zeros_like(dead)
     if rows >= 3:
         mean = above / np.maximum(times, 1)
@@ -129,13 +126,15 @@ def find_defects(counts: Tensor, air: Tensor, first_column: Any = None) -> Defec
         strength = np.pad(np.where(hot, np.abs(deviation), 0.0), ((0, 0), (1, 1)))
         hot &= np.abs(deviation) >= np.maximum(strength[:, :-2], strength[:, 2:])
     mask = np.stack([lost | (dead | hot)[part] for lost, part in zip(view_dead, parts, strict=True)])
-    single = _isolated(n, zero & ~mask)
-    if single.mean() > _FREQUENT:
+    at = np.argwhere(zero) if zero.any() else np.zeros((0, 3), np.int64)
+    at = at[~mask[tuple(at.T)]]
+    single = _isolated(n, at)
+    if len(single) > _FREQUENT * n.size:
         # So many are no accident: neighbours on one side are often lost together.
-        single |= _isolated(n, zero & ~mask, reach=3)
-    mask |= single
+        single = np.unique(np.concatenate([single, _isolated(n, at, reach=3)]), axis=0)
+    mask[tuple(single.T)] = True
     return Defects(
-        torch.from_numpy(mask), int(dead.sum()), int(hot.sum()), int(view_dead.sum()), int(single.sum())
+        torch.from_numpy(mask), int(dead.sum()), int(hot.sum()), int(view_dead.sum()), len(single)
     )  # fmt: skip
 
 
@@ -148,12 +147,9 @@ def _beside(cells: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.ma.filled(np.ma.median(stacked, axis=0), np.nan)
 
 
-def _isolated(n: NDArray[Any], zero: NDArray[np.bool_], reach: int = 1) -> NDArray[np.bool_]:
-    """Zeros whose non-zero neighbours in the row and the next rows are bright on both sides."""
-    out = np.zeros_like(zero)
-    at = np.argwhere(zero)
-    if at.size == 0:
-        return out
+def _isolated(n: NDArray[Any], at: NDArray[np.int64], reach: int = 1) -> NDArray[np.int64]:
+    """Those of the zeros ``at`` ``(k, 3)`` whose non-zero neighbours in the row and the next rows are bright on both
+    sides."""
     limits = np.array(n.shape) - 1
     sides = []
     for side in (-1, 1):
@@ -165,9 +161,7 @@ def _isolated(n: NDArray[Any], zero: NDArray[np.bool_], reach: int = 1) -> NDArr
             values.append(np.where(inside, n[q[:, 0], q[:, 1], q[:, 2]], 0.0))
         stacked = np.ma.masked_less_equal(np.stack(values), 0.0)
         sides.append(np.ma.filled(np.ma.median(stacked, axis=0), 0.0))
-    bright = at[(sides[0] > BRIGHT) & (sides[1] > BRIGHT)]
-    out[bright[:, 0], bright[:, 1], bright[:, 2]] = True
-    return out
+    return at[(sides[0] > BRIGHT) & (sides[1] > BRIGHT)]
 
 
 def mended(scan: Scan) -> tuple[Scan, list[str]]:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-__all__ = ["banded_add", "banded_cholesky", "stiffen"]
+__all__ = ["banded_add", "banded_cholesky", "damp", "stiffen"]
 
 
 @njit(parallel=True, cache=True, fastmath={"contract", "reassoc", "nsz"})
@@ -136,3 +136,60 @@ def stiffen(terms, points, least, step, most, definite):
             terms[0, 0, upper - 1, f] += stiffness
             terms[0, 1, upper - 1, f] -= stiffness
         definite[f] = good
+
+
+@njit(parallel=True, cache=True)
+def damp(terms, points, least, kept, shifts, level, lowest, todo):
+    """Damp position-dependent terms, then shift the diagonal, until all Σ_c points[k, c] terms[c] are definite.
+
+    Args:
+        terms, points, least: as in :func:`stiffen`; changed in place at the frequencies ``todo``.
+        kept: shares of the terms but the first that are kept, descending to 0; empty where there is but one term.
+        shifts: ascending shares of ``level`` that are added to the diagonal of the first term alone.
+        level: ``(frequencies,)`` mean diagonal.
+        lowest: what the diagonal becomes at least where nothing helps.
+        todo: indices of frequencies.
+    """
+    count, bands, nz, _ = terms.shape
+    for t in prange(todo.size):
+        f = todo[t]
+        own = np.empty((count, bands, nz), dtype=np.complex128)
+        for c in range(count):
+            for b in range(bands):
+                for z in range(nz):
+                    own[c, b, z] = terms[c, b, z, f]
+        matrix = np.empty((bands, nz), dtype=np.complex128)
+        lower = np.empty((bands, nz), dtype=np.complex128)
+        found = False
+        keep = 0.0
+        shift = 0.0
+        for s in range(kept.size + shifts.size):
+            keep = kept[s] if s < kept.size else 0.0
+            shift = 0.0 if s < kept.size else shifts[s - kept.size] * level[f]
+            found = True
+            # Without position-dependent terms all points are alike.
+            for k in range(points.shape[0] if keep > 0.0 else 1):
+                for b in range(bands):
+                    for z in range(nz):
+                        value = own[0, b, z]
+                        for c in range(1, count):
+                            value += keep * points[k, c] * own[c, b, z]
+                        matrix[b, z] = value
+                for z in range(nz):
+                    matrix[0, z] += shift
+                if _first_failure(matrix, least, lower) >= 0:
+                    found = False
+                    break
+            if found:
+                break
+        for b in range(bands):
+            for z in range(nz):
+                for c in range(1, count):
+                    terms[c, b, z, f] = keep * own[c, b, z] if found else 0.0
+                if not found:
+                    terms[0, b, z, f] = 0.0
+        for z in range(nz):
+            if found:
+                terms[0, 0, z, f] += shift
+            else:
+                terms[0, 0, z, f] = max(level[f], lowest)

@@ -6,8 +6,6 @@ mille of the frequencies the fitted spectrum is indefinite, which would let a we
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -27,17 +25,13 @@ SHIFTS = (3e-3, 1e-2, 3e-2, 0.1, 0.3, 1.0, 3.0)
 
 def cholesky(kernel: Tensor) -> tuple[Tensor, NDArray[np.bool_]]:
     """Banded L with L Lᴴ = kernel, ``(reach + 1, nz, ...)``, and where the kernel is positive definite, ``(...)``."""
-    flat, definite = _factor(kernel.cpu().reshape(*kernel.shape[:2], -1).to(torch.complex128).numpy())
-    return torch.from_numpy(flat).reshape(kernel.shape).to(kernel), definite.reshape(tuple(kernel.shape[2:]))
-
-
-def _factor(flat: Any, least: float = LEAST_PIVOT) -> tuple[Any, NDArray[np.bool_]]:
     from recon.gram.kernels import banded_cholesky  # numba loads with its first use
 
+    flat = kernel.cpu().reshape(*kernel.shape[:2], -1).to(torch.complex128).contiguous().numpy()
     lower = np.zeros_like(flat)
     definite = np.zeros(flat.shape[2], dtype=np.bool_)
-    banded_cholesky(np.ascontiguousarray(flat), least, lower, definite)
-    return lower, definite
+    banded_cholesky(flat, LEAST_PIVOT, lower, definite)
+    return torch.from_numpy(lower).reshape(kernel.shape).to(kernel), definite.reshape(tuple(kernel.shape[2:]))
 
 
 def make_definite(spectra: Tensor) -> Tensor:
@@ -54,26 +48,15 @@ def make_definite(spectra: Tensor) -> Tensor:
     flat = spectra.reshape(terms, bands, nz, -1).to(torch.complex128).numpy().copy()
     level = np.abs(flat[0, 0].real).mean(axis=0)
 
-    from recon.gram.kernels import stiffen  # numba loads with its first use
+    from recon.gram.kernels import damp, stiffen  # numba loads with its first use
 
     plain = flat.copy()
     definite = np.zeros(flat.shape[-1], dtype=np.bool_)
     stiffen(flat, _points(terms), LEAST_PIVOT, STIFFNESS, ADDITIONS, definite)
     todo = np.flatnonzero(~definite)
     flat[..., todo] = plain[..., todo]
-    for keep in KEPT if terms > 1 else ():
-        if todo.size:
-            flat[1:, :, :, todo] = keep * plain[1:, :, :, todo]
-            todo = _indefinite(flat, todo)
-    stiff = flat[0].copy()
-    for share in SHIFTS:
-        if todo.size:
-            flat[0, :, :, todo] = np.moveaxis(stiff[:, :, todo], -1, 0)
-            flat[0, 0, :, todo] += share * level[todo, None]
-            todo = _indefinite(flat, todo)
-    if todo.size:
-        flat[:, :, :, todo] = 0
-        flat[0, 0, :, todo] = np.maximum(level[todo, None], 1e-9 * level.max())
+    kept = np.array(KEPT if terms > 1 else ())
+    damp(flat, _points(terms), LEAST_PIVOT, kept, np.array(SHIFTS), level, 1e-9 * level.max(), todo)
     return torch.from_numpy(flat).reshape(spectra.shape).to(spectra)
 
 
@@ -81,12 +64,3 @@ def _points(terms: int) -> NDArray[np.float64]:
     """Polynomials b_c at the centre, the corners and the edge midpoints of the grid, ``(points, terms)``."""
     at = (-1, 0, 1) if terms > 1 else (0,)
     return np.array([[1, y, x, y * y, y * x, x * x][:terms] for y in at for x in at], dtype=np.float64)
-
-
-def _indefinite(flat: Any, among: Any) -> Any:
-    """Those of the frequencies ``among`` at which some point of the grid is indefinite."""
-    good = np.ones(among.size, dtype=np.bool_)
-    part = flat[..., among]
-    for b in _points(flat.shape[0]):
-        good &= _factor(np.tensordot(b, part, axes=1))[1]
-    return among[~good]
