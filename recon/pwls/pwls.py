@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -42,6 +42,8 @@ _LOG = logging.getLogger(__name__)
 MISFIT_LIMIT = 0.5
 # A model whose proposals do not halve in so many pairs has no place either.
 PATIENCE = 4
+# Largest ratio of two steps of the FFT model that is believed when what follows them is added up.
+SLOWEST = 0.9
 # The gradient is followed by recurrence and measured afresh after so many pairs: rounding adds up.
 REFRESH = 25
 # Rounding does not fall with the gradient: after a start whose data gradient is so many times that of 0, and where the
@@ -59,18 +61,18 @@ class PwlsResult:
 
     Args:
         x: ``(..., *grid.shape)`` mm⁻¹.
-        report: ``exact_pairs`` (A and Aᵀ applied together), ``inner_iterations`` (of the FFT model, one entry per outer
-            iteration), ``gradient`` (norm of the exact gradient of Φ over that of the zero volume, worst volume of the
-            batch, one entry per outer iteration), ``rmsd_hu`` (root mean square distance to the minimum in HU, worst
-            volume, one entry per outer iteration: as the FFT model sees it from the exact gradient; for a whole field
-            extrapolated from the latest steps, over the voxels that the data determine:
-            :attr:`recon.pwls.field_model.FieldModel.determined`), ``undetermined`` (share of the other voxels),
-            ``undetermined_rmsd_hu`` (the same estimate over them), ``converged``, ``tolerance_hu``, ``model`` ("gram"
-            or "gradient": who proposed the last step), ``model_misfit`` (of the FFT model on the first step, None
-            without one), ``misfit`` (weighted squared residual per reading of positive weight, one entry per volume:
-            about 1 for the right weights and many more readings than unknowns; from :func:`solve_normal`, which does
-            not know the data, None), ``seconds``, and the prior (``strength``, ``lambda``, ``threshold_hu_per_mm``,
-            ``p``, ``q``).
+        report: ``exact_pairs`` (A and Aᵀ applied together), ``inner_iterations`` (of the FFT model, one entry per
+            outer iteration), ``gradient`` (norm of the exact gradient of Φ over that of the zero volume, worst volume
+            of the batch, one entry per outer iteration), ``rmsd_hu`` (root mean square distance to the minimum in HU,
+            worst volume, one entry per outer iteration: as the FFT model sees it from the exact gradient and its
+            steps shrink (:func:`ahead`); for a whole field extrapolated from the latest steps, over the voxels that
+            the data determine: :attr:`recon.pwls.field_model.FieldModel.determined`), ``undetermined`` (share of the
+            other voxels), ``undetermined_rmsd_hu`` (the same estimate over them), ``converged``, ``tolerance_hu``,
+            ``model`` ("gram" or "gradient": who proposed the last step), ``model_misfit`` (of the FFT model on the
+            first step, None without one), ``misfit`` (weighted squared residual per reading of positive weight, one
+            entry per volume: about 1 for the right weights and many more readings than unknowns; from
+            :func:`solve_normal`, which does not know the data, None), ``seconds``, and the prior (``strength``,
+            ``lambda``, ``threshold_hu_per_mm``, ``p``, ``q``).
     """
 
     x: Tensor
@@ -108,8 +110,7 @@ def pwls(
         start: first volume ``(..., *grid.shape)`` mm⁻¹, default 0. It costs one exact pair and does not change the
             result; the volume returned has no larger Φ.
         tolerance: stop when the volume is this close to the minimum: root mean square, in HU (see ``rmsd_hu``), where
-            the data determine it; corners that some views miss hang on the prior and converge last. Where the FFT
-            model converges slowly its last step is up to 5 times shorter than what is left, and float32 may leave
+            the data determine it; corners that some views miss hang on the prior and converge last. float32 may leave
             5e-4 of the volume's noise (``tests/bench/precision.md``).
         max_exact: largest number of exact pairs; if it is reached, the report says ``converged: False`` and a
             warning is logged.
@@ -267,6 +268,7 @@ def _solve(
     inner: list[int] = []
     gradients: list[float] = []
     distances: list[float] = []
+    proposals: list[float] = []
     determined = (
         gram.determined if isinstance(gram, FieldModel) else torch.ones(shape[-len(spacing) :], dtype=torch.bool)
     )
@@ -280,8 +282,9 @@ def _solve(
         gradient = data_gradient + bound.gradient(x)
         gradients.append(float((dot(gradient, gradient, axes).sqrt() / reference).max()))
         proposed = float((dot(step, step, axes) / step[0].numel()).sqrt().max()) / hu
+        proposals.append(proposed)
         by_model = isinstance(proposer, ModelSolver)
-        distances.append(proposed if by_model else approach.remaining() / hu if approach.known else proposed)
+        distances.append(ahead(proposals) if by_model else approach.remaining() / hu if approach.known else proposed)
         if callback is not None:
             callback({
                 "outer": len(inner), "exact_pairs": pairs, "gradient": gradients[-1], "rmsd_hu": distances[-1], "x": x,
@@ -301,7 +304,7 @@ def _solve(
         pairs += 1
         if by_model and misfit is None:
             misfit = _misfit(gram, step, curved, axes)
-        if by_model and (misfit > MISFIT_LIMIT or _stalled(distances)):  # type: ignore[operator]
+        if by_model and (misfit > MISFIT_LIMIT or _stalled(proposals)):  # type: ignore[operator]
             proposer = GradientStep([(gram.periodic_spectrum(), None)], bound, b)
         if previous is not None:
             step, curved = _conjugate(x, step, curved, previous, bound)
@@ -350,8 +353,23 @@ def _misfit(gram: Any, step: Tensor, curved: Tensor, axes: int) -> float:
     return float((dot(error, error, axes) / size).sqrt().max())
 
 
-def _stalled(distances: list[float]) -> bool:
-    return len(distances) > PATIENCE and distances[-1] > 0.5 * distances[-1 - PATIENCE]
+def ahead(proposals: Sequence[float]) -> float:
+    """How far the minimum still is if the steps that the FFT model proposes go on to shrink as the last one did.
+
+    If each is q times the one before, d (1 + q + q² …) is ahead; but a model that shrinks its steps slowly takes them
+    too short, so what follows the last step counts twice. On insets with q from 0.02 to 0.45 the result was 0.8 to 1.25
+    times the true distance; d alone was up to 2.2 times too short.
+
+    Args:
+        proposals: lengths of the proposed steps.
+    """
+    d = proposals[-1]
+    q = min(d / proposals[-2], SLOWEST) if len(proposals) > 1 and proposals[-2] > 0 else 0.0
+    return d * (1 + q) / (1 - q)
+
+
+def _stalled(proposals: list[float]) -> bool:
+    return len(proposals) > PATIENCE and proposals[-1] > 0.5 * proposals[-1 - PATIENCE]
 
 
 def _conjugate(

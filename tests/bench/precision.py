@@ -308,7 +308,6 @@ NOTES = """\
 * FBP's rounding is below 0.01 HU at every size.
 * Below 1e-38 float32 has ever fewer bits (seven at 1e-41 · 0.02), and results are as coarse.
 * The PWLS insets are tiny and starved (noise of 600 HU), which makes rounding count most: 5e-4 of their noise is left.
-  A run that stops by the tolerance of 0.2 HU is further off where the model converges slowly: its last step is short.
 * MBIR's network works in units of the noise: it has no tolerance, and rounding is all that differs.
 * MBIR, joint PWLS and `conjugate_gradient` always start from zero; PWLS alone can be given a start.
 """

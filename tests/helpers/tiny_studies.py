@@ -15,7 +15,7 @@ TINY: dict[str, dict[str, Any]] = {
     },
     "dose-factor": {
         "n": 14, "slow_n": 12, "scene_n": 9, "doses": (2.0,), "scene_doses": (2.0,), "methods": ("linear", "qggmrf"),
-        "scenes": ("half_size_core",), "scene_methods": ("linear", "qggmrf"), "views": 48, "voxel_mm": 0.4,
+        "scenes": ("half_size_core",), "scene_methods": ("linear", "qggmrf"), "views": 24, "voxel_mm": 0.4,
         "kernels": ("soft",), "block": 7, "vessels": ("curved_5mm",),
     },
     "phantom": {"voxel_mm": 0.05, "sections": 2, "energies_kev": (55.0, 64.0)},

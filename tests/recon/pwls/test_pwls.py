@@ -56,6 +56,22 @@ def reference(dense, A, w, y, prior, information):
     return x.reshape(shape)
 
 
+@pytest.mark.parametrize("prior", [QGGMRF(0.3, 4.0, relative=True), quadratic(0.01)], ids=["edge-preserving", "weak"])
+def test_distance_is_right_where_the_model_converges_slowly(prior):
+    """A shift-invariant model of few views: each step is a fifth or half of the one before."""
+    A, w = problem(views=60, shape=(6, 21, 21), rows=8)
+    y = noisy(A, w)
+    gram = Gram(A, w, nodes=1)
+    bound = prior.bind(gram.information(HU), A.grid.spacing, HU)
+    exact = pwls(A, y.double(), w.double(), bound, hu=HU, gram=Gram(A, w.double(), nodes=1), tolerance=1e-3).x
+    for tolerance in (2.0, 0.2):
+        found = pwls(A, y, w, bound, hu=HU, gram=gram, tolerance=tolerance)
+        assert found.report["model"] == "gram"
+        true = hu_rms(found.x, exact)
+        assert true < tolerance
+        assert 0.8 * true < found.report["rmsd_hu"][-1] < 1.5 * true
+
+
 @pytest.mark.parametrize("prior", [quadratic(0.15), EDGE, QGGMRF(0.5, 30.0, 2.0, 1.2, 6)])
 def test_exact_minimum_within_three_pairs(inset, dense, prior):
     A, w, gram, y = inset
