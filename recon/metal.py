@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from torch import Tensor
 
+from torchpcct.robust import MEDIAN_TO_SD
+
 __all__ = ["DENSEST_HU", "metal_warnings"]
 
 DENSEST_HU = 3000.0
 """Enamel, the densest tissue. Titanium reads 16 000 HU."""
 _SIGMAS = 6.0
-_MAD = 1.4826
 
 
 def metal_warnings(volume: Tensor) -> list[str]:
@@ -23,7 +24,7 @@ def metal_warnings(volume: Tensor) -> list[str]:
         Warnings; empty if there is no metal.
     """
     peak, middle = float(volume.max()), volume.median()
-    noise = _MAD * float((volume - middle).abs().median())
+    noise = MEDIAN_TO_SD * float((volume - middle).abs().median())
     if not peak > DENSEST_HU + _SIGMAS * noise:
         return []
     return [

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from torchpcct.dead_cells import bridge
 from torchpcct.detector_window import DetectorWindow
+from torchpcct.robust import MEDIAN_TO_SD
 from torchpcct.scan import Scan
 
 __all__ = ["Defects", "find_defects", "mended"]
@@ -119,7 +120,7 @@ def find_defects(counts: Tensor, air: Tensor, first_column: Any = None) -> Defec
         # The object's edges are seen by all rows alike, the gain of a cell by one.
         deviation = mean - np.median(mean, axis=0)
         some = times > 0.25 * seen.max()
-        usual = 1.4826 * np.median(np.abs(deviation[some])) if some.any() else 0.0
+        usual = MEDIAN_TO_SD * np.median(np.abs(deviation[some])) if some.any() else 0.0
         error = np.hypot(np.sqrt(1.5 / np.maximum(level * times, 1.0)), usual)
         hot = some & (np.abs(deviation) > np.maximum(GAIN_ERROR, _SIGMAS * error)) & (level > BRIGHT)
         # The neighbours of a hot cell deviate by half as much, the other way.

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from torchpcct.geometry import Geometry
+from torchpcct.robust import MEDIAN_TO_SD
 from torchpcct.scanner.linearisation import WaterLinearisation
 from torchpcct.validate import number
 
@@ -27,7 +28,6 @@ _DARK = 1e-3
 """Cells that read no more in air than this share of the median cell are dead."""
 _TRANSFER_FRAMES = 4
 """Air frames that a photon transfer needs at least."""
-_MAD = 1.4826
 
 
 def _tensor(name: str, values: Any) -> Tensor:
@@ -241,7 +241,7 @@ def _photons(p: Tensor, mask: Tensor, geometry: Geometry) -> float:
     live = live[:: max(1, live.numel() // 1_000_000)]
     if not live.numel():
         return 1e6
-    sd = _MAD * float(live.abs().median())
+    sd = MEDIAN_TO_SD * float(live.abs().median())
     return float(min(max(1.0 / max(sd, 1e-4) ** 2, 1.0), 1e8))
 
 

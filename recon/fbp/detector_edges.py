@@ -18,6 +18,7 @@ from torch import Tensor
 
 from recon.fbp.angular_weights import is_offset
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid
+from torchpcct.robust import MEDIAN_TO_SD
 
 __all__ = ["Rows", "continued", "cut_off", "mirrored", "reach"]
 
@@ -83,7 +84,7 @@ def _rises(end: Tensor, limit: float) -> bool:
     smooth = torch.nn.functional.avg_pool1d(series, width, 1)
     margin = 0.0
     if series.shape[-1] > 2:
-        margin = 3.0 * float(series.diff(dim=-1).abs().median()) * 1.4826 / math.sqrt(2.0 * width)
+        margin = 3.0 * float(series.diff(dim=-1).abs().median()) * MEDIAN_TO_SD / math.sqrt(2.0 * width)
     return float((smooth > limit + margin).double().mean()) > _CUT_VIEWS
 
 

@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from rod_values import ROD_HU
 from scipy import ndimage
 from scipy.stats import beta, chi2
 
@@ -63,7 +64,7 @@ CASES = {
     "2.0 s, half contrast, with a point": Case("half contrast", 2.0, True, 4),
 }
 POINT_SD_MM = 0.4
-TISSUES_HU = {"fat": -92.65, "wall": 63.53, "fibrous": 103.22, "lumen": 479.97, "core": 41.07, "contrast": 62.15}
+TISSUES_HU = {**ROD_HU, "contrast": ROD_HU["fibrous"] - ROD_HU["core"]}
 """By rods of 4 mm (``notebooks/dose_factor``). Blood with iodine hardens its own beam: least squares with exact path
 lengths gives the narrower lumen 484.7 HU in the plaque (``notebooks/fbp_vs_mbir.ipynb``), where readings of scans
 find 485.0; of what is drawn through the operator they find the 480.0 that were drawn."""

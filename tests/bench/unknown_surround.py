@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from rod_values import ROD_HU
 from torch import Tensor
 
 from recon.fbp.fbp import fbp
@@ -48,8 +49,8 @@ IN_THE_MEDIASTINUM = (-40.0, -79.0, 0.0)
 """Of the thorax's plaque, mm: in fat, 9 mm beside the vertebra and as far from the lung."""
 WIDE = 2000
 """Columns that hold the thorax; the scanner's own 1500 would cut it off, and PWLS and MBIR would refuse it."""
+TISSUES_HU = {"patient" if name == "fat" else name: value for name, value in ROD_HU.items()}
 KEV, PHOTONS, MU_WATER = 70.0, 4e5, 0.0193
-TISSUES_HU = {"patient": -92.65, "wall": 63.53, "fibrous": 103.22, "lumen": 479.97, "core": 41.07}
 CYLINDER, THORAX = "cylinder of 24 cm", "thorax"
 
 

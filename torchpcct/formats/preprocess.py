@@ -13,6 +13,7 @@ from torch import Tensor
 from torchpcct.dead_cells import bridge
 from torchpcct.formats.damage import needed
 from torchpcct.geometry import ParallelBeam
+from torchpcct.robust import MEDIAN_TO_SD
 from torchpcct.scan import Scan
 
 __all__ = ["centred", "cleaned", "find_axis", "without_outliers", "without_stripes"]
@@ -62,7 +63,7 @@ def _by_centroid(lines: NDArray[np.float64], angles: NDArray[np.float64]) -> flo
     for _ in range(5):  # views that a lost reading has pulled aside are left out
         fit = np.linalg.lstsq(waves[kept], centroid[kept], rcond=None)[0]
         off = np.abs(centroid - waves @ fit)
-        kept = off <= 5.0 * 1.4826 * np.median(off) + 1e-9
+        kept = off <= 5.0 * MEDIAN_TO_SD * np.median(off) + 1e-9
     return float(fit[0])
 
 
@@ -106,7 +107,7 @@ def without_stripes(lines: Tensor, *, snr: float = 3.0) -> Tensor:
     flat = lines.reshape(-1, *lines.shape[-2:]).double().numpy()
     mean = flat.mean(1)
     off = mean - median_filter(mean, size=(1, 5), mode="nearest")
-    spread = 1.4826 * np.median(np.abs(off), axis=1, keepdims=True)
+    spread = MEDIAN_TO_SD * np.median(np.abs(off), axis=1, keepdims=True)
     clean = flat - np.where(np.abs(off) > snr * spread, off, 0.0)[:, None]
     return torch.from_numpy(clean).to(lines.dtype).reshape(lines.shape)
 
@@ -122,6 +123,6 @@ def without_outliers(lines: Tensor, *, threshold: float = 0.08) -> Tensor:
     flat = lines.reshape(-1, *lines.shape[-2:]).double().numpy()
     middle = median_filter(flat, size=(1, 3, 3), mode="nearest")
     off = np.abs(flat - middle)
-    spread = 1.4826 * np.median(off[off > 0]) if bool((off > 0).any()) else 0.0
+    spread = MEDIAN_TO_SD * np.median(off[off > 0]) if bool((off > 0).any()) else 0.0
     clean = np.where(off > max(threshold, 8.0 * spread), middle, flat)
     return torch.from_numpy(clean).to(lines.dtype).reshape(lines.shape)
