@@ -37,6 +37,7 @@ class Fault(NamedTuple):
 _T = "tests/torchpcct/test_no_silent_errors.py::"
 _R = "tests/recon/test_no_silent_errors.py::"
 _C = "tests/recon/test_cli_refusals.py::"
+_FIELD, _WF = "recon/pwls/field_model.py", "tests/recon/pwls/test_whole_field.py::"
 _D = "tests/torchpcct/test_defects.py::"
 _Q = "tests/torchpcct/metrics/test_residual_test.py::"
 _O = "tests/torchpcct/metrics/test_opposite_rays.py::"
@@ -196,6 +197,14 @@ FAULTS = (
           _F + "test_pwls_forgets_a_start_far_away"),
     Fault("bins of one spectrum pass", "torchpcct/spectral/model.py", "_ALIKE = 1e-7", "_ALIKE = -1.0",
           _F + "test_what_has_no_answer_is_refused"),
+    Fault("unmet voxels scaled by themselves", _FIELD, "LEAST_MET = 0.5", "LEAST_MET = 1e-4",
+          _WF + "test_slices_beyond_the_rows_do_not_slow_the_rest_down"),
+    Fault("one spectrum for all slices", _FIELD, "NODES, FACTOR = 5, 3.0", "NODES, FACTOR = 5, 1e30",
+          _WF + "test_slices_share_the_field"),
+    Fault("slow steps count once", "recon/pwls/pwls.py", "return d * (1 + q) / (1 - q)", "return d",
+          "tests/recon/pwls/test_pwls.py::test_distance_is_right_where_the_model_converges_slowly"),
+    Fault("indefinite frequencies pass", "recon/gram/positive_definite.py", "    damp(flat, _points",
+          "    _ = (flat, _points", "tests/recon/gram/test_gram.py::test_spectra_become_definite_whatever_they_are"),
 )  # fmt: skip
 
 

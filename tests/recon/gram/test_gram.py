@@ -7,6 +7,7 @@ import torch
 from inset_operators import CENTER, HU, matrix, problem, tissue
 
 from recon.gram.gram import Gram
+from recon.gram.positive_definite import make_definite
 from torchpcct import FanBeam, Projector, VolumeGrid
 from torchpcct.detector_window import shadow
 from torchpcct.geometry import full_turn
@@ -47,6 +48,24 @@ def test_self_adjoint_and_positive(inset):
     assert float((m - m.T).abs().max()) <= 1e-9 * float(m.abs().max())
     eigenvalues = torch.linalg.eigvalsh(m)
     assert float(eigenvalues[0]) > -1e-6 * float(eigenvalues[-1])
+
+
+@pytest.mark.parametrize("terms", [1, 6])
+def test_spectra_become_definite_whatever_they_are(terms):
+    """Frequencies: sound; position-dependent terms too large; indefinite at the centre; negative throughout."""
+    nz, kinds = 6, 4
+    spectra = torch.zeros(terms, 2, nz, 1, kinds, dtype=torch.complex64)
+    spectra[0, 0, :, 0] = torch.tensor([1.0, 1.0, 0.5, -1.0])
+    spectra[0, 1, :-1, 0] = torch.tensor([0.1, 0.1, 0.6, 0.2])
+    spectra[1:, 0, :, 0, 1] = 2.0
+    found = make_definite(spectra)
+    assert torch.equal(found[..., 0], spectra[..., 0])
+    corners = [(1.0, y, x, y * y, y * x, x * x)[:terms] for y in (-1, 0, 1) for x in (-1, 0, 1)]
+    for weights in corners:
+        band = torch.einsum("c,cbzf->fbz", torch.tensor(weights, dtype=torch.complex64), found[..., 0, :])
+        for main, below in band:
+            dense = torch.diag(main) + torch.diag(below[:-1], -1) + torch.diag(below[:-1].conj(), 1)
+            assert float(torch.linalg.eigvalsh(dense)[0]) > 0
 
 
 def test_row_phase_is_kept_slice_by_slice():
