@@ -117,7 +117,7 @@ in a further scene half as many as its twin."""
 
 RELATIVES = ("mbir_tissues", "mbir_viewing", "mbir_measuring", "mbir_one_step", "mbir_free", "fbp_cnn")
 """Methods with MBIR's network. Where they have no control of their own, MBIR's response follows their contrast more
-closely than linear filters do."""
+closely than linear filters do in most ROIs: one choice for all, made on the correlations of the study's draws."""
 
 TWIN_REALIZATIONS = 16
 """Of a further scene or vessel without its core, in whole blocks. What the core adds hardly changes from draw to draw
