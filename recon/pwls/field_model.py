@@ -87,12 +87,13 @@ class FieldModel:
         return _periodic(self._response(impulse) / self.seen[at], at)
 
     @cached_property
-    def nodes(self) -> list[tuple[Tensor, Tensor | None]]:
+    def nodes(self) -> list[tuple[Tensor, Tensor]]:
         """K_c and s_c, ``(z, 1, 1)``, of slices between the first and the last that is determined in the middle.
 
-        Where one K will do, it alone, and None. Otherwise this costs four projection pairs, when it is first asked for.
+        Where one K will do, it alone, with the share 1. A volume costs two projection pairs to find out, and two more
+        for the other slices, when this is first asked for.
         """
-        alone: list[tuple[Tensor, Tensor | None]] = [(self.spectrum, None)]
+        alone = [(self.spectrum, torch.ones_like(self.spectrum.flatten()[0]))]
         if self.grid.ndim < 3:
             return alone
         column = self.determined[:, self.at[1], self.at[2]].nonzero().flatten()
@@ -136,7 +137,7 @@ class GradientStep:
     """Steps of preconditioned conjugate gradients: −Σ_c D⁻¹ s_c F⁻¹ (K_c + η_c R)⁻¹ F s_c D⁻¹ times the gradient.
 
     Args:
-        nodes: K_c, ``rfftn`` layout of the grid, > 0, with s_c, broadcast to the grid; of a single one None: 1.
+        nodes: K_c, ``rfftn`` layout of the grid, > 0, with s_c, which broadcast to the grid.
         prior: its curvature at gradient 0 is R.
         x: volumes ``(batch, *shape)``; only their shape, dtype and device matter.
         scale: D² > 0, the shape of the grid; None: 1.
@@ -144,7 +145,7 @@ class GradientStep:
 
     def __init__(
         self,
-        nodes: Sequence[tuple[Tensor, Tensor | None]],
+        nodes: Sequence[tuple[Tensor, Tensor]],
         prior: BoundPrior,
         x: Tensor,
         scale: Tensor | None = None,
@@ -158,7 +159,7 @@ class GradientStep:
         if scale is not None:
             self._scale, inverse = scale.to(x).rsqrt(), scale.to(x).reciprocal()
         # In units of D² the prior weighs more where fewer rays pass: η_c is its mean over the slices of c.
-        self._nodes = [(k.to(x), None if s is None else s.to(x), _mean(inverse, s)) for k, s in nodes]
+        self._nodes = [(k.to(x), s.to(x), _mean(inverse, s.to(x))) for k, s in nodes]
 
     @classmethod
     def of(cls, model: FieldModel, prior: BoundPrior, x: Tensor) -> GradientStep:
@@ -173,22 +174,17 @@ class GradientStep:
         if self._steps & (self._steps - 1) == 0:  # after 0, 1, 2, 4, 8 … steps: by then x hardly changes
             self._share = mean_share(self.prior, x)
         self._steps += 1
-        step: Tensor | None = None
+        step = torch.zeros_like(g)
         for data, share, weight in self._nodes:
-            part = torch.fft.rfftn(g if share is None else g * share, dim=axes)
-            part = torch.fft.irfftn(part.div_(data + self._share * weight * self._prior), s=self._grid, dim=axes).neg_()
-            part = part if share is None else part * share
-            step = part if step is None else step + part
-        assert step is not None
+            part = torch.fft.rfftn(g * share, dim=axes).div_(data + self._share * weight * self._prior)
+            step -= share * torch.fft.irfftn(part, s=self._grid, dim=axes)
         return (step if self._scale is None else step * self._scale), 0
 
 
-def _mean(inverse: Tensor, share: Tensor | None) -> float:
+def _mean(inverse: Tensor, share: Tensor) -> float:
     """Mean of 1 / D² over the slices of a node."""
-    if inverse.dim() == 0 or share is None:
-        return float(inverse.mean(dtype=torch.float64))
-    weight = share.to(inverse).square().expand(inverse.shape)
-    return float((inverse * weight).sum(dtype=torch.float64) / weight.sum(dtype=torch.float64))
+    value, weight = torch.broadcast_tensors(inverse, share.square())
+    return float((value * weight).sum(dtype=torch.float64) / weight.sum(dtype=torch.float64))
 
 
 def _shares(slices: Sequence[int], like: Tensor) -> list[Tensor]:

@@ -305,7 +305,7 @@ def _solve(
         if by_model and misfit is None:
             misfit = _misfit(gram, step, curved, axes)
         if by_model and (misfit > MISFIT_LIMIT or _stalled(proposals)):  # type: ignore[operator]
-            proposer = GradientStep([(gram.periodic_spectrum(), None)], bound, b)
+            proposer = GradientStep([(gram.periodic_spectrum(), torch.ones(()))], bound, b)
         if previous is not None:
             step, curved = _conjugate(x, step, curved, previous, bound)
         # From 0: there a majorising search cannot end above where it began.
