@@ -18,8 +18,8 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from torchpcct.projector.cpu.simd import add_lines, spread_lines
-from torchpcct.projector.cpu.simd_interpolation import read_even
+from torchpcct.projector.cpu.simd import add_lines, spread_line, spread_lines, sum_lines
+from torchpcct.projector.cpu.simd_interpolation import add_steps, set_steps
 
 __all__ = ["backproject", "padded", "project"]
 
@@ -152,15 +152,12 @@ def _plan(p0, q0, p1, q1, l0, l1, path, layer, layered, r0, r1, width, across, a
 
 
 @_small
-def _add_rows(lanes, line, at, depth, z0, dz, row0, row_pitch, read, out):
+def _add_rows(lanes, line, at, depth, z0, dz, row0, row_pitch, out):
     """Add the row means of one layer (running sums ``line``) at the ray parameter ``depth`` to ``out``."""
     real = line.dtype.type
     step = depth * row_pitch / dz
     zeta = real((at[2] + depth * (row0 + at[7] - at[2]) - z0) / dz)
-    read_even(lanes, line, zeta, real(step), line.size - 8, line.size, read, read.size)
-    gain = real(1.0 / step)
-    for i in range(out.size):
-        out[i] += gain * (read[i + 1] - read[i])
+    add_steps(lanes, line, zeta, real(step), line.size - 8, line.size, real(1.0 / step), out, out.size)
 
 
 @_small
@@ -172,9 +169,9 @@ def _project_view(
     rows, columns = data.shape
     real = lines.dtype.type
     flat = lines.reshape(-1)
-    pair = np.zeros((2, knots), dtype=lines.dtype)
-    read = np.zeros(padded(rows + 1), dtype=lines.dtype)
-    sums = np.zeros((columns, rows), dtype=lines.dtype)
+    pair = np.zeros((3, knots), dtype=lines.dtype)
+    slab = pair[2]
+    sums = np.zeros((columns, padded(rows)), dtype=lines.dtype)
     table = np.empty((max(ny, nx), 2), dtype=np.int64)
     offset = np.empty(0, dtype=np.int64)
     low, high = np.empty(0, dtype=lines.dtype), np.empty(0, dtype=lines.dtype)
@@ -193,19 +190,19 @@ def _project_view(
             e0 = 0
             for n in range(runs):
                 now, e1 = table[n, 0], table[n, 1]
+                if not layered:
+                    sum_lines(lanes, flat, offset, low, e0, e1, knots, slab)
+                    _add_rows(lanes, slab, at, l0 + l1 * now, z0, dz, row0, row_pitch, sums[j])
+                    e0 = e1
+                    continue
                 lower, upper = now % 2, (now + 1) % 2
                 add_lines(lanes, flat, offset, low, high, e0, e1, knots, pair[lower], pair[upper])
                 e0 = e1
-                if not layered:
-                    _add_rows(lanes, pair[lower], at, l0 + l1 * now, z0, dz, row0, row_pitch, read, sums[j])
-                    _clear(pair[lower])
-                    _clear(pair[upper])  # zero weights of NaN or Inf
-                    continue
                 after = table[n + 1, 0] if n + 1 < runs else -9
                 for m in range(now, now + 2):
                     if m != after and m != after + 1:
                         line = pair[m % 2]
-                        _add_rows(lanes, line, at, m * layer, z0, dz, row0, row_pitch, read, sums[j])
+                        _add_rows(lanes, line, at, m * layer, z0, dz, row0, row_pitch, sums[j])
                         _clear(line)
             for i in range(rows):
                 rise = row0 + (i + 0.5) * row_pitch + at[7] - at[2]
@@ -268,13 +265,12 @@ def _row_sums(data, pose, centers, first, row0, row_pitch, begin, sums):
 
 
 @_small
-def _layer_values(lanes, sums, at, depth, z0, dz, row0, row_pitch, read, values):
+def _layer_values(lanes, sums, at, depth, z0, dz, row0, row_pitch, values):
     """Transpose of ``_add_rows``: what each voxel of a line at ``depth`` collects from the running row sums."""
     real = sums.dtype.type
     rho = ((z0 - at[2]) / depth - (row0 + at[7] - at[2])) / row_pitch
-    read_even(lanes, sums, real(rho), real(dz / (depth * row_pitch)), sums.size - 1, sums.size, read, read.size)
-    for z in range(values.size):
-        values[z] = read[z + 1] - read[z]
+    pitch = dz / (depth * row_pitch)
+    set_steps(lanes, sums, real(rho), real(pitch), sums.size - 1, sums.size, values, values.size)
 
 
 @_small
@@ -285,7 +281,6 @@ def _gather_slabs(
     """Slabs ``r0 … r1`` of ``_gather``; ``out``: ``(slabs, width, padded(nz))``."""
     _, width, nz = out.shape
     flat = out.reshape(-1)
-    read = np.empty(nz + 8, dtype=sums.dtype)
     pair = np.empty((2, nz), dtype=sums.dtype)
     table = np.empty((r1 - r0, 2), dtype=np.int64)
     offset = np.empty(0, dtype=np.int64)
@@ -305,20 +300,16 @@ def _gather_slabs(
             e0, before = 0, -9
             for n in range(runs):
                 now, e1 = table[n, 0], table[n, 1]
-                lower, upper = now % 2, (now + 1) % 2
+                line = sums[v - begin, j]
                 if layered:
                     for m in range(now, now + 2):
                         if m != before and m != before + 1:
-                            _layer_values(
-                                lanes, sums[v - begin, j], at, m * layer, z0, dz, row0, row_pitch, read, pair[m % 2]
-                            )
+                            _layer_values(lanes, line, at, m * layer, z0, dz, row0, row_pitch, pair[m % 2])
                     before = now
+                    spread_lines(lanes, flat, offset, low, high, e0, e1, nz, pair[now % 2], pair[(now + 1) % 2])
                 else:
-                    upper = lower  # its weight is zero
-                    _layer_values(
-                        lanes, sums[v - begin, j], at, l0 + l1 * now, z0, dz, row0, row_pitch, read, pair[lower]
-                    )
-                spread_lines(lanes, flat, offset, low, high, e0, e1, nz, pair[lower], pair[upper])
+                    _layer_values(lanes, line, at, l0 + l1 * now, z0, dz, row0, row_pitch, pair[0])
+                    spread_line(lanes, flat, offset, low, e0, e1, nz, pair[0])
                 e0 = e1
 
 

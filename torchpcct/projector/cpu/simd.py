@@ -20,7 +20,7 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
-__all__ = ["add_edges", "add_lines", "spread_lines", "sum_edges"]
+__all__ = ["add_edges", "add_lines", "spread_line", "spread_lines", "sum_edges", "sum_lines"]
 
 _FUSED = ("contract", "nsz", "arcp", "reassoc")
 
@@ -280,28 +280,50 @@ def add_lines(typingctx, lanes, lines, offset, low, high, e0, e1, size, below, a
     def codegen(context, builder, signature, args):
         c = _Code(context, builder, signature, args)
         _, lines, offset, low, high, e0, e1, size, below, above = c.values
-        sums = [[cgutils.alloca_once(builder, c.wide) for _ in range(4)] for _ in range(2)]
-
-        def body(first, vectors):
-            places = [builder.add(first, ir.Constant(c.index, i * c.width)) for i in range(vectors)]
-            for target, total in zip((below, above), sums, strict=True):
-                for place, part in zip(places, total, strict=False):
-                    builder.store(c.load(target, place, c.wide), part)
-            with cgutils.for_range(builder, e1, start=e0) as entry:
-                start = builder.load(builder.gep(offset, [entry.index]))
-                weights = [c.splat(c.load(w, entry.index, c.real), c.width) for w in (low, high)]
-                for i, place in enumerate(places):
-                    value = c.load(lines, builder.add(start, place), c.wide)
-                    for weight, total in zip(weights, sums, strict=True):
-                        builder.store(c.add(builder.load(total[i]), c.mul(weight, value)), total[i])
-            for target, total in zip((below, above), sums, strict=True):
-                for place, part in zip(places, total, strict=False):
-                    c.store(builder.load(part), target, place)
-
-        _columns(c, size, body)
+        _gather_lines(c, lines, offset, (low, high), e0, e1, size, (below, above), fresh=False)
         return context.get_dummy_value()
 
     return signature, codegen
+
+
+@intrinsic
+def sum_lines(typingctx, lanes, lines, offset, low, e0, e1, size, total):
+    """``total = Σ_e low[e] lines[offset[e]:]``: as ``add_lines``, for slabs that belong to no two layers."""
+    signature = types.void(lanes, lines, offset, low, e0, e1, size, total)
+
+    def codegen(context, builder, signature, args):
+        c = _Code(context, builder, signature, args)
+        _, lines, offset, low, e0, e1, size, total = c.values
+        _gather_lines(c, lines, offset, (low,), e0, e1, size, (total,), fresh=True)
+        return context.get_dummy_value()
+
+    return signature, codegen
+
+
+def _gather_lines(
+    c: Any, lines: Any, offset: Any, weights: Any, e0: Any, e1: Any, size: Any, targets: Any, fresh: bool
+) -> None:
+    """Weighted sums of lines, one per target; ``fresh``: what the targets held before is overwritten."""
+    b = c.b
+    sums = [[cgutils.alloca_once(b, c.wide) for _ in range(4)] for _ in targets]
+
+    def body(first: Any, vectors: int) -> None:
+        places = [b.add(first, ir.Constant(c.index, i * c.width)) for i in range(vectors)]
+        for target, total in zip(targets, sums, strict=True):
+            for place, part in zip(places, total, strict=False):
+                b.store(ir.Constant(c.wide, None) if fresh else c.load(target, place, c.wide), part)
+        with cgutils.for_range(b, e1, start=e0) as entry:
+            start = b.load(b.gep(offset, [entry.index]))
+            shares = [c.splat(c.load(w, entry.index, c.real), c.width) for w in weights]
+            for i, place in enumerate(places):
+                value = c.load(lines, b.add(start, place), c.wide)
+                for share, total in zip(shares, sums, strict=True):
+                    b.store(c.add(b.load(total[i]), c.mul(share, value)), total[i])
+        for target, total in zip(targets, sums, strict=True):
+            for place, part in zip(places, total, strict=False):
+                c.store(b.load(part), target, place)
+
+    _columns(c, size, body)
 
 
 @intrinsic
@@ -312,19 +334,41 @@ def spread_lines(typingctx, lanes, lines, offset, low, high, e0, e1, size, below
     def codegen(context, builder, signature, args):
         c = _Code(context, builder, signature, args)
         _, lines, offset, low, high, e0, e1, size, below, above = c.values
-
-        def body(first, vectors):
-            places = [builder.add(first, ir.Constant(c.index, i * c.width)) for i in range(vectors)]
-            given = [[c.load(source, place, c.wide) for place in places] for source in (below, above)]
-            with cgutils.for_range(builder, e1, start=e0) as entry:
-                start = builder.load(builder.gep(offset, [entry.index]))
-                weights = [c.splat(c.load(w, entry.index, c.real), c.width) for w in (low, high)]
-                for i, place in enumerate(places):
-                    where = builder.add(start, place)
-                    value = c.add(c.load(lines, where, c.wide), c.mul(weights[0], given[0][i]))
-                    c.store(c.add(value, c.mul(weights[1], given[1][i])), lines, where)
-
-        _columns(c, size, body)
+        _spread(c, lines, offset, (low, high), e0, e1, size, (below, above))
         return context.get_dummy_value()
 
     return signature, codegen
+
+
+@intrinsic
+def spread_line(typingctx, lanes, lines, offset, low, e0, e1, size, line):
+    """Transpose of ``sum_lines``: ``lines[offset[e]:] += low[e] line`` for e from e0 to e1."""
+    signature = types.void(lanes, lines, offset, low, e0, e1, size, line)
+
+    def codegen(context, builder, signature, args):
+        c = _Code(context, builder, signature, args)
+        _, lines, offset, low, e0, e1, size, line = c.values
+        _spread(c, lines, offset, (low,), e0, e1, size, (line,))
+        return context.get_dummy_value()
+
+    return signature, codegen
+
+
+def _spread(c: Any, lines: Any, offset: Any, weights: Any, e0: Any, e1: Any, size: Any, sources: Any) -> None:
+    """Add weighted sums of the sources to lines."""
+    b = c.b
+
+    def body(first: Any, vectors: int) -> None:
+        places = [b.add(first, ir.Constant(c.index, i * c.width)) for i in range(vectors)]
+        given = [[c.load(source, place, c.wide) for place in places] for source in sources]
+        with cgutils.for_range(b, e1, start=e0) as entry:
+            start = b.load(b.gep(offset, [entry.index]))
+            shares = [c.splat(c.load(w, entry.index, c.real), c.width) for w in weights]
+            for i, place in enumerate(places):
+                where = b.add(start, place)
+                value = c.load(lines, where, c.wide)
+                for share, source in zip(shares, given, strict=True):
+                    value = c.add(value, c.mul(share, source[i]))
+                c.store(value, lines, where)
+
+    _columns(c, size, body)

@@ -1,4 +1,4 @@
-"""Linear interpolation at equally spaced positions, eight at a time, as explicit SIMD.
+"""Linear interpolation at equally spaced positions, eight at a time, and its steps from one to the next, as explicit SIMD.
 
 Row edges lie evenly along a line of voxels. Eight neighbours of them read at most 8 (16) knots when they lie less than
 one (two) knots apart: these are loaded whole and picked in registers, where AVX2 has a permutation for it. Elsewhere,
@@ -7,6 +7,7 @@ and for larger steps, each pair of knots is loaded on its own. The arithmetic is
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
@@ -15,68 +16,108 @@ from numba.extending import intrinsic
 
 from torchpcct.projector.cpu.simd import _Code
 
-__all__ = ["read_even"]
+__all__ = ["add_steps", "set_steps"]
 
 # Eight positions at most this far apart fall on 8, or on 16, neighbouring knots.
 _STEP_OF_8, _STEP_OF_16 = 0.999, 2.13
 
 
 @intrinsic
-def read_even(typingctx, lanes, line, zeta0, step, last, size, read, count):
-    """``read[i]`` = ``line`` interpolated at ``zeta0 + step * i`` clamped to the knots 0…last, for i < count.
+def add_steps(typingctx, lanes, line, zeta0, step, last, size, gain, out, count):
+    """``out[i] += gain * (line(i + 1) - line(i))`` for i < count, ``line(i)`` that at ``zeta0 + step * i``.
 
-    ``lanes``: tuple of the vector's length W. ``size``: elements of ``line``, > last. ``count``: a multiple of W.
+    ``line``: knots 0…last, to which positions are clamped, with ``size`` elements, > last. ``lanes``: tuple of the
+    vector's length W. ``count``: a multiple of W.
     """
-    signature = types.void(lanes, line, zeta0, step, last, size, read, count)
+    signature = types.void(lanes, line, zeta0, step, last, size, gain, out, count)
 
     def codegen(context, builder, signature, args):
         c = _Code(context, builder, signature, args)
-        _, line, zeta0, step, last, size, read, count = c.values
-        positions = _Positions(c, zeta0, step, last)
-
-        def run(pick: Any) -> None:
-            with cgutils.for_range(builder, builder.sdiv(count, ir.Constant(c.index, c.width))) as loop:
-                first = c.times(loop.index, c.width)
-                k, part = positions.at(first)
-                low, high = pick(k)
-                c.store(c.add(low, c.mul(part, c.sub(high, low))), read, first)
-
-        def one_by_one(k: Any) -> tuple[Any, Any]:
-            pair = ir.VectorType(c.real, 2)
-            low = high = ir.Constant(c.wide, ir.Undefined)
-            for i in range(c.width):
-                place = ir.Constant(ir.IntType(32), i)
-                both = c.load(line, builder.sext(builder.extract_element(k, place), c.index), pair)
-                for j in range(2):
-                    value = builder.extract_element(both, ir.Constant(ir.IntType(32), j))
-                    if j:
-                        high = builder.insert_element(high, value, place)
-                    else:
-                        low = builder.insert_element(low, value, place)
-            return low, high
-
-        features = context.codegen().magic_tuple()[2]
-        if c.width != 8 or c.dtype != types.float32 or "+avx2" not in features.split(","):
-            run(one_by_one)
-            return context.get_dummy_value()
-        fits = [
-            builder.and_(
-                builder.fcmp_ordered("<=", step, ir.Constant(c.real, limit)),
-                builder.icmp_signed(">", size, ir.Constant(c.index, knots)),
-            )
-            for limit, knots in ((_STEP_OF_8, 8), (_STEP_OF_16, 16))
-        ]
-        with builder.if_else(fits[0]) as (then, otherwise):
-            with then:
-                run(lambda k: _pick(c, line, size, k, 1))
-            with otherwise, builder.if_else(fits[1]) as (wide, rest):
-                with wide:
-                    run(lambda k: _pick(c, line, size, k, 2))
-                with rest:
-                    run(one_by_one)
+        _, line, zeta0, step, last, size, gain, out, count = c.values
+        wide = c.splat(gain, c.width)
+        steps = _Steps(c, line, zeta0, step, last, size, count)
+        steps.give(context, lambda change, at: c.store(c.add(c.load(out, at, c.wide), c.mul(wide, change)), out, at))
         return context.get_dummy_value()
 
     return signature, codegen
+
+
+@intrinsic
+def set_steps(typingctx, lanes, line, zeta0, step, last, size, out, count):
+    """``out[i] = line(i + 1) - line(i)`` for i < count, see ``add_steps``."""
+    signature = types.void(lanes, line, zeta0, step, last, size, out, count)
+
+    def codegen(context, builder, signature, args):
+        c = _Code(context, builder, signature, args)
+        _, line, zeta0, step, last, size, out, count = c.values
+        steps = _Steps(c, line, zeta0, step, last, size, count)
+        steps.give(context, lambda change, at: c.store(change, out, at))
+        return context.get_dummy_value()
+
+    return signature, codegen
+
+
+class _Steps:
+    """What a line rises by from each of evenly spaced positions to the next."""
+
+    def __init__(self, c: Any, line: Any, zeta0: Any, step: Any, last: Any, size: Any, count: Any) -> None:
+        self.c, self.line, self.step, self.size, self.count = c, line, step, size, count
+        self.positions = _Positions(c, zeta0, step, last)
+
+    def give(self, context: Any, take: Callable[[Any, Any], None]) -> None:
+        """Call ``take(W steps, index of the first)`` for all of them."""
+        c, b = self.c, self.c.b
+        features = context.codegen().magic_tuple()[2]
+        if c.width != 8 or c.dtype != types.float32 or "+avx2" not in features.split(","):
+            self._run(self._one_by_one, take)
+            return
+        fits = [
+            b.and_(
+                b.fcmp_ordered("<=", self.step, ir.Constant(c.real, limit)),
+                b.icmp_signed(">", self.size, ir.Constant(c.index, knots)),
+            )
+            for limit, knots in ((_STEP_OF_8, 8), (_STEP_OF_16, 16))
+        ]
+        with b.if_else(fits[0]) as (then, otherwise):
+            with then:
+                self._run(lambda k: _pick(c, self.line, self.size, k, 1), take)
+            with otherwise, b.if_else(fits[1]) as (wide, rest):
+                with wide:
+                    self._run(lambda k: _pick(c, self.line, self.size, k, 2), take)
+                with rest:
+                    self._run(self._one_by_one, take)
+
+    def _run(self, pick: Callable[[Any], tuple[Any, Any]], take: Callable[[Any, Any], None]) -> None:
+        """The values of a vector stay in registers until those of the next are known."""
+        c = self.c
+
+        def values(first: Any) -> Any:
+            k, part = self.positions.at(first)
+            low, high = pick(k)
+            return c.add(low, c.mul(part, c.sub(high, low)))
+
+        held = cgutils.alloca_once(c.b, c.wide)
+        c.b.store(values(ir.Constant(c.index, 0)), held)
+        with cgutils.for_range(c.b, c.b.sdiv(self.count, ir.Constant(c.index, c.width))) as loop:
+            first = c.times(loop.index, c.width)
+            here, next_ = c.b.load(held), values(c.b.add(first, ir.Constant(c.index, c.width)))
+            take(c.sub(c.shuffle(here, next_, list(range(1, c.width + 1))), here), first)
+            c.b.store(next_, held)
+
+    def _one_by_one(self, k: Any) -> tuple[Any, Any]:
+        c = self.c
+        pair = ir.VectorType(c.real, 2)
+        low = high = ir.Constant(c.wide, ir.Undefined)
+        for i in range(c.width):
+            place = ir.Constant(ir.IntType(32), i)
+            both = c.load(self.line, c.b.sext(c.b.extract_element(k, place), c.index), pair)
+            for j in range(2):
+                value = c.b.extract_element(both, ir.Constant(ir.IntType(32), j))
+                if j:
+                    high = c.b.insert_element(high, value, place)
+                else:
+                    low = c.b.insert_element(low, value, place)
+        return low, high
 
 
 class _Positions:
