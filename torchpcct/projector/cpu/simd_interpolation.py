@@ -1,4 +1,4 @@
-"""Linear interpolation at equally spaced positions, eight at a time, and its steps from one to the next, as explicit SIMD.
+"""Linear interpolation at equally spaced positions, eight at a time, and the steps between them, as explicit SIMD.
 
 Row edges lie evenly along a line of voxels. Eight neighbours of them read at most 8 (16) knots when they lie less than
 one (two) knots apart: these are loaded whole and picked in registers, where AVX2 has a permutation for it. Elsewhere,
