@@ -16,10 +16,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from torchpcct.projector.cpu.simd import add_lines, spread_lines
 from torchpcct.projector.cpu.simd_interpolation import read_even
+from torchpcct.threads import run
 
 __all__ = ["backproject", "padded", "project"]
 
@@ -31,12 +32,12 @@ MAX_LAYERS_PER_SLAB = 0.4
 NEAREST = 1e-6
 # Slabs of one task of the adjoint: enough to reuse a layer, few enough to share the work. Fixed, for determinism.
 SLAB_BLOCK = 24
-# Ray geometry in float64, called per cell and not per voxel.
-_small = njit(cache=True, fastmath=_FLAGS, error_model="numpy")
+# Called by kernels only (no wrappers: they compile faster). Ray geometry in float64, per cell and not per voxel.
+_small = njit(cache=True, fastmath=_FLAGS, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
+_kernel = njit(nogil=True, cache=True, fastmath=_FLAGS, error_model="numpy")
 
 
-@_small
-def padded(n):
+def padded(n: int) -> int:
     """``n`` rounded up to whole SIMD registers, so that no loop along z has a scalar remainder."""
     return (n + 7) // 8 * 8
 
@@ -104,12 +105,12 @@ def _room(p0, q0, p1, q1, r0, r1, width):
 
 
 @_small
-def _plan(p0, q0, p1, q1, l0, l1, path, layer, layered, r0, r1, width, across, along, table, offset, low, high):
+def _plan(p0, q0, p1, q1, l0, l1, path, layer, layered, r0, r1, width, across, along, layers, ends, offset, low, high):
     """What one cell reads of the slabs ``r0 … r1``: runs of slabs between the same two layers, and their lines.
 
     Entry e adds line ``offset[e]`` with the weight ``low[e]`` to the run's lower layer and ``high[e]`` to the upper.
-    ``table`` receives per run: lower layer, end of its entries. Where slabs are interpolated one by one
-    (``layered`` false) a slab is a run, its row is the slab, and all its weight is ``low``.
+    ``layers`` and ``ends`` receive the lower layer of every run and the end of its entries. Where slabs are
+    interpolated one by one (``layered`` false) a slab is a run, its row is the slab, and all its weight is ``low``.
 
     Returns:
         the number of runs.
@@ -133,7 +134,7 @@ def _plan(p0, q0, p1, q1, l0, l1, path, layer, layered, r0, r1, width, across, a
             here = r
         if here != now:
             now = here
-            table[runs, 0] = now
+            layers[runs] = now
             runs += 1
         start = r * across
         k = int(lo)
@@ -147,7 +148,7 @@ def _plan(p0, q0, p1, q1, l0, l1, path, layer, layered, r0, r1, width, across, a
             e += 1
             k += 1
             left = float(k)
-        table[runs - 1, 1] = e
+        ends[runs - 1] = e
     return runs
 
 
@@ -170,12 +171,16 @@ def _project_view(
     """All segments of one view; ``lines``: ``(ny * nx, knots)``, ``data``: ``(rows, columns)``."""
     knots = lines.shape[1]
     rows, columns = data.shape
-    real = lines.dtype.type
+    real, r0 = lines.dtype.type, np.int64(0)  # typed as in the adjoint: else what takes it is compiled for each
     flat = lines.reshape(-1)
-    pair = np.zeros((2, knots), dtype=lines.dtype)
-    read = np.zeros(padded(rows + 1), dtype=lines.dtype)
-    sums = np.zeros((columns, rows), dtype=lines.dtype)
-    table = np.empty((max(ny, nx), 2), dtype=np.int64)
+    read = np.empty((rows + 8) // 8 * 8, dtype=lines.dtype)  # padded(rows + 1)
+    pair = np.empty((2, knots), dtype=lines.dtype)
+    sums = np.empty((columns, rows), dtype=lines.dtype)
+    for line in pair:
+        _clear(line)
+    for line in sums:
+        _clear(line)
+    layers, ends = np.empty(max(ny, nx), dtype=np.int64), np.empty(max(ny, nx), dtype=np.int64)
     offset = np.empty(0, dtype=np.int64)
     low, high = np.empty(0, dtype=lines.dtype), np.empty(0, dtype=lines.dtype)
     for s in range(s0, s1):
@@ -185,14 +190,14 @@ def _project_view(
         for j in range(segments[s, 2], segments[s, 2] + segments[s, 3]):
             p0, q0, p1, q1, l0, l1, path, square = _cell(at, edges, centers, first + j, axis, lattice)
             layered = abs(l1) < MAX_LAYERS_PER_SLAB * layer
-            offset, low, high = _with_room(_room(p0, q0, p1, q1, 0, slabs, width), offset, low, high)
+            offset, low, high = _with_room(_room(p0, q0, p1, q1, r0, slabs, width), offset, low, high)
             runs = _plan(
-                p0, q0, p1, q1, l0, l1, path, layer, layered, 0, slabs, width, across, along, table, offset, low,
-                high,
+                p0, q0, p1, q1, l0, l1, path, layer, layered, r0, slabs, width, across, along, layers, ends, offset,
+                low, high,
             )  # fmt: skip
             e0 = 0
             for n in range(runs):
-                now, e1 = table[n, 0], table[n, 1]
+                now, e1 = layers[n], ends[n]
                 lower, upper = now % 2, (now + 1) % 2
                 add_lines(lanes, flat, offset, low, high, e0, e1, knots, pair[lower], pair[upper])
                 e0 = e1
@@ -201,7 +206,7 @@ def _project_view(
                     _clear(pair[lower])
                     _clear(pair[upper])  # zero weights of NaN or Inf
                     continue
-                after = table[n + 1, 0] if n + 1 < runs else -9
+                after = layers[n + 1] if n + 1 < runs else -9
                 for m in range(now, now + 2):
                     if m != after and m != after + 1:
                         line = pair[m % 2]
@@ -215,11 +220,12 @@ def _project_view(
             data[i, j] = sums[j, i]
 
 
-@njit(parallel=True, cache=True)
+@_kernel
 def _project(
-    lanes, lines, ny, nx, pose, edges, centers, first, segments, start, lattice, z0, dz, row0, row_pitch, layer, data
-):
-    for v in prange(data.shape[0]):
+    begin, end, lanes, lines, ny, nx, pose, edges, centers, first, segments, start, lattice, z0, dz, row0, row_pitch,
+    layer, data,
+):  # fmt: skip
+    for v in range(begin, end):
         _project_view(
             lanes, lines, ny, nx, pose[v], edges, centers, first[v], segments, start[v], start[v + 1], lattice,
             z0, dz, row0, row_pitch, layer, data[v],
@@ -240,9 +246,9 @@ def project(lines, ny, nx, pose, edges, centers, first, segments, start, lattice
         data: ``(views, rows, columns)`` output, overwritten.
     """
     lanes = (0,) * (32 // lines.dtype.itemsize)
-    _project(
-        lanes, lines, ny, nx, pose, edges, centers, first, segments, start, lattice, z0, dz, row0, row_pitch, layer,
-        data,
+    run(
+        _project, data.shape[0], lanes, lines, ny, nx, pose, edges, centers, first, segments, start, lattice, z0, dz,
+        row0, row_pitch, layer, data,
     )  # fmt: skip
 
 
@@ -260,11 +266,12 @@ def _row_sums_view(data, at, centers, first, row0, row_pitch, sums):
             sums[j, i + 1] = sums[j, i] + slant * data[i, j]
 
 
-@njit(parallel=True, cache=True)
-def _row_sums(data, pose, centers, first, row0, row_pitch, begin, sums):
-    """Readings times their slant, summed along the rows: ``(views, columns, rows + 1)``."""
-    for v in prange(sums.shape[0]):
-        _row_sums_view(data[begin + v], pose[begin + v], centers, first[begin + v], row0, row_pitch, sums[v])
+@_kernel
+def _row_sums(begin, end, data, pose, centers, first, row0, row_pitch, view0, sums):
+    """Readings times their slant, summed along the rows: ``(views, columns, rows + 1)``, from ``view0`` on."""
+    for n in range(begin, end):
+        v = view0 + n
+        _row_sums_view(data[v], pose[v], centers, first[v], row0, row_pitch, sums[n])
 
 
 @_small
@@ -279,7 +286,7 @@ def _layer_values(lanes, sums, at, depth, z0, dz, row0, row_pitch, read, values)
 
 @_small
 def _gather_slabs(
-    lanes, sums, pose, edges, centers, first, segments, seg0, seg1, begin, axis, lattice, z0, dz, row0, row_pitch,
+    lanes, sums, pose, edges, centers, first, segments, seg0, seg1, view0, axis, lattice, z0, dz, row0, row_pitch,
     layer, r0, r1, out,
 ):  # fmt: skip
     """Slabs ``r0 … r1`` of ``_gather``; ``out``: ``(slabs, width, padded(nz))``."""
@@ -287,7 +294,7 @@ def _gather_slabs(
     flat = out.reshape(-1)
     read = np.empty(nz + 8, dtype=sums.dtype)
     pair = np.empty((2, nz), dtype=sums.dtype)
-    table = np.empty((r1 - r0, 2), dtype=np.int64)
+    layers, ends = np.empty(r1 - r0, dtype=np.int64), np.empty(r1 - r0, dtype=np.int64)
     offset = np.empty(0, dtype=np.int64)
     low, high = np.empty(0, dtype=sums.dtype), np.empty(0, dtype=sums.dtype)
     for s in range(seg0, seg1):
@@ -300,42 +307,41 @@ def _gather_slabs(
             layered = abs(l1) < MAX_LAYERS_PER_SLAB * layer
             offset, low, high = _with_room(_room(p0, q0, p1, q1, r0, r1, width), offset, low, high)
             runs = _plan(
-                p0, q0, p1, q1, l0, l1, path, layer, layered, r0, r1, width, width * nz, nz, table, offset, low, high
-            )
+                p0, q0, p1, q1, l0, l1, path, layer, layered, r0, r1, width, width * nz, nz, layers, ends, offset, low,
+                high,
+            )  # fmt: skip
             e0, before = 0, -9
             for n in range(runs):
-                now, e1 = table[n, 0], table[n, 1]
+                now, e1 = layers[n], ends[n]
                 lower, upper = now % 2, (now + 1) % 2
                 if layered:
                     for m in range(now, now + 2):
                         if m != before and m != before + 1:
                             _layer_values(
-                                lanes, sums[v - begin, j], at, m * layer, z0, dz, row0, row_pitch, read, pair[m % 2]
+                                lanes, sums[v - view0, j], at, m * layer, z0, dz, row0, row_pitch, read, pair[m % 2]
                             )
                     before = now
                 else:
                     upper = lower  # its weight is zero
                     _layer_values(
-                        lanes, sums[v - begin, j], at, l0 + l1 * now, z0, dz, row0, row_pitch, read, pair[lower]
+                        lanes, sums[v - view0, j], at, l0 + l1 * now, z0, dz, row0, row_pitch, read, pair[lower]
                     )
                 spread_lines(lanes, flat, offset, low, high, e0, e1, nz, pair[lower], pair[upper])
                 e0 = e1
 
 
-@njit(parallel=True, cache=True)
+@_kernel
 def _gather(
-    lanes, sums, pose, edges, centers, first, segments, seg0, seg1, begin, lattice, z0, dz, row0, row_pitch, layer,
-    by_row, by_column,
+    begin, end, lanes, sums, pose, edges, centers, first, segments, seg0, seg1, view0, lattice, z0, dz, row0,
+    row_pitch, layer, by_row, by_column,
 ):  # fmt: skip
-    """Add a chunk of views to ``by_row``, ``(ny, nx, padded(nz))``, and ``by_column``, its transpose."""
-    ny, nx = by_row.shape[:2]
-    row_tasks = (ny + SLAB_BLOCK - 1) // SLAB_BLOCK
-    tasks = row_tasks + (nx + SLAB_BLOCK - 1) // SLAB_BLOCK
-    for task in prange(tasks):
+    """Add a chunk of views to ``by_row``, ``(ny, nx, padded(nz))``, and ``by_column``, its transpose, by blocks."""
+    row_tasks = (by_row.shape[0] + SLAB_BLOCK - 1) // SLAB_BLOCK
+    for task in range(begin, end):
         axis = 0 if task < row_tasks else 1
         out, r0 = (by_row, task * SLAB_BLOCK) if axis == 0 else (by_column, (task - row_tasks) * SLAB_BLOCK)
         _gather_slabs(
-            lanes, sums, pose, edges, centers, first, segments, seg0, seg1, begin, axis, lattice,
+            lanes, sums, pose, edges, centers, first, segments, seg0, seg1, view0, axis, lattice,
             z0, dz, row0, row_pitch, layer, r0, min(r0 + SLAB_BLOCK, out.shape[0]), out,
         )  # fmt: skip
 
@@ -355,13 +361,14 @@ def backproject(
     lanes = (0,) * (32 // data.dtype.itemsize)
     by_row = np.zeros((ny, nx, padded(nz)), dtype=data.dtype)
     by_column = np.zeros((nx, ny, padded(nz)), dtype=data.dtype)
-    for begin in range(0, views, chunk):
-        stop = min(begin + chunk, views)
-        sums = np.empty((stop - begin, columns, rows + 1), dtype=data.dtype)
-        _row_sums(data, pose, centers, first, row0, row_pitch, begin, sums)
-        _gather(
-            lanes, sums, pose, edges, centers, first, segments, start[begin], start[stop], begin, lattice,
-            z0, dz, row0, row_pitch, layer, by_row, by_column,
+    tasks = sum(-(-slabs // SLAB_BLOCK) for slabs in (ny, nx))
+    for before in range(0, views, chunk):
+        after = min(before + chunk, views)
+        sums = np.empty((after - before, columns, rows + 1), dtype=data.dtype)
+        run(_row_sums, after - before, data, pose, centers, first, row0, row_pitch, before, sums)
+        run(
+            _gather, tasks, lanes, sums, pose, edges, centers, first, segments, start[before], start[after], before,
+            lattice, z0, dz, row0, row_pitch, layer, by_row, by_column,
         )  # fmt: skip
     by_row += by_column.transpose(1, 0, 2)
     volume[...] = by_row[..., :nz].transpose(2, 0, 1)
