@@ -17,6 +17,8 @@ __all__ = ["get_num_threads", "run", "set_num_threads"]
 
 _PIECES = 4
 """Pieces per thread at most: whoever is done takes the next, so that unequal work is shared."""
+_LEAST = 50_000
+"""Operations of a piece at least: as long as it takes to wake a thread, some 50 µs."""
 _number: int | None = None
 
 
@@ -27,7 +29,7 @@ def get_num_threads() -> int:
     if _number is None:
         from numba import config  # late: importing the package stays quick
 
-        _number = int(config.NUMBA_NUM_THREADS)
+        _number = int(config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
     return _number
 
 
@@ -115,22 +117,23 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_renew)
 
 
-def run(kernel: Any, count: int, *args: Any, least: int = 1) -> None:
+def run(kernel: Any, count: int, *args: Any, operations: int = _LEAST) -> None:
     """``kernel(begin, end, *args)`` on pieces of 0 … count, at once on several threads.
 
     Args:
         kernel: compiled with ``nogil=True``; whatever it writes at an index must be that index's alone, so that the
             result does not depend on the pieces.
         count: number of indices.
-        least: indices of the smallest piece that is worth another thread, some 50 µs of work.
+        operations: about how many sums and products an index takes; too little work for two stays on this thread.
 
     Raises:
         what a kernel raises, once no other thread computes any more.
     """
     threads = get_num_threads()
-    number = min(count // least, _PIECES * threads) if threads > 1 else 1
-    if number <= 1:
-        kernel(0, count, *args)
+    number = min(count, _PIECES * threads, count * operations // _LEAST)
+    if threads == 1 or number <= 1:
+        if count:
+            kernel(0, count, *args)
         return
     bounds = [count * i // number for i in range(number + 1)]
     call = _Call(kernel, list(pairwise(bounds)), args)

@@ -43,7 +43,7 @@ def test_threads_take_part_and_pieces_are_as_large_as_asked(number):
         if len(seen) <= number:
             together.wait(30)  # passes only if as many threads compute at once
 
-    threads.run(kernel, 1000, least=150)
+    threads.run(kernel, 1000, operations=300)
     assert len({ident for _, _, ident in seen}) == number
     assert sorted(i for begin, end, _ in seen for i in range(begin, end)) == list(range(1000))
     assert len(seen) == (1 if number == 1 else 6)
@@ -51,7 +51,7 @@ def test_threads_take_part_and_pieces_are_as_large_as_asked(number):
 
 def test_little_work_stays_here():
     seen = []
-    threads.run(lambda begin, end: seen.append((begin, end, threading.get_ident())), 99, least=50)
+    threads.run(lambda begin, end: seen.append((begin, end, threading.get_ident())), 99, operations=1000)
     assert seen == [(0, 99, threading.get_ident())]
 
 

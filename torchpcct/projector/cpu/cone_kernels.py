@@ -14,6 +14,7 @@ fixed order, so that results do not depend on the number of threads.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -32,8 +33,10 @@ MAX_LAYERS_PER_SLAB = 0.4
 NEAREST = 1e-6
 # Slabs of one task of the adjoint: enough to reuse a layer, few enough to share the work. Fixed, for determinism.
 SLAB_BLOCK = 24
-# Called by kernels only (no wrappers: they compile faster). Ray geometry in float64, per cell and not per voxel.
-_small = njit(cache=True, fastmath=_FLAGS, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
+# Of functions that only kernels call: without wrappers for Python and C they compile faster.
+INNER: Any = {"cache": True, "error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+# Ray geometry in float64, called per cell and not per voxel.
+_small = njit(**INNER, fastmath=_FLAGS)
 _kernel = njit(nogil=True, cache=True, fastmath=_FLAGS, error_model="numpy")
 
 
@@ -164,13 +167,14 @@ def _add_rows(lanes, line, at, depth, z0, dz, row0, row_pitch, read, out):
         out[i] += gain * (read[i + 1] - read[i])
 
 
-@_small
-def _project_view(
-    lanes, lines, ny, nx, at, edges, centers, first, segments, s0, s1, lattice, z0, dz, row0, row_pitch, layer, data
-):
-    """All segments of one view; ``lines``: ``(ny * nx, knots)``, ``data``: ``(rows, columns)``."""
+@_kernel
+def _project(
+    begin, end, lanes, lines, ny, nx, pose, edges, centers, first, segments, start, lattice, z0, dz, row0, row_pitch,
+    layer, data,
+):  # fmt: skip
+    """The views ``begin … end``; ``lines``: ``(ny * nx, knots)``, ``data``: ``(views, rows, columns)``."""
     knots = lines.shape[1]
-    rows, columns = data.shape
+    _, rows, columns = data.shape
     real, r0 = lines.dtype.type, np.int64(0)  # typed as in the adjoint: else what takes it is compiled for each
     flat = lines.reshape(-1)
     read = np.empty((rows + 8) // 8 * 8, dtype=lines.dtype)  # padded(rows + 1)
@@ -178,58 +182,48 @@ def _project_view(
     sums = np.empty((columns, rows), dtype=lines.dtype)
     for line in pair:
         _clear(line)
-    for line in sums:
-        _clear(line)
     layers, ends = np.empty(max(ny, nx), dtype=np.int64), np.empty(max(ny, nx), dtype=np.int64)
     offset = np.empty(0, dtype=np.int64)
     low, high = np.empty(0, dtype=lines.dtype), np.empty(0, dtype=lines.dtype)
-    for s in range(s0, s1):
-        axis = segments[s, 1]
-        slabs, width = (ny, nx) if axis == 0 else (nx, ny)
-        across, along = (nx * knots, knots) if axis == 0 else (knots, nx * knots)
-        for j in range(segments[s, 2], segments[s, 2] + segments[s, 3]):
-            p0, q0, p1, q1, l0, l1, path, square = _cell(at, edges, centers, first + j, axis, lattice)
-            layered = abs(l1) < MAX_LAYERS_PER_SLAB * layer
-            offset, low, high = _with_room(_room(p0, q0, p1, q1, r0, slabs, width), offset, low, high)
-            runs = _plan(
-                p0, q0, p1, q1, l0, l1, path, layer, layered, r0, slabs, width, across, along, layers, ends, offset,
-                low, high,
-            )  # fmt: skip
-            e0 = 0
-            for n in range(runs):
-                now, e1 = layers[n], ends[n]
-                lower, upper = now % 2, (now + 1) % 2
-                add_lines(lanes, flat, offset, low, high, e0, e1, knots, pair[lower], pair[upper])
-                e0 = e1
-                if not layered:
-                    _add_rows(lanes, pair[lower], at, l0 + l1 * now, z0, dz, row0, row_pitch, read, sums[j])
-                    _clear(pair[lower])
-                    _clear(pair[upper])  # zero weights of NaN or Inf
-                    continue
-                after = layers[n + 1] if n + 1 < runs else -9
-                for m in range(now, now + 2):
-                    if m != after and m != after + 1:
-                        line = pair[m % 2]
-                        _add_rows(lanes, line, at, m * layer, z0, dz, row0, row_pitch, read, sums[j])
-                        _clear(line)
-            for i in range(rows):
-                rise = row0 + (i + 0.5) * row_pitch + at[7] - at[2]
-                sums[j, i] *= real(math.sqrt(1.0 + rise * rise / square))
-    for i in range(rows):
-        for j in range(columns):
-            data[i, j] = sums[j, i]
-
-
-@_kernel
-def _project(
-    begin, end, lanes, lines, ny, nx, pose, edges, centers, first, segments, start, lattice, z0, dz, row0, row_pitch,
-    layer, data,
-):  # fmt: skip
     for v in range(begin, end):
-        _project_view(
-            lanes, lines, ny, nx, pose[v], edges, centers, first[v], segments, start[v], start[v + 1], lattice,
-            z0, dz, row0, row_pitch, layer, data[v],
-        )  # fmt: skip
+        at = pose[v]
+        for line in sums:
+            _clear(line)
+        for s in range(start[v], start[v + 1]):
+            axis = segments[s, 1]
+            slabs, width = (ny, nx) if axis == 0 else (nx, ny)
+            across, along = (nx * knots, knots) if axis == 0 else (knots, nx * knots)
+            for j in range(segments[s, 2], segments[s, 2] + segments[s, 3]):
+                p0, q0, p1, q1, l0, l1, path, square = _cell(at, edges, centers, first[v] + j, axis, lattice)
+                layered = abs(l1) < MAX_LAYERS_PER_SLAB * layer
+                offset, low, high = _with_room(_room(p0, q0, p1, q1, r0, slabs, width), offset, low, high)
+                runs = _plan(
+                    p0, q0, p1, q1, l0, l1, path, layer, layered, r0, slabs, width, across, along, layers, ends, offset,
+                    low, high,
+                )  # fmt: skip
+                e0 = 0
+                for n in range(runs):
+                    now, e1 = layers[n], ends[n]
+                    lower, upper = now % 2, (now + 1) % 2
+                    add_lines(lanes, flat, offset, low, high, e0, e1, knots, pair[lower], pair[upper])
+                    e0 = e1
+                    if not layered:
+                        _add_rows(lanes, pair[lower], at, l0 + l1 * now, z0, dz, row0, row_pitch, read, sums[j])
+                        _clear(pair[lower])
+                        _clear(pair[upper])  # zero weights of NaN or Inf
+                        continue
+                    after = layers[n + 1] if n + 1 < runs else -9
+                    for m in range(now, now + 2):
+                        if m != after and m != after + 1:
+                            line = pair[m % 2]
+                            _add_rows(lanes, line, at, m * layer, z0, dz, row0, row_pitch, read, sums[j])
+                            _clear(line)
+                for i in range(rows):
+                    rise = row0 + (i + 0.5) * row_pitch + at[7] - at[2]
+                    sums[j, i] *= real(math.sqrt(1.0 + rise * rise / square))
+        for i in range(rows):
+            for j in range(columns):
+                data[v, i, j] = sums[j, i]
 
 
 def project(lines, ny, nx, pose, edges, centers, first, segments, start, lattice, z0, dz, row0, row_pitch, layer, data):
@@ -252,26 +246,22 @@ def project(lines, ny, nx, pose, edges, centers, first, segments, start, lattice
     )  # fmt: skip
 
 
-@_small
-def _row_sums_view(data, at, centers, first, row0, row_pitch, sums):
-    columns, edges = sums.shape
-    for j in range(columns):
-        a, b = centers[first + j, 0], centers[first + j, 1]
-        dx, dy = a * at[3] + b * at[5], a * at[4] + b * at[6]
-        square = dx * dx + dy * dy
-        sums[j, 0] = 0
-        for i in range(edges - 1):
-            rise = row0 + (i + 0.5) * row_pitch + at[7] - at[2]
-            slant = data.dtype.type(math.sqrt(1.0 + rise * rise / square))
-            sums[j, i + 1] = sums[j, i] + slant * data[i, j]
-
-
 @_kernel
 def _row_sums(begin, end, data, pose, centers, first, row0, row_pitch, view0, sums):
     """Readings times their slant, summed along the rows: ``(views, columns, rows + 1)``, from ``view0`` on."""
+    _, columns, edges = sums.shape
     for n in range(begin, end):
         v = view0 + n
-        _row_sums_view(data[v], pose[v], centers, first[v], row0, row_pitch, sums[n])
+        at = pose[v]
+        for j in range(columns):
+            a, b = centers[first[v] + j, 0], centers[first[v] + j, 1]
+            dx, dy = a * at[3] + b * at[5], a * at[4] + b * at[6]
+            square = dx * dx + dy * dy
+            sums[n, j, 0] = 0
+            for i in range(edges - 1):
+                rise = row0 + (i + 0.5) * row_pitch + at[7] - at[2]
+                slant = data.dtype.type(math.sqrt(1.0 + rise * rise / square))
+                sums[n, j, i + 1] = sums[n, j, i] + slant * data[v, i, j]
 
 
 @_small
@@ -284,52 +274,6 @@ def _layer_values(lanes, sums, at, depth, z0, dz, row0, row_pitch, read, values)
         values[z] = read[z + 1] - read[z]
 
 
-@_small
-def _gather_slabs(
-    lanes, sums, pose, edges, centers, first, segments, seg0, seg1, view0, axis, lattice, z0, dz, row0, row_pitch,
-    layer, r0, r1, out,
-):  # fmt: skip
-    """Slabs ``r0 … r1`` of ``_gather``; ``out``: ``(slabs, width, padded(nz))``."""
-    _, width, nz = out.shape
-    flat = out.reshape(-1)
-    read = np.empty(nz + 8, dtype=sums.dtype)
-    pair = np.empty((2, nz), dtype=sums.dtype)
-    layers, ends = np.empty(r1 - r0, dtype=np.int64), np.empty(r1 - r0, dtype=np.int64)
-    offset = np.empty(0, dtype=np.int64)
-    low, high = np.empty(0, dtype=sums.dtype), np.empty(0, dtype=sums.dtype)
-    for s in range(seg0, seg1):
-        if segments[s, 1] != axis:
-            continue
-        v = segments[s, 0]
-        at = pose[v]
-        for j in range(segments[s, 2], segments[s, 2] + segments[s, 3]):
-            p0, q0, p1, q1, l0, l1, path, _ = _cell(at, edges, centers, first[v] + j, axis, lattice)
-            layered = abs(l1) < MAX_LAYERS_PER_SLAB * layer
-            offset, low, high = _with_room(_room(p0, q0, p1, q1, r0, r1, width), offset, low, high)
-            runs = _plan(
-                p0, q0, p1, q1, l0, l1, path, layer, layered, r0, r1, width, width * nz, nz, layers, ends, offset, low,
-                high,
-            )  # fmt: skip
-            e0, before = 0, -9
-            for n in range(runs):
-                now, e1 = layers[n], ends[n]
-                lower, upper = now % 2, (now + 1) % 2
-                if layered:
-                    for m in range(now, now + 2):
-                        if m != before and m != before + 1:
-                            _layer_values(
-                                lanes, sums[v - view0, j], at, m * layer, z0, dz, row0, row_pitch, read, pair[m % 2]
-                            )
-                    before = now
-                else:
-                    upper = lower  # its weight is zero
-                    _layer_values(
-                        lanes, sums[v - view0, j], at, l0 + l1 * now, z0, dz, row0, row_pitch, read, pair[lower]
-                    )
-                spread_lines(lanes, flat, offset, low, high, e0, e1, nz, pair[lower], pair[upper])
-                e0 = e1
-
-
 @_kernel
 def _gather(
     begin, end, lanes, sums, pose, edges, centers, first, segments, seg0, seg1, view0, lattice, z0, dz, row0,
@@ -337,13 +281,49 @@ def _gather(
 ):  # fmt: skip
     """Add a chunk of views to ``by_row``, ``(ny, nx, padded(nz))``, and ``by_column``, its transpose, by blocks."""
     row_tasks = (by_row.shape[0] + SLAB_BLOCK - 1) // SLAB_BLOCK
+    nz = by_row.shape[2]
+    read = np.empty(nz + 8, dtype=sums.dtype)
+    pair = np.empty((2, nz), dtype=sums.dtype)
+    layers, ends = np.empty(SLAB_BLOCK, dtype=np.int64), np.empty(SLAB_BLOCK, dtype=np.int64)
+    offset = np.empty(0, dtype=np.int64)
+    low, high = np.empty(0, dtype=sums.dtype), np.empty(0, dtype=sums.dtype)
     for task in range(begin, end):
         axis = 0 if task < row_tasks else 1
         out, r0 = (by_row, task * SLAB_BLOCK) if axis == 0 else (by_column, (task - row_tasks) * SLAB_BLOCK)
-        _gather_slabs(
-            lanes, sums, pose, edges, centers, first, segments, seg0, seg1, view0, axis, lattice,
-            z0, dz, row0, row_pitch, layer, r0, min(r0 + SLAB_BLOCK, out.shape[0]), out,
-        )  # fmt: skip
+        slabs, width = out.shape[:2]
+        r1 = min(r0 + SLAB_BLOCK, slabs)
+        flat = out.reshape(-1)
+        for s in range(seg0, seg1):
+            if segments[s, 1] != axis:
+                continue
+            v = segments[s, 0]
+            at = pose[v]
+            for j in range(segments[s, 2], segments[s, 2] + segments[s, 3]):
+                p0, q0, p1, q1, l0, l1, path, _ = _cell(at, edges, centers, first[v] + j, axis, lattice)
+                layered = abs(l1) < MAX_LAYERS_PER_SLAB * layer
+                offset, low, high = _with_room(_room(p0, q0, p1, q1, r0, r1, width), offset, low, high)
+                runs = _plan(
+                    p0, q0, p1, q1, l0, l1, path, layer, layered, r0, r1, width, width * nz, nz, layers, ends, offset,
+                    low, high,
+                )  # fmt: skip
+                e0, before = 0, -9
+                for n in range(runs):
+                    now, e1 = layers[n], ends[n]
+                    lower, upper = now % 2, (now + 1) % 2
+                    if layered:
+                        for m in range(now, now + 2):
+                            if m != before and m != before + 1:
+                                _layer_values(
+                                    lanes, sums[v - view0, j], at, m * layer, z0, dz, row0, row_pitch, read, pair[m % 2]
+                                )
+                        before = now
+                    else:
+                        upper = lower  # its weight is zero
+                        _layer_values(
+                            lanes, sums[v - view0, j], at, l0 + l1 * now, z0, dz, row0, row_pitch, read, pair[lower]
+                        )
+                    spread_lines(lanes, flat, offset, low, high, e0, e1, nz, pair[lower], pair[upper])
+                    e0 = e1
 
 
 def backproject(

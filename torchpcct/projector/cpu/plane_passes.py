@@ -25,7 +25,6 @@ from torchpcct.threads import run
 __all__ = ["PlanePasses"]
 
 _WIDTHS = (1, 2, 4, 8)
-LEAST_SLABS = 32  # of which summing is worth another thread
 # Lanes whose positions spread over this many voxels at most reach two, or three, intervals between knots.
 _NEAR, _FAR = 1.0, 2.0
 
@@ -150,7 +149,7 @@ class PlanePasses:
                 lines = np.empty((*shape, width), dtype=x.dtype)
                 slabs, pixels = (ny, nx) if axis == 0 else (nx, ny)
                 table = self._lane_table(n, count, width, axis)
-                run(load_image, len(lines), images, table, places[axis], slabs, pixels, lines, least=LEAST_SLABS)
+                run(load_image, len(lines), images, table, places[axis], slabs, pixels, lines, operations=lines[0].size)
                 sums.append(lines.reshape(shape[0], -1))
             run(
                 project, len(out), (0,) * width, t.reach, self.segments, self.offset, self.start, *sums, t.p, t.q,
@@ -178,7 +177,8 @@ class PlanePasses:
                 backproject, spread_tasks(size), (0,) * width, t.reach, self.segments, self.offset, t.p, t.q, t.weight,
                 t.apart, values.reshape(-1), size, places, by_row, by_column,
             )  # fmt: skip
-            run(collect, -(-ny // TILE), by_row, by_column, self.inverse, self.operations, x[n : n + step])
+            tiles, pixels = -(-ny // TILE), TILE * nx * 2 * width
+            run(collect, tiles, by_row, by_column, self.inverse, self.operations, x[n : n + step], operations=pixels)
         return x
 
     def _lane_table(self, first: int, count: int, width: int, axis: int) -> NDArray[np.int64]:

@@ -18,6 +18,8 @@ import math
 import numpy as np
 from numba import njit
 
+from torchpcct.projector.cpu.cone_kernels import INNER
+
 __all__ = ["SLAB_BLOCK", "backproject_vectors", "project_vectors"]
 
 SLAB_BLOCK = 16
@@ -26,7 +28,7 @@ NEAREST = 1e-6
 """Slabs closer to the source than this part of the way to the detector are behind it."""
 _POINT = 1e-9
 """A rectangle narrower than this part of a voxel is a point."""
-_small = njit(cache=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
+_small = njit(**INNER)
 
 
 @_small
