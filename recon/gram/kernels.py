@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -13,7 +14,11 @@ from numba import njit
 __all__ = ["banded_add", "banded_cholesky", "damp", "stiffen"]
 
 
-@njit(nogil=True, cache=True, fastmath={"contract", "reassoc", "nsz"})
+# It allocates nothing, and needs no reference counts.
+_VIEWS_ONLY: Any = {"nogil": True, "cache": True, "fastmath": {"contract", "reassoc", "nsz"}, "_nrt": False}
+
+
+@njit(**_VIEWS_ONLY)
 def banded_add(begin, end, kernel, x, scale, out):
     """out += scale · K x for every frequency of the rows ``begin … end`` along y.
 
