@@ -206,6 +206,27 @@ def _add_by_index(near, far, turned, m, z, step, origin, column, lower, upper, t
         total[p, k] += a + upper[k] * (column[near_row + np.uint32(1)] - a)
 
 
+@njit(**_INLINE, _nrt=False)
+def _add_view(
+    index, weight, height, first, last, row_scale, kink, table, tau, turned, origin, column, lower, upper, heights,
+    total,
+):  # fmt: skip
+    """What one view adds to every voxel column of a tile; apart, because it needs no reference counts."""
+    number = total.dtype.type
+    for p in range(index.size):
+        position = min(max(index[p], 0.0), last)
+        i = int(position)
+        fraction = (position - i) * weight[p]
+        near, far = number(weight[p] - fraction), number(fraction)
+        step = number(height[p] * row_scale)
+        m = np.uint64(i - first)
+        q = np.uint64(p)
+        if kink:
+            _add_by_kink(near, far, table, m, heights, tau, step, total, q)
+        else:
+            _add_by_index(near, far, turned, m, heights, step, origin, column, lower, upper, total, q)
+
+
 @njit(**_OPTIONS)
 def backproject_3d(
     begin,
@@ -306,18 +327,10 @@ def backproject_3d(
                         g[k] = here
                         d[k] = here - source[j]
                         e[k] = source[j + np.uint32(2)] - here
-            for p in range(n):
-                position = min(max(index[p], 0.0), last)
-                i = int(position)
-                fraction = (position - i) * weight[p]
-                near, far = number(weight[p] - fraction), number(fraction)
-                step = number(height[p] * row_scale)
-                m = np.uint64(i - first)
-                q = np.uint64(p)
-                if kink:
-                    _add_by_kink(near, far, table, m, heights, tau, step, total, q)
-                else:
-                    _add_by_index(near, far, turned, m, heights, step, origin, column, lower, upper, total, q)
+            _add_view(
+                index, weight, height, first, last, row_scale, kink, table, tau, turned, origin, column, lower, upper,
+                heights, total,
+            )  # fmt: skip
         for k in range(nz):
             for p in range(n):
                 out[b, k, y0 + p // width, x0 + p % width] = total[p, k]
