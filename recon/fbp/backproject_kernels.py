@@ -89,23 +89,9 @@ def backproject_2d(begin, end, kind, data, cosines, sines, shifts, starts, x, y,
             row[columns] = number(0)  # read with weight 0 at the last column's centre
             for iy in range(first, end):
                 _positions_2d(
-                    kind,
-                    xs,
-                    y[iy],
-                    cosines[v],
-                    sines[v],
-                    shifts[v, 0],
-                    shifts[v, 1],
-                    sod,
-                    sdd,
-                    scale,
-                    starts[v],
-                    columns - 1,
-                    atan,
-                    index,
-                    near,
-                    far,
-                )
+                    kind, xs, y[iy], cosines[v], sines[v], shifts[v, 0], shifts[v, 1], sod, sdd, scale, starts[v],
+                    columns - 1, atan, index, near, far,
+                )  # fmt: skip
                 line = total[iy - first]
                 for i in range(nx):
                     k = np.uint32(index[i])
