@@ -26,6 +26,7 @@ ROWS = 16
 _FAST = {"contract", "nsz", "arcp"}
 _OPTIONS: Any = {"nogil": True, "cache": True, "error_model": "numpy", "fastmath": _FAST}
 _INLINE: Any = {"cache": True, "error_model": "numpy", "fastmath": _FAST}
+_BARE: Any = {**_INLINE, "_nrt": False}  # without reference counts: for what allocates nothing
 
 
 @njit(**_INLINE)
@@ -192,7 +193,7 @@ def _add_by_index(near, far, turned, m, z, step, origin, column, lower, upper, t
         total[p, k] += a + upper[k] * (column[near_row + np.uint32(1)] - a)
 
 
-@njit(**_INLINE, _nrt=False)
+@njit(**_BARE)
 def _add_view(
     index, weight, height, first, last, row_scale, kink, table, tau, turned, origin, column, lower, upper, heights,
     total,
