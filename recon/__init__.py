@@ -11,7 +11,7 @@ import sys
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-import torchpcct  # noqa: F401  (first: it settles how the thread pools of numba and torch wait)
+import torchpcct  # noqa: F401  (first: it settles how torch's threads wait)
 
 if TYPE_CHECKING:
     from recon.api import METHODS, reconstruct

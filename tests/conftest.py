@@ -13,9 +13,10 @@ def _cores_are_shared():
     """Each process computes with its share of the cores: threads that wait for each other are slower than few."""
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     if workers > 1:
-        import numba
         import torch
 
+        from torchpcct.threads import get_num_threads, set_num_threads
+
         threads = max(1, (os.cpu_count() or 1) // workers)
-        numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+        set_num_threads(min(threads, get_num_threads()))
         torch.set_num_threads(threads)

@@ -3,8 +3,8 @@
 import os
 from typing import TYPE_CHECKING, Any
 
-# numba's and torch's thread pools take turns here. By default an idle OpenMP thread spins for a while and steals the
-# core from the other pool: several times slower. OpenMP reads it when torch loads, so it stands before anything else.
+# The threads of the kernels (threads.py) and of torch take turns. By default an idle OpenMP thread spins and steals the
+# core from the others: several times slower. OpenMP reads it when torch loads, so it stands before anything else.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 from torchpcct.files import VERSION

@@ -16,8 +16,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import njit
 from torch import Tensor
+
+from torchpcct.threads import run
 
 __all__ = ["compound_poisson", "draw", "normal", "poisson", "seed_key", "stream"]
 
@@ -25,6 +27,7 @@ _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _MIX1 = np.uint64(0xBF58476D1CE4E5B9)
 _MIX2 = np.uint64(0x94D049BB133111EB)
 _S30, _S27, _S31, _S11 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(11)
+_OPERATIONS = 50  # about those of a random number
 _TO_UNIT = 1.0 / 9007199254740992.0  # 2**-53
 
 
@@ -80,9 +83,9 @@ def _poisson_one(mean: float, state: Any) -> float:
             return k
 
 
-@njit(parallel=True, cache=True)
-def _poisson_rows(mean: Any, first: Any, scale: float, key: Any, out: Any) -> None:
-    for i in prange(mean.shape[0]):
+@njit(nogil=True, cache=True)
+def _poisson_rows(begin: int, end: int, mean: Any, first: Any, scale: float, key: Any, out: Any) -> None:
+    for i in range(begin, end):
         for j in range(mean.shape[1]):
             lam = np.float64(mean[i, j]) * scale
             if lam > 0.0:
@@ -93,18 +96,18 @@ def _poisson_rows(mean: Any, first: Any, scale: float, key: Any, out: Any) -> No
                 out[i, j] = np.nan
 
 
-@njit(parallel=True, cache=True)
-def _normal_rows(first: Any, key: Any, out: Any) -> None:
-    for i in prange(out.shape[0]):
+@njit(nogil=True, cache=True)
+def _normal_rows(begin: int, end: int, first: Any, key: Any, out: Any) -> None:
+    for i in range(begin, end):
         for j in range(out.shape[1]):
             state, u = draw(stream(key, first[i] + j))
             state, v = draw(state)
             out[i, j] = math.sqrt(-2.0 * math.log(u)) * math.cos(2.0 * math.pi * v)
 
 
-@njit(parallel=True, cache=True)
-def _compound_rows(mean: Any, quantum: Any, first: Any, scale: float, key: Any, out: Any) -> None:
-    for i in prange(mean.shape[0]):
+@njit(nogil=True, cache=True, error_model="numpy")
+def _compound_rows(begin: int, end: int, mean: Any, quantum: Any, first: Any, scale: float, key: Any, out: Any) -> None:
+    for i in range(begin, end):
         for j in range(mean.shape[1]):
             q = np.float64(quantum[i, j])
             lam = np.float64(mean[i, j]) * scale / q
@@ -154,7 +157,9 @@ def poisson(mean: Tensor, first_index: Any, seed: int, scale: float = 1.0) -> Te
     """
     flat = mean.detach().cpu().contiguous().reshape(-1, mean.shape[-1])
     out = torch.empty_like(flat)
-    _poisson_rows(flat.numpy(), _first(first_index, flat.shape[0]), float(scale), seed_key(seed), out.numpy())
+    first = _first(first_index, flat.shape[0])
+    row = _OPERATIONS * flat.shape[1]
+    run(_poisson_rows, len(first), flat.numpy(), first, float(scale), seed_key(seed), out.numpy(), operations=row)
     return out.reshape(mean.shape)
 
 
@@ -190,7 +195,9 @@ def compound_poisson(
     weight = quantum.detach().cpu().contiguous().reshape(flat.shape)
     first = _first(first_index, flat.shape[0])
     out = torch.empty_like(flat)
-    _compound_rows(flat.numpy(), weight.numpy(), first, float(scale), seed_key(seed), out.numpy())
+    arrays = flat.numpy(), weight.numpy()
+    row = _OPERATIONS * flat.shape[1]
+    run(_compound_rows, len(first), *arrays, first, float(scale), seed_key(seed), out.numpy(), operations=row)
     if electronic:
         added = normal(tuple(flat.shape), first, seed, flat.dtype, purpose=_ELECTRONICS)
         out.add_(added, alpha=float(electronic))
@@ -202,5 +209,6 @@ def normal(
 ) -> Tensor:
     """Standard normal numbers keyed like :func:`poisson`; ``shape`` is ``(..., n)``."""
     out = torch.empty((math.prod(shape[:-1]), shape[-1]), dtype=dtype)
-    _normal_rows(_first(first_index, out.shape[0]), seed_key(seed, purpose), out.numpy())
+    first, row = _first(first_index, len(out)), _OPERATIONS * shape[-1]
+    run(_normal_rows, len(out), first, seed_key(seed, purpose), out.numpy(), operations=row)
     return out.reshape(shape)

@@ -20,6 +20,7 @@ from torchpcct.dead_cells import bridge
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.robust import MEDIAN_TO_SD
 from torchpcct.scan import Scan
+from torchpcct.threads import run
 
 __all__ = ["Defects", "find_defects", "mended"]
 
@@ -101,7 +102,7 @@ def find_defects(counts: Tensor, air: Tensor, first_column: Any = None) -> Defec
 
     alive = np.flatnonzero(~view_dead)
     seen, dark, bright = (np.zeros((rows, air.shape[1])) for _ in range(3))
-    levels(n, first, alive, seen, dark, bright)
+    run(levels, rows, n, first, alive, seen, dark, bright, operations=3 * alive.size * columns)
     used = seen > 0
     level = bright / np.maximum(seen, 1)
     dead = used & (dark > 0.75 * seen)
@@ -110,7 +111,7 @@ def find_defects(counts: Tensor, air: Tensor, first_column: Any = None) -> Defec
     dead &= np.fmax(_beside(good_level), _beside(good_level.T).T) > BRIGHT
     # How far a cell's log signal lies above the mean of its neighbours', over the views in which both are good.
     above, times = np.zeros_like(seen), np.zeros_like(seen)
-    bends(n, first, alive, dead, above, times)
+    run(bends, rows, n, first, alive, dead, above, times, operations=20 * alive.size * columns)
     # The air's own share, which no view changes.
     expected = reference[:, 1:-1] - (reference[:, :-2] + reference[:, 2:]) / 2
     above[:, 1:-1] -= np.where(times[:, 1:-1] > 0, times[:, 1:-1] * expected, 0.0)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 __all__ = ["bends", "levels"]
 
 
-@njit(parallel=True, cache=True)
-def levels(counts, first, views, seen, dark, bright):
+@njit(nogil=True, cache=True)
+def levels(begin, end, counts, first, views, seen, dark, bright):
     """Add to every cell how often it was read, how often it read 0, and its counts.
 
     Args:
@@ -20,8 +20,8 @@ def levels(counts, first, views, seen, dark, bright):
         views: int64 indices of the views that count.
         seen, dark, bright: ``(rows, detector columns)`` float64.
     """
-    _, rows, columns = counts.shape
-    for r in prange(rows):
+    columns = counts.shape[2]
+    for r in range(begin, end):
         for v in views:
             at = first[v]
             for c in range(columns):
@@ -31,8 +31,8 @@ def levels(counts, first, views, seen, dark, bright):
                 bright[r, at + c] += n
 
 
-@njit(parallel=True, cache=True)
-def bends(counts, first, views, dead, above, times):
+@njit(nogil=True, cache=True)
+def bends(begin, end, counts, first, views, dead, above, times):
     """Add how far the log of every cell lies above the mean of its neighbours', and how often all three were good.
 
     Args:
@@ -40,8 +40,8 @@ def bends(counts, first, views, dead, above, times):
         dead: ``(rows, detector columns)`` bool, cells to leave out.
         above, times: ``(rows, detector columns)`` float64.
     """
-    _, rows, columns = counts.shape
-    for r in prange(rows):
+    columns = counts.shape[2]
+    for r in range(begin, end):
         log = np.empty(columns)
         for v in views:
             at = first[v]

@@ -14,6 +14,7 @@ from torch import Tensor
 from recon.linear_operator import apply_linear
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
+from torchpcct.threads import run
 from torchpcct.vector_geometry import check_motion
 
 __all__ = ["BackprojectionPlan", "backproject", "check_data", "data_shape"]
@@ -187,9 +188,12 @@ class BackprojectionPlan:
             numbers = data.reshape(-1, *shape).contiguous().numpy()
             arguments = self._arguments(data.dtype)
             if self.cone:
-                kernels.backproject_3d(self.kind, numbers, *arguments, *self._tile(), out.numpy())
+                tile = self._tile()
+                tasks = len(out) * math.prod(-(-n // t) for n, t in zip(out.shape[-2:], tile, strict=True))
+                run(kernels.backproject_3d, tasks, self.kind, numbers, *arguments, *tile, out.numpy())
             else:
-                kernels.backproject_2d(self.kind, numbers, *arguments, out.numpy())
+                tasks = len(out) * -(-out.shape[1] // kernels.ROWS)
+                run(kernels.backproject_2d, tasks, self.kind, numbers, *arguments, out.numpy())
             if self.mask is not None:
                 out.masked_fill_(torch.from_numpy(self.mask), 0.0)
         return out.view(*lead, *self.grid.shape)
@@ -210,9 +214,10 @@ class BackprojectionPlan:
             arguments = self._arguments(volume.dtype)
             if self.cone:
                 numbers = volume.permute(0, 2, 3, 1).contiguous().numpy()
-                kernels.spread_3d(self.kind, numbers, *arguments, out.numpy())
+                run(kernels.spread_3d, len(out) * w.views, self.kind, numbers, *arguments, out.numpy())
             else:
-                kernels.spread_2d(self.kind, volume.contiguous().numpy(), *arguments, out.numpy())
+                numbers = volume.contiguous().numpy()
+                run(kernels.spread_2d, len(out) * w.views, self.kind, numbers, *arguments, out.numpy())
         return out.view(*lead, *shape)
 
 

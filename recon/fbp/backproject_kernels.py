@@ -14,17 +14,19 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
-__all__ = ["backproject_2d", "backproject_3d", "spread_2d", "spread_3d"]
+__all__ = ["ROWS", "backproject_2d", "backproject_3d", "spread_2d", "spread_3d"]
 
 PARALLEL, FLAT, CURVED = 0, 1, 2
+ROWS = 16
+"""Rows of a task of :func:`backproject_2d`."""
 
-# Inside the parallel loops no slice is assigned to: numba 0.68 miscompiles some (`column[:] = 0` left an element out).
 # No "nnan" or "ninf": NaN and Inf of the data must reach the image.
 _FAST = {"contract", "nsz", "arcp"}
-_OPTIONS: Any = {"parallel": True, "cache": True, "error_model": "numpy", "fastmath": _FAST}
+_OPTIONS: Any = {"nogil": True, "cache": True, "error_model": "numpy", "fastmath": _FAST}
 _INLINE: Any = {"cache": True, "error_model": "numpy", "fastmath": _FAST}
+_BARE: Any = {**_INLINE, "_nrt": False}  # without reference counts: for what allocates nothing
 
 
 @njit(**_INLINE)
@@ -65,14 +67,14 @@ def _positions_2d(kind, x, y, c, s, toward, aside, sod, sdd, scale, start, last,
 
 
 @njit(**_OPTIONS)
-def backproject_2d(kind, data, cosines, sines, shifts, starts, x, y, sod, sdd, scale, atan, out):
+def backproject_2d(begin, end, kind, data, cosines, sines, shifts, starts, x, y, sod, sdd, scale, atan, out):
     """``data (B, V, columns)`` into ``out (B, Y, X)``."""
-    batch, views, columns = data.shape
+    _, views, columns = data.shape
     ny, nx = out.shape[1], out.shape[2]
     number = data.dtype.type
-    block = 16
+    block = ROWS
     blocks = (ny + block - 1) // block
-    for task in prange(batch * blocks):
+    for task in range(begin, end):
         b, first = task // blocks, (task % blocks) * block
         end = min(first + block, ny)
         total = np.zeros((block, nx), data.dtype)
@@ -88,23 +90,9 @@ def backproject_2d(kind, data, cosines, sines, shifts, starts, x, y, sod, sdd, s
             row[columns] = number(0)  # read with weight 0 at the last column's centre
             for iy in range(first, end):
                 _positions_2d(
-                    kind,
-                    xs,
-                    y[iy],
-                    cosines[v],
-                    sines[v],
-                    shifts[v, 0],
-                    shifts[v, 1],
-                    sod,
-                    sdd,
-                    scale,
-                    starts[v],
-                    columns - 1,
-                    atan,
-                    index,
-                    near,
-                    far,
-                )
+                    kind, xs, y[iy], cosines[v], sines[v], shifts[v, 0], shifts[v, 1], sod, sdd, scale, starts[v],
+                    columns - 1, atan, index, near, far,
+                )  # fmt: skip
                 line = total[iy - first]
                 for i in range(nx):
                     k = np.uint32(index[i])
@@ -115,12 +103,12 @@ def backproject_2d(kind, data, cosines, sines, shifts, starts, x, y, sod, sdd, s
 
 
 @njit(**_OPTIONS)
-def spread_2d(kind, volume, cosines, sines, shifts, starts, x, y, sod, sdd, scale, atan, out):
+def spread_2d(begin, end, kind, volume, cosines, sines, shifts, starts, x, y, sod, sdd, scale, atan, out):
     """Transpose of :func:`backproject_2d`: ``volume (B, Y, X)`` into ``out (B, V, columns)``."""
-    batch, views, columns = out.shape
+    _, views, columns = out.shape
     ny, nx = volume.shape[1], volume.shape[2]
     number = volume.dtype.type
-    for task in prange(batch * views):
+    for task in range(begin, end):
         b, v = task // views, task % views
         index = np.empty(nx, np.int32)
         near, far = np.empty(nx, volume.dtype), np.empty(nx, volume.dtype)
@@ -205,8 +193,31 @@ def _add_by_index(near, far, turned, m, z, step, origin, column, lower, upper, t
         total[p, k] += a + upper[k] * (column[near_row + np.uint32(1)] - a)
 
 
+@njit(**_BARE)
+def _add_view(
+    index, weight, height, first, last, row_scale, kink, table, tau, turned, origin, column, lower, upper, heights,
+    total,
+):  # fmt: skip
+    """What one view adds to every voxel column of a tile; apart, because it needs no reference counts."""
+    number = total.dtype.type
+    for p in range(index.size):
+        position = min(max(index[p], 0.0), last)
+        i = int(position)
+        fraction = (position - i) * weight[p]
+        near, far = number(weight[p] - fraction), number(fraction)
+        step = number(height[p] * row_scale)
+        m = np.uint64(i - first)
+        q = np.uint64(p)
+        if kink:
+            _add_by_kink(near, far, table, m, heights, tau, step, total, q)
+        else:
+            _add_by_index(near, far, turned, m, heights, step, origin, column, lower, upper, total, q)
+
+
 @njit(**_OPTIONS)
 def backproject_3d(
+    begin,
+    end,
     kind,
     data,
     cosines,
@@ -227,7 +238,7 @@ def backproject_3d(
     out,
 ):
     """``data (B, V, rows, columns)`` into ``out (B, Z, Y, X)``, tile by tile of ``tile_y × tile_x`` voxel columns."""
-    batch, views, rows, columns = data.shape
+    _, views, rows, columns = data.shape
     nz, ny, nx = out.shape[1], out.shape[2], out.shape[3]
     number = data.dtype.type
     tiles_y, tiles_x = (ny + tile_y - 1) // tile_y, (nx + tile_x - 1) // tile_x
@@ -235,7 +246,7 @@ def backproject_3d(
     padded = (nz + 7) // 8 * 8
     last = columns - 1.0
     origin = number(row_start)
-    for task in prange(batch * tiles):
+    for task in range(begin, end):
         b = task // tiles
         iy, ix = (task % tiles) // tiles_x, task % tiles_x
         y0, y1 = iy * ny // tiles_y, (iy + 1) * ny // tiles_y
@@ -303,32 +314,26 @@ def backproject_3d(
                         g[k] = here
                         d[k] = here - source[j]
                         e[k] = source[j + np.uint32(2)] - here
-            for p in range(n):
-                position = min(max(index[p], 0.0), last)
-                i = int(position)
-                fraction = (position - i) * weight[p]
-                near, far = number(weight[p] - fraction), number(fraction)
-                step = number(height[p] * row_scale)
-                m = np.uint64(i - first)
-                q = np.uint64(p)
-                if kink:
-                    _add_by_kink(near, far, table, m, heights, tau, step, total, q)
-                else:
-                    _add_by_index(near, far, turned, m, heights, step, origin, column, lower, upper, total, q)
+            _add_view(
+                index, weight, height, first, last, row_scale, kink, table, tau, turned, origin, column, lower, upper,
+                heights, total,
+            )  # fmt: skip
         for k in range(nz):
             for p in range(n):
                 out[b, k, y0 + p // width, x0 + p % width] = total[p, k]
 
 
 @njit(**_OPTIONS)
-def spread_3d(kind, volume, cosines, sines, shifts, starts, x, y, z, sod, sdd, scale, row_scale, row_start, atan, out):
+def spread_3d(
+    begin, end, kind, volume, cosines, sines, shifts, starts, x, y, z, sod, sdd, scale, row_scale, row_start, atan, out
+):
     """Transpose of :func:`backproject_3d`: ``volume (B, Y, X, Z)`` into ``out (B, V, rows, columns)``."""
-    batch, views, rows, columns = out.shape
+    _, views, rows, columns = out.shape
     ny, nx, nz = volume.shape[1], volume.shape[2], volume.shape[3]
     number = volume.dtype.type
     zero, last = number(0), columns - 1.0
     last_row, origin = number(rows - 1), number(row_start)
-    for task in prange(batch * views):
+    for task in range(begin, end):
         b, v = task // views, task % views
         index, weight, height = np.empty(nx), np.empty(nx), np.empty(nx)
         line = np.empty(nx)

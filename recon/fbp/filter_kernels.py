@@ -5,22 +5,22 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 __all__ = ["align", "unalign"]
 
-_OPTIONS: Any = {"parallel": True, "cache": True, "error_model": "numpy"}
+_OPTIONS: Any = {"nogil": True, "cache": True, "error_model": "numpy"}
 
 
 @njit(**_OPTIONS)
-def align(data, angular, cosine, first, offset, out):
+def align(begin, end, data, angular, cosine, first, offset, out):
     """``out[v, r, offset[v] + i] = angular · cosine · data[v, r, i]``, zero elsewhere.
 
     ``angular (V, 1 or columns)`` and ``cosine (R, columns)`` refer to detector columns, ``first[v] + i``.
     """
-    views, rows, width = data.shape
+    _, rows, width = data.shape
     length = out.shape[2]
-    for v in prange(views):
+    for v in range(begin, end):
         low, start = offset[v], first[v]
         for r in range(rows):
             source, target, weights = data[v, r], out[v, r], cosine[r, start : start + width]
@@ -40,10 +40,10 @@ def align(data, angular, cosine, first, offset, out):
 
 
 @njit(**_OPTIONS)
-def unalign(aligned, angular, cosine, first, offset, out):
+def unalign(begin, end, aligned, angular, cosine, first, offset, out):
     """Transpose of :func:`align`, added to ``out (V, R, width)``."""
-    views, rows, width = out.shape
-    for v in prange(views):
+    _, rows, width = out.shape
+    for v in range(begin, end):
         low, start = np.uint64(offset[v]), np.uint64(first[v])
         for r in range(rows):
             for i in range(width):

@@ -19,6 +19,7 @@ from torch import Tensor
 from recon.fbp.ramp import fast_length, ramp_kernel
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam
+from torchpcct.threads import run
 
 __all__ = ["CHUNK_BYTES", "FilterPlan"]
 
@@ -144,7 +145,8 @@ class FilterPlan:
             frame = buffer[: v1 - v0]
             for source, target in zip(data, out, strict=True):
                 rows = source[v0:v1, r0 : r0 + b.rows]
-                align(rows.numpy(), angular[v0:v1], cosine, first[v0:v1], offset[v0:v1], frame.numpy())
+                views = angular[v0:v1], cosine, first[v0:v1], offset[v0:v1]
+                run(align, v1 - v0, rows.numpy(), *views, frame.numpy(), operations=frame[0].numel())
                 self._convolve(frame, responses, target[:, v0:v1])
         return out.view(*lead, *out.shape[1:])
 
@@ -174,7 +176,8 @@ class FilterPlan:
             for source, target in zip(gradient, out, strict=True):
                 frame = self._correlate(source[:, v0:v1], responses)
                 rows = target[v0:v1, r0 : r0 + b.rows]
-                unalign(frame.numpy(), angular[v0:v1], cosine, first[v0:v1], offset[v0:v1], rows.numpy())
+                views = angular[v0:v1], cosine, first[v0:v1], offset[v0:v1]
+                run(unalign, v1 - v0, frame.numpy(), *views, rows.numpy(), operations=frame[0].numel())
         return out.view(*lead, *out.shape[1:])
 
     def _correlate(self, gradient: Tensor, responses: Tensor) -> Tensor:

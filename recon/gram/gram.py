@@ -24,6 +24,7 @@ from torch import Tensor
 
 from recon.gram.impulse_response import Nodes, kernel_at, node_positions, slice_reach
 from recon.gram.positive_definite import cholesky, make_definite
+from torchpcct.threads import run
 from torchpcct.validate import number
 
 __all__ = ["Gram", "check_weights", "information_at_reference"]
@@ -293,7 +294,11 @@ def _banded_add(kernel: Tensor, x: Tensor, scale: float, out: Tensor) -> None:
 
         real = kernel.real.numpy().dtype.type
         shape = (-1, *x.shape[-3:])
-        banded_add(kernel.numpy(), x.reshape(shape).numpy(), real(scale), out.view(shape).numpy())
+        row = 4 * x.shape[-1] * kernel.shape[0] * x[..., 0, 0].numel()
+        run(
+            banded_add, x.shape[-2], kernel.numpy(), x.reshape(shape).numpy(), real(scale), out.view(shape).numpy(),
+            operations=row,
+        )  # fmt: skip
         return
     out += (scale * kernel[0].real) * x
     for b in range(1, kernel.shape[0]):

@@ -1,27 +1,35 @@
-"""CPU kernels of the Gram operator: Hermitian banded matrices along z, one per in-plane frequency."""
+"""CPU kernels of the Gram operator: Hermitian banded matrices along z, one per in-plane frequency.
+
+:func:`torchpcct.threads.run` calls them on ``begin … end`` of the rows of frequencies, or frequencies, or ``todo``.
+"""
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 __all__ = ["banded_add", "banded_cholesky", "damp", "stiffen"]
 
 
-@njit(parallel=True, cache=True, fastmath={"contract", "reassoc", "nsz"})
-def banded_add(kernel, x, scale, out):
-    """out += scale · K x for every frequency.
+# It allocates nothing, and needs no reference counts.
+_VIEWS_ONLY: Any = {"nogil": True, "cache": True, "fastmath": {"contract", "reassoc", "nsz"}, "_nrt": False}
+
+
+@njit(**_VIEWS_ONLY)
+def banded_add(begin, end, kernel, x, scale, out):
+    """out += scale · K x for every frequency of the rows ``begin … end`` along y.
 
     Args:
         kernel: ``(reach + 1, nz, fy, fx)`` lower bands; the main diagonal is real.
         x, out: ``(batch, nz, fy, fx)`` complex, contiguous.
         scale: real, in the precision of x.
     """
-    bands, nz, fy, fx = kernel.shape
+    bands, nz, _, fx = kernel.shape
     batch = x.shape[0]
-    for y in prange(fy):
+    for y in range(begin, end):
         for n in range(batch):
             for z in range(nz):
                 to = out[n, z, y]
@@ -39,8 +47,8 @@ def banded_add(kernel, x, scale, out):
                             to[i] += scale * (upper[i].conjugate() * above[i])
 
 
-@njit(parallel=True, cache=True)
-def banded_cholesky(kernel, least, lower, definite):
+@njit(nogil=True, cache=True)
+def banded_cholesky(begin, end, kernel, least, lower, definite):
     """L with L Lᴴ = K for every frequency, and whether K is positive definite there.
 
     Args:
@@ -49,8 +57,8 @@ def banded_cholesky(kernel, least, lower, definite):
         lower: like kernel; filled up to the first pivot that fails.
         definite: ``(frequencies,)`` bool.
     """
-    bands, nz, count = kernel.shape
-    for f in prange(count):
+    bands, nz, _ = kernel.shape
+    for f in range(begin, end):
         good = True
         for j in range(nz):
             for b in range(min(bands, nz - j)):
@@ -89,8 +97,8 @@ def _first_failure(matrix, least, lower):
     return -1
 
 
-@njit(parallel=True, cache=True)
-def stiffen(terms, points, least, step, most, definite):
+@njit(nogil=True, cache=True)
+def stiffen(begin, end, terms, points, least, step, most, definite):
     """Tie neighbouring slices together, just where and as much as the matrices Σ_c points[k, c] terms[c] need it.
 
     Args:
@@ -101,8 +109,8 @@ def stiffen(terms, points, least, step, most, definite):
         most: largest number of additions per frequency.
         definite: ``(frequencies,)`` bool, whether it succeeded.
     """
-    count, bands, nz, frequencies = terms.shape
-    for f in prange(frequencies):
+    count, bands, nz, _ = terms.shape
+    for f in range(begin, end):
         matrix = np.empty((bands, nz), dtype=np.complex128)
         lower = np.empty((bands, nz), dtype=np.complex128)
         level = 0.0
@@ -138,8 +146,8 @@ def stiffen(terms, points, least, step, most, definite):
         definite[f] = good
 
 
-@njit(parallel=True, cache=True)
-def damp(terms, points, least, kept, shifts, level, lowest, todo):
+@njit(nogil=True, cache=True)
+def damp(begin, end, terms, points, least, kept, shifts, level, lowest, todo):
     """Damp position-dependent terms, then shift the diagonal, until all Σ_c points[k, c] terms[c] are definite.
 
     Args:
@@ -151,7 +159,7 @@ def damp(terms, points, least, kept, shifts, level, lowest, todo):
         todo: indices of frequencies.
     """
     count, bands, nz, _ = terms.shape
-    for t in prange(todo.size):
+    for t in range(begin, end):
         f = todo[t]
         own = np.empty((count, bands, nz), dtype=np.complex128)
         for c in range(count):

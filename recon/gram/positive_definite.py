@@ -11,6 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchpcct.threads import run
+
 __all__ = ["cholesky", "make_definite"]
 
 # Smallest pivot, as a share of the diagonal, that a definite spectrum must have.
@@ -30,7 +32,8 @@ def cholesky(kernel: Tensor) -> tuple[Tensor, NDArray[np.bool_]]:
     flat = kernel.cpu().reshape(*kernel.shape[:2], -1).to(torch.complex128).contiguous().numpy()
     lower = np.zeros_like(flat)
     definite = np.zeros(flat.shape[2], dtype=np.bool_)
-    banded_cholesky(flat, LEAST_PIVOT, lower, definite)
+    work = 4 * lower[..., 0].size * len(lower)
+    run(banded_cholesky, definite.size, flat, LEAST_PIVOT, lower, definite, operations=work)
     return torch.from_numpy(lower).reshape(kernel.shape).to(kernel), definite.reshape(tuple(kernel.shape[2:]))
 
 
@@ -52,11 +55,12 @@ def make_definite(spectra: Tensor) -> Tensor:
 
     plain = flat.copy()
     definite = np.zeros(flat.shape[-1], dtype=np.bool_)
-    stiffen(flat, _points(terms), LEAST_PIVOT, STIFFNESS, ADDITIONS, definite)
+    run(stiffen, definite.size, flat, _points(terms), LEAST_PIVOT, STIFFNESS, ADDITIONS, definite)
     todo = np.flatnonzero(~definite)
     flat[..., todo] = plain[..., todo]
     kept = np.array(KEPT if terms > 1 else ())
-    damp(flat, _points(terms), LEAST_PIVOT, kept, np.array(SHIFTS), level, 1e-9 * level.max(), todo)
+    least = 1e-9 * level.max()
+    run(damp, todo.size, flat, _points(terms), LEAST_PIVOT, kept, np.array(SHIFTS), level, least, todo)
     return torch.from_numpy(flat).reshape(spectra.shape).to(spectra)
 
 

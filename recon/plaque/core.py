@@ -18,6 +18,7 @@ from scipy.linalg import solve_triangular
 from recon.plaque.kernels import core_fractions
 from recon.plaque.local_gram import LocalGram
 from recon.plaque.vessel import BLUR, BLUR_UNIT, Fit, Vessel
+from torchpcct.threads import run
 
 __all__ = ["CorePrior", "CoreSpace", "Evidence"]
 
@@ -189,9 +190,10 @@ class CoreSpace:
     def shares(self, shapes: Floats) -> NDArray[np.float32]:
         """Share of each of the chosen voxels in every body, ``(m, n)``."""
         out = np.empty((len(shapes), len(self.chosen)), np.float32)
-        core_fractions(
-            np.ascontiguousarray(shapes[:, CENTRE]), np.ascontiguousarray(self.axes(shapes)), np.exp(shapes[:, AXES]),
-            np.exp(shapes[:, CAP]), self.points, self.vessel.half, self.inner, self.lumen, self.normals, self.blur, out,
+        run(
+            core_fractions, len(shapes), np.ascontiguousarray(shapes[:, CENTRE]),
+            np.ascontiguousarray(self.axes(shapes)), np.exp(shapes[:, AXES]), np.exp(shapes[:, CAP]), self.points,
+            self.vessel.half, self.inner, self.lumen, self.normals, self.blur, out, operations=50 * len(self.points),
         )  # fmt: skip
         return out
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from numba import njit, prange
+from numba import njit
 
 __all__ = ["core_fractions", "gather_block", "outline_radius", "outline_spread", "plane_fractions", "symmetric_step"]
 
@@ -76,8 +76,8 @@ def plane_fractions(distance, widths, blur, share, slope):
         share[i], slope[i] = _behind(distance[i], max(a, least), max(b, least), max(c, least))
 
 
-@njit(parallel=True, cache=True)
-def core_fractions(centres, axes, semi, caps, points, half, inner, lumen, normals, blur, out):
+@njit(nogil=True, cache=True)
+def core_fractions(begin, end, centres, axes, semi, caps, points, half, inner, lumen, normals, blur, out):
     """Share of every voxel inside each ellipsoid, inside the fibrous layer and farther than a cap from the lumen.
 
     Nested outlines that face each other within a voxel are parallel planes there: the part inside of several is the
@@ -92,7 +92,7 @@ def core_fractions(centres, axes, semi, caps, points, half, inner, lumen, normal
         blur: variance of the edges' blur in the plane, mm².
         out: ``(bodies, n)``, filled.
     """
-    for p in prange(centres.shape[0]):
+    for p in range(begin, end):
         cz, cy, cx = centres[p]
         largest = max(semi[p, 0], semi[p, 1], semi[p, 2]) + half[0] + half[1] + half[2]
         flattest = 0.0
@@ -136,8 +136,8 @@ def core_fractions(centres, axes, semi, caps, points, half, inner, lumen, normal
                 out[p, i] = max(min(share, inner[i], 1.0 - blood), 0.0)
 
 
-@njit(parallel=True, cache=True, fastmath={"contract", "reassoc", "nsz"})
-def gather_block(kernel, polynomials, there, runs, out):
+@njit(nogil=True, cache=True, fastmath={"contract", "reassoc", "nsz"})
+def gather_block(begin, end, kernel, polynomials, there, runs, out):
     """The Gram operator from voxels of one slice to voxels of another.
 
     Args:
@@ -150,7 +150,7 @@ def gather_block(kernel, polynomials, there, runs, out):
     terms = kernel.shape[0]
     my, mx = kernel.shape[1] // 2, kernel.shape[2] // 2
     half = kernel.dtype.type(0.5)
-    for i in prange(there.shape[0]):
+    for i in range(begin, end):
         y, x = there[i]
         for r in range(runs.shape[0]):
             v, u, column, count = runs[r]

@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from recon.plaque.kernels import gather_block, symmetric_step
+from torchpcct.threads import run
 
 __all__ = ["LocalGram"]
 
@@ -103,7 +104,8 @@ class LocalGram:
             for z in range(nz - b):
                 if len(planes[z]) and len(planes[z + b]):
                     out = np.empty((len(planes[z + b]), len(planes[z])), np.float32)
-                    gather_block(near[b, z], polynomials, planes[z + b], runs[z], out)
+                    work = 4 * len(polynomials) * out.shape[1]
+                    run(gather_block, len(out), near[b, z], polynomials, planes[z + b], runs[z], out, operations=work)
                     blocks[z, b] = out
         return cls(blocks, slices)
 

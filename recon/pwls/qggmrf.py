@@ -35,6 +35,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchpcct.threads import run
 from torchpcct.validate import number
 
 __all__ = ["DEFAULT_PRIOR", "QGGMRF", "BoundPrior", "quadratic"]
@@ -258,8 +259,8 @@ class BoundPrior:
 
         a, b = self._volumes(x), self._volumes(direction)
         out = np.empty_like(a)
-        majorize: Any = kernels.majorize_channels if self.channels else kernels.majorize
-        majorize(a, b, *self._tables(a.dtype, both=True), out)
+        kernel: Any = kernels.majorize_channels if self.channels else kernels.majorize
+        self._by_rows(kernel, a, b, *self._tables(a.dtype, both=True), out)
         return torch.from_numpy(out).reshape(x.shape)
 
     def _fused_along(self, x: Tensor, direction: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
@@ -267,10 +268,14 @@ class BoundPrior:
 
         a, v, u = self._volumes(x), self._volumes(direction), self._volumes(other)
         rows = np.empty((a.shape[0], *a.shape[-3:-1], 2))
-        along: Any = kernels.along_channels if self.channels else kernels.along
-        along(a, u, v, *self._tables(a.dtype, both=False), rows)
+        kernel: Any = kernels.along_channels if self.channels else kernels.along
+        self._by_rows(kernel, a, u, v, *self._tables(a.dtype, both=False), rows)
         sums = torch.from_numpy(rows.sum(axis=(1, 2))).reshape(*x.shape[: x.dim() - self.axes], 2)
         return sums[..., 0], sums[..., 1]
+
+    def _by_rows(self, kernel: Any, x: NDArray[Any], *rest: Any) -> None:
+        rows = len(x) * x.shape[-3] * x.shape[-2]
+        run(kernel, rows, x, *rest, operations=4 * len(self.offsets) * x.size // rows)
 
     def _volumes(self, x: Tensor) -> NDArray[Any]:
         """``(batch, [channels,] nz, ny, nx)`` contiguous."""

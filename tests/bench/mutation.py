@@ -147,8 +147,8 @@ FAULTS = (
           "parts = [np.s_[:, 0:columns] for c in first]", _D + "test_cells_are_followed_through_a_window"),
     Fault("damaged pieces pass", "recon/study/store.py", "if mark and digest !=", "if False and digest !=",
           _C + "test_damaged_pieces_are_computed_again"),
-    Fault("lock held for ever", "torchpcct/projector/engine.py", "after_in_child=_renew_lock",
-          "after_in_parent=_renew_lock", _C + "test_a_fork_while_another_thread_projects_does_not_hang"),
+    Fault("threads left behind by a fork", "torchpcct/threads.py", "after_in_child=_renew", "after_in_parent=_renew",
+          "tests/torchpcct/projector/test_manners.py::test_a_forked_process_computes_on_threads_of_its_own"),
     Fault("layers of the window", "torchpcct/projector/tables.py",
           "self.grid, self.rays.row_edge, self.rays.row_pitch, rows)",
           "self.grid, self.heights[2], self.rays.row_pitch, self.rays.rows)",
@@ -203,8 +203,8 @@ FAULTS = (
           _WF + "test_slices_share_the_field"),
     Fault("slow steps count once", "recon/pwls/pwls.py", "return d * (1 + q) / (1 - q)", "return d",
           "tests/recon/pwls/test_pwls.py::test_distance_is_right_where_the_model_converges_slowly"),
-    Fault("indefinite frequencies pass", "recon/gram/positive_definite.py", "    damp(flat, _points",
-          "    _ = (flat, _points", "tests/recon/gram/test_gram.py::test_spectra_become_definite_whatever_they_are"),
+    Fault("indefinite frequencies pass", "recon/gram/positive_definite.py", "    run(damp, todo.size",
+          "    _ = (damp, todo.size", "tests/recon/gram/test_gram.py::test_spectra_become_definite_whatever_they_are"),
 )  # fmt: skip
 
 

@@ -24,13 +24,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 import torch
 
 from torchpcct.detector_window import shadow
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
 from torchpcct.projector import Projector
+from torchpcct.threads import get_num_threads, set_num_threads
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "helpers"))  # where pytest finds them, too
 from analytic import Ellipsoid, Gaussian, line_integrals, rasterize
@@ -132,7 +132,7 @@ def ours(case: Case, dtype: torch.dtype, threads: int) -> Peer:
 
     def on_threads(work: Pass) -> Pass:
         def run() -> Any:
-            numba.set_num_threads(threads)
+            set_num_threads(threads)
             return work()
 
         return run
@@ -281,7 +281,7 @@ def xcist(case: Case, path: str | None) -> Peer | None:
 
 def measure(case: Case, repeats: int, library: str | None) -> list[dict[str, Any]]:
     """One table row per projector; the timed passes are interleaved."""
-    cores = numba.config.NUMBA_NUM_THREADS
+    cores = get_num_threads()
     found = {
         f"torchpcct float32, {cores} threads": ours(case, torch.float32, cores),
         "torchpcct float32, 1 thread": ours(case, torch.float32, 1),

@@ -156,18 +156,6 @@ def test_damaged_pieces_are_computed_again(tmp_path, monkeypatch):
     assert store.piece("p", "key", pytest.fail)["a"].tolist() == [0, 0]
 
 
-def test_a_fork_while_another_thread_projects_does_not_hang():
-    code = (
-        "import os, threading\nfrom torchpcct.projector import engine\n"
-        "engine._LAUNCH.acquire()\n"  # as a thread that is projecting holds it
-        "pid = os.fork()\n"
-        "if pid == 0: os._exit(0 if engine._LAUNCH.acquire(timeout=5) else 1)\n"
-        "print('STATUS', os.waitpid(pid, 0)[1])"
-    )
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=120)
-    assert "STATUS 0" in run.stdout, run.stderr
-
-
 def test_a_package_that_nobody_can_write_names_numbas_variable(monkeypatch):
     import torchpcct
 

@@ -1,6 +1,5 @@
 """One thread and two: our kernels give the same bits; torch's matrix products and convolutions stay within a bound."""
 
-import numba
 import pytest
 import torch
 from small_scan import GRID
@@ -8,25 +7,24 @@ from small_scan import GRID
 from recon import reconstruct
 from recon.fbp.fbp import fbp
 from torchpcct import Projector
+from torchpcct.threads import get_num_threads, set_num_threads
 
 TOLERANCE_HU = {"fbp": 0.0, "pwls": 0.0, "mbir": 0.01}
 """As the docstring of :func:`recon.reconstruct` says; measured for MBIR: 8e-5 … 2.4e-4 HU."""
 
 
 def _on(threads, compute):
-    before = numba.get_num_threads(), torch.get_num_threads()
-    numba.set_num_threads(threads)
+    before = get_num_threads(), torch.get_num_threads()
+    set_num_threads(threads)
     torch.set_num_threads(threads)
     try:
         return compute()
     finally:
-        numba.set_num_threads(before[0])
+        set_num_threads(before[0])
         torch.set_num_threads(before[1])
 
 
 def _both(compute):
-    if numba.config.NUMBA_NUM_THREADS < 2:
-        pytest.skip("numba was started on one thread")
     return _on(1, compute), _on(2, compute)
 
 

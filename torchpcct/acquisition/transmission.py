@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -32,6 +32,7 @@ from torchpcct.acquisition.bodies import BodySet
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam
 from torchpcct.scene.chords import interval
+from torchpcct.threads import run
 
 __all__ = ["SUB_RAY_COUNTS", "Beam", "compress", "expected_readings", "sub_rays"]
 
@@ -116,20 +117,20 @@ def compress(contrast: Floats, longest_mm: float = 1000.0, tolerance: float = 1e
     return np.ascontiguousarray(coefficients), np.ascontiguousarray(basis)
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy")
 def _readings(
-    cos_b: Any, sin_b: Any, view_step: Any, sod: float, sdd: float, curved: bool, u0: float, du: float, v0: float,
-    dv: float, focal_w: float, focal_l: float, points: Any, kinds: Any, params: Any, coefficients: Any, basis: Any,
-    offsets: Any, drift: Any, circle: Any, reach: float, spectra: Any, row_factor: Any, first_column: Any,
-    first_row: int, surround: Any, out: Any,
+    begin: int, end: int, cos_b: Any, sin_b: Any, view_step: Any, sod: float, sdd: float, curved: bool, u0: float,
+    du: float, v0: float, dv: float, focal_w: float, focal_l: float, points: Any, kinds: Any, params: Any,
+    coefficients: Any, basis: Any, offsets: Any, drift: Any, circle: Any, reach: float, spectra: Any, row_factor: Any,
+    first_column: Any, first_row: int, surround: Any, out: Any,
 ) -> None:  # fmt: skip
-    bins, views, rows, columns = out.shape
+    bins, _, rows, columns = out.shape
     energies = basis.shape[1]
     rank = basis.shape[0]
     bodies = kinds.size
     count = points.shape[0]
     has_surround = surround.shape[0] > 0
-    for view in prange(views):
+    for view in range(begin, end):
         mean = np.empty(rank)
         start = np.empty(rank)
         sample = np.empty(rank)
@@ -274,12 +275,12 @@ def expected_readings(
         + float(np.abs(bodies.drift).max(initial=0.0))
     )
     empty = np.empty((0, 0, 0))
-    _readings(
-        np.cos(geometry.angles), np.sin(geometry.angles), np.ascontiguousarray(view_step), geometry.sod, geometry.sdd,
-        geometry.detector == "curved", geometry.column_positions[0], du, geometry.row_positions[0], dv,
-        *beam.focal_spot, np.ascontiguousarray(beam.points), bodies.kinds, bodies.params, coefficients, basis,
-        bodies.offsets, bodies.drift, np.array(bodies.circle), reach, np.ascontiguousarray(beam.spectra),
-        np.ascontiguousarray(beam.row_factor), window.first_column, window.first_row,
-        empty if surround is None else np.ascontiguousarray(surround), out,
+    run(
+        _readings, geometry.views, np.cos(geometry.angles), np.sin(geometry.angles), np.ascontiguousarray(view_step),
+        geometry.sod, geometry.sdd, geometry.detector == "curved", geometry.column_positions[0], du,
+        geometry.row_positions[0], dv, *beam.focal_spot, np.ascontiguousarray(beam.points), bodies.kinds, bodies.params,
+        coefficients, basis, bodies.offsets, bodies.drift, np.array(bodies.circle), reach,
+        np.ascontiguousarray(beam.spectra), np.ascontiguousarray(beam.row_factor), window.first_column,
+        window.first_row, empty if surround is None else np.ascontiguousarray(surround), out,
     )  # fmt: skip
     return torch.from_numpy(out)

@@ -30,6 +30,7 @@ from torchpcct.scanner import Scanner
 from torchpcct.scene import Scene
 from torchpcct.scene.chords import interval
 from torchpcct.scene.materials import material
+from torchpcct.threads import run
 from torchpcct.validate import choice, number, whole
 
 __all__ = ["QUANTITIES", "plane_points", "primary_dose"]
@@ -42,15 +43,15 @@ _FAN_NODES = 1025
 _GROUP_KEV = 3.0
 
 
-@numba.njit(parallel=True, cache=True, error_model="numpy")
+@numba.njit(nogil=True, cache=True, error_model="numpy")
 def _dose(
-    xs: Any, ys: Any, z: float, cos_b: Any, sin_b: Any, sod: float, kinds: Any, params: Any, coefficients: Any,
-    basis: Any, half_fan: float, fluence: Any, deposit: Any, medium: Any, falloff: int, out: Any,
+    begin: int, end: int, xs: Any, ys: Any, z: float, cos_b: Any, sin_b: Any, sod: float, kinds: Any, params: Any,
+    coefficients: Any, basis: Any, half_fan: float, fluence: Any, deposit: Any, medium: Any, falloff: int, out: Any,
 ) -> None:  # fmt: skip
     rank, energies = basis.shape
     nodes = fluence.shape[0]
     step = (nodes - 1) / (2.0 * half_fan)
-    for i in numba.prange(xs.size):
+    for i in range(begin, end):
         own = medium[i]
         if own < 0:
             continue
@@ -174,9 +175,9 @@ def primary_dose(
     beta = (np.arange(views) + 0.5) * (2.0 * math.pi / views)
     flat = points.reshape(-1, 2)
     out = np.zeros(len(flat))
-    _dose(
-        np.ascontiguousarray(flat[:, 0]), np.ascontiguousarray(flat[:, 1]), float(z_mm), np.cos(beta), np.sin(beta),
-        g.sod, kinds, params, coefficients, basis, half, np.ascontiguousarray(fluence), deposit, labels.reshape(-1),
-        _AXIAL.index(axial), out,
+    run(
+        _dose, len(flat), np.ascontiguousarray(flat[:, 0]), np.ascontiguousarray(flat[:, 1]), float(z_mm), np.cos(beta),
+        np.sin(beta), g.sod, kinds, params, coefficients, basis, half, np.ascontiguousarray(fluence), deposit,
+        labels.reshape(-1), _AXIAL.index(axial), out,
     )  # fmt: skip
     return np.asarray((out * (scanner.source.current_ma * exposure_s)).reshape(points.shape[:-1]))

@@ -28,6 +28,7 @@ from torchpcct.geometry import VolumeGrid
 from torchpcct.scanner import Scanner
 from torchpcct.scene import Scene
 from torchpcct.scene.materials import Material
+from torchpcct.threads import run
 from torchpcct.validate import number, whole
 
 __all__ = ["MonteCarloDose", "monte_carlo_dose"]
@@ -172,11 +173,11 @@ def monte_carlo_dose(
     n = (int(histories) // BATCHES) * BATCHES
     tally = np.zeros((BATCHES, 2, *grid.shape))
     axes = grid.axes
-    transport(
-        n, seed_key(seed), medium, float(axes[1][0] - grid.spacing[1] / 2), float(axes[0][0] - grid.spacing[0] / 2),
-        float(grid.spacing[0]), radius, phantom_length_mm / 2.0, scan_length_mm / 2.0, sod, half, fan_cdf,
-        np.ascontiguousarray(energy_cdf), energies, _CUTOFF_KEV, _TABLE_STEP_KEV, total, photo, compton, absorption,
-        largest, squares, form, _CUTOFF_KEV, tally,
+    run(
+        transport, BATCHES, n, seed_key(seed), medium, float(axes[1][0] - grid.spacing[1] / 2),
+        float(axes[0][0] - grid.spacing[0] / 2), float(grid.spacing[0]), radius, phantom_length_mm / 2.0,
+        scan_length_mm / 2.0, sod, half, fan_cdf, np.ascontiguousarray(energy_cdf), energies, _CUTOFF_KEV,
+        _TABLE_STEP_KEV, total, photo, compton, absorption, largest, squares, form, _CUTOFF_KEV, tally,
     )  # fmt: skip
     # Photons per mAs in the fan and per mm of beam width at the isocentre: fluence at sod × sod dγ.
     photons = per_angle.sum() * (2.0 * half / _FAN_NODES) * 1e6 / sod

@@ -86,12 +86,12 @@ def _turned(dx: float, dy: float, dz: float, cosine: float, phi: float) -> Any:
     return x * norm, y * norm, z * norm
 
 
-@numba.njit(parallel=True, cache=True, error_model="numpy")
+@numba.njit(nogil=True, cache=True, error_model="numpy")
 def transport(
-    histories: int, key: Any, labels: Any, x0: float, y0: float, step: float, radius: float, half_z: float,
-    score_z: float, sod: float, half_fan: float, fan_cdf: Any, energy_cdf: Any, energies: Any, table_low: float,
-    table_step: float, attenuation: Any, photo: Any, compton: Any, absorption: Any, largest: Any, squares: Any,
-    form: Any, cutoff: float, tally: Any,
+    begin: int, end: int, histories: int, key: Any, labels: Any, x0: float, y0: float, step: float, radius: float,
+    half_z: float, score_z: float, sod: float, half_fan: float, fan_cdf: Any, energy_cdf: Any, energies: Any,
+    table_low: float, table_step: float, attenuation: Any, photo: Any, compton: Any, absorption: Any, largest: Any,
+    squares: Any, form: Any, cutoff: float, tally: Any,
 ) -> None:  # fmt: skip
     """Energy deposited per map pixel by unscattered (tally[:, 0]) and scattered (tally[:, 1]) photons, keV.
 
@@ -102,7 +102,7 @@ def transport(
     share = histories // batches
     nodes = fan_cdf.size
     last = largest.size - 2
-    for batch in numba.prange(batches):
+    for batch in range(begin, end):
         for history in range(batch * share, (batch + 1) * share):
             state = stream(key, history)
             state, u = draw(state)

@@ -1,45 +1,15 @@
-"""What the kernels' compiler and thread pool ask of a process: a word while it waits, and no use after a fork."""
+"""A word while kernels compile."""
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import os
-import sys
 from functools import cache
 from typing import Any
 
-__all__ = ["announce_compilation", "refuse_after_fork"]
+__all__ = ["announce_compilation"]
 
 _LOG = logging.getLogger(__name__)
 _OURS = ("torchpcct.", "recon.", "train.")
-_forked_from_threads = False
-
-
-def _note_fork() -> None:
-    """In a forked child: were threads of GNU OpenMP running in the parent?"""
-    global _forked_from_threads
-    numba = sys.modules.get("numba")
-    with contextlib.suppress(ValueError):  # no kernel has run yet: the child starts threads of its own
-        _forked_from_threads = numba is not None and numba.threading_layer() == "omp"
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_note_fork)
-
-
-def refuse_after_fork() -> None:
-    """Raise an error where numba would end the process.
-
-    Raises:
-        RuntimeError: this process was forked from one that had run kernels on GNU OpenMP.
-    """
-    if _forked_from_threads:
-        raise RuntimeError(
-            "this process was forked after its parent had run projector kernels, and threads of GNU OpenMP do not "
-            "outlive a fork: start workers with multiprocessing_context='spawn' (DataLoader), or set the environment "
-            "variable NUMBA_THREADING_LAYER=workqueue before Python starts, or project in the main process"
-        )
 
 
 @cache

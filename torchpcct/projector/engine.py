@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import os
-import threading
 import warnings
 import weakref
 from functools import cached_property
@@ -17,24 +15,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
-from torchpcct.projector.compiling import announce_compilation, refuse_after_fork
+from torchpcct.projector.compiling import announce_compilation
 from torchpcct.projector.cuda import passes as cuda
 from torchpcct.projector.tables import Tables, VectorTables
 
 __all__ = ["ENGINES", "Engine"]
 
-# numba's fallback threading layer must not be entered from two threads at once.
-_LAUNCH = threading.Lock()
-
-
-def _renew_lock() -> None:
-    """A fork copies the lock as it is: held for ever, if another thread was projecting."""
-    global _LAUNCH
-    _LAUNCH = threading.Lock()
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_renew_lock)
 _TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-10}
 _CHECKED: dict[tuple[str, torch.dtype], bool] = {}
 
@@ -116,10 +102,8 @@ class Engine:
                 f"a pass of this scan needs {need} bytes of working memory, memory allows {memory}: raise it, or use "
                 "fewer voxels, fewer columns, float32" + (", or a smaller batch" if self.tables.grid.ndim == 2 else "")
             )
-        refuse_after_fork()
         announce_compilation()
-        with _LAUNCH:
-            result = self.cpu.adjoint(array) if transposed else self.cpu.forward(array)
+        result = self.cpu.adjoint(array) if transposed else self.cpu.forward(array)
         return torch.from_numpy(np.ascontiguousarray(result))
 
     def workspace(self, batch: int, itemsize: int, device: str) -> int:

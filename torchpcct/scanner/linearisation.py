@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from torchpcct.detector_window import DetectorWindow
+from torchpcct.threads import run
 from torchpcct.validate import number, numbers, whole
 
 __all__ = ["POLYNOMIAL_UP_TO", "WaterLinearisation"]
@@ -151,7 +152,10 @@ class WaterLinearisation:
                 raise ValueError(f"the window reaches beyond the {self.scale.size} columns of the water correction")
             first = np.repeat(window.first_column, window.rows)
         out = torch.empty_like(flat)
-        evaluate(flat.numpy(), first, self.coefficients, self.scale, slope, out.numpy())
+        work = flat.shape[1] * 3 * self.coefficients.shape[1]
+        run(
+            evaluate, len(flat), flat.numpy(), first, self.coefficients, self.scale, slope, out.numpy(), operations=work
+        )
         return out.reshape(p.shape).to(p.device)
 
     def apply(self, p: Tensor, window: DetectorWindow | None = None) -> Tensor:

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 from typing import Any
 
-from numba import njit, prange
+from numba import njit
 
 __all__ = ["evaluate"]
 
 
-@njit(parallel=True, cache=True)
-def evaluate(p: Any, first_column: Any, coefficients: Any, scale: Any, slope: bool, out: Any) -> None:
+@njit(nogil=True, cache=True)
+def evaluate(
+    begin: int, end: int, p: Any, first_column: Any, coefficients: Any, scale: Any, slope: bool, out: Any
+) -> None:
     """Corrected line integrals (or the slope of the correction) of ``(lines, columns)`` readings.
 
     Line i starts at detector column ``first_column[i % first_column.size]``. Inside 0 … scale a polynomial, beyond
     both ends straight on.
     """
     order = coefficients.shape[1]
-    for i in prange(p.shape[0]):
+    for i in range(begin, end):
         start = first_column[i % first_column.size]
         for j in range(p.shape[1]):
             c = start + j

@@ -349,21 +349,12 @@ def interval(
     return steep(narrowed, lx, ly, lz, ux, uy, uz, row[19], row[20], row[21], row[22], row[18])
 
 
-@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
-def _chords(kinds: Any, params: Any, origins: Any, directions: Any, first: int, last: int, out: Any) -> None:
-    for n in range(first, last):
+@numba.njit(nogil=True, cache=True, fastmath=_FAST, error_model="numpy")
+def chords(begin: int, end: int, kinds: Any, params: Any, origins: Any, directions: Any, out: Any) -> None:
+    """Chord of the lines ``begin … end`` in every shape, ``out (B, N)``."""
+    for n in range(begin, end):
         ox, oy, oz = origins[n, 0], origins[n, 1], origins[n, 2]
         dx, dy, dz = directions[n, 0], directions[n, 1], directions[n, 2]
         for b in range(kinds.shape[0]):
             t0, t1 = interval(kinds[b], params[b], ox, oy, oz, dx, dy, dz)
             out[b, n] = 0.0 if t1 <= t0 else t1 - t0
-
-
-@numba.njit(cache=True, parallel=True, error_model="numpy")
-def chords(kinds: Any, params: Any, origins: Any, directions: Any, out: Any) -> None:
-    """Chord of every line in every shape, ``out (B, N)``."""
-    # In blocks, so that the large body of the loop is no part of the parallel function, which compiles slowly.
-    block = 512
-    lines = origins.shape[0]
-    for k in numba.prange((lines + block - 1) // block):
-        _chords(kinds, params, origins, directions, k * block, min((k + 1) * block, lines), out)

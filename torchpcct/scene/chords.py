@@ -28,6 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 from torchpcct.scene.bodies import Box, Ellipsoid, EllipticCylinder, Shape
 from torchpcct.scene.chord_kernels import BOX, BULGED, CYLINDER, ELLIPSOID, NARROWED, chords, interval
 from torchpcct.scene.tubes import BulgedTube, NarrowedTube
+from torchpcct.threads import run
 
 __all__ = ["PARAMETERS", "chord_lengths", "interval", "pack"]
 
@@ -165,5 +166,6 @@ def chord_lengths(scene: Any, origins: ArrayLike, directions: ArrayLike) -> NDAr
         raise ValueError(f"directions must have a length greater than 0, but row {int(np.argmin(length))} is 0")
     o, d = np.broadcast_arrays(o, d / length)
     out = np.empty((kinds.size, o.shape[0]), dtype=np.float64)
-    chords(kinds, params, np.ascontiguousarray(o), np.ascontiguousarray(d), out)
+    lines = np.ascontiguousarray(o), np.ascontiguousarray(d)
+    run(chords, len(o), kinds, params, *lines, out, operations=50 * kinds.size)
     return out

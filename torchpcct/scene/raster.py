@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scene.bodies import Shape
 from torchpcct.scene.chords import interval, pack
+from torchpcct.threads import run
 from torchpcct.validate import whole
 
 __all__ = ["volume_fractions"]
@@ -19,11 +20,13 @@ __all__ = ["volume_fractions"]
 Floats = NDArray[np.float64]
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
-def _fill(kinds: Any, params: Any, zs: Any, ys: Any, x_edge: float, dx: float, lines: int, out: Any) -> None:
-    bodies, nz, ny, nx = out.shape
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _fill(
+    begin: int, end: int, kinds: Any, params: Any, zs: Any, ys: Any, x_edge: float, dx: float, lines: int, out: Any
+) -> None:
+    bodies, _, ny, nx = out.shape
     share = 1.0 / lines
-    for job in numba.prange(nz * ny):
+    for job in range(begin, end):
         k, j = job // ny, job % ny
         for b in range(bodies):
             for line in range(lines):
@@ -79,7 +82,11 @@ def volume_fractions(shapes: Sequence[Shape], parents: Sequence[int], grid: Volu
         zs = np.zeros((1, lines))
     ys = y[:, None] + (across - 0.5) * dy
     filled = np.zeros((kinds.size, zs.shape[0], y.size, x.size))
-    _fill(kinds, params, zs, ys, float(x[0] - dx / 2.0), float(dx), lines, filled)
+    work = 50 * kinds.size * lines
+    run(
+        _fill, len(zs) * len(ys), kinds, params, zs, ys, float(x[0] - dx / 2.0), float(dx), lines, filled,
+        operations=work,
+    )  # fmt: skip
     own = filled.copy()
     for k, parent in enumerate(parents):
         if parent >= 0:

@@ -18,6 +18,7 @@ from torch import Tensor
 from torchpcct.scan import Scan
 from torchpcct.spectral.decompose_kernels import sensitivity, solve
 from torchpcct.spectral.model import SpectralModel, evaluate
+from torchpcct.threads import run
 
 __all__ = ["Decomposition", "cramer_rao", "decompose", "decompose_scan", "decompose_surround", "inverse"]
 
@@ -133,9 +134,10 @@ class _Decompose(torch.autograd.Function):
         # One step goes at most two attenuation lengths at 60 keV.
         reach = np.diff(model.bounds, axis=1)[:, 0] / 10.0
         results = (out.numpy(), information.numpy(), steps.numpy())
-        solve(
-            n.numpy(), column, intensity, model.attenuation, model.spectra, coarse_mu, coarse_spectra, *model.start,
-            box, reach, reduce_bias, COARSE_TOLERANCE, tolerance, STEP_LIMIT, *results,
+        run(
+            solve, rays, n.numpy(), column, intensity, model.attenuation, model.spectra, coarse_mu, coarse_spectra,
+            *model.start, box, reach, reduce_bias, COARSE_TOLERANCE, tolerance, STEP_LIMIT, *results,
+            operations=30 * model.spectra[0].size,
         )  # fmt: skip
         # Absurd counts (1e30) would carry infinite information in float32.
         information.clamp_(max=torch.finfo(counts.dtype).max)
@@ -153,7 +155,10 @@ class _Decompose(torch.autograd.Function):
         model, column, intensity, reduce_bias, box = ctx.rest
         jacobian = torch.empty((2, model.bins, column.size), dtype=torch.float64)
         n, a = (x.detach().to(torch.float64).contiguous().reshape(x.shape[0], -1).numpy() for x in (counts, out))
-        sensitivity(n, a, column, intensity, model.attenuation, model.spectra, box, reduce_bias, jacobian.numpy())
+        run(
+            sensitivity, column.size, n, a, column, intensity, model.attenuation, model.spectra, box, reduce_bias,
+            jacobian.numpy(), operations=10 * model.spectra[0].size,
+        )  # fmt: skip
         g = (grad.reshape(2, 1, -1) * jacobian).sum(0)
         return g.reshape(counts.shape).to(counts.dtype), *(None,) * 6
 

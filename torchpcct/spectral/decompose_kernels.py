@@ -14,7 +14,7 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 __all__ = ["expected", "sensitivity", "solve"]
 
@@ -32,7 +32,6 @@ _LOWEST, _HIGHEST = -300.0, 200.0
 # After so many steps they are halved, after twice as many quartered, …
 _PATIENCE = 40
 
-_BLOCK = 256
 _SUM = {"reassoc", "contract", "nsz"}
 
 
@@ -165,81 +164,80 @@ def _iterate(
     return a1, a2, f11, f12, f22, -1
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy")
 def solve(
-    counts: Any, column: Any, scale: Any, mu: Any, spectra: Any, coarse_mu: Any, coarse_spectra: Any, air: Any,
-    start_step: Any, start: Any, direction: Any, bounds: Any, reach: Any, reduce_bias: bool, coarse_tolerance: float,
-    tolerance: float, limit: int, out: Any, information: Any, steps: Any,
+    begin: int, end: int, counts: Any, column: Any, scale: Any, mu: Any, spectra: Any, coarse_mu: Any,
+    coarse_spectra: Any, air: Any, start_step: Any, start: Any, direction: Any, bounds: Any, reach: Any,
+    reduce_bias: bool, coarse_tolerance: float, tolerance: float, limit: int, out: Any, information: Any, steps: Any,
 ) -> None:  # fmt: skip
     """Estimates for ``counts`` (bins, rays); see :func:`torchpcct.spectral.decompose.decompose`.
 
     ``start`` (columns, nodes) tabulates the path along ``direction`` over the line integral ln(air / Σ counts), in
     steps of ``start_step`` (columns,) from 0. ``steps``: number of Newton steps with the full spectra, −1 at the limit.
     """
-    bins, rays = counts.shape
-    energies, groups = mu.shape[1], coarse_mu.shape[1]
-    for block in prange((rays + _BLOCK - 1) // _BLOCK):
-        v = np.empty((6, energies))
-        group_v = np.empty((6, groups))
-        m = np.empty((bins, 6))
-        n = np.empty(bins)
-        for i in range(block * _BLOCK, min((block + 1) * _BLOCK, rays)):
-            c = column[i]
-            s = scale[i]
-            total = 0.0
-            for b in range(bins):
-                n[b] = counts[b, i]
-                total += n[b]
-            p = (math.log(air[c] * s) - math.log(total + 0.5)) / start_step[c]
-            p = min(max(p, 0.0), start.shape[1] - 1.0)
-            k = min(int(p), start.shape[1] - 2)
-            t = start[c, k] + (p - k) * (start[c, k + 1] - start[c, k])
-            a1 = min(max(t * direction[0], bounds[0, 0]), bounds[0, 1])
-            a2 = min(max(t * direction[1], bounds[1, 0]), bounds[1, 1])
-            # A few energies bring the estimate near, at a fraction of the cost; the full spectra then decide.
-            a1, a2, _, _, _, _ = _iterate(
-                n, s, coarse_mu, coarse_spectra[c], group_v, m, a1, a2, bounds, reach, reduce_bias, coarse_tolerance, 12
-            )
-            a1, a2, f11, f12, f22, count = _iterate(
-                n, s, mu, spectra[c], v, m, a1, a2, bounds, reach, reduce_bias, tolerance, limit
-            )
-            out[0, i] = a1
-            out[1, i] = a2
-            information[0, i] = f11
-            information[1, i] = f12
-            information[2, i] = f22
-            steps[i] = count
+    bins = counts.shape[0]
+    v = np.empty((6, mu.shape[1]))
+    group_v = np.empty((6, coarse_mu.shape[1]))
+    m = np.empty((bins, 6))
+    n = np.empty(bins)
+    for i in range(begin, end):
+        c = column[i]
+        s = scale[i]
+        total = 0.0
+        for b in range(bins):
+            n[b] = counts[b, i]
+            total += n[b]
+        p = (math.log(air[c] * s) - math.log(total + 0.5)) / start_step[c]
+        p = min(max(p, 0.0), start.shape[1] - 1.0)
+        k = min(int(p), start.shape[1] - 2)
+        t = start[c, k] + (p - k) * (start[c, k + 1] - start[c, k])
+        a1 = min(max(t * direction[0], bounds[0, 0]), bounds[0, 1])
+        a2 = min(max(t * direction[1], bounds[1, 0]), bounds[1, 1])
+        # A few energies bring the estimate near, at a fraction of the cost; the full spectra then decide.
+        a1, a2, _, _, _, _ = _iterate(
+            n, s, coarse_mu, coarse_spectra[c], group_v, m, a1, a2, bounds, reach, reduce_bias, coarse_tolerance, 12
+        )
+        a1, a2, f11, f12, f22, count = _iterate(
+            n, s, mu, spectra[c], v, m, a1, a2, bounds, reach, reduce_bias, tolerance, limit
+        )
+        out[0, i] = a1
+        out[1, i] = a2
+        information[0, i] = f11
+        information[1, i] = f12
+        information[2, i] = f22
+        steps[i] = count
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
-def expected(line_integrals: Any, column: Any, scale: Any, mu: Any, spectra: Any, counts: Any, slopes: Any) -> None:
+@njit(nogil=True, cache=True, error_model="numpy")
+def expected(
+    begin: int, end: int, line_integrals: Any, column: Any, scale: Any, mu: Any, spectra: Any, counts: Any, slopes: Any
+) -> None:
     """λ into ``counts`` (bins, rays); λ₁, λ₂, λ₁₁, λ₁₂, λ₂₂ into ``slopes`` (5, bins, rays)."""
-    bins, rays = counts.shape
-    for block in prange((rays + _BLOCK - 1) // _BLOCK):
-        v = np.empty((6, mu.shape[1]))
-        m = np.empty((bins, 6))
-        for i in range(block * _BLOCK, min((block + 1) * _BLOCK, rays)):
-            _transmissions(line_integrals[0, i], line_integrals[1, i], mu, v)
-            _moments(spectra[column[i]], v, scale[i], m)
-            for b in range(bins):
-                counts[b, i] = m[b, 0]
-                for k in range(5):
-                    slopes[k, b, i] = m[b, 1 + k]
+    bins = counts.shape[0]
+    v = np.empty((6, mu.shape[1]))
+    m = np.empty((bins, 6))
+    for i in range(begin, end):
+        _transmissions(line_integrals[0, i], line_integrals[1, i], mu, v)
+        _moments(spectra[column[i]], v, scale[i], m)
+        for b in range(bins):
+            counts[b, i] = m[b, 0]
+            for k in range(5):
+                slopes[k, b, i] = m[b, 1 + k]
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy")
 def sensitivity(
-    counts: Any, line_integrals: Any, column: Any, scale: Any, mu: Any, spectra: Any, bounds: Any, reduce_bias: bool,
-    out: Any,
+    begin: int, end: int, counts: Any, line_integrals: Any, column: Any, scale: Any, mu: Any, spectra: Any, bounds: Any,
+    reduce_bias: bool, out: Any,
 ) -> None:  # fmt: skip
     """∂a / ∂n (2, bins, rays) at the solution, by the implicit function theorem: (−∂U/∂a)⁻¹ ∂U/∂n.
 
     The derivative of the pseudo-counts c_i = ½ tr(G ∂²λ_i), G = F⁻¹, is
     ∂_s c_i = ½ tr(G ∂_s∂²λ_i) − ½ tr(G ∂_sF G ∂²λ_i).
     """
-    bins, rays = counts.shape
+    bins = counts.shape[0]
     energies = mu.shape[1]
-    for i in prange(rays):
+    for i in range(begin, end):
         a1, a2 = line_integrals[0, i], line_integrals[1, i]
         held1 = a1 <= bounds[0, 0] or a1 >= bounds[0, 1]
         held2 = a2 <= bounds[1, 0] or a2 >= bounds[1, 1]

@@ -23,6 +23,7 @@ from torchpcct.scanner import Scanner
 from torchpcct.scene.materials import material
 from torchpcct.spectral.basis import Basis, pe_pvc
 from torchpcct.spectral.decompose_kernels import expected
+from torchpcct.threads import run
 
 __all__ = ["SpectralModel"]
 
@@ -254,7 +255,10 @@ def evaluate(model: SpectralModel, line_integrals: Tensor, column: Any, intensit
     a = line_integrals.detach().to(torch.float64).reshape(2, -1).numpy()
     counts = np.empty((model.bins, column.size))
     slopes = np.empty((5, model.bins, column.size))
-    expected(np.ascontiguousarray(a), column, intensity, model.attenuation, model.spectra, counts, slopes)
+    run(
+        expected, column.size, np.ascontiguousarray(a), column, intensity, model.attenuation, model.spectra, counts,
+        slopes, operations=6 * model.spectra[0].size,
+    )  # fmt: skip
     return counts, slopes
 
 

@@ -8,7 +8,6 @@ from dataclasses import replace
 from functools import cached_property, partial
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -37,6 +36,7 @@ from torchpcct.spectral import (
     decompose_surround,
     vmi,
 )
+from torchpcct.threads import get_num_threads
 
 __all__ = ["SpectralScan", "second_order_bound", "starved_rays", "water_hu"]
 
@@ -160,7 +160,7 @@ class SpectralScan:
             "failed": int((~found.converged).sum()) + int((~torch.isfinite(found.line_integrals)).sum()),
             "rays_per_second": rays / seconds,
             "rays_per_core_second": rays / spent,
-            "threads": numba.get_num_threads(),
+            "threads": get_num_threads(),
         }
 
 

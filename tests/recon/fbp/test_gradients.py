@@ -15,6 +15,7 @@ from recon.fbp.fbp import fbp, filter_sinogram, filter_windowed
 from recon.fbp.filter_plan import FilterPlan
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid, full_turn
+from torchpcct.threads import get_num_threads, set_num_threads
 
 # Random numbers are no objects: they do not end in air.
 pytestmark = pytest.mark.filterwarnings("ignore:the rows end inside the object")
@@ -172,8 +173,6 @@ def test_vmap_and_leading_axes(case):
 
 
 def test_modes_threads_and_buffers(case):
-    import numba
-
     geometry, grid = case
     data = torch.randn(geometry.shape, generator=torch.Generator().manual_seed(4))
     kept = data.clone()
@@ -184,15 +183,15 @@ def test_modes_threads_and_buffers(case):
     assert torch.equal(data, kept)
     with torch.inference_mode():
         assert torch.equal(fbp(data, geometry, grid), snapshot)
-    threads = numba.get_num_threads()
+    threads = get_num_threads()
     try:
-        numba.set_num_threads(1)
+        set_num_threads(1)
         filtered = filter_sinogram(data, geometry)
         alone = backproject(filtered, geometry, grid)
-        numba.set_num_threads(threads)
+        set_num_threads(threads)
         assert torch.equal(backproject(filtered, geometry, grid), alone)
     finally:
-        numba.set_num_threads(threads)
+        set_num_threads(threads)
 
 
 @pytest.mark.parametrize("columns", [61, 400], ids=["fft", "matrix"])

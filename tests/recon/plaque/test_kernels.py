@@ -52,7 +52,7 @@ def body(centre, semi, spacing=0.2, count=24, cap=0.0, lumen=None):
     far = np.full(n, 50.0) if lumen is None else lumen(points)
     normals = np.tile([0.0, 0.0, spacing / 2], (n, 1))
     out = np.empty((1, n), np.float32)
-    core_fractions(np.array([centre]), np.eye(3)[None], np.array([semi]), np.array([cap]), points,
+    core_fractions(0, 1, np.array([centre]), np.eye(3)[None], np.array([semi]), np.array([cap]), points,
                    np.full(3, spacing / 2), np.ones(n), far, normals, 0.0, out)  # fmt: skip
     return float(out.sum(dtype=np.float64)) * spacing**3
 

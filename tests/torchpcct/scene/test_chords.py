@@ -18,6 +18,7 @@ from torchpcct.scene import (
     rotation_matrix,
 )
 from torchpcct.scene.chords import pack
+from torchpcct.threads import get_num_threads, set_num_threads
 
 PLACE = (-29.63, -30.38, 0.4)
 TILT = rotation_matrix((1.0, 2.0, -0.5), 0.7)
@@ -222,15 +223,13 @@ def test_bad_input_is_named():
 
 
 def test_same_result_with_one_thread():
-    import numba
-
     o, d = rays(np.random.default_rng(0), 5000, 626.0, 5.0)
     shapes = list(SHAPES.values())
     many = chord_lengths(shapes, o, d)
-    threads = numba.get_num_threads()
-    numba.set_num_threads(1)
+    threads = get_num_threads()
+    set_num_threads(1)
     try:
         single = chord_lengths(shapes, o, d)
     finally:
-        numba.set_num_threads(threads)
+        set_num_threads(threads)
     assert np.array_equal(many, single)

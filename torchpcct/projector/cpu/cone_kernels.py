@@ -14,12 +14,14 @@ fixed order, so that results do not depend on the number of threads.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from torchpcct.projector.cpu.simd import add_lines, spread_line, spread_lines, sum_lines
 from torchpcct.projector.cpu.simd_interpolation import add_steps, set_steps
+from torchpcct.threads import run
 
 __all__ = ["backproject", "padded", "project"]
 
@@ -31,12 +33,14 @@ MAX_LAYERS_PER_SLAB = 0.4
 NEAREST = 1e-6
 # Slabs of one task of the adjoint: enough to reuse a layer, few enough to share the work. Fixed, for determinism.
 SLAB_BLOCK = 24
+# Of functions that only kernels call: without wrappers for Python and C they compile faster.
+INNER: Any = {"cache": True, "error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 # Ray geometry in float64, called per cell and not per voxel.
-_small = njit(cache=True, fastmath=_FLAGS, error_model="numpy")
+_small = njit(**INNER, fastmath=_FLAGS)
+_kernel = njit(nogil=True, cache=True, fastmath=_FLAGS, error_model="numpy")
 
 
-@_small
-def padded(n):
+def padded(n: int) -> int:
     """``n`` rounded up to whole SIMD registers, so that no loop along z has a scalar remainder."""
     return (n + 7) // 8 * 8
 
@@ -104,12 +108,12 @@ def _room(p0, q0, p1, q1, r0, r1, width):
 
 
 @_small
-def _plan(p0, q0, p1, q1, l0, l1, path, layer, layered, r0, r1, width, across, along, table, offset, low, high):
+def _plan(p0, q0, p1, q1, l0, l1, path, layer, layered, r0, r1, width, across, along, layers, ends, offset, low, high):
     """What one cell reads of the slabs ``r0 … r1``: runs of slabs between the same two layers, and their lines.
 
     Entry e adds line ``offset[e]`` with the weight ``low[e]`` to the run's lower layer and ``high[e]`` to the upper.
-    ``table`` receives per run: lower layer, end of its entries. Where slabs are interpolated one by one
-    (``layered`` false) a slab is a run, its row is the slab, and all its weight is ``low``.
+    ``layers`` and ``ends`` receive the lower layer of every run and the end of its entries. Where slabs are
+    interpolated one by one (``layered`` false) a slab is a run, its row is the slab, and all its weight is ``low``.
 
     Returns:
         the number of runs.
@@ -133,7 +137,7 @@ def _plan(p0, q0, p1, q1, l0, l1, path, layer, layered, r0, r1, width, across, a
             here = r
         if here != now:
             now = here
-            table[runs, 0] = now
+            layers[runs] = now
             runs += 1
         start = r * across
         k = int(lo)
@@ -147,7 +151,7 @@ def _plan(p0, q0, p1, q1, l0, l1, path, layer, layered, r0, r1, width, across, a
             e += 1
             k += 1
             left = float(k)
-        table[runs - 1, 1] = e
+        ends[runs - 1] = e
     return runs
 
 
@@ -160,67 +164,61 @@ def _add_rows(lanes, line, at, depth, z0, dz, row0, row_pitch, out):
     add_steps(lanes, line, zeta, real(step), line.size - 8, line.size, real(1.0 / step), out, out.size)
 
 
-@_small
-def _project_view(
-    lanes, lines, ny, nx, at, edges, centers, first, segments, s0, s1, lattice, z0, dz, row0, row_pitch, layer, data
-):
-    """All segments of one view; ``lines``: ``(ny * nx, knots)``, ``data``: ``(rows, columns)``."""
+@_kernel
+def _project(
+    begin, end, lanes, lines, ny, nx, pose, edges, centers, first, segments, start, lattice, z0, dz, row0, row_pitch,
+    layer, data,
+):  # fmt: skip
+    """The views ``begin … end``; ``lines``: ``(ny * nx, knots)``, ``data``: ``(views, rows, columns)``."""
     knots = lines.shape[1]
-    rows, columns = data.shape
-    real = lines.dtype.type
+    _, rows, columns = data.shape
+    real, r0 = lines.dtype.type, np.int64(0)  # typed as in the adjoint: else what takes it is compiled for each
     flat = lines.reshape(-1)
-    pair = np.zeros((3, knots), dtype=lines.dtype)
-    slab = pair[2]
-    sums = np.zeros((columns, padded(rows)), dtype=lines.dtype)
-    table = np.empty((max(ny, nx), 2), dtype=np.int64)
+    pair, slab = np.empty((2, knots), dtype=lines.dtype), np.empty(knots, dtype=lines.dtype)
+    sums = np.empty((columns, (rows + 7) // 8 * 8), dtype=lines.dtype)  # padded(rows)
+    for line in pair:
+        _clear(line)
+    layers, ends = np.empty(max(ny, nx), dtype=np.int64), np.empty(max(ny, nx), dtype=np.int64)
     offset = np.empty(0, dtype=np.int64)
     low, high = np.empty(0, dtype=lines.dtype), np.empty(0, dtype=lines.dtype)
-    for s in range(s0, s1):
-        axis = segments[s, 1]
-        slabs, width = (ny, nx) if axis == 0 else (nx, ny)
-        across, along = (nx * knots, knots) if axis == 0 else (knots, nx * knots)
-        for j in range(segments[s, 2], segments[s, 2] + segments[s, 3]):
-            p0, q0, p1, q1, l0, l1, path, square = _cell(at, edges, centers, first + j, axis, lattice)
-            layered = abs(l1) < MAX_LAYERS_PER_SLAB * layer
-            offset, low, high = _with_room(_room(p0, q0, p1, q1, 0, slabs, width), offset, low, high)
-            runs = _plan(
-                p0, q0, p1, q1, l0, l1, path, layer, layered, 0, slabs, width, across, along, table, offset, low,
-                high,
-            )  # fmt: skip
-            e0 = 0
-            for n in range(runs):
-                now, e1 = table[n, 0], table[n, 1]
-                if not layered:
-                    sum_lines(lanes, flat, offset, low, e0, e1, knots, slab)
-                    _add_rows(lanes, slab, at, l0 + l1 * now, z0, dz, row0, row_pitch, sums[j])
+    for v in range(begin, end):
+        at = pose[v]
+        for line in sums:
+            _clear(line)
+        for s in range(start[v], start[v + 1]):
+            axis = segments[s, 1]
+            slabs, width = (ny, nx) if axis == 0 else (nx, ny)
+            across, along = (nx * knots, knots) if axis == 0 else (knots, nx * knots)
+            for j in range(segments[s, 2], segments[s, 2] + segments[s, 3]):
+                p0, q0, p1, q1, l0, l1, path, square = _cell(at, edges, centers, first[v] + j, axis, lattice)
+                layered = abs(l1) < MAX_LAYERS_PER_SLAB * layer
+                offset, low, high = _with_room(_room(p0, q0, p1, q1, r0, slabs, width), offset, low, high)
+                runs = _plan(
+                    p0, q0, p1, q1, l0, l1, path, layer, layered, r0, slabs, width, across, along, layers, ends, offset,
+                    low, high,
+                )  # fmt: skip
+                e0 = 0
+                for n in range(runs):
+                    now, e1 = layers[n], ends[n]
+                    if not layered:
+                        sum_lines(lanes, flat, offset, low, e0, e1, knots, slab)
+                        _add_rows(lanes, slab, at, l0 + l1 * now, z0, dz, row0, row_pitch, sums[j])
+                        e0 = e1
+                        continue
+                    add_lines(lanes, flat, offset, low, high, e0, e1, knots, pair[now % 2], pair[(now + 1) % 2])
                     e0 = e1
-                    continue
-                lower, upper = now % 2, (now + 1) % 2
-                add_lines(lanes, flat, offset, low, high, e0, e1, knots, pair[lower], pair[upper])
-                e0 = e1
-                after = table[n + 1, 0] if n + 1 < runs else -9
-                for m in range(now, now + 2):
-                    if m != after and m != after + 1:
-                        line = pair[m % 2]
-                        _add_rows(lanes, line, at, m * layer, z0, dz, row0, row_pitch, sums[j])
-                        _clear(line)
-            for i in range(rows):
-                rise = row0 + (i + 0.5) * row_pitch + at[7] - at[2]
-                sums[j, i] *= real(math.sqrt(1.0 + rise * rise / square))
-    for i in range(rows):
-        for j in range(columns):
-            data[i, j] = sums[j, i]
-
-
-@njit(parallel=True, cache=True)
-def _project(
-    lanes, lines, ny, nx, pose, edges, centers, first, segments, start, lattice, z0, dz, row0, row_pitch, layer, data
-):
-    for v in prange(data.shape[0]):
-        _project_view(
-            lanes, lines, ny, nx, pose[v], edges, centers, first[v], segments, start[v], start[v + 1], lattice,
-            z0, dz, row0, row_pitch, layer, data[v],
-        )  # fmt: skip
+                    after = layers[n + 1] if n + 1 < runs else -9
+                    for m in range(now, now + 2):
+                        if m != after and m != after + 1:
+                            line = pair[m % 2]
+                            _add_rows(lanes, line, at, m * layer, z0, dz, row0, row_pitch, sums[j])
+                            _clear(line)
+                for i in range(rows):
+                    rise = row0 + (i + 0.5) * row_pitch + at[7] - at[2]
+                    sums[j, i] *= real(math.sqrt(1.0 + rise * rise / square))
+        for i in range(rows):
+            for j in range(columns):
+                data[v, i, j] = sums[j, i]
 
 
 def project(lines, ny, nx, pose, edges, centers, first, segments, start, lattice, z0, dz, row0, row_pitch, layer, data):
@@ -237,31 +235,28 @@ def project(lines, ny, nx, pose, edges, centers, first, segments, start, lattice
         data: ``(views, rows, columns)`` output, overwritten.
     """
     lanes = (0,) * (32 // lines.dtype.itemsize)
-    _project(
-        lanes, lines, ny, nx, pose, edges, centers, first, segments, start, lattice, z0, dz, row0, row_pitch, layer,
-        data,
+    run(
+        _project, data.shape[0], lanes, lines, ny, nx, pose, edges, centers, first, segments, start, lattice, z0, dz,
+        row0, row_pitch, layer, data,
     )  # fmt: skip
 
 
-@_small
-def _row_sums_view(data, at, centers, first, row0, row_pitch, sums):
-    columns, edges = sums.shape
-    for j in range(columns):
-        a, b = centers[first + j, 0], centers[first + j, 1]
-        dx, dy = a * at[3] + b * at[5], a * at[4] + b * at[6]
-        square = dx * dx + dy * dy
-        sums[j, 0] = 0
-        for i in range(edges - 1):
-            rise = row0 + (i + 0.5) * row_pitch + at[7] - at[2]
-            slant = data.dtype.type(math.sqrt(1.0 + rise * rise / square))
-            sums[j, i + 1] = sums[j, i] + slant * data[i, j]
-
-
-@njit(parallel=True, cache=True)
-def _row_sums(data, pose, centers, first, row0, row_pitch, begin, sums):
-    """Readings times their slant, summed along the rows: ``(views, columns, rows + 1)``."""
-    for v in prange(sums.shape[0]):
-        _row_sums_view(data[begin + v], pose[begin + v], centers, first[begin + v], row0, row_pitch, sums[v])
+@_kernel
+def _row_sums(begin, end, data, pose, centers, first, row0, row_pitch, view0, sums):
+    """Readings times their slant, summed along the rows: ``(views, columns, rows + 1)``, from ``view0`` on."""
+    _, columns, edges = sums.shape
+    for n in range(begin, end):
+        v = view0 + n
+        at = pose[v]
+        for j in range(columns):
+            a, b = centers[first[v] + j, 0], centers[first[v] + j, 1]
+            dx, dy = a * at[3] + b * at[5], a * at[4] + b * at[6]
+            square = dx * dx + dy * dy
+            sums[n, j, 0] = 0
+            for i in range(edges - 1):
+                rise = row0 + (i + 0.5) * row_pitch + at[7] - at[2]
+                slant = data.dtype.type(math.sqrt(1.0 + rise * rise / square))
+                sums[n, j, i + 1] = sums[n, j, i] + slant * data[v, i, j]
 
 
 @_small
@@ -273,62 +268,51 @@ def _layer_values(lanes, sums, at, depth, z0, dz, row0, row_pitch, values):
     set_steps(lanes, sums, real(rho), real(pitch), sums.size - 1, sums.size, values, values.size)
 
 
-@_small
-def _gather_slabs(
-    lanes, sums, pose, edges, centers, first, segments, seg0, seg1, begin, axis, lattice, z0, dz, row0, row_pitch,
-    layer, r0, r1, out,
+@_kernel
+def _gather(
+    begin, end, lanes, sums, pose, edges, centers, first, segments, seg0, seg1, view0, lattice, z0, dz, row0,
+    row_pitch, layer, by_row, by_column,
 ):  # fmt: skip
-    """Slabs ``r0 … r1`` of ``_gather``; ``out``: ``(slabs, width, padded(nz))``."""
-    _, width, nz = out.shape
-    flat = out.reshape(-1)
+    """Add a chunk of views to ``by_row``, ``(ny, nx, padded(nz))``, and ``by_column``, its transpose, by blocks."""
+    row_tasks = (by_row.shape[0] + SLAB_BLOCK - 1) // SLAB_BLOCK
+    nz = by_row.shape[2]
     pair = np.empty((2, nz), dtype=sums.dtype)
-    table = np.empty((r1 - r0, 2), dtype=np.int64)
+    layers, ends = np.empty(SLAB_BLOCK, dtype=np.int64), np.empty(SLAB_BLOCK, dtype=np.int64)
     offset = np.empty(0, dtype=np.int64)
     low, high = np.empty(0, dtype=sums.dtype), np.empty(0, dtype=sums.dtype)
-    for s in range(seg0, seg1):
-        if segments[s, 1] != axis:
-            continue
-        v = segments[s, 0]
-        at = pose[v]
-        for j in range(segments[s, 2], segments[s, 2] + segments[s, 3]):
-            p0, q0, p1, q1, l0, l1, path, _ = _cell(at, edges, centers, first[v] + j, axis, lattice)
-            layered = abs(l1) < MAX_LAYERS_PER_SLAB * layer
-            offset, low, high = _with_room(_room(p0, q0, p1, q1, r0, r1, width), offset, low, high)
-            runs = _plan(
-                p0, q0, p1, q1, l0, l1, path, layer, layered, r0, r1, width, width * nz, nz, table, offset, low, high
-            )
-            e0, before = 0, -9
-            for n in range(runs):
-                now, e1 = table[n, 0], table[n, 1]
-                line = sums[v - begin, j]
-                if layered:
-                    for m in range(now, now + 2):
-                        if m != before and m != before + 1:
-                            _layer_values(lanes, line, at, m * layer, z0, dz, row0, row_pitch, pair[m % 2])
-                    before = now
-                    spread_lines(lanes, flat, offset, low, high, e0, e1, nz, pair[now % 2], pair[(now + 1) % 2])
-                else:
-                    _layer_values(lanes, line, at, l0 + l1 * now, z0, dz, row0, row_pitch, pair[0])
-                    spread_line(lanes, flat, offset, low, e0, e1, nz, pair[0])
-                e0 = e1
-
-
-@njit(parallel=True, cache=True)
-def _gather(
-    lanes, sums, pose, edges, centers, first, segments, seg0, seg1, begin, lattice, z0, dz, row0, row_pitch, layer,
-    by_row, by_column,
-):  # fmt: skip
-    """Add a chunk of views to ``by_row``, ``(ny, nx, padded(nz))``, and ``by_column``, its transpose."""
-    ny, nx = by_row.shape[:2]
-    row_tasks = (ny + SLAB_BLOCK - 1) // SLAB_BLOCK
-    tasks = row_tasks + (nx + SLAB_BLOCK - 1) // SLAB_BLOCK
-    for task in prange(tasks):
+    for task in range(begin, end):
         axis = 0 if task < row_tasks else 1
         out, r0 = (by_row, task * SLAB_BLOCK) if axis == 0 else (by_column, (task - row_tasks) * SLAB_BLOCK)
-        _gather_slabs(
-            lanes, sums, pose, edges, centers, first, segments, seg0, seg1, begin, axis, lattice,
-            z0, dz, row0, row_pitch, layer, r0, min(r0 + SLAB_BLOCK, out.shape[0]), out,
-        )  # fmt: skip
+        slabs, width = out.shape[:2]
+        r1 = min(r0 + SLAB_BLOCK, slabs)
+        flat = out.reshape(-1)
+        for s in range(seg0, seg1):
+            if segments[s, 1] != axis:
+                continue
+            v = segments[s, 0]
+            at = pose[v]
+            for j in range(segments[s, 2], segments[s, 2] + segments[s, 3]):
+                p0, q0, p1, q1, l0, l1, path, _ = _cell(at, edges, centers, first[v] + j, axis, lattice)
+                layered = abs(l1) < MAX_LAYERS_PER_SLAB * layer
+                offset, low, high = _with_room(_room(p0, q0, p1, q1, r0, r1, width), offset, low, high)
+                runs = _plan(
+                    p0, q0, p1, q1, l0, l1, path, layer, layered, r0, r1, width, width * nz, nz, layers, ends, offset,
+                    low, high,
+                )  # fmt: skip
+                e0, before = 0, -9
+                for n in range(runs):
+                    now, e1 = layers[n], ends[n]
+                    line = sums[v - view0, j]
+                    if layered:
+                        for m in range(now, now + 2):
+                            if m != before and m != before + 1:
+                                _layer_values(lanes, line, at, m * layer, z0, dz, row0, row_pitch, pair[m % 2])
+                        before = now
+                        spread_lines(lanes, flat, offset, low, high, e0, e1, nz, pair[now % 2], pair[(now + 1) % 2])
+                    else:
+                        _layer_values(lanes, line, at, l0 + l1 * now, z0, dz, row0, row_pitch, pair[0])
+                        spread_line(lanes, flat, offset, low, e0, e1, nz, pair[0])
+                    e0 = e1
 
 
 def backproject(
@@ -346,13 +330,14 @@ def backproject(
     lanes = (0,) * (32 // data.dtype.itemsize)
     by_row = np.zeros((ny, nx, padded(nz)), dtype=data.dtype)
     by_column = np.zeros((nx, ny, padded(nz)), dtype=data.dtype)
-    for begin in range(0, views, chunk):
-        stop = min(begin + chunk, views)
-        sums = np.empty((stop - begin, columns, rows + 1), dtype=data.dtype)
-        _row_sums(data, pose, centers, first, row0, row_pitch, begin, sums)
-        _gather(
-            lanes, sums, pose, edges, centers, first, segments, start[begin], start[stop], begin, lattice,
-            z0, dz, row0, row_pitch, layer, by_row, by_column,
+    tasks = sum(-(-slabs // SLAB_BLOCK) for slabs in (ny, nx))
+    for before in range(0, views, chunk):
+        after = min(before + chunk, views)
+        sums = np.empty((after - before, columns, rows + 1), dtype=data.dtype)
+        run(_row_sums, after - before, data, pose, centers, first, row0, row_pitch, before, sums)
+        run(
+            _gather, tasks, lanes, sums, pose, edges, centers, first, segments, start[before], start[after], before,
+            lattice, z0, dz, row0, row_pitch, layer, by_row, by_column,
         )  # fmt: skip
     by_row += by_column.transpose(1, 0, 2)
     volume[...] = by_row[..., :nz].transpose(2, 0, 1)

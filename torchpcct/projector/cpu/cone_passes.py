@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from torchpcct.projector.cpu.cone_kernels import backproject, project
+from torchpcct.projector.cpu.cone_kernels import backproject, padded, project
 from torchpcct.projector.tables import Tables
+from torchpcct.threads import get_num_threads
 
 __all__ = ["ConePasses"]
 
@@ -54,7 +54,7 @@ class ConePasses:
         """Working memory of the passes of one volume: forward, adjoint, adjoint per view held at a time."""
         r, table = self.tables.rays, 8 * (8 * self.tables.rays.views + 4 * len(self.tables.segments.table))
         nz, ny, nx = self.tables.grid.shape
-        forward = ny * nx * (nz + 16) + r.columns * r.rows * int(numba.get_num_threads())
+        forward = ny * nx * (nz + 16) + r.columns * padded(r.rows) * get_num_threads()
         return (
             table + itemsize * forward,
             table + itemsize * 2 * ny * nx * (nz + 8),

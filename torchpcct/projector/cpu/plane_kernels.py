@@ -10,22 +10,20 @@ weights. Forward runs in parallel over views, the adjoint over slab blocks; all 
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
-from numba import njit, prange
+from numba import njit
+from numpy.typing import NDArray
 
-from torchpcct.projector.cpu.cone_kernels import _FLAGS, _depth_line, _edge_line
+from torchpcct.projector.cpu.cone_kernels import _depth_line, _edge_line, _kernel, _small
 from torchpcct.projector.cpu.simd import add_edges, sum_edges
 
-__all__ = ["backproject", "cell_values", "collect", "deal", "load_image", "project", "tabulate"]
+__all__ = ["TILE", "backproject", "cell_values", "collect", "deal", "load_image", "project", "spread_tasks", "tabulate"]
 
 BLOCK = 16  # slabs per block: their knots fit the second-level cache
-# Light steps stay serial: a parallel kernel costs a second to compile and they take a millisecond.
-_small = njit(cache=True, fastmath=_FLAGS, error_model="numpy")
+TILE = 32  # pixels of a tile's edge
 
 
-@_small
+@_kernel
 def tabulate(segments, offset, pose, edges, centers, first, lattice, slabs, parallel, bias, across, p, q, gain, weight):
     """Edge lines ``p, q`` and cell gains of every segment (at ``offset[s]``), slab weights ``(segments, …, lanes)``.
 
@@ -81,16 +79,16 @@ def _active(p, q, here, count, r0, r1, top):
     return e0, e1
 
 
-@njit(parallel=True, cache=True)
-def load_image(image, address, place, count, width, sums):
+@njit(nogil=True, cache=True)
+def load_image(begin, end, image, address, place, count, width, sums):
     """Running sums of one axis, ``(slabs, knots, lanes)``, of ``(batch, pixels)`` under the lane addresses.
 
     ``address``: ``(lanes, 4)``: batch index, base, per slab, per step. ``place``: ``(lanes, 2)``: slab and knot where
     the ``count`` slabs of ``width`` pixels begin; all around is zero. The last knot repeats up to the end, so that the
     interpolation may read beyond it.
     """
-    slabs, knots, lanes = sums.shape
-    for r in prange(slabs):
+    _, knots, lanes = sums.shape
+    for r in range(begin, end):
         for l in range(lanes):
             i, first = r - place[l, 0], place[l, 1]
             total = sums.dtype.type(0)
@@ -132,15 +130,15 @@ def _beyond(reach):
     return max(1, len(reach))
 
 
-@njit(parallel=True, cache=True)
-def project(lanes, reach, segments, offset, start, by_row, by_column, p, q, gain, weight, apart, out):
-    """Lane readings of all canonical views, ``out``: ``(views, columns * lanes)``, overwritten.
+@njit(nogil=True, cache=True)
+def project(begin, end, lanes, reach, segments, offset, start, by_row, by_column, p, q, gain, weight, apart, out):
+    """Lane readings of canonical views, ``out``: ``(views, columns * lanes)``, overwritten.
 
     ``by_row, by_column``: ``(slabs, knots * lanes)``. ``apart``: ``(2, 2 * lanes)``, see ``simd.sum_edges``.
     """
     width = len(lanes)
     real = by_row.dtype.type
-    for v in prange(out.shape[0]):
+    for v in range(begin, end):
         line = out[v]
         line[:] = 0
         for axis in range(2):
@@ -153,7 +151,7 @@ def project(lanes, reach, segments, offset, start, by_row, by_column, p, q, gain
             )  # fmt: skip
 
 
-@_small
+@_kernel
 def deal(out, target, reverse, batch, data):
     """Lane readings ``(views, columns, lanes)`` to ``data``, ``(batch, views, columns)``.
 
@@ -171,7 +169,7 @@ def deal(out, target, reverse, batch, data):
                         data[n, to, i] = out[v, j, n * operations + g]
 
 
-@_small
+@_kernel
 def cell_values(data, target, reverse, segments, offset, gain, values):
     """Transpose of ``deal``: readings times their gain as ``values``, ``(entries, lanes)``, overwritten."""
     operations = target.shape[1]
@@ -218,21 +216,15 @@ def _reverse_sums(out, r0, r1, knots, width, total, place, planes):
                     planes[l, i, m] = total[l]
 
 
-@_small
-def _mixing_stride(tasks):
-    """A stride that visits all tasks once, in an order of which every run is a fair sample.
-
-    Each thread takes a run of neighbouring tasks. With symmetric views nearly all rays follow one axis: in the order
-    rows, then columns, one of two threads would have nothing to do.
-    """
-    stride = max(1, int(0.618 * tasks))
-    while math.gcd(stride, tasks) > 1:
-        stride += 1
-    return stride
+def spread_tasks(size: NDArray[np.int64]) -> int:
+    """Tasks of :func:`backproject`: blocks of slabs of both axes."""
+    return int((-(-size[:, 0] // BLOCK)).sum())
 
 
-@njit(parallel=True, cache=True)
-def backproject(lanes, reach, segments, offset, p, q, weight, apart, values, size, place, by_row, by_column):
+@njit(nogil=True, cache=True)
+def backproject(
+    begin, end, lanes, reach, segments, offset, p, q, weight, apart, values, size, place, by_row, by_column
+):
     """Transpose of :func:`project`: cell values ``(entries * lanes,)`` to ``(lanes, slabs, width)`` per axis.
 
     ``size``: ``(2, 2)``, slabs and knots per axis. ``place``: ``(2, lanes, 2)``, see ``load_image``.
@@ -240,10 +232,7 @@ def backproject(lanes, reach, segments, offset, p, q, weight, apart, values, siz
     width = len(lanes)
     real = by_row.dtype.type
     row_tasks = (size[0, 0] + BLOCK - 1) // BLOCK
-    tasks = row_tasks + (size[1, 0] + BLOCK - 1) // BLOCK
-    stride = _mixing_stride(tasks)
-    for turn in prange(tasks):
-        task = turn * stride % tasks
+    for task in range(begin, end):
         axis = 0 if task < row_tasks else 1
         planes, r0 = (by_row, task * BLOCK) if axis == 0 else (by_column, (task - row_tasks) * BLOCK)
         r1 = min(r0 + BLOCK, size[axis, 0])
@@ -266,20 +255,20 @@ def _collect_tile(plane, at, y0, y1, x0, x1, swap, image):
             image[y, x] += plane[b, a] if swap else plane[a, b]
 
 
-@njit(parallel=True, cache=True)
-def collect(by_row, by_column, inverse, operations, image):
-    """Sum the lanes back onto ``image``, ``(batch, ny, nx)``; transpose of ``load_image`` for both axes.
+@njit(nogil=True, cache=True)
+def collect(begin, end, by_row, by_column, inverse, operations, image):
+    """Sum the lanes back onto ``image``, ``(batch, ny, nx)``, by rows of tiles; transpose of ``load_image``, both axes.
 
     ``inverse``: ``(operations, 6)``: row and column of the operated image read at pixel (y, x), each as
     base, per y, per x. Tiles, since half of the lanes are read across their rows.
     """
     batch, ny, nx = image.shape
-    for tile in prange((ny + 31) // 32):
-        y0, y1 = tile * 32, min(tile * 32 + 32, ny)
+    for tile in range(begin, end):
+        y0, y1 = tile * TILE, min((tile + 1) * TILE, ny)
         for n in range(batch):
             image[n, y0:y1] = 0
-            for x0 in range(0, nx, 32):
+            for x0 in range(0, nx, TILE):
                 for g in range(operations):
                     l = n * operations + g
-                    _collect_tile(by_row[l], inverse[g], y0, y1, x0, min(x0 + 32, nx), False, image[n])
-                    _collect_tile(by_column[l], inverse[g], y0, y1, x0, min(x0 + 32, nx), True, image[n])
+                    _collect_tile(by_row[l], inverse[g], y0, y1, x0, min(x0 + TILE, nx), False, image[n])
+                    _collect_tile(by_column[l], inverse[g], y0, y1, x0, min(x0 + TILE, nx), True, image[n])

@@ -7,17 +7,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpcct.projector.cpu.plane_kernels import (
+    TILE,
     backproject,
     cell_values,
     collect,
     deal,
     load_image,
     project,
+    spread_tasks,
     tabulate,
 )
 from torchpcct.projector.cpu.symmetry import Orbits, address, find_orbits, no_orbits, place
 from torchpcct.projector.rays import Segments, slab_lattice
 from torchpcct.projector.tables import Tables
+from torchpcct.threads import run
 
 __all__ = ["PlanePasses"]
 
@@ -145,11 +148,12 @@ class PlanePasses:
             for axis, shape in enumerate(self._size(len(t.reach))):
                 lines = np.empty((*shape, width), dtype=x.dtype)
                 slabs, pixels = (ny, nx) if axis == 0 else (nx, ny)
-                load_image(images, self._lane_table(n, count, width, axis), places[axis], slabs, pixels, lines)
+                table = self._lane_table(n, count, width, axis)
+                run(load_image, len(lines), images, table, places[axis], slabs, pixels, lines, operations=lines[0].size)
                 sums.append(lines.reshape(shape[0], -1))
-            project(
-                (0,) * width, t.reach, self.segments, self.offset, self.start, *sums, t.p, t.q, t.gain, t.weight,
-                t.apart, out,
+            run(
+                project, len(out), (0,) * width, t.reach, self.segments, self.offset, self.start, *sums, t.p, t.q,
+                t.gain, t.weight, t.apart, out,
             )  # fmt: skip
             orbits = self.orbits
             deal(out.reshape(len(out), -1, width), orbits.target, orbits.reverse, count, y[n : n + count])
@@ -169,11 +173,12 @@ class PlanePasses:
             part = y[n : n + step]
             orbits = self.orbits
             cell_values(part, orbits.target, orbits.reverse, self.segments, self.offset, t.gain, values)
-            backproject(
-                (0,) * width, t.reach, self.segments, self.offset, t.p, t.q, t.weight, t.apart, values.reshape(-1),
-                size, places, by_row, by_column,
+            run(
+                backproject, spread_tasks(size), (0,) * width, t.reach, self.segments, self.offset, t.p, t.q, t.weight,
+                t.apart, values.reshape(-1), size, places, by_row, by_column,
             )  # fmt: skip
-            collect(by_row, by_column, self.inverse, self.operations, x[n : n + step])
+            tiles, pixels = -(-ny // TILE), TILE * nx * 2 * width
+            run(collect, tiles, by_row, by_column, self.inverse, self.operations, x[n : n + step], operations=pixels)
         return x
 
     def _lane_table(self, first: int, count: int, width: int, axis: int) -> NDArray[np.int64]:

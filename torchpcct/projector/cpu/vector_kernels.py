@@ -16,9 +16,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
-__all__ = ["backproject_vectors", "project_vectors"]
+from torchpcct.projector.cpu.cone_kernels import INNER
+
+__all__ = ["SLAB_BLOCK", "backproject_vectors", "project_vectors"]
 
 SLAB_BLOCK = 16
 """Slabs of one task of the adjoint."""
@@ -26,7 +28,7 @@ NEAREST = 1e-6
 """Slabs closer to the source than this part of the way to the detector are behind it."""
 _POINT = 1e-9
 """A rectangle narrower than this part of a voxel is a point."""
-_small = njit(cache=True, error_model="numpy")
+_small = njit(**INNER)
 
 
 @_small
@@ -114,9 +116,9 @@ def _project_view(pose, parallel, lower, spacing, shape, strides, flat, data):
             )
 
 
-@njit(parallel=True, cache=True)
-def project_vectors(poses, parallel, lower, spacing, shape, strides, flat, data):
-    """Line integrals of one volume.
+@njit(nogil=True, cache=True)
+def project_vectors(begin, end, poses, parallel, lower, spacing, shape, strides, flat, data):
+    """Line integrals of one volume in the views ``begin … end``.
 
     Args:
         poses: ``(views, 4, 3)``, see :class:`torchpcct.vector_geometry.VectorGeometry`.
@@ -125,7 +127,7 @@ def project_vectors(poses, parallel, lower, spacing, shape, strides, flat, data)
         flat: the volume, flat.
         data: ``(views, rows, columns)`` output, overwritten.
     """
-    for n in prange(data.shape[0]):
+    for n in range(begin, end):
         _project_view(poses[n], parallel, lower, spacing, shape, strides, flat, data[n])
 
 
@@ -144,14 +146,11 @@ def _gather_slabs(poses, parallel, lower, spacing, shape, strides, data, axis, r
                     )  # fmt: skip
 
 
-@njit(parallel=True, cache=True)
-def backproject_vectors(poses, parallel, lower, spacing, shape, strides, data, flat):
-    """The exact transpose of :func:`project_vectors`; ``flat`` must be 0 on entry."""
-    for axis in range(3):
-        blocks = (shape[axis] + SLAB_BLOCK - 1) // SLAB_BLOCK
-        for block in prange(blocks):
-            r0 = block * SLAB_BLOCK
-            _gather_slabs(
-                poses, parallel, lower, spacing, shape, strides, data, axis, r0,
-                min(r0 + SLAB_BLOCK, shape[axis]), flat,
-            )  # fmt: skip
+@njit(nogil=True, cache=True)
+def backproject_vectors(begin, end, poses, parallel, lower, spacing, shape, strides, data, axis, flat):
+    """Add the exact transpose of :func:`project_vectors` to ``flat``: rays along one axis, in blocks of its slabs."""
+    for block in range(begin, end):
+        r0 = block * SLAB_BLOCK
+        _gather_slabs(
+            poses, parallel, lower, spacing, shape, strides, data, axis, r0, min(r0 + SLAB_BLOCK, shape[axis]), flat
+        )

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from torchpcct.projector.cpu.vector_kernels import backproject_vectors, project_vectors
+from torchpcct.projector.cpu.vector_kernels import SLAB_BLOCK, backproject_vectors, project_vectors
 from torchpcct.projector.tables import VectorTables
+from torchpcct.threads import run
 
 __all__ = ["VectorPasses"]
 
@@ -32,14 +33,16 @@ class VectorPasses:
         views, rows, columns = self._readings
         y = np.empty((x.shape[0], views, rows, columns), dtype=x.dtype)
         for n in range(x.shape[0]):
-            project_vectors(*self._scan, np.ascontiguousarray(x[n]).reshape(-1), y[n])
+            run(project_vectors, views, *self._scan, np.ascontiguousarray(x[n]).reshape(-1), y[n])
         return y.reshape(x.shape[0], *self.tables.range_shape)
 
     def adjoint(self, y: NDArray) -> NDArray:
         x = np.zeros((y.shape[0], *self.tables.domain_shape), dtype=y.dtype)
         data = np.ascontiguousarray(y).reshape(y.shape[0], *self._readings)
         for n in range(y.shape[0]):
-            backproject_vectors(*self._scan, data[n], x[n].reshape(-1))
+            for axis, size in enumerate(self._scan[-2]):
+                blocks = -(-int(size) // SLAB_BLOCK)
+                run(backproject_vectors, blocks, *self._scan, data[n], axis, x[n].reshape(-1))
         return x
 
     @property
