@@ -33,8 +33,11 @@ MAX_LAYERS_PER_SLAB = 0.4
 NEAREST = 1e-6
 # Slabs of one task of the adjoint: enough to reuse a layer, few enough to share the work. Fixed, for determinism.
 SLAB_BLOCK = 24
-# Of functions that only kernels call: without wrappers for Python and C they compile faster.
-INNER: Any = {"cache": True, "error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+# Of functions that only kernels call. Without wrappers for Python and C they compile faster. Inlined they exist once,
+# in the kernel: of one that is called, a fresh process and one that reads the cache have copies that round differently.
+INNER: Any = {
+    "cache": True, "forceinline": True, "error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True,
+}  # fmt: skip
 # Ray geometry in float64, called per cell and not per voxel.
 _small = njit(**INNER, fastmath=_FLAGS)
 _kernel = njit(nogil=True, cache=True, fastmath=_FLAGS, error_model="numpy")
