@@ -145,6 +145,7 @@ def run(kernel: Any, count: int, *args: Any, operations: int = _LEAST) -> None:
             reports.append(call.reports.get())
     finally:
         call.pieces.clear()  # of an interrupted call
+        call.args = ()  # a helper that wakes only now must not keep the arrays
     for _, error in reports:
         if error is not None:
             raise error

@@ -261,6 +261,16 @@ def test_the_distance_to_the_limit_of_a_geometric_approach():
     assert Approach(start, torch.zeros(500, dtype=torch.bool)).remaining() == 0.0
 
 
+def test_an_approach_that_gets_faster_is_seen():
+    """As conjugate gradients often do; by the last quarter of the way alone it would be 26 and 62 times too long."""
+    approach = Approach(torch.ones(1, 500, dtype=torch.float64))
+    for k in range(1, 61):
+        left = math.exp(-((k / 12) ** 1.5))
+        approach.add(torch.full((1, 500), left, dtype=torch.float64))
+        if k >= 20:
+            assert left <= approach.remaining() <= 13 * left
+
+
 def test_corners_do_not_hold_the_stop_and_are_reported():
     A = Projector(ParallelBeam(torch.arange(40).numpy() * math.pi / 40, 26, 1.0), VolumeGrid((26, 26), 1.0))
     r = torch.hypot(*torch.meshgrid(*[torch.from_numpy(a) for a in A.grid.axes], indexing="ij"))
