@@ -4,6 +4,7 @@ import gc
 import subprocess
 import sys
 import threading
+import time
 import weakref
 
 import numpy as np
@@ -17,6 +18,9 @@ from torchpcct import threads
 def number(request):
     before = threads.get_num_threads()
     threads.set_num_threads(request.param)
+    ready = time.monotonic() + 30  # helpers of the test before may wake late
+    while len(threads._pool.idle) < threads._pool.started and time.monotonic() < ready:
+        time.sleep(0.001)
     yield request.param
     threads.set_num_threads(before)
 
