@@ -76,7 +76,7 @@ def backproject_2d(begin, end, kind, data, cosines, sines, shifts, starts, x, y,
     blocks = (ny + block - 1) // block
     for task in range(begin, end):
         b, first = task // blocks, (task % blocks) * block
-        end = min(first + block, ny)
+        stop = min(first + block, ny)
         total = np.zeros((block, nx), data.dtype)
         index = np.empty(nx, np.int32)
         near, far = np.empty(nx, data.dtype), np.empty(nx, data.dtype)
@@ -88,7 +88,7 @@ def backproject_2d(begin, end, kind, data, cosines, sines, shifts, starts, x, y,
             for i in range(columns):
                 row[i] = data[b, v, i]
             row[columns] = number(0)  # read with weight 0 at the last column's centre
-            for iy in range(first, end):
+            for iy in range(first, stop):
                 _positions_2d(
                     kind, xs, y[iy], cosines[v], sines[v], shifts[v, 0], shifts[v, 1], sod, sdd, scale, starts[v],
                     columns - 1, atan, index, near, far,
@@ -97,7 +97,7 @@ def backproject_2d(begin, end, kind, data, cosines, sines, shifts, starts, x, y,
                 for i in range(nx):
                     k = np.uint32(index[i])
                     line[i] += near[i] * row[k] + far[i] * row[k + np.uint32(1)]
-        for iy in range(first, end):
+        for iy in range(first, stop):
             for i in range(nx):
                 out[b, iy, i] = total[iy - first, i]
 
@@ -290,13 +290,13 @@ def backproject_3d(
                 low, high = min(low, height[p]), max(high, height[p])
                 left, right = min(left, index[p]), max(right, index[p])
             first = int(min(max(left, 0.0), last))
-            end = int(min(max(right, 0.0), last)) + 2
+            stop = int(min(max(right, 0.0), last)) + 2
             slab = data[b, v]
             # columns become contiguous; the outermost rows are repeated
             for r in range(rows):
-                for i in range(first, end):
+                for i in range(first, stop):
                     turned[i - first, r + 1] = slab[r, min(i, columns - 1)]
-            for i in range(end - first):
+            for i in range(stop - first):
                 turned[i, 0], turned[i, rows + 1] = turned[i, 1], turned[i, rows]
             reach = max(abs(z[0] + lift), abs(z[nz - 1] + lift)) * row_scale
             kink = reach * (high - low) <= 1.0
@@ -306,7 +306,7 @@ def backproject_3d(
                     middle = min(max(math.floor(r), 0.0), rows - 1.0)
                     tau[k] = number(row_start - middle)
                     lower[k] = np.int32(middle)
-                for i in range(end - first):
+                for i in range(stop - first):
                     source, g, d, e = turned[i], table[i, 0], table[i, 1], table[i, 2]
                     for k in range(nz):
                         j = np.uint32(lower[k])

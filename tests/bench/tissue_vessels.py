@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 from rod_values import ROD_HU
+from tissues import reconstructed
 
 from recon.mbir.mbir import Mbir
 from recon.mbir.tissues import TissueMbir
@@ -56,21 +57,17 @@ def measured(problem: InsetProblem, name: str, doses: list[float], draws: int) -
     found: dict[str, Any] = {}
     for dose in doses:
         rows: dict[str, list[Any]] = {k: [] for k in methods}
-        used, presence = 0, []
+        used, presence, gram = 0, [], problem.gram.scaled(dose)
         for k in range(draws):
-            noise = problem.gram.scaled(dose).noise(generator=torch.Generator().manual_seed(k))
+            noise = gram.noise(generator=torch.Generator().manual_seed(k))
             for label, method in methods.items():
                 row = []
                 for i in range(2):
                     b = (clean[i] * dose + noise)[None]
-                    if isinstance(method, TissueMbir):
-                        solved = method.solved(problem, b, dose)
-                        volume = method.in_hu(problem, solved.u, solved.normal)[0]
-                        used += solved.notes[0]["tissues"]["used"]
-                        presence.append(solved.notes[0]["tissues"].get("presence", float("nan")))
-                    else:
-                        with torch.no_grad():
-                            volume = method(problem, b, dose)[0]
+                    volume, tissues = reconstructed(method, problem, b, dose)
+                    if tissues is not None:
+                        used += tissues["used"]
+                        presence.append(tissues.get("presence", float("nan")))
                     contrast = [float(fibrous(volume)) - float(core(volume)) for core, fibrous in pairs]
                     inside = vessel_voxels[i]
                     row.append([*contrast, float((volume - true[i])[inside].square().mean())])

@@ -53,14 +53,10 @@ def measured(problem: InsetProblem, plaques: int, dose: float) -> dict[str, Any]
         for true in held.image[i]:
             b = (gram.apply(true * hu + problem.mu_ref - problem.level) + noise)[None]
             for name, method in methods.items():
-                if isinstance(method, TissueMbir):
-                    solved = method.solved(problem, b, dose)
-                    volume = method.in_hu(problem, solved.u, solved.normal)[0]
-                    used += solved.notes[0]["tissues"]["used"]
-                    presence.append(solved.notes[0]["tissues"].get("presence", float("nan")))
-                else:
-                    with torch.no_grad():
-                        volume = method(problem, b, dose)[0]
+                volume, tissues = reconstructed(method, problem, b, dose)
+                if tissues is not None:
+                    used += tissues["used"]
+                    presence.append(tissues.get("presence", float("nan")))
                 core, fibrous = (float(volume[roi > 0].mean()) for roi in (held.core_roi[i], held.fibrous_roi[i]))
                 error = (volume - true).square()
                 rows[name].append([fibrous - core, float(error[vessel].mean()), float(error[~vessel].mean())])
@@ -70,6 +66,17 @@ def measured(problem: InsetProblem, plaques: int, dose: float) -> dict[str, Any]
         "used": used, "of": 2 * plaques, "presence": np.reshape(presence, (-1, 2)).tolist(),
         "cpu_seconds": time.process_time() - start, "methods": {n: np.array(v) for n, v in found.items()},
     }  # fmt: skip
+
+
+def reconstructed(
+    method: Any, problem: InsetProblem, b: torch.Tensor, dose: float
+) -> tuple[torch.Tensor, dict[str, Any] | None]:
+    """Volume of one statistic ``(1, z, y, x)`` in HU, and what is said of its tissues (None: not asked for)."""
+    if isinstance(method, TissueMbir):
+        solved = method.solved(problem, b, dose)
+        return method.in_hu(problem, solved.u, solved.normal)[0], solved.notes[0]["tissues"]
+    with torch.no_grad():
+        return method(problem, b, dose)[0], None
 
 
 def figures(values: Any) -> dict[str, float]:

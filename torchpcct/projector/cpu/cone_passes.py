@@ -72,7 +72,7 @@ class ConePasses:
 def running_sums(x: NDArray[Any]) -> NDArray[Any]:
     """``(nz, ny, nx)`` to the ``lines`` of ``cone_kernels.project``."""
     nz, ny, nx = x.shape
-    lines = np.empty((ny * nx, (nz + 7) // 8 * 8 + 8), dtype=x.dtype)
+    lines = np.empty((ny * nx, padded(nz) + 8), dtype=x.dtype)
     lines[:, 0] = 0
     np.cumsum(x.reshape(nz, ny * nx).T, axis=-1, out=lines[:, 1 : nz + 1])
     lines[:, nz + 1 :] = lines[:, nz, None]
