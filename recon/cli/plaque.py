@@ -26,11 +26,13 @@ def _plaque(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     from recon.plaque.data import TissueData
     from recon.plaque.reading import read_plaque
     from recon.plaque.report import save, table
+    from recon.plaque.vessel_prior import VesselPrior
     from recon.pwls.inset_problem import InsetProblem
     from recon.study.paper.plaque_scan import INSET_MM
     from torchpcct.scan import Scan
     from torchpcct.scene.plaque import PAPER_POSITION
 
+    believed = VesselPrior(tuple(arguments.wall or VesselPrior.wall), tuple(arguments.fibrous or VesselPrior.fibrous))
     scan = Scan.load(arguments.scan)
     shape = tuple(math.ceil(e / voxel - 1e-6) for e in arguments.extent or INSET_MM)
     grid = VolumeGrid(shape, voxel, tuple(arguments.center or PAPER_POSITION[::-1]))
@@ -39,8 +41,9 @@ def _plaque(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     data = TissueData.of_scan(scan, problem)
     made = time.perf_counter()
     reading = read_plaque(
-        data, arguments.point, point_sd=arguments.point_sd, particles=arguments.particles, seed=arguments.seed
-    )
+        data, arguments.point, point_sd=arguments.point_sd, particles=arguments.particles, vessel_prior=believed,
+        seed=arguments.seed,
+    )  # fmt: skip
     seconds = {"operator": round(made - start, 2), "reading": round(time.perf_counter() - made, 2)}
     others = {"soft FBP": reconstruct(scan, grid, "fbp", kernel="soft").data}
     for method in arguments.beside:
@@ -67,6 +70,11 @@ def add_plaque(commands: Commands) -> None:
     parser.add_argument("--point", type=float, nargs=3, metavar=axes, help="where a reader sees the plaque, mm")
     parser.add_argument("--point-sd", type=float, default=0.4, metavar="MM", help="its error (default 0.4)")
     parser.add_argument("--particles", type=int, default=300, metavar="N", help="shapes followed (default 300)")
+    for tissue in ("wall", "fibrous"):
+        parser.add_argument(
+            f"--{tissue}", type=float, nargs=2, metavar=("HU", "SD"),
+            help="its value before the data (default: what is usual at 120 kVp; the report says it)",
+        )  # fmt: skip
     parser.add_argument("--beside", nargs="*", default=[], metavar="METHOD", help="also read these: pwls mbir")
     parser.add_argument("--voxel", type=float, default=0.2, metavar="MM", help="voxel size (default 0.2)")
     parser.add_argument("--center", type=float, nargs=3, metavar=axes, help="centre in mm (default: the plaque)")

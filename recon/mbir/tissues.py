@@ -26,10 +26,15 @@ from torch import Tensor
 from recon.mbir.mbir import Mbir, Solution
 from recon.plaque.data import TissueData
 from recon.plaque.reading import PlaqueReading, read_plaque
+from recon.plaque.vessel_prior import VesselPrior
 from recon.pwls.inset_problem import InsetProblem
 from torchpcct.validate import numbers
 
 __all__ = ["TissueMbir"]
+
+BELIEVED = VesselPrior(wall=(50.0, 25.0), fibrous=(95.0, 60.0), orders=4)
+"""Wider than a reading's: an image is looked at by people who have not chosen what the tissues are expected to be, and
+its outlines shall follow flat ellipses, too."""
 
 
 class TissueMbir(Mbir):
@@ -61,7 +66,7 @@ class TissueMbir(Mbir):
         for k in range(b.shape[0]):
             try:
                 data = TissueData.of_statistic(b[k], problem, exposure_s)
-                reading = read_plaque(data, self.point, seed=self.seed)
+                reading = read_plaque(data, self.point, vessel_prior=BELIEVED, seed=self.seed)
             except ValueError as error:
                 notes.append(_unused(f"no tissues were fitted: {error}"))
                 continue

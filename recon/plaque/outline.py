@@ -12,12 +12,9 @@ from numpy.typing import NDArray
 from recon.plaque.centreline import Coordinates
 from recon.plaque.kernels import outline_radius, outline_spread
 
-__all__ = ["ORDERS", "Outline", "OutlineAt"]
+__all__ = ["Outline", "OutlineAt"]
 
 Floats = NDArray[np.float64]
-
-ORDERS = 4
-"""Fourier orders of a section: 1 moves it, 2 makes it an ellipse, 3 an egg; a flat ellipse needs 4."""
 
 _KNOT_MM = 0.9
 _CORRELATION_MM = 2.0
@@ -33,7 +30,7 @@ class OutlineAt:
     Attributes:
         first: ``(n,)`` first of the four splines that reach each point.
         spline, spline_slope: ``(n, 4)`` their values and derivatives along s.
-        wave, wave_slope: ``(n, 2·ORDERS + 1)`` Fourier functions and their derivatives by θ.
+        wave, wave_slope: ``(n, 2·orders + 1)`` Fourier functions and their derivatives by θ.
     """
 
     first: NDArray[np.int64]
@@ -43,14 +40,14 @@ class OutlineAt:
     wave_slope: Floats
 
     def radius(self, shape: Floats) -> tuple[Floats, Floats, Floats]:
-        """r, dr/dθ and dr/ds at the points for coefficients ``(splines, 2·ORDERS + 1)``."""
+        """r, dr/dθ and dr/ds at the points for coefficients ``(splines, 2·orders + 1)``."""
         found = np.empty((3, len(self.first)))
         parts = (self.first, self.spline, self.spline_slope, self.wave, self.wave_slope)
         outline_radius(*parts, np.ascontiguousarray(shape), *found)
         return found[0], found[1], found[2]
 
     def spread(self, slope: Floats, out: Any) -> None:
-        """Add slope · dr/d(coefficients) to ``out`` ``(n, splines · (2·ORDERS + 1))``, of any float type."""
+        """Add slope · dr/d(coefficients) to ``out`` ``(n, splines · (2·orders + 1))``, of any float type."""
         outline_spread(slope, self.first, self.spline, self.wave, out)
 
 
@@ -60,10 +57,12 @@ class Outline:
 
     Args:
         low, high: mm.
+        orders: Fourier orders, as :class:`recon.plaque.vessel_prior.VesselPrior` has them.
     """
 
     low: float
     high: float
+    orders: int
 
     @property
     def splines(self) -> int:
@@ -73,7 +72,7 @@ class Outline:
     @property
     def size(self) -> int:
         """Number of coefficients."""
-        return self.splines * (2 * ORDERS + 1)
+        return self.splines * (2 * self.orders + 1)
 
     def at(self, c: Coordinates) -> OutlineAt:
         """The outline's functions at points; beyond its ends it goes on as it ends."""
@@ -86,14 +85,14 @@ class Outline:
         u = t - first
         spline = np.stack([(1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, -3 * u**3 + 3 * u**2 + 3 * u + 1, u**3], 1) / 6
         slope = np.stack([-((1 - u) ** 2), 3 * u**2 - 4 * u, -3 * u**2 + 2 * u + 1, u**2], 1) / (2 * _KNOT_MM)
-        k = np.arange(1, ORDERS + 1)
+        k = np.arange(1, self.orders + 1)
         c, s_ = np.cos(theta[:, None] * k), np.sin(theta[:, None] * k)
         ones = np.ones((len(theta), 1))
         return OutlineAt(first, spline, slope, np.hstack([ones, c, s_]), np.hstack([0 * ones, -k * s_, k * c]))
 
     def constant(self, radius: Floats, at: Floats) -> Floats:
-        """Coefficients ``(splines, 2·ORDERS + 1)`` of a round vessel of ``radius`` at positions ``at``, smoothed."""
-        shape = np.zeros((self.splines, 2 * ORDERS + 1))
+        """Coefficients ``(splines, 2·orders + 1)`` of a round vessel of ``radius`` at positions ``at``, smoothed."""
+        shape = np.zeros((self.splines, 2 * self.orders + 1))
         centres = self.low + (np.arange(self.splines) - 1) * _KNOT_MM
         weight = np.exp(-0.5 * ((centres[:, None] - at) / _KNOT_MM) ** 2) + 1e-9
         shape[:, 0] = (weight @ radius) / weight.sum(1)
@@ -104,5 +103,5 @@ class Outline:
         centres = np.arange(self.splines) * _KNOT_MM
         lag = math.sqrt(5.0) * np.abs(centres[:, None] - centres) / _CORRELATION_MM
         k = (1 + lag + lag**2 / 3) * np.exp(-lag)
-        order = np.concatenate([[0], np.arange(1, ORDERS + 1), np.arange(1, ORDERS + 1)])
+        order = np.concatenate([[0], np.arange(1, self.orders + 1), np.arange(1, self.orders + 1)])
         return np.kron(np.linalg.inv(k), np.diag((order >= least_order) / np.array(_SD_MM)[order] ** 2))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from recon.plaque.particles import Cloud, lead
 from recon.plaque.quality import misfit, texture
 from recon.plaque.start import find_vessel
 from recon.plaque.vessel import FAT, FIBROUS, Fit, Vessel
+from recon.plaque.vessel_prior import VesselPrior
 from torchpcct.geometry import VolumeGrid
 from torchpcct.validate import number, numbers, whole
 
@@ -139,6 +140,7 @@ def read_plaque(
     point_sd: float = 0.4,
     particles: int = 300,
     prior: float = 0.5,
+    vessel_prior: VesselPrior | None = None,
     seed: int = 0,
 ) -> PlaqueReading:
     """Read the vessel in an inset.
@@ -149,6 +151,7 @@ def read_plaque(
         point_sd: standard deviation of its error along each axis, mm.
         particles: shapes of the core that are followed; fewer than 300 widen the spread of the result.
         prior: probability of a core before the data.
+        vessel_prior: what is believed of the vessel; None: usual tissues at 120 kVp.
         seed: of the Monte Carlo.
 
     Returns:
@@ -165,7 +168,7 @@ def read_plaque(
     prior = number("prior", prior, low=0.0, high=1.0)
     rng = np.random.default_rng(seed)
     start = find_vessel(data.pilot(), data.grid, None if where is None else np.array(where))
-    vessel = Vessel(data, start)
+    vessel = Vessel(data, start, vessel_prior)
     fit = vessel.fit(vessel.first_guess(), expected=True)
     fit = _calcified(vessel, fit, particles, rng)
     core = CorePrior(point=place, point_sd=point_sd)
@@ -263,7 +266,8 @@ def _read(
         _regions(vessel, fit, space, shares, calcifications), _image(vessel, fit), _image(vessel, plain),
         _on_grid(vessel, _layer(plain)), square, spread, tau.sd_hu, tau.high_hu,
         {"particles": particles, "seed": seed, "log_evidence": cloud.log_evidence, "log_evidence_first": first,
-         "point": prior_of_core.point, "source": vessel.data.source, "voxels": len(vessel.index),
+         "point": prior_of_core.point, "vessel_prior": asdict(vessel.prior),
+         "source": vessel.data.source, "voxels": len(vessel.index),
          "core_center_mm": cloud.points[:, :3].mean(0).tolist(), "prior": prior},
     )  # fmt: skip
 

@@ -24,6 +24,7 @@ from recon.plaque.data import TissueData
 from recon.plaque.kernels import plane_fractions
 from recon.plaque.local_gram import LocalGram
 from recon.plaque.outline import Outline, OutlineAt
+from recon.plaque.vessel_prior import VesselPrior
 
 __all__ = ["BLUR", "BLUR_UNIT", "FAT", "FIBROUS", "LUMEN", "THICKNESS", "WALL", "Drawing", "Fit", "Start", "Vessel"]
 
@@ -34,14 +35,13 @@ _FIRST = 12
 """Positions of the first parameters: values, log wall thickness, variance of the edges' blur in 0.01 mm², three for
 each end (position and tilts of a plane); then the lumen's and the outer outline's coefficients."""
 
-_VALUE_SD = (100.0, 25.0, 60.0, 300.0)
+_FAT_SD, _LUMEN_SD = 100.0, 300.0
+"""Prior of fat and lumen about what the start reads, HU."""
 _EXPECTED_SD = (10.0, 15.0)
 """Of wall and fibrous tissue, HU, in a fit that expects them to be what they usually are."""
 _EXPECTED_ROUND = 4.0
 """So much less than else the outlines leave an ellipse in such a fit: a calcification beside the lumen would otherwise
 be taken for a bulge of it, and leave no trace."""
-_VALUE_MEAN = (-90.0, 50.0, 95.0)
-"""Prior of fat, wall and fibrous tissue, HU; the lumen's mean is what the start reads."""
 _WALL_MM, _WALL_LOG_SD = 0.2, 0.2
 _BLUR, _BLUR_SD, BLUR_UNIT = 0.2, 1.0, 0.01
 """Variance by which edges are softer than the operator's: focal spot, turning gantry, tissue; in units of 0.01 mm²."""
@@ -143,11 +143,12 @@ class Vessel:
     Args:
         data: statistic and operator.
         start: where the vessel is.
+        prior: of tissue values and outlines.
     """
 
-    def __init__(self, data: TissueData, start: Start) -> None:
+    def __init__(self, data: TissueData, start: Start, prior: VesselPrior | None = None) -> None:
         grid = self.grid = data.grid
-        self.data, self.start = data, start
+        self.data, self.start, self.prior = data, start, prior or VesselPrior()
         low = max(start.ends[0], -1.0) - 1.0
         high = min(start.ends[1], start.lumen.length + 1.0) + 1.0
         points = np.stack(np.meshgrid(*grid.axes, indexing="ij"), -1).reshape(-1, 3)
@@ -163,8 +164,9 @@ class Vessel:
         self.half = np.array(grid.spacing) / 2
         self.outer_at = Coordinates(near.s[flat], near.rho[flat], near.theta[flat], near.frame[flat])
         self.lumen_at = start.lumen.coordinates(self.points)
-        self.lumen_outline = Outline(min(low, float(self.lumen_at.s.min())), max(high, float(self.lumen_at.s.max())))
-        self.outer_outline = Outline(float(self.outer_at.s.min()), float(self.outer_at.s.max()))
+        low, high = min(low, float(self.lumen_at.s.min())), max(high, float(self.lumen_at.s.max()))
+        self.lumen_outline = Outline(low, high, self.prior.orders)
+        self.outer_outline = Outline(float(self.outer_at.s.min()), float(self.outer_at.s.max()), self.prior.orders)
         self._lumen, self._outer = self.lumen_outline.at(self.lumen_at), self.outer_outline.at(self.outer_at)
         c = self.lumen_at
         self._planes = np.stack([np.ones(len(flat)), c.rho * np.cos(c.theta), c.rho * np.sin(c.theta)], 1)
@@ -206,10 +208,12 @@ class Vessel:
     def _prior_of(self) -> tuple[Floats, Floats]:
         fat, blood = self.start.values
         ends = [v for e in self.start.ends for v in (e if math.isfinite(e) else 0.0, 0.0, 0.0)]
-        first = [fat, *_VALUE_MEAN[1:], blood, math.log(_WALL_MM), _BLUR, *ends]
+        (wall, wall_sd), (fibrous, fibrous_sd) = self.prior.wall, self.prior.fibrous
+        first = [fat, wall, fibrous, blood, math.log(_WALL_MM), _BLUR, *ends]
         mean = np.concatenate([first, np.zeros(self.size - _FIRST)])
         precision = np.zeros((self.size, self.size))
-        sd = np.array([*_VALUE_SD, _WALL_LOG_SD, _BLUR_SD, *_END_SD_MM, *_END_SD_MM])
+        values = (_FAT_SD, wall_sd, fibrous_sd, _LUMEN_SD)
+        sd = np.array([*values, _WALL_LOG_SD, _BLUR_SD, *_END_SD_MM, *_END_SD_MM])
         precision[range(_FIRST), range(_FIRST)] = sd**-2.0
         parts = ((self.lumen_part, self.lumen_outline), (self.outer_part, self.outer_outline))
         for (part, outline), (_, radii) in zip(parts, self.start.radii, strict=True):
@@ -293,7 +297,8 @@ class Vessel:
         precision = np.zeros((self.size + k, self.size + k))
         precision[: self.size, : self.size] = self._prior
         if expected:
-            precision[[WALL, FIBROUS], [WALL, FIBROUS]] = np.array(_EXPECTED_SD) ** -2.0
+            sd = np.minimum(_EXPECTED_SD, (self.prior.wall[1], self.prior.fibrous[1]))
+            precision[[WALL, FIBROUS], [WALL, FIBROUS]] = sd**-2.0
             for part, outline in ((self.lumen_part, self.lumen_outline), (self.outer_part, self.outer_outline)):
                 precision[part, part] += (_EXPECTED_ROUND**2 - 1) * outline.precision(least_order=3)
         precision[range(self.size, self.size + k), range(self.size, self.size + k)] = _BODY_SD**-2.0

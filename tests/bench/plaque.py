@@ -56,7 +56,9 @@ CASES = {
     "2.0 s, blind": Case("paper", 2.0, False),
     "2.0 s, with a point": Case("paper", 2.0, True),
     "2.0 s, no core, blind": Case("absent_core", 2.0, False),
+    "2.0 s, no core, with a point": Case("absent_core", 2.0, True),
     "0.35 s, with a point": Case("paper", 0.35, True),
+    "0.35 s, blind": Case("paper", 0.35, False),
     "2.0 s, held-out plaques, with a point": Case("held out", 2.0, True),
     "2.0 s, texture of 10 HU, with a point": Case("texture", 2.0, True, 4),
     "2.0 s, soft edges, with a point": Case("soft edges", 2.0, True, 4),
@@ -292,10 +294,28 @@ def summary(work: Path) -> dict[str, Any]:
                 beside = [pair for pair in pairs if np.isfinite(pair[0])]  # thresholds can lose the edges
                 if len(beside) > 1:
                     entry["figures"][name][other] = _spread(*np.array(beside).T)
+        contrast = np.array([d["figures"]["contrast"]["value"] for d in read])
         if absent:
-            entry["contrast_if_there"] = float(np.mean([d["figures"]["contrast"]["value"] for d in read]))
+            entry["contrast_if_there"] = float(contrast.mean())
+        else:
+            # What a user is given: the contrast of the claimed cores.
+            given = np.array([d["figures"]["contrast"]["value"] - d["truth"]["contrast"] for d in read if _given(d)])
+            entry["given"] = {"n": len(given), "bias": float(given.mean()) if len(given) else float("nan"),
+                              "rmse": float(np.sqrt(np.mean(given**2))) if len(given) else float("nan")}  # fmt: skip
         cases[_stem(case)] = entry
+    for case, what in CASES.items():
+        absent = _stem(f"{what.exposure_s:.1f} s, no core, {'with a point' if what.pointed else 'blind'}")
+        if what.scene == "paper" and absent in cases and _stem(case) in cases:
+            contrast = cases[_stem(case)]["figures"]["contrast"]
+            slope = (contrast["mean"] - cases[absent]["contrast_if_there"]) / contrast["true"]
+            contrast |= {"slope": slope, "corrected_sd": contrast["sd"] / slope}
     return {"command": "python tests/bench/plaque.py", "point_sd_mm": POINT_SD_MM, "cases": cases}
+
+
+def _given(draw: dict[str, Any]) -> bool:
+    """Whether the reading gives a contrast (see ``recon.plaque.reading``), or refuses it."""
+    low, high = (draw["figures"]["contrast"][end] for end in ("low", "high"))
+    return draw["presence"] >= CERTAIN and not low <= 0.0 <= high
 
 
 def _share(found: int, n: int) -> dict[str, float]:
@@ -329,13 +349,23 @@ def text(result: dict[str, Any]) -> str:
             f"median P {entry['median_presence']:.3f}, least {entry['least_presence']:.3f}; "
             f"not read {entry['failed']}; "
             f"calcified {entry['calcified']}; warned {entry['warned']}; residual {entry['chi2']:.3f}; texture "
-            f"{entry['texture_hu']:.1f} HU; {entry['cpu_seconds']:.1f} CPU s a reading (loaded machine).",
+            f"{entry['texture_hu']:.1f} HU; {entry['cpu_seconds']:.1f} CPU s a reading (loaded machine)."
+            + (
+                " Contrast given: {n} times, bias {bias:+.1f}, RMSE {rmse:.1f} HU.".format(**entry["given"])
+                if entry.get("given", {}).get("n")
+                else " No contrast given."
+                if "given" in entry
+                else f" Contrast if there were one: {entry['contrast_if_there']:+.1f} HU."
+            ),
             "",
             "| | true | mean | bias | SD [95 %] | told | RMSE | coverage | soft FBP: mean, SD | MBIR: mean, SD | "
             "FBP by thresholds: bias, RMSE |",
             "|---" * 11 + "|",
         ]
         for name, f in entry["figures"].items():
+            if "corrected_sd" in f:
+                lines[-3] += (f" Contrast from none to all: slope {f['slope']:.2f}, SD at slope 1 "
+                              f"{f['corrected_sd']:.1f} HU.")  # fmt: skip
             d = 1 if abs(f["true"]) > 20 else 2
             cells = [f"{f['true']:.{d}f}", f"{f['mean']:.{d}f}", f"{f['bias']:+.{d}f}",
                      f"{f['sd']:.{d}f} [{f['sd_low']:.{d}f}, {f['sd_high']:.{d}f}]", f"{f['told_sd']:.{d}f}",

@@ -142,7 +142,7 @@ def test_filter_transpose_is_exact(name):
 
 
 # forward-mode AD of PyTorch itself still goes through torch.jit
-@pytest.mark.filterwarnings("ignore:.*torch.jit.script.*:DeprecationWarning")
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script.*")
 def test_gradients_of_first_and_second_order(case):
     geometry, grid = case
     data = torch.randn(geometry.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(2))

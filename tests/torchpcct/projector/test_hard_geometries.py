@@ -253,7 +253,7 @@ def test_calls_do_not_share_buffers(name):
     assert torch.equal(back, copy)
 
 
-@pytest.mark.filterwarnings("ignore:.*torch.jit.script.*:DeprecationWarning")  # raised inside torch.func.jvp
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script.*")  # raised inside torch.func.jvp
 @pytest.mark.parametrize("name", ["fan_flat", "cone_window"])
 def test_modes_and_torch_func(name):
     A = _projector(name)

@@ -1,0 +1,54 @@
+"""What is believed of a vessel: refused when it cannot be meant, and felt by the fit."""
+
+import drawn_vessel
+import numpy as np
+import pytest
+
+from recon.plaque import VesselPrior
+from recon.plaque.start import find_vessel
+from recon.plaque.vessel import FIBROUS, WALL, Vessel
+
+
+@pytest.mark.parametrize(
+    ("values", "error", "match"),
+    [
+        ({"wall": (50.0, 0.0)}, ValueError, "wall"),
+        ({"wall": (float("nan"), 10.0)}, ValueError, "wall"),
+        ({"fibrous": (95.0, -1.0)}, ValueError, "fibrous"),
+        ({"fibrous": 95.0}, ValueError, "fibrous"),
+        ({"fibrous": ("a", 1.0)}, TypeError, "fibrous"),
+        ({"orders": 1}, ValueError, "orders"),
+        ({"orders": 5}, ValueError, "orders"),
+        ({"orders": 3.0}, TypeError, "orders"),
+    ],
+)
+def test_what_cannot_be_believed_is_refused(values, error, match):
+    with pytest.raises(error, match=match):
+        VesselPrior(**values)
+
+
+@pytest.fixture(scope="module")
+def seen():
+    gram = drawn_vessel.operator()
+    data = drawn_vessel.data(gram, drawn_vessel.image(gram.grid, 0.0))
+    return data, find_vessel(data.pilot(), data.grid, None)
+
+
+def test_a_firm_belief_holds_and_a_loose_one_gives_way(seen):
+    """Values far from the truth: pulled there with 1 HU of doubt, hardly with 100 HU."""
+    fits = []
+    for sd in (1.0, 100.0):
+        vessel = Vessel(*seen, VesselPrior((0.0, sd), (160.0, sd)))
+        fits.append(vessel.fit(vessel.first_guess()).parameters)
+    true = [drawn_vessel.VALUES[t] for t in ("wall", "fibrous")]
+    off = [np.abs(p[[WALL, FIBROUS]] - true) for p in fits]
+    assert off[1][1] < 12
+    assert off[0][1] > 3 * off[1][1]
+    assert off[0][0] > off[1][0]
+
+
+def test_orders_are_those_of_both_outlines(seen):
+    for orders in (2, 3, 4):
+        vessel = Vessel(*seen, VesselPrior(orders=orders))
+        guess = vessel.first_guess()
+        assert vessel.lumen_shape(guess).shape[1] == vessel.outer_shape(guess).shape[1] == 2 * orders + 1
