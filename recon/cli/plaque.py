@@ -73,7 +73,7 @@ def add_plaque(commands: Commands) -> None:
     for tissue in ("wall", "fibrous"):
         parser.add_argument(
             f"--{tissue}", type=float, nargs=2, metavar=("HU", "SD"),
-            help="its value before the data (default: what is usual at 120 kVp; the report says it)",
+            help="its value before the data (default: what is usual; the report says it)",
         )  # fmt: skip
     parser.add_argument("--beside", nargs="*", default=[], metavar="METHOD", help="also read these: pwls mbir")
     parser.add_argument("--voxel", type=float, default=0.2, metavar="MM", help="voxel size (default 0.2)")

@@ -151,7 +151,7 @@ def read_plaque(
         point_sd: standard deviation of its error along each axis, mm.
         particles: shapes of the core that are followed; fewer than 300 widen the spread of the result.
         prior: probability of a core before the data.
-        vessel_prior: what is believed of the vessel; None: usual tissues at 120 kVp.
+        vessel_prior: what is believed of the vessel; None: usual tissues.
         seed: of the Monte Carlo.
 
     Returns:

@@ -19,7 +19,7 @@ class VesselPrior:
     A wall is about one voxel thick, and its value trades with its thickness; values of fibrous tissue and core trade
     with the core's size and the outlines: a prior as wide as the tissues' own variety keeps them from what no tissue
     is. Fibrous plaque has 91 ± 21 HU (Schroeder et al. 2001, J. Am. Coll. Cardiol. 37, 1430), unenhanced muscle 50 to
-    60 HU. Other tube voltages or enhanced walls want other values.
+    60 HU. An enhanced wall wants another value.
 
     Args:
         wall: mean and standard deviation, HU.

@@ -40,9 +40,9 @@ COMMANDS: dict[str, list[str]] = {
     "motion": ["study", "motion"],
     "dose-factor": [
         "dose-factor", "--n", "24", "--slow-n", "16", "--tissue-n", "16", "--doses", "0.35", "2.0", "--methods",
-        "linear", "linear_z", "mbir", "mbir_tissues", "fbp_cnn", "qggmrf", "tv", "--scenes", "half_size_core",
+        "linear", "linear_z", "mbir", "mbir_tissues", "fbp_cnn", "qggmrf", "tv", "--scenes", "stent",
         "--vessels", "curved_5mm", "--scene-n", "16",
-        "--scene-methods", "linear", "mbir",
+        "--scene-methods", "linear", "mbir", "mbir_tissues",
     ],
     "train": [],
 }  # fmt: skip

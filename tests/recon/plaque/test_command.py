@@ -32,3 +32,8 @@ def test_refuses_a_point_outside(tmp_path, capsys):
     assert main([*arguments, "--no-progress"]) == 2
     assert "outside of the volume" in capsys.readouterr().err
     assert not (tmp_path / "reading").exists()
+
+
+def test_refuses_a_belief_that_is_none(tmp_path, capsys):
+    assert main(["plaque", str(tmp_path / "scan.h5"), "--wall", "50", "0", "--no-progress"]) == 2
+    assert "standard deviation of wall" in capsys.readouterr().err
