@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,9 @@ from torchpcct.validate import whole
 __all__ = ["acquire", "plan"]
 
 log = logging.getLogger(__name__)
+
+VIEWS_AT_A_TIME = 64
+"""Views whose readings are computed, and kept, together."""
 
 
 def plan(
@@ -57,6 +61,7 @@ def acquire(
     tolerance_hu: float = 0.5,
     sub_rays: int | None = None,
     progress: Callable[[float], None] | None = None,
+    keep: Callable[[str, Callable[[], Tensor]], Tensor] | None = None,
 ) -> Scan:
     """Simulate a scan: exact chords, polychromatic, finite focal spot, cells and views, quantum noise.
 
@@ -73,6 +78,8 @@ def acquire(
         tolerance_hu: effects of the beam that would change less than this are left out (see :func:`plan`).
         sub_rays: number of beam samples a reading; None: as many as an error of 1e-3 of the peak needs.
         progress: called with the finished fraction, 0…1.
+        keep: called with a name and what computes it for every block of views, returns its readings: computed, or
+            those that it kept of an interrupted simulation with the same arguments. None: nothing is kept.
 
     Returns:
         :class:`torchpcct.Scan`; counts float32. Of an energy-integrating detector: signals in keV, with the second
@@ -102,7 +109,7 @@ def acquire(
     dense, one = beam._replace(points=sub_rays_of(SUB_RAY_COUNTS[-1])), g.select([0])
     symmetric, step = bodies.symmetric(energies, one), np.array([bodies.view_step])
     surround = expected_readings(one, DetectorWindow.full(one), symmetric, dense, step).numpy()[:, 0]
-    counts = _readings(plan_, bodies, scanner, energies, beam, surround, progress)
+    counts = _readings(plan_, bodies, scanner, energies, beam, surround, progress, keep or _computed)
     if plan_.pile_up is not None:
         counts, air, surround = recorded(plan_.pile_up, counts, air, surround, plan_.kept or DetectorWindow.full(g))
     quantum = quanta(scanner, counts, energies)
@@ -133,22 +140,31 @@ def acquire(
     return scan if exposure_s is None else scan.with_noise(exposure_s, seed)
 
 
+def _computed(_: str, compute: Callable[[], Tensor]) -> Tensor:
+    return compute()
+
+
 def _readings(
-    plan_: Plan, bodies: Bodies, scanner: Scanner, energies: Any, beam: Beam, surround: Any, progress: Any
+    plan_: Plan, bodies: Bodies, scanner: Scanner, energies: Any, beam: Beam, surround: Any, progress: Any, keep: Any
 ) -> Tensor:
     """Expected readings ``(bins, views, rows, columns)`` of the kept cells, float32."""
     g, active = scanner.geometry, plan_.active
     kept = plan_.kept or DetectorWindow.full(g)
     out = torch.empty((len(surround), *kept.shape), dtype=torch.float32)
     background = torch.from_numpy(surround.astype(np.float32))
-    block = 64
-    for v0 in range(0, g.views, block):
-        views = slice(v0, min(v0 + block, g.views))
+
+    def near(views: slice) -> Tensor:
+        """What the bodies inside the region change, of the active cells."""
+        assert active is not None
+        part, step = g.select(views), np.full(views.stop - views.start, bodies.view_step)
+        found = expected_readings(part, active.select(views), bodies.at(energies, part), beam, step, surround)
+        return found.to(torch.float32)
+
+    for v0 in range(0, g.views, VIEWS_AT_A_TIME):
+        views = slice(v0, min(v0 + VIEWS_AT_A_TIME, g.views))
         out[:, views] = background[:, None] if plan_.kept is None else kept.select(views).take(background)
         if active is not None:
-            part, seen = g.select(views), active.select(views)
-            step = np.full(part.views, bodies.view_step)
-            values = expected_readings(part, seen, bodies.at(energies, part), beam, step, surround).to(torch.float32)
+            values = keep(f"views_{views.start}-{views.stop}", partial(near, views))
             rows = slice(active.first_row - kept.first_row, active.first_row - kept.first_row + active.rows)
             for i, v in enumerate(range(views.start, views.stop)):
                 first = int(active.first_column[v] - kept.first_column[v])

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+import shutil
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -129,12 +130,20 @@ class StudyScene(Variant):
     def _acquire(self, path: Path) -> Scan:
         grids = [self.grid_of(v) for v in {FBP_BASE[1], self.settings.voxel_mm, REFERENCE_VOXEL_MM}]
         on = duty(self.scanner, FULL_VIEWS["PCCT"])
-        whole = acquire(self.scene, self.scanner, region=enclosing(grids), duty=on)
+        # Thin metal takes minutes to simulate: blocks of views are kept until the scan is on disk.
+        place, key = f"scans/{self._file}_{self.settings.views}", f"views={self.settings.views} duty={on:g}"
+
+        def keep(block: str, compute: Callable[[], Tensor]) -> Tensor:
+            found = self.store.piece(f"{place}/{block}", key, lambda: {"readings": compute().numpy()})
+            return torch.from_numpy(found["readings"])
+
+        whole = acquire(self.scene, self.scanner, region=enclosing(grids), duty=on, keep=keep)
         assert whole.window is not None
         windows = [shadow(whole.geometry, g, margin=1) for g in grids]
         near = DetectorWindow.union(windows, whole.geometry.columns).widened(FILTER_MARGIN_COLUMNS, whole.window)
         scan = replace(whole, counts=whole.window.crop(whole.counts, near), window=near)
         scan.save(path)
+        shutil.rmtree(self.store.folder / place, ignore_errors=True)
         return scan
 
     def release(self) -> None:

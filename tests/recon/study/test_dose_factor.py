@@ -33,6 +33,7 @@ from recon.study.dose_factor.seen import Seen
 from recon.study.dose_factor.settings import MAIN_SCENES, ROIS, Settings
 from recon.study.dose_factor.vessels import VesselPlace
 from recon.study.store import Store
+from torchpcct.acquisition import transmission
 from torchpcct.metrics import RegionNoise
 
 TINY = Settings(**SMALLEST["dose-factor"])
@@ -62,6 +63,31 @@ def scene(folder, measured):
 @pytest.fixture(scope="module")
 def clean_b(scene):
     return torch.from_numpy(scene.facts.statistic)
+
+
+def test_an_interrupted_simulation_keeps_blocks_of_views(tmp_path, monkeypatch):
+    """And takes them away when the scan is there."""
+    settings, store = replace(TINY, views=128), Store(tmp_path)
+    whole = transmission.expected_readings
+    blocks = []
+
+    def some(part, *arguments):
+        if part.views == 64:
+            blocks.append(part)
+            if len(blocks) == 2:
+                raise KeyboardInterrupt
+        return whole(part, *arguments)
+
+    monkeypatch.setattr("torchpcct.acquisition.acquire.expected_readings", some)
+    with pytest.raises(KeyboardInterrupt):
+        _ = StudyScene("paper", settings, store).clean
+    assert [p.name for p in (tmp_path / "scans/paper_128").iterdir()] == ["views_0-64.npz"]
+    clean = StudyScene("paper", settings, store).clean
+    assert len(blocks) == 3
+    assert [p.name for p in (tmp_path / "scans").iterdir()] == ["paper_128.h5"]
+    monkeypatch.undo()
+    other = StudyScene("paper", settings, Store(tmp_path / "other")).clean
+    assert torch.equal(clean.counts, other.counts)
 
 
 def test_truth_is_that_of_rods(measured, analysed):

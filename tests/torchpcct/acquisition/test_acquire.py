@@ -33,6 +33,29 @@ def clean(plaque):
     return acquire(plaque[0], scanner(), region=INSET, duty=0.02)
 
 
+def test_an_interrupted_scan_goes_on_with_what_was_kept(plaque):
+    kept, computed = {}, []
+
+    def keep(name, compute, most=2):
+        if name not in kept:
+            if len(computed) == most:
+                raise KeyboardInterrupt
+            computed.append(name)
+            kept[name] = compute()
+        return kept[name]
+
+    def scan(**options):
+        return acquire(plaque[0], scanner(200, 2), region=INSET, duty=0.02, sub_rays=1, **options)
+
+    with pytest.raises(KeyboardInterrupt):
+        scan(keep=keep)
+    assert computed == ["views_0-64", "views_64-128"]
+    computed.clear()
+    again = scan(keep=keep)
+    assert computed == ["views_128-192", "views_192-200"]
+    assert torch.equal(again.counts, scan().counts)
+
+
 def reference_line_integrals(scene, scan_system, cells, duty, count, rng):
     """Brute force: every sub-ray of a reading is a random beam sample, every energy is summed. ``cells`` (N, 3)."""
     g = scan_system.geometry
