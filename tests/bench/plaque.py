@@ -300,8 +300,16 @@ def summary(work: Path) -> dict[str, Any]:
         else:
             # What a user is given: the contrast of the claimed cores.
             given = np.array([d["figures"]["contrast"]["value"] - d["truth"]["contrast"] for d in read if _given(d)])
-            entry["given"] = {"n": len(given), "bias": float(given.mean()) if len(given) else float("nan"),
-                              "rmse": float(np.sqrt(np.mean(given**2))) if len(given) else float("nan")}  # fmt: skip
+            covered = sum(
+                d["figures"]["contrast"]["low"] <= d["truth"]["contrast"] <= d["figures"]["contrast"]["high"]
+                for d in read if _given(d)
+            )  # fmt: skip
+            entry["given"] = {
+                "n": len(given),
+                "covered": covered,
+                "bias": float(given.mean()) if len(given) else float("nan"),
+                "rmse": float(np.sqrt(np.mean(given**2))) if len(given) else float("nan"),
+            }
         cases[_stem(case)] = entry
     for case, what in CASES.items():
         absent = _stem(f"{what.exposure_s:.1f} s, no core, {'with a point' if what.pointed else 'blind'}")
@@ -333,6 +341,23 @@ def _spread(values: Any, true: Any) -> dict[str, Any]:
             "sd_low": low, "sd_high": high, "rmse": float(np.sqrt(np.mean((values - true) ** 2)))}  # fmt: skip
 
 
+def _contrast(entry: dict[str, Any]) -> str:
+    """What a user is given of the contrast, and how much of a true one is read."""
+    if "given" not in entry:
+        return f"Contrast if there were one: {entry['contrast_if_there']:+.1f} HU."
+    told = "No contrast given."
+    if entry["given"]["n"]:
+        told = (
+            "Contrast given: {n} times, bias {bias:+.1f}, RMSE {rmse:.1f} HU, in its interval {covered} times.".format(
+                **entry["given"]
+            )
+        )
+    contrast = entry["figures"]["contrast"]
+    if "slope" in contrast:
+        told += " From no core to all of it: slope {slope:.2f}, SD at slope 1 {corrected_sd:.1f} HU.".format(**contrast)
+    return told
+
+
 def text(result: dict[str, Any]) -> str:
     """Markdown."""
     lines = ["# Reading the paper's plaque by its tissues", "", f"`{result['command']}`", "",
@@ -349,23 +374,14 @@ def text(result: dict[str, Any]) -> str:
             f"median P {entry['median_presence']:.3f}, least {entry['least_presence']:.3f}; "
             f"not read {entry['failed']}; "
             f"calcified {entry['calcified']}; warned {entry['warned']}; residual {entry['chi2']:.3f}; texture "
-            f"{entry['texture_hu']:.1f} HU; {entry['cpu_seconds']:.1f} CPU s a reading (loaded machine)."
-            + (
-                " Contrast given: {n} times, bias {bias:+.1f}, RMSE {rmse:.1f} HU.".format(**entry["given"])
-                if entry.get("given", {}).get("n")
-                else " No contrast given."
-                if "given" in entry
-                else f" Contrast if there were one: {entry['contrast_if_there']:+.1f} HU."
-            ),
+            f"{entry['texture_hu']:.1f} HU; {entry['cpu_seconds']:.1f} CPU s a reading (loaded machine). "
+            f"{_contrast(entry)}",
             "",
             "| | true | mean | bias | SD [95 %] | told | RMSE | coverage | soft FBP: mean, SD | MBIR: mean, SD | "
             "FBP by thresholds: bias, RMSE |",
             "|---" * 11 + "|",
         ]
         for name, f in entry["figures"].items():
-            if "corrected_sd" in f:
-                lines[-3] += (f" Contrast from none to all: slope {f['slope']:.2f}, SD at slope 1 "
-                              f"{f['corrected_sd']:.1f} HU.")  # fmt: skip
             d = 1 if abs(f["true"]) > 20 else 2
             cells = [f"{f['true']:.{d}f}", f"{f['mean']:.{d}f}", f"{f['bias']:+.{d}f}",
                      f"{f['sd']:.{d}f} [{f['sd_low']:.{d}f}, {f['sd_high']:.{d}f}]", f"{f['told_sd']:.{d}f}",
