@@ -81,6 +81,10 @@ class Store:
             np.savez(part, key=np.array(key + _MARK + _digest(key, arrays)), **arrays)
         return arrays
 
+    def drop(self, name: str) -> None:
+        """Forget what lies below a piece's name: its parts, of no use once the piece is there."""
+        shutil.rmtree(self.folder / name, ignore_errors=True)
+
 
 T = TypeVar("T")
 

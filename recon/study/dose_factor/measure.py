@@ -15,7 +15,6 @@ So the difference between two of them is free of what noise they have in common.
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -26,7 +25,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from recon.study.dose_factor.exact_figures import fbp_figures, linear_figures
 from recon.study.dose_factor.exact_linear import statistic_covariance
@@ -35,6 +33,7 @@ from recon.study.dose_factor.methods import Method, fingerprint, load_methods
 from recon.study.dose_factor.places import Place, Places, ScenePlace
 from recon.study.dose_factor.readings import Readings
 from recon.study.dose_factor.realisations import NOISY_SCENE, Realisations, joined
+from recon.study.dose_factor.reconstructed import reconstructed
 from recon.study.dose_factor.response import RESPONSE_DRAWS, linear_response
 from recon.study.dose_factor.scene import SceneFacts, StudyScene
 from recon.study.dose_factor.settings import (
@@ -321,7 +320,8 @@ class _Study:
 
         def compute() -> dict[str, Any]:
             of = self.noise.image_statistic if method.name in IMAGE_METHODS else self.noise.statistic
-            volume, seconds = _timed(method, scene, of(name, dose, block), dose)
+            b = of(name, dose, block)
+            volume, seconds = reconstructed(method, scene.problem, b, dose, self.store, place, key)
             readings = self._readings("method")
             result = {"readings": readings.linear(volume), "seconds": np.array(seconds)}
             if name in MAIN_SCENES[:2]:
@@ -334,7 +334,10 @@ class _Study:
             return result
 
         place = f"methods/{method.name}/{name}_{dose:g}s_{block.start}-{block.stop}"
-        return self.store.piece(place, f"{self.noise.key} {fingerprint(method)} 3", compute)
+        key = f"{self.noise.key} {fingerprint(method)} 3"
+        found = self.store.piece(place, key, compute)
+        self.store.drop(place)
+        return found
 
     def _scene_methods(self) -> list[Method]:
         s = self.settings
@@ -362,16 +365,3 @@ class _Study:
             self.report(compute.__name__.replace("_", " "), k / len(self.settings.doses))
             found[dose] = compute(self.noise, *arguments, dose)
         return found
-
-
-def _timed(method: Method, scene: StudyScene, b: Tensor, dose: float) -> tuple[Tensor, float]:
-    start = time.perf_counter()
-    with torch.no_grad():
-        volume = method(scene.problem, b, dose)
-    seconds = time.perf_counter() - start
-    if tuple(volume.shape) != tuple(b.shape) or not bool(torch.isfinite(volume).all()):
-        raise ValueError(
-            f"the method {method.name!r} gave {tuple(volume.shape)} for {tuple(b.shape)} or NaN or Inf "
-            f"(scene {scene.name}, {dose:g} s): repair it or leave it out with --methods"
-        )
-    return volume.to(torch.float32), seconds

@@ -28,6 +28,7 @@ from recon.pwls.inset_problem import InsetProblem
 from recon.study.dose_factor.exact_linear import exact_linear, statistic_covariance
 from recon.study.dose_factor.methods import Method, fingerprint, load_methods
 from recon.study.dose_factor.realisations import Realisations, joined
+from recon.study.dose_factor.reconstructed import reconstructed
 from recon.study.dose_factor.response import linear_response
 from recon.study.dose_factor.settings import LINEAR_METHODS, TWIN_REALIZATIONS
 from recon.study.paper.plaque_scan import Functional
@@ -143,10 +144,16 @@ class Places:
         ]  # fmt: skip
         return {**joined(parts), **known}
 
-    def _piece(self, method: Method, place: Place, dose: float, part: str, compute: Any) -> dict[str, Any]:
+    def _at(self, method: Method, place: Place, dose: float, part: str) -> tuple[str, str]:
+        """Name and key of a piece."""
         key = f"{self.noise.key} {place.key} {fingerprint(method)} {self.settings.controls} 4"
-        name = f"methods/{method.name}/{place.name}_{dose:g}s_{part}"
-        return self.noise.store.piece(name, key, lambda: compute(method, place, dose))
+        return f"methods/{method.name}/{place.name}_{dose:g}s_{part}", key
+
+    def _piece(self, method: Method, place: Place, dose: float, part: str, compute: Any) -> dict[str, Any]:
+        name, key = self._at(method, place, dose, part)
+        found = self.noise.store.piece(name, key, lambda: compute(method, place, dose))
+        self.noise.store.drop(name)
+        return found
 
     def _drawn_from(self, place: Place) -> Scan | None:
         return None if self.settings.fast_noise else place.clean
@@ -197,19 +204,18 @@ class Places:
         noise = self.noise.gram_noise(place.noise_of, dose, block)
         weights, clean = place.weights, place.statistics * dose
 
-        def read(b: Tensor) -> tuple[Floats, Tensor]:
-            with torch.no_grad():
-                volumes = method(place.problem, b, dose)
-            if not bool(torch.isfinite(volumes).all()):
-                raise ValueError(f"the method {method.name!r} gave NaN or Inf ({place.name}, {dose:g} s)")
+        name, key = self._at(method, place, dose, f"{block.start}-{block.stop}")
+
+        def read(b: Tensor, which: str) -> tuple[Floats, Tensor]:
+            volumes, _ = reconstructed(method, place.problem, b, dose, self.noise.store, f"{name}/{which}", key)
             return torch.einsum("nzyx,rzyx->nr", volumes.double(), weights).numpy(), volumes
 
         b = clean[0] + noise
-        readings, volumes = read(b)
+        readings, volumes = read(b, "there")
         twin = len(clean) > 1 and block.start < TWIN_REALIZATIONS
         seen = torch.einsum("nzyx,rzyx->nr", b.double(), torch.from_numpy(adjoints).double()).numpy() + offset
         return {
-            "readings": readings, "absent": read(clean[1] + noise)[0] if twin else readings[:0],
+            "readings": readings, "absent": read(clean[1] + noise, "absent")[0] if twin else readings[:0],
             "fat": volumes.flatten(1)[:, torch.from_numpy(place.fat)].numpy().astype(np.float16),
             "controls": seen.reshape(len(seen), -1, len(weights)),
         }  # fmt: skip

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -143,7 +142,7 @@ class StudyScene(Variant):
         near = DetectorWindow.union(windows, whole.geometry.columns).widened(FILTER_MARGIN_COLUMNS, whole.window)
         scan = replace(whole, counts=whole.window.crop(whole.counts, near), window=near)
         scan.save(path)
-        shutil.rmtree(self.store.folder / place, ignore_errors=True)
+        self.store.drop(place)
         return scan
 
     def release(self) -> None:

@@ -27,6 +27,7 @@ from recon.study.dose_factor.methods import (
 from recon.study.dose_factor.places import Places
 from recon.study.dose_factor.readings import Readings, true_volume
 from recon.study.dose_factor.realisations import Realisations
+from recon.study.dose_factor.reconstructed import reconstructed
 from recon.study.dose_factor.response import linear_response
 from recon.study.dose_factor.scene import StudyScene
 from recon.study.dose_factor.seen import Seen
@@ -398,8 +399,31 @@ def test_a_method_that_fails_is_named(scene, clean_b):
         def __call__(self, problem, b, exposure_s):
             return b * float("nan")
 
-    with pytest.raises(ValueError, match=r"'broken'.*--methods"):
-        study._timed(Broken(), scene, clean_b[None], 2.0)
+    with pytest.raises(ValueError, match=r"'broken'.*paper_2s.*--methods"):
+        reconstructed(Broken(), scene.problem, clean_b[None], 2.0, scene.store, "paper_2s", "")
+
+
+def test_parts_of_a_long_method_are_kept_until_their_block_is(scene, clean_b, tmp_path):
+    class Long:
+        name, calls = "tv", 0
+
+        def __call__(self, problem, b, exposure_s):
+            self.calls += 1
+            if self.calls == 3:
+                raise KeyboardInterrupt
+            return 2.0 * b
+
+    method, store = Long(), Store(tmp_path)
+    b = torch.stack([clean_b * (1 + k) for k in range(5)])
+    with pytest.raises(KeyboardInterrupt):
+        reconstructed(method, scene.problem, b, 2.0, store, "tv/0-5", "key")
+    assert sorted(p.name for p in (tmp_path / "tv/0-5").iterdir()) == ["0.npz", "2.npz"]
+    volume, seconds = reconstructed(method, scene.problem, b, 2.0, store, "tv/0-5", "key")
+    assert method.calls == 4  # the last part alone was missing
+    assert torch.equal(volume, 2.0 * b)
+    assert seconds > 0
+    store.drop("tv/0-5")
+    assert not list((tmp_path / "tv").iterdir())
 
 
 def test_wider_rois(analysed, scene):
