@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 from numba import njit
 
 __all__ = ["core_fractions", "gather_block", "outline_radius", "outline_spread", "plane_fractions", "symmetric_step"]
@@ -86,7 +87,7 @@ def core_fractions(begin, end, centres, axes, semi, caps, points, half, inner, l
     Args:
         centres: ``(bodies, 3)`` mm; axes: ``(bodies, 3, 3)`` rows are the unit axes; semi: ``(bodies, 3)`` mm.
         caps: ``(bodies,)`` mm.
-        points: ``(n, 3)`` voxel centres; half: ``(3,)`` half edges of a voxel.
+        points: ``(n, 3)`` voxel centres, ordered by z; half: ``(3,)`` half edges of a voxel.
         inner: ``(n,)`` share of each voxel inside the wall's inner surface.
         lumen: ``(n,)`` distance from the lumen, mm; normals: ``(n, 3)`` half edges times the lumen's unit normal.
         blur: variance of the edges' blur in the plane, mm².
@@ -98,8 +99,9 @@ def core_fractions(begin, end, centres, axes, semi, caps, points, half, inner, l
         flattest = 0.0
         for k in range(3):
             flattest += 1.0 / semi[p, k] ** 2
-        for i in range(points.shape[0]):
-            out[p, i] = 0.0
+        out[p] = 0.0
+        first, last = np.searchsorted(points[:, 0], cz - largest), np.searchsorted(points[:, 0], cz + largest)
+        for i in range(first, last):
             z, y, x = points[i, 0] - cz, points[i, 1] - cy, points[i, 2] - cx
             if z * z + y * y + x * x > largest * largest or inner[i] <= 0.0:
                 continue

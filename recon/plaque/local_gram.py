@@ -6,7 +6,6 @@ transforms of the whole inset, hundreds of them in one fit.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,41 +21,6 @@ Floats = NDArray[np.floating[Any]]
 
 LARGEST = 1_500_000_000
 """Bytes that the blocks may take."""
-
-
-_RANK = 5e-4
-"""Share of a column's norm that may be lost where a slice's columns are written in fewer."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Packed:
-    """Columns of one slice, ``basis @ mix``.
-
-    Neighbouring splines times the same wave are almost the same on a slice across the vessel: fewer columns do.
-
-    Attributes:
-        rows, used: voxels and columns that are not 0.
-        basis: ``(rows, q)``; mix: ``(q, used)``.
-    """
-
-    rows: NDArray[np.int64]
-    used: NDArray[np.int64]
-    basis: Floats
-    mix: Floats
-
-
-def _packed(part: Floats) -> _Packed | None:
-    there = part != 0
-    rows, used = np.flatnonzero(there.any(1)), np.flatnonzero(there.any(0))
-    if not len(rows):
-        return None
-    columns = part[np.ix_(rows, used)]
-    norm = np.sqrt(np.einsum("nk,nk->k", columns, columns))
-    unit = columns / norm
-    exact = unit.astype(np.float64)
-    values, vectors = np.linalg.eigh(exact.T @ exact)
-    kept = vectors[:, values > _RANK**2].astype(part.dtype)
-    return _Packed(rows, used, unit @ kept, kept.T * norm)
 
 
 class LocalGram:
@@ -115,13 +79,12 @@ class LocalGram:
         if x.shape[1] == 1:
             self._apply_one(x[:, 0], out[:, 0])
             return out
-        at, parts = self.slices, self._pack(x)
+        at, parts = self.slices, self._used(x)
         for (z, b), block in self.blocks.items():
             for of, to, turned in ((z, z + b, False), (z + b, z, True)) if b else ((z, z, False),):
-                p = parts[of]
-                if p is not None:
-                    near = block[p.rows].T if turned else block[:, p.rows]
-                    out[at[to] : at[to + 1], p.used] += (near @ p.basis) @ p.mix
+                columns, part = parts[of]
+                if len(columns):
+                    out[at[to] : at[to + 1], columns] += (block.T if turned else block) @ part
         return out
 
     def _apply_one(self, x: Floats, out: Floats) -> None:
@@ -135,16 +98,15 @@ class LocalGram:
 
     def curvature(self, x: Floats) -> NDArray[np.float64]:
         """xᵀ G x of columns ``(n, k)`` float32, ``(k, k)``."""
-        parts = self._pack(x)
+        parts = self._used(x)
         out = np.zeros((x.shape[1], x.shape[1]))
         for (z, b), block in self.blocks.items():
-            here, there = parts[z], parts[z + b]
-            if here is not None and there is not None:
-                met = there.basis.T @ (block[np.ix_(there.rows, here.rows)] @ here.basis)
-                met = there.mix.T @ met @ here.mix
-                out[np.ix_(there.used, here.used)] += met
+            (columns, here), (others, there) = parts[z], parts[z + b]
+            if len(columns) and len(others):
+                met = there.T @ (block @ here)
+                out[np.ix_(others, columns)] += met
                 if b:
-                    out[np.ix_(here.used, there.used)] += met.T
+                    out[np.ix_(columns, others)] += met.T
         return out
 
     def energies(self, x: Floats) -> NDArray[np.float64]:
@@ -163,9 +125,14 @@ class LocalGram:
                 out += (2.0 if b else 1.0) * np.einsum("nk,nk->k", met, there)
         return out
 
-    def _pack(self, x: Floats) -> list[_Packed | None]:
-        at = self.slices
-        return [_packed(x[at[z] : at[z + 1]]) for z in range(len(at) - 1)]
+    def _used(self, x: Floats) -> list[tuple[NDArray[np.int64], Floats]]:
+        """Columns that are not 0 on a slice, and what they are there: a spline's reach only a few slices."""
+        found = []
+        for z in range(len(self.slices) - 1):
+            part = x[self.slices[z] : self.slices[z + 1]]
+            columns = np.flatnonzero(part.any(0))
+            found.append((columns, part[:, columns]))
+        return found
 
     def part(self, chosen: NDArray[np.int64]) -> LocalGram:
         """G between some of the voxels, whose positions are given in rising order."""

@@ -166,6 +166,8 @@ def read_plaque(
     point_sd = number("point_sd", point_sd, positive=True, unit="mm")
     particles, seed = whole("particles", particles, 50), whole("seed", seed, 0)
     prior = number("prior", prior, low=0.0, high=1.0)
+    if not isinstance(vessel_prior, VesselPrior | None):
+        raise TypeError(f"vessel_prior must be a recon.plaque.VesselPrior, got {type(vessel_prior).__name__}")
     rng = np.random.default_rng(seed)
     start = find_vessel(data.pilot(), data.grid, None if where is None else np.array(where))
     vessel = Vessel(data, start, vessel_prior)

@@ -155,10 +155,9 @@ class Vessel:
         near = start.outer.coordinates(points)
         reach = np.interp(near.s, *start.radii[1])
         # Voxels of the vessel, and some beyond its ends, if it has any inside.
-        ends = start.lumen.coordinates(points).s
-        first, last = start.ends[0] - _MARGIN_MM, start.ends[1] + _MARGIN_MM
-        chosen = (near.rho < reach + _MARGIN_MM) & (ends > first) & (ends < last)
-        flat = np.flatnonzero(chosen)
+        wide = np.flatnonzero(near.rho < reach + _MARGIN_MM)
+        along = start.lumen.coordinates(points[wide]).s
+        flat = wide[(along > start.ends[0] - _MARGIN_MM) & (along < start.ends[1] + _MARGIN_MM)]
         self.index = np.stack(np.unravel_index(flat, grid.shape), 1).astype(np.int64)
         self.points = points[flat]
         self.half = np.array(grid.spacing) / 2

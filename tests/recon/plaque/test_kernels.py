@@ -9,7 +9,7 @@ from inset_operators import problem
 
 from recon.gram.gram import Gram
 from recon.plaque.kernels import core_fractions, plane_fractions
-from recon.plaque.local_gram import LocalGram, _packed
+from recon.plaque.local_gram import LocalGram
 
 HALF = np.array([0.1, 0.15, 0.08])
 
@@ -91,19 +91,6 @@ def test_blocks_are_the_operator(nodes):
     few[chosen] = x[chosen]
     assert np.allclose(local.part(chosen).apply(x[chosen]), local.apply(few)[chosen], rtol=1e-4,
                        atol=1e-5 * np.abs(exact).max())  # fmt: skip
-
-
-def test_columns_that_are_almost_the_same_are_packed_into_few():
-    """What is lost is less than the share of a column's norm that may be."""
-    rng = np.random.default_rng(1)
-    waves = rng.standard_normal((60, 3))
-    columns = (waves @ rng.standard_normal((3, 40)) * np.logspace(-3, 3, 40)).astype(np.float32)
-    columns[:7] = 0.0
-    packed = _packed(columns)
-    assert packed.basis.shape == (53, 3)
-    lost = np.linalg.norm(packed.basis @ packed.mix - columns[7:], axis=0)
-    assert (lost < 5e-4 * np.linalg.norm(columns, axis=0)).all()
-    assert _packed(0.0 * columns) is None
 
 
 def test_too_many_voxels_are_refused(monkeypatch):

@@ -89,6 +89,8 @@ def test_refusals(gram):
         read_plaque(data, particles=3)
     with pytest.raises(ValueError, match="point must be 3 numbers"):
         read_plaque(data, (1.0, 2.0))
+    with pytest.raises(TypeError, match="VesselPrior, got tuple"):
+        read_plaque(data, vessel_prior=(50.0, 15.0))
     with pytest.raises(ValueError, match="NaN"):
         TissueData(data.b * float("nan"), gram, 1.0)
     with pytest.raises(ValueError, match="one \\(z, y, x\\) grid"):
