@@ -226,19 +226,25 @@ class InsetProblem:
             raise ValueError(f"the scans of one batch must have one exposure, got {sorted(exposures)} s")
         return float(exposures.pop())
 
-    def solve(self, scans: Sequence[Scan], prior: QGGMRF, **options: Any) -> tuple[Tensor, dict[str, Any]]:
-        """PWLS of several realisations of one exposure: ``(scans, z, y, x)`` HU, and the solver's report."""
+    def solve(
+        self, scans: Sequence[Scan], prior: QGGMRF, data: Sequence[Tensor] | None = None, **options: Any
+    ) -> tuple[Tensor, dict[str, Any]]:
+        """PWLS of several realisations of one exposure: ``(scans, z, y, x)`` HU, and the solver's report.
+
+        ``data`` are :meth:`data` of the scans, where they are at hand already.
+        """
         exposure = self.exposure(scans)
+        lines = [self.data(s) for s in scans] if data is None else list(data)
         result = pwls(
-            self.projector, torch.stack([self.data(s) for s in scans]), self.weights * exposure, prior,
-            hu=self.mu_ref / 1000.0, gram=self.model.scaled(exposure), **options,
+            self.projector, torch.stack(lines), self.weights * exposure, prior, hu=self.mu_ref / 1000.0,
+            gram=self.model.scaled(exposure), **options,
         )  # fmt: skip
         return to_hu(result.x + self.level, self.mu_ref), dict(result.report)
 
 
-def _tested(problem: InsetProblem, scan: Scan, volume: Volume) -> Volume:
+def _tested(problem: InsetProblem, scan: Scan, data: Tensor, volume: Volume) -> Volume:
     """The volume with what its residual says; findings are logged as warnings, too."""
-    found = problem.residual_test(scan, volume.data)
+    found = problem.residual_test(scan, volume.data, data)
     for text in found.findings:
         _LOG.warning("%s", text)
     tested = {
@@ -290,14 +296,16 @@ def reconstruct_pwls(
     problem = problem or InsetProblem(scans[0], grid)
     volumes: list[Volume] = []
     for i in range(0, len(scans), batch):
-        data, report = problem.solve(scans[i : i + batch], prior or DEFAULT_PRIOR, tolerance=tolerance, **options)
+        part = scans[i : i + batch]
+        data = [problem.data(s) for s in part]
+        found, report = problem.solve(part, prior or DEFAULT_PRIOR, data, tolerance=tolerance, **options)
         open_ends = [] if report["converged"] else [unfinished(report)]
         for text in open_ends:
             warnings.warn(text, RuntimeWarning, stacklevel=2)
-        report["seconds"] = round((time.perf_counter() - start) / len(data), 3)
-        for scan, values in zip(scans[i : i + batch], data, strict=True):
+        report["seconds"] = round((time.perf_counter() - start) / len(part), 3)
+        for scan, lines, values in zip(part, data, found, strict=True):
             volume = Volume(values.to(torch.float32), grid, {**report, "warnings": open_ends})
-            volumes.append(volume if scan.noise_free else _tested(problem, scan, volume))
+            volumes.append(volume if scan.noise_free else _tested(problem, scan, lines, volume))
         start = time.perf_counter()
         if progress is not None:
             progress(min(i + batch, len(scans)) / len(scans))
