@@ -31,6 +31,7 @@ from torch import Tensor
 from torchpcct.acquisition.bodies import BodySet
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam
+from torchpcct.kernel_cache import forget_outdated
 from torchpcct.scene.chords import interval
 from torchpcct.threads import run
 
@@ -284,3 +285,6 @@ def expected_readings(
         window.first_row, empty if surround is None else np.ascontiguousarray(surround), out,
     )  # fmt: skip
     return torch.from_numpy(out)
+
+
+forget_outdated(__name__)

@@ -26,6 +26,7 @@ from torchpcct.dose.coefficients import (
     mass_interaction,
 )
 from torchpcct.geometry import VolumeGrid
+from torchpcct.kernel_cache import forget_outdated
 from torchpcct.scanner import Scanner
 from torchpcct.scene import Scene
 from torchpcct.scene.chords import interval
@@ -181,3 +182,6 @@ def primary_dose(
         labels.reshape(-1), _AXIAL.index(axial), out,
     )  # fmt: skip
     return np.asarray((out * (scanner.source.current_ma * exposure_s)).reshape(points.shape[:-1]))
+
+
+forget_outdated(__name__)

@@ -12,6 +12,7 @@ from typing import Any
 import numba
 
 from torchpcct.counting_noise import draw, stream
+from torchpcct.kernel_cache import forget_outdated
 from torchpcct.scanner.compton import ELECTRON_REST_KEV
 
 __all__ = ["BATCHES", "transport"]
@@ -164,3 +165,6 @@ def transport(
                 state, u = draw(state)
                 phi = 2.0 * math.pi * u
                 dx, dy, dz = _turned(dx, dy, dz, cosine, phi)
+
+
+forget_outdated(__name__)

@@ -11,9 +11,6 @@ Quadrics and boxes are met at most once. The tubes of :mod:`torchpcct.scene.tube
   most two crossings, and Newton's iteration from the section at the closest approach finds both;
 * a steeper ray may leave the tube at a flank of the bulge and enter it again. It is searched piece by piece for all
   crossings; the interval returned starts at the first entry and has the exact TOTAL length inside.
-
-numba's ``cache=True`` does not see a change of a function that is called from another file: after a change of
-``chord_kernels.py`` touch the files whose kernels call :func:`interval`, or clear their caches.
 """
 
 from __future__ import annotations

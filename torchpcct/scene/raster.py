@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpcct.geometry import VolumeGrid
+from torchpcct.kernel_cache import forget_outdated
 from torchpcct.scene.bodies import Shape
 from torchpcct.scene.chords import interval, pack
 from torchpcct.threads import run
@@ -92,3 +93,6 @@ def volume_fractions(shapes: Sequence[Shape], parents: Sequence[int], grid: Volu
         if parent >= 0:
             own[parent] -= filled[k]
     return np.clip(own, 0.0, 1.0, out=own).reshape(kinds.size, *grid.shape)
+
+
+forget_outdated(__name__)

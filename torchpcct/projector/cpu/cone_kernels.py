@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from torchpcct.kernel_cache import forget_outdated
 from torchpcct.projector.cpu.simd import add_lines, spread_line, spread_lines, sum_lines
 from torchpcct.projector.cpu.simd_interpolation import add_steps, set_steps
 from torchpcct.threads import run
@@ -344,3 +345,6 @@ def backproject(
         )  # fmt: skip
     by_row += by_column.transpose(1, 0, 2)
     volume[...] = by_row[..., :nz].transpose(2, 0, 1)
+
+
+forget_outdated(__name__)

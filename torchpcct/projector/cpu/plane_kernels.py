@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from torchpcct.kernel_cache import forget_outdated
 from torchpcct.projector.cpu.cone_kernels import _depth_line, _edge_line, _kernel, _small
 from torchpcct.projector.cpu.simd import add_edges, sum_edges
 
@@ -272,3 +273,6 @@ def collect(begin, end, by_row, by_column, inverse, operations, image):
                     l = n * operations + g
                     _collect_tile(by_row[l], inverse[g], y0, y1, x0, min(x0 + TILE, nx), False, image[n])
                     _collect_tile(by_column[l], inverse[g], y0, y1, x0, min(x0 + TILE, nx), True, image[n])
+
+
+forget_outdated(__name__)

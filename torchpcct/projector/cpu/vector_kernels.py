@@ -18,6 +18,7 @@ import math
 import numpy as np
 from numba import njit
 
+from torchpcct.kernel_cache import forget_outdated
 from torchpcct.projector.cpu.cone_kernels import INNER
 
 __all__ = ["SLAB_BLOCK", "backproject_vectors", "project_vectors"]
@@ -154,3 +155,6 @@ def backproject_vectors(begin, end, poses, parallel, lower, spacing, shape, stri
         _gather_slabs(
             poses, parallel, lower, spacing, shape, strides, data, axis, r0, min(r0 + SLAB_BLOCK, shape[axis]), flat
         )
+
+
+forget_outdated(__name__, "torchpcct.projector.cpu.cone_kernels")

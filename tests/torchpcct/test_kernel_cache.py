@@ -1,0 +1,89 @@
+"""A compiled kernel is not older than the functions it holds."""
+
+import importlib
+import os
+import pkgutil
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import pytest
+
+import recon
+import torchpcct
+import train
+from torchpcct.kernel_cache import sources
+
+HELPER = """
+    from numba import njit
+    @njit(cache=True)
+    def value(x):
+        return x + {}
+"""
+KERNEL = """
+    from numba import njit
+    from torchpcct.made_up.helper import value
+    from torchpcct.kernel_cache import forget_outdated
+    @njit(cache=True)
+    def kernel(x):
+        return 2 * value(x)
+    {}
+"""
+RUN = """
+    import sys, types
+    package = types.ModuleType("torchpcct.made_up")
+    package.__path__ = [sys.argv[1]]
+    sys.modules["torchpcct.made_up"] = package
+    from torchpcct.made_up.kernel import kernel
+    print(kernel(1), sum(kernel.stats.cache_hits.values()))
+"""
+
+
+def run(folder):
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "cache")}
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(RUN), str(folder)], env=environment, capture_output=True, text=True,
+        check=True,
+    )  # fmt: skip
+    value, hits = done.stdout.split()
+    return int(value), int(hits)
+
+
+def edit(path, text, age):
+    path.write_text(textwrap.dedent(text))
+    then = time.time() + age
+    os.utime(path, (then, then))
+
+
+@pytest.mark.parametrize(("call", "second"), [("forget_outdated(__name__)", 202), ("", 4)])
+def test_an_edited_function_reaches_the_kernels_that_call_it(tmp_path, call, second):
+    """Without the call numba gives the old result: if that ends, the module is of no use any more."""
+    edit(tmp_path / "helper.py", HELPER.format(1), age=-100)
+    edit(tmp_path / "kernel.py", KERNEL.format(call), age=-100)
+    assert run(tmp_path) == (4, 0)
+    assert run(tmp_path) == (4, 1)  # kept
+    edit(tmp_path / "helper.py", HELPER.format(100), age=0)
+    assert run(tmp_path)[0] == second
+    edit(tmp_path / "helper.py", HELPER.format(1000), age=3600)  # a wrong clock: no process compiles again and again
+    assert run(tmp_path) == (second, 1)
+
+
+def modules():
+    for package in (torchpcct, recon, train):
+        for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+            source = Path(found.module_finder.path, *found.name.rpartition(".")[2:]).with_suffix(".py")
+            if source.exists() and "cache=True" in source.read_text(encoding="utf-8"):
+                yield found.name, source.read_text(encoding="utf-8")
+
+
+def test_every_module_whose_kernels_hold_others_forgets_outdated_ones():
+    seen = dict(modules())
+    assert "torchpcct.projector.cpu.cone_kernels" in seen
+    for name in seen:
+        importlib.import_module(name)
+    missing = [n for n, text in seen.items() if sources(n) and "\nforget_outdated(__name__" not in text]
+    assert not missing
+    held = {p.name for p in sources("torchpcct.projector.cpu.plane_kernels")}
+    assert {"cone_kernels.py", "simd.py", "simd_interpolation.py"} <= held

@@ -1,0 +1,75 @@
+"""Compiled kernels that are older than a function they hold: numba's cache looks at a kernel's own file only.
+
+A kernel holds the compiled code of all functions it calls. Where one of them, in another file, is edited or updated in
+place (``git pull`` of an editable installation), the cache would go on giving the old code, silently.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+__all__ = ["forget_outdated", "sources"]
+
+_OURS = ("torchpcct.", "recon.", "train.")
+
+
+def sources(name: str, *constants: str) -> set[Path]:
+    """Files of the compiled functions that a module's kernels may call, its own left out.
+
+    Args:
+        name: of an imported module.
+        constants: names of modules whose constants its kernels hold, which nothing tells of.
+    """
+    found: set[str] = set()
+    _follow(sys.modules[name], found)
+    files = {sys.modules[n].__file__ for n in (found | set(constants)) - {name}}
+    return {Path(f) for f in files if f is not None}
+
+
+def _follow(module: ModuleType, found: set[str]) -> None:
+    if module.__name__ in found:
+        return
+    found.add(module.__name__)
+    for value in list(vars(module).values()):
+        inner = getattr(value, "__wrapped__", None)  # numba's functions wrap Python's
+        other = getattr(inner, "__module__", "") or ""
+        if other.startswith(_OURS) and type(value).__module__.startswith("numba.") and other in sys.modules:
+            _follow(sys.modules[other], found)
+
+
+def forget_outdated(name: str, *constants: str) -> int:
+    """Forget a module's compiled kernels where they are older than a function they call; to be called at its end.
+
+    Args:
+        name, constants: as for :func:`sources`.
+
+    Returns:
+        How many were forgotten. Files that cannot be removed stay.
+    """
+    module = sys.modules[name]
+    folders = {_folder(v) for v in vars(module).values() if getattr(v, "__module__", None) == name} - {None}
+    # A file from the future (a wrong clock) would have the kernels compiled by every process.
+    newest = max((t for t in map(_changed, sources(name, *constants)) if t <= time.time()), default=0.0)
+    forgotten = 0
+    for folder in folders:
+        for index in Path(str(folder)).glob(f"{Path(str(module.__file__)).stem}.*.nbi"):
+            try:
+                if _changed(index) < newest:
+                    index.unlink()
+                    forgotten += 1
+            except OSError:  # another process was faster, or may not write here
+                continue
+    return forgotten
+
+
+def _folder(kernel: Any) -> str | None:
+    """Where a kernel's compiled code lies; None: it is no kernel, or is not kept."""
+    return getattr(getattr(kernel, "stats", None), "cache_path", None)
+
+
+def _changed(path: Path) -> float:
+    return path.stat().st_mtime
