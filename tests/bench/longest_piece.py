@@ -39,9 +39,9 @@ COMMANDS: dict[str, list[str]] = {
     "hardcases": ["hardcases"],
     "motion": ["study", "motion"],
     "dose-factor": [
-        "dose-factor", "--n", "8", "--slow-n", "8", "--tissue-n", "8", "--doses", "0.35", "--methods", "linear", "mbir",
-        "mbir_tissues", "fbp_cnn", "tv", "--scenes", "stent", "--vessels", "curved_5mm", "--scene-n", "8",
-        "--scene-doses", "0.35", "--scene-methods", "linear", "mbir", "mbir_tissues",
+        "dose-factor", "--n", "8", "--slow-n", "8", "--tissue-n", "8", "--doses", "0.35", "--methods", "linear",
+        "quadratic", "mbir", "mbir_tissues", "fbp_cnn", "qggmrf", "tv", "--scenes", "stent", "--vessels", "curved_5mm",
+        "--scene-n", "8", "--scene-doses", "0.35", "--scene-methods", "linear", "mbir", "mbir_tissues",
     ],
     "train": [],
 }  # fmt: skip

@@ -33,7 +33,7 @@ from recon.study.dose_factor.methods import Method, fingerprint, load_methods
 from recon.study.dose_factor.places import Place, Places, ScenePlace
 from recon.study.dose_factor.readings import Readings
 from recon.study.dose_factor.realisations import NOISY_SCENE, Realisations, joined
-from recon.study.dose_factor.reconstructed import reconstructed
+from recon.study.dose_factor.reconstructed import in_parts, reconstructed
 from recon.study.dose_factor.response import RESPONSE_DRAWS, linear_response
 from recon.study.dose_factor.scene import SceneFacts, StudyScene
 from recon.study.dose_factor.settings import (
@@ -216,10 +216,13 @@ class _Study:
             for dose in s.doses:
                 self.report("exact: FBP, linear methods", done / steps)
                 done += 1
+                place, key = f"exact/{method.name}_{dose:g}s", f"{self.noise.key} {fingerprint(method)}"
+                kept = in_parts(method, self.store, place, key)
                 found = self.store.piece(
-                    f"exact/{method.name}_{dose:g}s", f"{self.noise.key} {fingerprint(method)}",
-                    partial(linear_figures, method, scenes, self._readings("method"), dose, not s.fast_noise),
+                    place, key,
+                    partial(linear_figures, kept, scenes, self._readings("method"), dose, not s.fast_noise),
                 )  # fmt: skip
+                self.store.drop(place)
                 m.linear[method.name, dose] = found
         for dose in s.doses:
             m.controls[dose] = self._controls(dose)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from functools import partial
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -12,15 +14,15 @@ from torch import Tensor
 
 from recon.pwls.inset_problem import InsetProblem
 from recon.study.dose_factor.methods import Method
-from recon.study.dose_factor.settings import TISSUE_METHODS
+from recon.study.dose_factor.settings import LINEAR_METHODS, TISSUE_METHODS
 from recon.study.store import Store
 
-__all__ = ["reconstructed"]
+__all__ = ["in_parts", "reconstructed"]
 
-LONG = ("tv", *TISSUE_METHODS)
+LONG = ("quadratic", "tv", *TISSUE_METHODS)
 """Methods that take seconds a volume, on a busy core half a minute."""
-PART = 2
-"""Realisations of such a method that are reconstructed, and kept, together."""
+PART, LINEAR_PART = 2, 16
+"""Volumes of such a method, and of a linear one, that are reconstructed, and kept, together."""
 
 
 def reconstructed(
@@ -45,6 +47,31 @@ def reconstructed(
         parts.append(kept)
     volume = torch.from_numpy(np.concatenate([p["volume"] for p in parts]))
     return volume, sum(float(p["seconds"]) for p in parts)
+
+
+def in_parts(method: Method, store: Store, place: str, key: str) -> Callable[[InsetProblem, Tensor, float], Tensor]:
+    """A linear method that keeps what it computes, of the same calls in the same order, if it is a long one.
+
+    Args:
+        method: of :data:`recon.study.dose_factor.settings.LINEAR_METHODS`.
+        store: keeps the parts under ``place`` with ``key``, until they are dropped.
+    """
+    assert method.name in LINEAR_METHODS
+    if method.name not in LONG:
+        return method
+    calls = count()
+
+    def run(problem: InsetProblem, b: Tensor, dose: float) -> Tensor:
+        if torch.is_grad_enabled():
+            return method(problem, b, dose)
+        call, parts = next(calls), []
+        for first in range(0, len(b), LINEAR_PART):
+            part = b[first : first + LINEAR_PART]
+            compute = partial(_as_arrays, method, problem, part, dose, place)
+            parts.append(store.piece(f"{place}/{call}_{first}", key, compute)["volume"])
+        return torch.from_numpy(np.concatenate(parts))
+
+    return run
 
 
 def _part(method: Method, problem: InsetProblem, b: Tensor, dose: float, place: str) -> dict[str, Any]:

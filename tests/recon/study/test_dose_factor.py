@@ -27,7 +27,7 @@ from recon.study.dose_factor.methods import (
 from recon.study.dose_factor.places import Places
 from recon.study.dose_factor.readings import Readings, true_volume
 from recon.study.dose_factor.realisations import Realisations
-from recon.study.dose_factor.reconstructed import reconstructed
+from recon.study.dose_factor.reconstructed import in_parts, reconstructed
 from recon.study.dose_factor.response import linear_response
 from recon.study.dose_factor.scene import StudyScene
 from recon.study.dose_factor.seen import Seen
@@ -424,6 +424,31 @@ def test_parts_of_a_long_method_are_kept_until_their_block_is(scene, clean_b, tm
     assert seconds > 0
     store.drop("tv/0-5")
     assert not list((tmp_path / "tv").iterdir())
+
+
+def test_a_long_linear_method_keeps_its_calls_in_their_order(scene, clean_b, tmp_path, monkeypatch):
+    class Linear:
+        name, seen = "quadratic", 0
+
+        def __call__(self, problem, b, exposure_s):
+            self.seen += len(b)
+            return 2.0 * b
+
+    monkeypatch.setattr("recon.study.dose_factor.reconstructed.LINEAR_PART", 2)
+    method, store = Linear(), Store(tmp_path)
+    b = torch.stack([clean_b * (1 + k) for k in range(5)])
+    for _ in range(2):  # the second time all is there
+        run = in_parts(method, store, "exact/quadratic", "key")
+        with torch.no_grad():
+            assert torch.equal(run(scene.problem, b, 2.0), 2.0 * b)
+            assert torch.equal(run(scene.problem, b[:1] + 1.0, 2.0), 2.0 * (b[:1] + 1.0))
+        assert method.seen == 6
+    names = {p.name for p in (tmp_path / "exact/quadratic").iterdir()}
+    assert names == {"0_0.npz", "0_2.npz", "0_4.npz", "1_0.npz"}
+    leaf = b[:1].clone().requires_grad_()
+    assert run(scene.problem, leaf, 2.0).requires_grad  # autograd sees through it
+    method.name = "linear"
+    assert in_parts(method, store, "exact/linear", "key") is method
 
 
 def test_wider_rois(analysed, scene):
