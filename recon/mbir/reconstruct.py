@@ -13,6 +13,7 @@ from recon.mbir.field import reconstruct_field_mbir
 from recon.mbir.mbir import Mbir, average_onto, working_grid
 from recon.mbir.tissues import TissueMbir
 from recon.mbir.unrolled import low_residual
+from recon.plaque.vessel_prior import VesselPrior
 from recon.pwls.field_problem import is_whole_field
 from recon.pwls.inset_problem import InsetProblem
 from torchpcct.geometry import VolumeGrid
@@ -36,6 +37,7 @@ def reconstruct_mbir(
     noise_map: bool = False,
     tissues: bool = False,
     point: Any = None,
+    vessel_prior: VesselPrior | None = None,
 ) -> list[Volume]:
     """Unrolled MBIR with the learned prior, of an inset or of a whole field (:mod:`recon.mbir.field`).
 
@@ -54,6 +56,7 @@ def reconstruct_mbir(
             seconds a volume longer. Where no vessel is found, or its tissues do not explain the data, the volume is
             the one without, with a warning.
         point: ``(z, y, x)`` mm where a reader sees the plaque, for ``tissues``; None: in the largest vessel.
+        vessel_prior: what ``tissues`` believes of the vessel's tissues before the data; None: a coronary artery.
 
     Returns:
         Volumes in HU. Report: ``iterations``, ``look``, ``residual`` (what is left of the data at the low frequencies
@@ -72,8 +75,10 @@ def reconstruct_mbir(
         network = network.looking(look)
     if point is not None and not tissues:
         raise ValueError("point says where a plaque is: give it with tissues=True")
+    if vessel_prior is not None and not tissues:
+        raise ValueError("vessel_prior says what a vessel is made of: give it with tissues=True")
     if tissues:
-        network = TissueMbir(network, point)
+        network = TissueMbir(network, point, vessel_prior=vessel_prior)
     if problem is None and is_whole_field(scans[0], grid):
         for name, asked in (("noise_map", noise_map), ("tissues", tissues)):
             if asked:

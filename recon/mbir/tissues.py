@@ -32,10 +32,6 @@ from torchpcct.validate import numbers
 
 __all__ = ["TissueMbir"]
 
-BELIEVED = VesselPrior(wall=(50.0, 25.0), fibrous=(95.0, 60.0), orders=4)
-"""Wider than a reading's: an image is looked at by people who have not chosen what the tissues are expected to be, and
-its outlines shall follow flat ellipses, too. The published dose factors were measured with it."""
-
 
 class TissueMbir(Mbir):
     """:class:`recon.mbir.mbir.Mbir` with tissues.
@@ -46,15 +42,18 @@ class TissueMbir(Mbir):
         network: gives weights, look and parts.
         point: ``(z, y, x)`` mm where a reader sees the plaque; None: in the largest vessel.
         seed: of the reading's Monte Carlo.
+        vessel_prior: what is believed of the vessel before the data; None: what a reading believes, a coronary artery.
 
     Raises:
         ValueError, TypeError: a point that is not three finite numbers.
     """
 
-    def __init__(self, network: Mbir, point: Any = None, seed: int = 0) -> None:
+    def __init__(
+        self, network: Mbir, point: Any = None, seed: int = 0, vessel_prior: VesselPrior | None = None
+    ) -> None:
         super().__init__(network.model, network.look, **network.parts)
         self.point = None if point is None else numbers("point", point, 3, unit="mm")
-        self.seed = seed
+        self.seed, self.vessel_prior = seed, vessel_prior
 
     @torch.no_grad()
     def solved(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> Solution:
@@ -66,7 +65,7 @@ class TissueMbir(Mbir):
         for k in range(b.shape[0]):
             try:
                 data = TissueData.of_statistic(b[k], problem, exposure_s)
-                reading = read_plaque(data, self.point, vessel_prior=BELIEVED, seed=self.seed)
+                reading = read_plaque(data, self.point, vessel_prior=self.vessel_prior, seed=self.seed)
             except ValueError as error:
                 notes.append(_unused(f"no tissues were fitted: {error}"))
                 continue

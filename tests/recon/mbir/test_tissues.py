@@ -16,6 +16,7 @@ from recon.mbir.mbir import Mbir
 from recon.mbir.network import NetworkConfig
 from recon.mbir.tissues import TissueMbir
 from recon.mbir.unrolled import Unrolled
+from recon.plaque import VesselPrior
 
 BALL = np.s_[2:5, 2:5, 2:5]
 """A bright thing in the fat that no tissue of the vessel is."""
@@ -107,6 +108,20 @@ def test_tissues_that_do_not_explain_the_data_are_not_used(drawn, network, truth
     assert "residual is 2.00" in found.notes[0]["warnings"][0]
 
 
+def test_what_is_believed_of_the_vessel_reaches_the_reading(drawn, network, truth, monkeypatch):
+    seen = []
+
+    def reading(*arguments, vessel_prior, seed):
+        seen.append(vessel_prior)
+        raise ValueError("seen")
+
+    monkeypatch.setattr(tissues, "read_plaque", reading)
+    b = statistic(drawn, truth, 1)
+    for believed in (None, VesselPrior(wall=(20.0, 5.0))):
+        TissueMbir(network, vessel_prior=believed).looking(1.0).solved(drawn, b, 1.0)
+    assert seen == [None, VesselPrior(wall=(20.0, 5.0))]
+
+
 def test_what_is_not_proven_is_left_as_the_plain_reconstruction_has_it(solved):
     plain = solved[0]
     shape = tuple(plain.shape)
@@ -147,5 +162,7 @@ def test_another_look_keeps_the_tissues_and_noise_units_are_the_inverse_of_hu(dr
 def test_refusals(clean, problem):
     with pytest.raises(ValueError, match="tissues=True"):
         reconstruct(clean, GRID, "mbir", point=(0, 0, 0))
+    with pytest.raises(ValueError, match="vessel_prior says"):
+        reconstruct(clean, GRID, "mbir", vessel_prior=VesselPrior())
     with pytest.raises(ValueError, match="point must be 3 numbers"):
         reconstruct(clean, GRID, "mbir", tissues=True, point=(0, 0))
