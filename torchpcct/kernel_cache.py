@@ -12,9 +12,10 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-__all__ = ["forget_outdated", "sources"]
+__all__ = ["OURS", "forget_outdated", "sources"]
 
-_OURS = ("torchpcct.", "recon.", "train.")
+OURS = ("torchpcct.", "recon.", "train.")
+"""What the names of our modules begin with."""
 
 
 def sources(name: str, *constants: str) -> set[Path]:
@@ -37,7 +38,7 @@ def _follow(module: ModuleType, found: set[str]) -> None:
     for value in list(vars(module).values()):
         inner = getattr(value, "__wrapped__", None)  # numba's functions wrap Python's
         other = getattr(inner, "__module__", "") or ""
-        if other.startswith(_OURS) and type(value).__module__.startswith("numba.") and other in sys.modules:
+        if other.startswith(OURS) and type(value).__module__.startswith("numba.") and other in sys.modules:
             _follow(sys.modules[other], found)
 
 

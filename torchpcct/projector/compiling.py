@@ -6,10 +6,11 @@ import logging
 from functools import cache
 from typing import Any
 
+from torchpcct.kernel_cache import OURS
+
 __all__ = ["announce_compilation"]
 
 _LOG = logging.getLogger(__name__)
-_OURS = ("torchpcct.", "recon.", "train.")
 
 
 @cache
@@ -22,7 +23,7 @@ def announce_compilation() -> None:
 
         def on_start(self, event: Any) -> None:
             function = getattr(event.data.get("dispatcher"), "py_func", None)
-            if not self.said and getattr(function, "__module__", "").startswith(_OURS):
+            if not self.said and getattr(function, "__module__", "").startswith(OURS):
                 Announce.said = True
                 _LOG.warning(
                     "compiling kernels for this processor: this call takes up to a minute longer, later ones read them "

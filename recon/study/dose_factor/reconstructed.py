@@ -40,13 +40,7 @@ def reconstructed(
     if method.name not in LONG:
         found = _part(method, problem, b, dose, place)
         return found["volume"], found["seconds"]
-    parts = []
-    for first in range(0, len(b), PART):
-        part = b[first : first + PART]
-        kept = store.piece(f"{place}/{first}", key, partial(_as_arrays, method, problem, part, dose, place))
-        parts.append(kept)
-    volume = torch.from_numpy(np.concatenate([p["volume"] for p in parts]))
-    return volume, sum(float(p["seconds"]) for p in parts)
+    return _kept(method, problem, b, dose, store, f"{place}/", key, PART)
 
 
 def in_parts(method: Method, store: Store, place: str, key: str) -> Callable[[InsetProblem, Tensor, float], Tensor]:
@@ -64,14 +58,21 @@ def in_parts(method: Method, store: Store, place: str, key: str) -> Callable[[In
     def run(problem: InsetProblem, b: Tensor, dose: float) -> Tensor:
         if torch.is_grad_enabled():
             return method(problem, b, dose)
-        call, parts = next(calls), []
-        for first in range(0, len(b), LINEAR_PART):
-            part = b[first : first + LINEAR_PART]
-            compute = partial(_as_arrays, method, problem, part, dose, place)
-            parts.append(store.piece(f"{place}/{call}_{first}", key, compute)["volume"])
-        return torch.from_numpy(np.concatenate(parts))
+        return _kept(method, problem, b, dose, store, f"{place}/{next(calls)}_", key, LINEAR_PART)[0]
 
     return run
+
+
+def _kept(
+    method: Method, problem: InsetProblem, b: Tensor, dose: float, store: Store, start: str, key: str, size: int
+) -> tuple[Tensor, float]:
+    """Volumes and seconds, ``size`` volumes at a time, each kept under ``start`` and its first volume's position."""
+    parts = []
+    for first in range(0, len(b), size):
+        part = b[first : first + size]
+        parts.append(store.piece(f"{start}{first}", key, partial(_as_arrays, method, problem, part, dose, start)))
+    volume = torch.from_numpy(np.concatenate([p["volume"] for p in parts]))
+    return volume, sum(float(p["seconds"]) for p in parts)
 
 
 def _part(method: Method, problem: InsetProblem, b: Tensor, dose: float, place: str) -> dict[str, Any]:
