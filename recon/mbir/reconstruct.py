@@ -52,9 +52,9 @@ def reconstruct_mbir(
             (:mod:`recon.mbir.unrolled`); None: that of ``network``, which is 0.5 unless it was loaded with another.
         noise_map: add an estimate of each voxel's standard deviation, ``report["noise_sd_hu"]``.
         tissues: fit the tissues of a contrast-enhanced vessel first, and let the network reconstruct what they leave
-            (:mod:`recon.mbir.tissues`): sharp outlines, and a core at full contrast where the data prove one; four
-            seconds a volume longer. Where no vessel is found, or its tissues do not explain the data, the volume is
-            the one without, with a warning.
+            (:mod:`recon.mbir.tissues`): sharp outlines, and a core at full contrast where the data prove one; a
+            few seconds a volume longer. Where no vessel is found, or its tissues do not explain the data, the volume
+            is the one without, with a warning.
         point: ``(z, y, x)`` mm where a reader sees the plaque, for ``tissues``; None: in the largest vessel.
         vessel_prior: what ``tissues`` believes of the vessel's tissues before the data; None: a coronary artery.
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -39,25 +40,17 @@ def measured(problem: InsetProblem, plaques: int, dose: float) -> dict[str, Any]
     """Method → ``(plaques, 2, 3)``: with and without core; contrast, error in the vessel, error beside it."""
     network = Mbir.load()
     methods = {"linear": LinearFilter(), "mbir": network, "mbir_tissues": TissueMbir(network)}
-    gram, hu = problem.gram.scaled(dose), problem.mu_ref / 1000.0
     found: dict[str, list[Any]] = {name: [] for name in methods}
     used, presence, start = 0, [], time.process_time()
-    for k in range(plaques):
-        held = validation_scenes(
-            problem.grid.shape, problem.grid.spacing, seed=k // 8, contrasts=(-CONTRAST_HU, 0.0), size=8
-        )
-        i = k % 8
-        vessel = held.image[i, 1] > held.scenes[i].background + 10.0
-        noise = gram.noise(generator=torch.Generator().manual_seed(k))
+    for pair, core_roi, fibrous_roi, vessel in held_out_draws(problem, plaques, dose):
         rows: dict[str, list[Any]] = {name: [] for name in methods}
-        for true in held.image[i]:
-            b = (gram.apply(true * hu + problem.mu_ref - problem.level) + noise)[None]
+        for b, true in pair:
             for name, method in methods.items():
-                volume, tissues = reconstructed(method, problem, b, dose)
+                volume, tissues = reconstructed(method, problem, b[None], dose)
                 if tissues is not None:
                     used += tissues["used"]
                     presence.append(tissues.get("presence", float("nan")))
-                core, fibrous = (float(volume[roi > 0].mean()) for roi in (held.core_roi[i], held.fibrous_roi[i]))
+                core, fibrous = (float(volume[roi].mean()) for roi in (core_roi, fibrous_roi))
                 error = (volume - true).square()
                 rows[name].append([fibrous - core, float(error[vessel].mean()), float(error[~vessel].mean())])
         for name, row in rows.items():
@@ -66,6 +59,22 @@ def measured(problem: InsetProblem, plaques: int, dose: float) -> dict[str, Any]
         "used": used, "of": 2 * plaques, "presence": np.reshape(presence, (-1, 2)).tolist(),
         "cpu_seconds": time.process_time() - start, "methods": {n: np.array(v) for n, v in found.items()},
     }  # fmt: skip
+
+
+def held_out_draws(
+    problem: InsetProblem, plaques: int, dose: float
+) -> Iterator[tuple[list[tuple[torch.Tensor, torch.Tensor]], torch.Tensor, torch.Tensor, torch.Tensor]]:
+    """Of each plaque, with its core and without: statistic and true volume (HU); and core, fibrous tissue, vessel."""
+    gram, hu = problem.gram.scaled(dose), problem.mu_ref / 1000.0
+    for k in range(plaques):
+        held = validation_scenes(
+            problem.grid.shape, problem.grid.spacing, seed=k // 8, contrasts=(-CONTRAST_HU, 0.0), size=8
+        )
+        i = k % 8
+        vessel = held.image[i, 1] > held.scenes[i].background + 10.0
+        noise = gram.noise(generator=torch.Generator().manual_seed(k))
+        pair = [(gram.apply(true * hu + problem.mu_ref - problem.level) + noise, true) for true in held.image[i]]
+        yield pair, held.core_roi[i] > 0, held.fibrous_roi[i] > 0, vessel
 
 
 def reconstructed(

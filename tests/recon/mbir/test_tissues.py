@@ -16,7 +16,7 @@ from recon.mbir.mbir import Mbir
 from recon.mbir.network import NetworkConfig
 from recon.mbir.tissues import TissueMbir
 from recon.mbir.unrolled import Unrolled
-from recon.plaque import VesselPrior
+from recon.plaque import TissueData, VesselPrior, read_plaque
 
 BALL = np.s_[2:5, 2:5, 2:5]
 """A bright thing in the fat that no tissue of the vessel is."""
@@ -127,13 +127,21 @@ def test_what_is_not_proven_is_left_as_the_plain_reconstruction_has_it(solved):
     shape = tuple(plain.shape)
     layer = np.zeros(shape, np.float32)
     layer[10] = 0.5
-    reading = SimpleNamespace(
-        presence=0.25, image=np.full(shape, 40.0, np.float32), image_without=np.full(shape, 100.0, np.float32),
-        layer=layer,
-    )  # fmt: skip
-    found = tissues._tissues(reading, plain)
+    image, without = (np.full(shape, value, np.float32) for value in (40.0, 100.0))
+    reading = SimpleNamespace(image=image, image_without=without, layer=layer)
+    found = tissues.tissue_image(reading, plain, 0.25)
     assert torch.allclose(found[9], torch.tensor(0.25 * 40.0 + 0.75 * 100.0))
     assert torch.allclose(found[10], 10.0 + 0.75 * (50.0 + 0.5 * plain[10]), atol=1e-3)
+
+
+def test_a_core_is_drawn_as_far_as_it_is_probable(drawn, network, truth, monkeypatch):
+    b = statistic(drawn, truth, 1)
+    reading = read_plaque(TissueData.of_statistic(b[0], drawn, 1.0))
+    seen = []
+    monkeypatch.setattr(tissues, "read_plaque", lambda *arguments, **settings: replace(reading, presence=0.25))
+    monkeypatch.setattr(tissues, "tissue_image", lambda r, plain, share: seen.append(share) or plain)
+    TissueMbir(network).solved(drawn, b, 1.0)
+    assert seen == [0.25]
 
 
 def test_from_a_scan(clean, problem, caplog):
