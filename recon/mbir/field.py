@@ -5,7 +5,10 @@ Four things differ from an inset (:mod:`recon.mbir.mbir`):
 * AᵀWA is applied by the projector itself: the FFT model of an inset does not hold over a whole field.
 * Noise changes over the field. With s(x) = (AᵀW 1 at the middle / AᵀW 1 at x)^½ the problem is solved for
   u = x / (c s), c the noise scale at the middle. S AᵀWA S has everywhere about the spectrum of the middle (Fessler and
-  Booth 1999, IEEE Trans. Image Process. 8:688), so noise looks to the network as it did in training.
+  Booth 1999, IEEE Trans. Image Process. 8:688), so noise looks to the network as it did in training. But which
+  directions are starved changes from place to place (across the shoulders, along a rib), so that spectrum is averaged
+  over the directions in plane: where it is small in a direction and the true one is not, a step towards the data would
+  be mostly noise.
 * What the inset's surround is there, a strongly regularised PWLS is here: it takes the body's outline, bones and lungs
   off the data, and the network sees the rest, as in training. It need not converge, the data decide about the sum.
 * The network sees blocks that overlap, each with its own noise scale as condition.
@@ -83,7 +86,8 @@ class FieldGram:
         seen = rest if problem.plane else rest[0]
         self.ratio = (self._middle / seen.clamp_min(self._middle / LARGEST_RATIO**2)).sqrt()
         self.determined = model.determined.expand(self.ratio.shape)
-        self._spectrum = (model.spectrum[None] if problem.plane else model.spectrum) * self._middle
+        self._spectrum = _turned(model.spectrum[None] if problem.plane else model.spectrum, self.ratio.shape)
+        self._spectrum *= self._middle
         self._model = model
 
     def exact(self, x: Tensor) -> Tensor:
@@ -107,6 +111,19 @@ class FieldGram:
         n = self._model.grid.ndim
         spacing = (self._voxel_mm,) * n
         return self._model.information(hu, spacing) * self._voxel_mm ** (n - 3)
+
+
+def _turned(spectrum: Tensor, shape: Sequence[int]) -> Tensor:
+    """Mean of a spectrum (``rfftn`` layout of volumes of ``shape``) over the directions in plane."""
+    y, x = (torch.fft.fftfreq(n, dtype=torch.float64) for n in shape[-2:])
+    radius = torch.hypot(y[:, None], x[: spectrum.shape[-1]].abs()) * min(shape[-2:])
+    ring = radius.round().long()
+    size = int(ring.max()) + 1
+    index = ring.flatten().to(spectrum.device)
+    sums = torch.zeros(*spectrum.shape[:-2], size, dtype=spectrum.dtype, device=spectrum.device)
+    sums.index_add_(-1, index, spectrum.flatten(-2))
+    mean = sums / torch.bincount(index, minlength=size).clamp_min(1).to(spectrum)
+    return mean[..., index].reshape(spectrum.shape)
 
 
 def trained_grid(grid: VolumeGrid, geometry: Any) -> VolumeGrid:

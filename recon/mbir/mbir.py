@@ -177,6 +177,7 @@ class Mbir:
             found.append(
                 f"the noise scale of the scan, {scale:.0f} HU, lies outside of the {low:.0f}…{high:.0f} HU of the "
                 "training: the contrast of small structures may be wrong"
+                + (', and edges of bone less sharp than by "fbp" or "pwls"' if scale < low else "")
             )
         if peak > LARGEST_HU:
             found.append(

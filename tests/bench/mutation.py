@@ -200,6 +200,10 @@ FAULTS = (
           _M + "test_what_is_not_proven_is_left_as_the_plain_reconstruction_has_it"),
     Fault("the core's probability is not asked", _TISSUE, "volumes[k], reading.presence", "volumes[k], 1.0",
           _M + "test_a_core_is_drawn_as_far_as_it_is_probable"),
+    Fault("the middle's starved directions are taken for everybody's", "recon/mbir/field.py", "return mean[..., index]",
+          "return spectrum.reshape(-1, index.numel())",
+          "tests/recon/mbir/test_field.py::"
+          "test_a_step_towards_the_data_is_not_mostly_noise_where_other_rays_are_starved_than_in_the_middle"),
     Fault("tissues that do not fit are used", _TISSUE, "if reading.warnings:", "if False:",
           _M + "test_tissues_that_do_not_explain_the_data_are_not_used"),
     Fault("another look forgets the tissues", "recon/mbir/mbir.py", "other = copy.copy(self)",

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from recon import reconstruct
-from recon.mbir.field import FieldGram, blockwise, trained_grid
+from recon.mbir.field import FieldGram, _turned, blockwise, trained_grid
 from recon.mbir.mbir import Mbir
 from recon.mbir.network import Network, NetworkConfig
-from recon.mbir.problem import NormalisedProblem
+from recon.mbir.problem import NormalisedProblem, filtered
 from recon.pwls.field_problem import FieldProblem
 from torchpcct import ConeBeam, ParallelBeam, Projector, Scan, VolumeGrid, full_turn
 
@@ -79,6 +79,43 @@ def test_a_stack_of_slices_is_nearer_to_the_truth_than_fbp(shipped):
     assert 0 < volume.report["residual"] < 0.02
     assert 0.5 < volume.report["chi2"] < 1.2
     assert volume.report["voxel_mm"] == 0.5
+
+
+def starved(photons, seed=0):
+    """Two dense rods beside the middle of eight slices of water: few photons cross both."""
+    _, y, x = torch.meshgrid(*[torch.from_numpy(a) for a in SLICES.axes], indexing="ij")
+    rods = torch.hypot(x.abs() - 6, y) < 2
+    truth = (MU * (torch.hypot(y, x) < 11) + 60 * MU * rods).float()
+    lines = Projector(PARALLEL, SLICES.slice)(truth)
+    counts = torch.poisson(photons * torch.exp(-lines), generator=torch.Generator().manual_seed(seed))
+    return Scan.from_counts(counts, PARALLEL, air=photons, mu_water=MU)
+
+
+def test_a_step_towards_the_data_is_not_mostly_noise_where_other_rays_are_starved_than_in_the_middle():
+    scan = starved(5e4)
+    problem = FieldProblem(scan, SLICES)
+    slices = problem.slices(scan)
+    gram = FieldGram(problem, [w for _, w in slices], 0.2)
+    noise = torch.stack([
+        problem.projector.T(w.sqrt() * torch.randn(w.shape, generator=torch.Generator().manual_seed(k)))
+        for k, (_, w) in enumerate(slices)
+    ])  # fmt: skip
+    normal = NormalisedProblem.from_statistic(gram, (gram.ratio * noise)[None], torch.ones(1), HU, 0.2)
+    step = filtered(normal.beta, 1.0 / (normal.spectrum() + 0.1))[0]
+    y, x = torch.meshgrid(*[torch.from_numpy(a) for a in SLICES.slice.axes], indexing="ij")
+    # Noise of covariance H becomes H / (H + 0.1)², 2.5 at most, wherever H is what it is taken for.
+    for part in ((y.abs() > 5) & (torch.hypot(y, x) < 10), torch.hypot(y, x) < 3):
+        assert 1.0 < float(step[:, part].square().mean()) < 2.5
+
+
+def test_mean_of_a_spectrum_over_the_directions():
+    y, x = torch.fft.fftfreq(30)[:, None], torch.fft.rfftfreq(41)
+    round_one = torch.exp(-20 * (y**2 + x**2))
+    longer = 1 + 0.5 * torch.cos(2 * torch.atan2(y.expand(30, 21), x.expand(30, 21)))
+    found = _turned(torch.stack([round_one, round_one * longer]), (2, 30, 41))
+    inside = (torch.hypot(y, x) > 0.1) & (torch.hypot(y, x) < 0.45)
+    assert float((found[0] - round_one)[inside].abs().max()) < 0.08
+    assert float((found[1] / found[0])[inside].sub(1).abs().max()) < 0.1
 
 
 def test_one_slice_and_a_cone_beam(shipped):
