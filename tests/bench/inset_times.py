@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from rod_values import ROD_HU
+from rod_values import true_volume
 
 import recon
 from recon.mbir.mbir import Mbir
@@ -66,8 +66,7 @@ def main() -> None:
     coarse, fine = inset_grid(plaque, 0.25), inset_grid(plaque, 0.2)
     region = VolumeGrid((1, 1, 1), tuple(np.maximum(coarse.extent, fine.extent)), fine.center)
     clean = acquire(scene, presets.pcct(), region=region)
-    values = {**ROD_HU, "patient": ROD_HU["fat"]}
-    true = {g: torch.from_numpy(scene.render(g, {n: values[n] for n in scene.names})).float() for g in (coarse, fine)}
+    truth = {grid: true_volume(scene, grid) for grid in (coarse, fine)}
     run = methods(coarse, fine, clean)
     seconds: dict[str, list[float]] = {name: [] for name in run}
     squares: dict[str, list[float]] = {name: [] for name in run}
@@ -79,8 +78,8 @@ def main() -> None:
             if k:
                 seconds[name].append(time.perf_counter() - began)
                 if volume is not None:
-                    off = (volume.data - true[volume.grid])[true[volume.grid] > ROD_HU["fat"] + 10.0]
-                    squares[name].append(float(off.square().mean()))
+                    true, vessel = truth[volume.grid]
+                    squares[name].append(float((volume.data - true)[vessel].square().mean()))
     rows = [
         {"method": name, "seconds": float(np.median(s)), "least_seconds": min(s), "most_seconds": max(s),
          **({"rmse_vessel_hu": float(np.sqrt(np.mean(squares[name])))} if squares[name] else {})}

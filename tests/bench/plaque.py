@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from results import write_results
 from rod_values import ROD_HU
 from scipy import ndimage
 from scipy.stats import beta, chi2
@@ -453,9 +454,7 @@ def main() -> None:
                     draws.beside(case, k, network)
     result = summary(options.work)
     result |= {"seeds": f"0 … {options.n - 1}, the same of scan, point and Monte Carlo", "torch": torch.__version__}
-    for name, content in (("report.json", json.dumps(result, indent=1) + "\n"), ("report.md", text(result))):
-        with written_whole(options.out / name) as part:
-            part.write_text(content, encoding="utf-8")
+    write_results(options.out, "report", result, text(result))
     with written_whole(options.out / "plaque.png") as part:
         picture(result).savefig(part, dpi=120)
     print(text(result))

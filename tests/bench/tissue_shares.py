@@ -13,7 +13,6 @@ all rows share.
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -22,7 +21,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from rod_values import ROD_HU
+from results import write_results
+from rod_values import ROD_HU, true_volume
 from tissues import CONTRAST_HU, held_out_draws
 from torch import Tensor
 
@@ -34,7 +34,6 @@ from recon.pwls.inset_problem import InsetProblem
 from recon.study.dose_factor.settings import Settings
 from recon.study.dose_factor.variant import Variant
 from torchpcct.acquisition.acquire import acquire
-from torchpcct.files import written_whole
 
 SHARES: dict[str, Callable[[float], float]] = {
     "never": lambda p: 0.0,
@@ -61,11 +60,8 @@ def paper_draws(problem: InsetProblem, clean: list[Tensor], draws: int, dose: fl
     """Of the paper's plaque, with its core and without."""
     scenes = [Variant(name, Settings()) for name in ("paper", "absent_core")]
     rois = {name: scenes[0].pair_of(roi).on(problem.grid) for name, roi in (("paper", "paper"), ("whole", "tissue"))}
-    values = {**ROD_HU, "patient": ROD_HU["fat"]}
-    true = [
-        torch.from_numpy(s.scene.render(problem.grid, {n: values[n] for n in s.scene.names})).float() for s in scenes
-    ]
-    vessel, gram = true[1] > ROD_HU["fat"] + 10.0, problem.gram.scaled(dose)
+    true, (_, vessel) = zip(*(true_volume(s.scene, problem.grid) for s in scenes), strict=True)
+    gram = problem.gram.scaled(dose)
     for k in range(draws):
         noise = gram.noise(generator=torch.Generator().manual_seed(k))
         yield [Draw(clean[i] * dose + noise, true[i], vessel, rois) for i in range(2)]
@@ -182,7 +178,6 @@ def main() -> None:
         "command": f"python tests/bench/tissue_shares.py --draws {options.draws} --plaques {options.plaques}",
         "torch": torch.__version__, "cpu_seconds": 0.0, "runs": [],
     }  # fmt: skip
-    options.out.mkdir(parents=True, exist_ok=True)
     for dose in options.doses:
         for scenes, pairs, contrast in (
             ("the paper's plaque", paper_draws(problem, clean, options.draws, dose), true_contrast),
@@ -193,9 +188,7 @@ def main() -> None:
             result["cpu_seconds"] += time.process_time() - began
             result["runs"].append({"scenes": scenes, "exposure_s": dose, "rois": found["rois"],
                                    "presence": found["presence"], "methods": figures(found, contrast)})  # fmt: skip
-            for file, content in (("shares.json", json.dumps(result, indent=1) + "\n"), ("shares.md", text(result))):
-                with written_whole(options.out / file) as part:
-                    part.write_text(content, encoding="utf-8")
+            write_results(options.out, "shares", result, text(result))
     print(text(result))
 
 

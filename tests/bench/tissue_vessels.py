@@ -11,13 +11,13 @@ and lumen against the painted truth.
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from results import write_results
 from rod_values import ROD_HU
 from tissues import reconstructed
 
@@ -29,7 +29,6 @@ from recon.study.dose_factor.vessel_shapes import vessel
 from recon.study.dose_factor.vessels import fine_grid, projected
 from recon.study.paper.plaque_scan import inset_grid
 from torchpcct.acquisition.acquire import acquire
-from torchpcct.files import written_whole
 from torchpcct.scanner import presets
 from torchpcct.scene.plaque import plaque_scene
 
@@ -127,14 +126,11 @@ def main() -> None:
         "command": f"python tests/bench/tissue_vessels.py --draws {options.draws}", "torch": torch.__version__,
         "tissues_hu": TISSUES_HU, "cpu_seconds": 0.0, "vessels": {},
     }  # fmt: skip
-    options.out.mkdir(parents=True, exist_ok=True)
     for name in options.vessels:
         began = time.process_time()
         result["vessels"][name] = measured(problem, name, options.doses, options.draws)
         result["cpu_seconds"] += time.process_time() - began
-        for file, content in (("vessels.json", json.dumps(result, indent=1) + "\n"), ("vessels.md", text(result))):
-            with written_whole(options.out / file) as part:
-                part.write_text(content, encoding="utf-8")
+        write_results(options.out, "vessels", result, text(result))
     print(text(result))
 
 

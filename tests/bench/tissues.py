@@ -10,7 +10,6 @@ scan with its noise; a reading is blind. Contrast is that of the voxels wholly i
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from results import write_results
 
 from recon.mbir.mbir import Mbir
 from recon.mbir.tissues import TissueMbir
@@ -25,7 +25,6 @@ from recon.pwls.inset_problem import InsetProblem
 from recon.study.dose_factor.methods import LinearFilter
 from recon.study.paper.plaque_scan import inset_grid
 from torchpcct.acquisition.acquire import acquire
-from torchpcct.files import written_whole
 from torchpcct.scanner import presets
 from torchpcct.scene.plaque import plaque_scene
 from train.scenes.held_out import validation_scenes
@@ -136,10 +135,7 @@ def main() -> None:
         doses.append({"exposure_s": dose, "groups": groups, **{k: v for k, v in found.items() if k != "methods"}})
     result = {"command": f"python tests/bench/tissues.py --plaques {options.plaques}", "contrast_hu": CONTRAST_HU,
               "torch": torch.__version__, "doses": doses}  # fmt: skip
-    options.out.mkdir(parents=True, exist_ok=True)
-    for name, content in (("held_out.json", json.dumps(result, indent=1) + "\n"), ("held_out.md", text(result))):
-        with written_whole(options.out / name) as part:
-            part.write_text(content, encoding="utf-8")
+    write_results(options.out, "held_out", result, text(result))
     print(text(result))
 
 
