@@ -1,4 +1,6 @@
-"""Execute notebooks and store them with their outputs: ``python notebooks/execute.py [--full] [notebook …]``."""
+"""Execute notebooks and store them with their outputs: ``python notebooks/execute.py [--full] [notebook …]``.
+
+The metadata keep the hash of the weights that MBIR ran with: a test compares it with that of the shipped ones."""
 
 from __future__ import annotations
 
@@ -10,6 +12,8 @@ from pathlib import Path
 
 import nbformat
 from nbclient import NotebookClient
+
+from recon.mbir.mbir import Mbir
 
 HERE = Path(__file__).parent
 PARAMETER = re.compile(r"^QUICK = (True|False)$", re.MULTILINE)
@@ -37,6 +41,7 @@ def execute(path: Path, quick: bool, timeout: int = 7200) -> float:
     notebook.metadata = {
         "kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},
         "language_info": {"name": "python"},
+        "torchpcct": {"weights_sha256": Mbir.load().weights_sha256},
     }
     part = path.with_suffix(".part")
     nbformat.write(notebook, part)

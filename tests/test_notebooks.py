@@ -1,6 +1,8 @@
 """The notebooks run at quick scale, and what is stored of them is whole."""
 
+import ast
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -60,6 +62,68 @@ def test_stored_notebook_is_whole(name):
         assert place not in shown
 
 
+DELETING = {"unlink", "remove", "rmtree", "rmdir", "removedirs", "rename", "replace", "move"}
+WRITING = {"save", "File", "write_text", "write_bytes", "savefig", "imwrite", "open"}
+
+
+def harms(source):
+    """Calls of an example that delete or move a file, or write one whose name a user may have given to theirs."""
+    found = []
+    for call in (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call)):
+        name = getattr(call.func, "attr", getattr(call.func, "id", ""))
+        owner = getattr(getattr(call.func, "value", None), "id", "")
+        modes = [a.value for a in call.args[1:] if isinstance(a, ast.Constant) and isinstance(a.value, str)]
+        reads = name in ("File", "open") and not any(set(mode) & set("wax+") for mode in modes)
+        # A name by itself lies in the folder where the notebook runs, which is the user's.
+        bare = call.args and isinstance(call.args[0], ast.Constant | ast.Name | ast.JoinedStr)
+        deletes = name in DELETING and owner in ("os", "shutil", "Path", "") and bool(owner or not call.args)
+        if deletes or name in ("unlink", "rmtree") or (name in WRITING and not reads and bare):
+            found.append(ast.unparse(call))
+    return found
+
+
+def test_a_harmful_example_is_found():
+    """What the scan below looks for: ``your_own_data.ipynb`` once overwrote and deleted the user's ``tooth.h5``."""
+    source = """
+with h5py.File("tooth.h5", "w") as file: pass
+for name in ("tooth.h5", "tooth.mha"): Path(name).unlink()
+shutil.rmtree("tooth_dicom")
+volume.save(name)
+volume.save(work / name)
+h5py.File("theirs.h5", "r")
+text.replace("a", "b")
+"""
+    assert len(harms(source)) == 4
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_notebook_writes_or_deletes_what_it_has_not_made(name):
+    notebook = nbformat.read(FOLDER / name, as_version=4)
+    code = [c.source for c in notebook.cells if c.cell_type == "code"]
+    plain = "\n".join(line for source in code for line in source.splitlines() if not line.startswith("%"))
+    assert not harms(plain)
+
+
+def test_no_example_of_the_readme_writes_onto_its_input():
+    text = (FOLDER.parent / "README.md").read_text(encoding="utf-8")
+    for block in re.findall(r"```python\n(.*?)```", text, re.S):
+        assert not [call for call in harms(block) if ".save(" not in call]
+        read = set(re.findall(r"open_scan\(\"(.*?)\"", block))
+        assert not read & set(re.findall(r"save\(\"(.*?)\"", block))
+
+
+@needs_weights
+@pytest.mark.parametrize("name", NAMES)
+def test_stored_notebook_is_of_the_shipped_weights(name):
+    """A picture of old weights once stood there, in which MBIR was noisier than FBP."""
+    from recon.mbir.mbir import Mbir
+
+    notebook = nbformat.read(FOLDER / name, as_version=4)
+    if "mbir" in "".join(c.source for c in notebook.cells if c.cell_type == "code"):
+        stored = notebook.metadata.get("torchpcct", {}).get("weights_sha256")
+        assert stored == Mbir.load().weights_sha256, f"execute it again: python notebooks/execute.py notebooks/{name}"
+
+
 def test_first_scan_is_short():
     assert len(code_lines(nbformat.read(FOLDER / "first_scan.ipynb", as_version=4))) < 15
 
@@ -73,9 +137,11 @@ def test_first_scan_runs(tmp_path):
 @pytest.mark.slow
 def test_your_own_data_runs(tmp_path):
     pytest.importorskip("algotom")
+    (tmp_path / "tooth.h5").write_bytes(b"the user's own")
     notebook = run("your_own_data.ipynb", tmp_path, 1800)
     assert len(pictures(notebook)) == 2
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["your_own_data.ipynb"]  # it cleans up behind itself
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["tooth.h5", "your_own_data.ipynb"]
+    assert (tmp_path / "tooth.h5").read_bytes() == b"the user's own"
     texts = [o.data["text/markdown"] for o in outputs(notebook) if "text/markdown" in o.get("data", {})]
     quieter = {row.split(" | ")[0]: float(row.split(" | ")[-1].rstrip(" |")) for row in texts[2].splitlines()[2:]}
     assert quieter["| FBP, ram-lak"] == 1.0

@@ -310,7 +310,7 @@ def _one(
         "method": "mbir", "iterations": model.steps, "look": network.look,
         "residual": float(low_residual(replace(normal, beta=whole), left, network.look)),
         "chi2": float(torch.stack(squares).sum()) / max(readings, 1), "noise_scale_hu": (low, high),
-        "warnings": list(dict.fromkeys(warnings)),
+        "weights_sha256": network.weights_sha256, "warnings": list(dict.fromkeys(warnings)),
     }  # fmt: skip
     return found, info
 

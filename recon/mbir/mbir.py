@@ -22,7 +22,7 @@ from torch import Tensor
 from recon.mbir.network import NetworkConfig
 from recon.mbir.problem import NormalisedProblem
 from recon.mbir.unrolled import DEFAULT_LOOK, Unrolled, look_frequency
-from recon.mbir.weights_io import read_tensors
+from recon.mbir.weights_io import digest, read_tensors
 from recon.pwls.inset_problem import InsetProblem
 from torchpcct.geometry import VolumeGrid
 from torchpcct.volume import from_hu, to_hu
@@ -98,6 +98,11 @@ class Mbir:
                 "a new installation of the package)"
             ) from error
         return cls(model, look)
+
+    @property
+    def weights_sha256(self) -> str:
+        """SHA-256 of the weights' names, types, shapes and values, as in their training card."""
+        return digest(self.model.state_dict())
 
     def problem(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> NormalisedProblem:
         """The normalised problem of ``b`` ``(batch, z, y, x)``, AᵀW y with the weights of the exposure."""

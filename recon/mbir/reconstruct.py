@@ -61,8 +61,9 @@ def reconstruct_mbir(
     Returns:
         Volumes in HU. Report: ``iterations``, ``look``, ``residual`` (what is left of the data at the low frequencies
         that are the data's own, over what there was, :func:`recon.mbir.unrolled.low_residual`), ``chi2`` (weighted
-        squared residual per reading), of noisy scans ``residual_p`` (:mod:`torchpcct.metrics.residual_test`: does the
-        volume explain its data?), ``warnings``, ``seconds``; with ``tissues`` what was read of them, under that name.
+        squared residual per reading), ``weights_sha256``, of noisy scans ``residual_p``
+        (:mod:`torchpcct.metrics.residual_test`: does the volume explain its data?), ``warnings``, ``seconds``; with
+        ``tissues`` what was read of them, under that name.
 
     Raises:
         ValueError, TypeError: see :class:`recon.pwls.inset_problem.InsetProblem`; a problem that was made for another
@@ -108,7 +109,7 @@ def reconstruct_mbir(
             chi2 = (statistic.energy + float(misfit[k])) / statistic.readings
             info: dict[str, Any] = {
                 "method": "mbir", "iterations": network.model.steps, "look": network.look, "residual": residuals[k],
-                "chi2": chi2, "seconds": round(seconds, 3),
+                "chi2": chi2, "seconds": round(seconds, 3), "weights_sha256": network.weights_sha256,
             }  # fmt: skip
             info |= solution.notes[k]
             info["warnings"] = [
