@@ -5,7 +5,8 @@ of a scan carries exactly the noise that the full scan has there, and realisatio
 The stream is SplitMix64 (Steele, Lea, Flood 2014); Poisson numbers come from Hörmann's transformed rejection PTRS
 (1993) for means of 10 and more, and from inversion below; normal numbers from Box and Muller (1958).
 
-An energy-integrating detector adds up the energies of a Poisson number of quanta: :func:`compound_poisson`.
+An energy-integrating detector adds up the energies of a Poisson number of quanta: :func:`compound_poisson`. A lower
+dose of counts that are there already is drawn by :func:`thinned`.
 Other kernels that need random numbers take them from here too: :func:`seed_key`, :func:`stream` and :func:`draw`.
 """
 
@@ -21,7 +22,7 @@ from torch import Tensor
 
 from torchpcct.threads import run
 
-__all__ = ["compound_poisson", "draw", "normal", "poisson", "seed_key", "stream"]
+__all__ = ["compound_poisson", "draw", "normal", "poisson", "seed_key", "stream", "thinned"]
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _MIX1 = np.uint64(0xBF58476D1CE4E5B9)
@@ -83,6 +84,62 @@ def _poisson_one(mean: float, state: Any) -> float:
             return k
 
 
+@njit(cache=True)
+def _binomial_one(n: float, p: float, state: Any) -> float:
+    """Of ``n`` events those that happen, each with the probability ``p`` ≤ ½."""
+    q = 1.0 - p
+    ratio = p / q
+    if n * p < 10.0:
+        state, u = draw(state)
+        share = math.exp(n * math.log1p(-p))
+        k = 0.0
+        while u > share and k < n:
+            u -= share
+            share *= ratio * (n - k) / (k + 1.0)
+            k += 1.0
+        return k
+    sd = math.sqrt(n * p * q)
+    b = 1.15 + 2.53 * sd
+    a = -0.0873 + 0.0248 * b + 0.01 * p
+    v_r = 0.92 - 4.2 / b
+    alpha = (2.83 + 5.1 / b) * sd
+    mode = math.floor((n + 1.0) * p)
+    top = math.lgamma(mode + 1.0) + math.lgamma(n - mode + 1.0)
+    while True:
+        state, u = draw(state)
+        u -= 0.5
+        state, v = draw(state)
+        us = 0.5 - abs(u)
+        k = math.floor((2.0 * a / us + b) * u + n * p + 0.5)
+        if us >= 0.07 and v <= v_r:
+            return k
+        if k < 0.0 or k > n:
+            continue
+        if math.log(v * alpha / (a / (us * us) + b)) <= (
+            top - math.lgamma(k + 1.0) - math.lgamma(n - k + 1.0) + (k - mode) * math.log(ratio)
+        ):
+            return k
+
+
+@njit(nogil=True, cache=True)
+def _thinned_rows(begin: int, end: int, counts: Any, first: Any, fraction: float, key: Any, out: Any) -> None:
+    for i in range(begin, end):
+        for j in range(counts.shape[1]):
+            given = np.float64(counts[i, j])
+            state = stream(key, first[i] + j)
+            n = math.floor(given)
+            if n < given:
+                # A gain has made them no whole numbers: up or down, so that the mean stays.
+                state, u = draw(state)
+                n += 1.0 if u < given - n else 0.0
+            if n <= 0.0:
+                out[i, j] = fraction * min(given, 0.0)
+            elif fraction <= 0.5:
+                out[i, j] = _binomial_one(n, fraction, state)
+            else:
+                out[i, j] = n - _binomial_one(n, 1.0 - fraction, state)
+
+
 @njit(nogil=True, cache=True)
 def _poisson_rows(begin: int, end: int, mean: Any, first: Any, scale: float, key: Any, out: Any) -> None:
     for i in range(begin, end):
@@ -119,7 +176,7 @@ def _compound_rows(begin: int, end: int, mean: Any, quantum: Any, first: Any, sc
                 out[i, j] = np.nan
 
 
-_QUANTA, _ELECTRONICS = 0, 1
+_QUANTA, _ELECTRONICS, _THINNING, _THINNED_ELECTRONICS = 0, 1, 2, 3
 """Purposes of a reading's random numbers: each has a stream of its own."""
 
 
@@ -130,7 +187,8 @@ def seed_key(seed: int, purpose: int = _QUANTA) -> Any:
     if not 0 <= seed < 2**63:
         raise ValueError(f"seed must lie in 0 … 2**63 - 1, got {seed}")
     with np.errstate(over="ignore"):
-        return np.uint64(_mix.py_func((np.uint64(seed) ^ (np.uint64(purpose) << np.uint64(63))) * _GOLDEN + _MIX1))
+        start = (np.uint64(seed) ^ (np.uint64(purpose) << np.uint64(63))) * _GOLDEN + _MIX1
+        return np.uint64(_mix.py_func(start + np.uint64(purpose >> 1) * _MIX2))
 
 
 def _first(first: Any, rows: int) -> Any:
@@ -202,6 +260,43 @@ def compound_poisson(
         added = normal(tuple(flat.shape), first, seed, flat.dtype, purpose=_ELECTRONICS)
         out.add_(added, alpha=float(electronic))
     return out.reshape(mean.shape)
+
+
+def thinned(
+    counts: Tensor, first_index: Any, seed: int, fraction: float, quantum: Tensor | None = None, electronic: float = 0.0
+) -> Tensor:
+    """Counts at a fraction of the dose: each event stays with that probability (binomial thinning).
+
+    Of Poisson counts of mean λ the result is Poisson of mean ``fraction`` · λ, exactly. Readings that are no whole
+    number of quanta are rounded up or down at random first. The signal of an energy-integrating detector is thinned as
+    if all its quanta had the one size ``quantum``, and electronic noise is added until it is what it was: mean and
+    variance are right, higher moments are approximate.
+
+    Args:
+        counts: ``(..., n)`` noisy readings, float32 or float64, on the CPU.
+        first_index: ``(...)`` whole numbers, the global index of the first reading of each row of ``n``.
+        seed: realisation number, ≥ 0.
+        fraction: in (0, 1].
+        quantum: the shape of ``counts``; None: 1.
+        electronic: standard deviation of the electronic noise in ``counts``, which no dose changes.
+
+    Returns:
+        Shape and dtype of ``counts``.
+    """
+    flat = counts.detach().cpu().contiguous().reshape(-1, counts.shape[-1])
+    size = None if quantum is None else quantum.detach().cpu().contiguous().reshape(flat.shape)
+    first = _first(first_index, flat.shape[0])
+    out = torch.empty_like(flat)
+    quanta = flat if size is None else flat / size
+    row = _OPERATIONS * flat.shape[1]
+    key = seed_key(seed, _THINNING)
+    run(_thinned_rows, len(first), quanta.numpy(), first, float(fraction), key, out.numpy(), operations=row)
+    if size is not None:
+        out *= size
+    if electronic:
+        added = normal(tuple(flat.shape), first, seed, flat.dtype, purpose=_THINNED_ELECTRONICS)
+        out.add_(added, alpha=float(electronic) * math.sqrt(1.0 - fraction**2))
+    return out.reshape(counts.shape)
 
 
 def normal(

@@ -206,6 +206,47 @@ class Scan:
             seed=int(seed),
         )
 
+    def at_dose(self, fraction: float, seed: int = 0) -> Scan:
+        """The same scan as if it had been taken with a fraction of its dose: a measured scan, its noise included.
+
+        Photon counts are thinned: each photon stays with the probability ``fraction``, which makes Poisson counts of
+        the lower dose exactly, whatever the object; every energy bin by itself. Air readings and exposure scale, dead
+        readings stay dead. Counts that are no whole numbers (a gain), line integrals of a known number of photons and
+        the signal of an energy-integrating detector get the right mean and variance
+        (:func:`torchpcct.counting_noise.thinned`), and ``info["lower_dose"]`` says that this is approximate.
+
+        Args:
+            fraction: of the dose, in (0, 1].
+            seed: realisation number, ≥ 0; a reading's noise depends on it and on the reading's place alone.
+
+        Raises:
+            ValueError: a noise-free scan; a fraction outside of (0, 1]; line integrals whose number of photons was not
+                given; an energy-integrating scan that does not hold ``quantum``.
+        """
+        fraction = number("fraction", fraction, positive=True, high=1.0)
+        if self.noise_free:
+            raise ValueError(
+                "at_dose thins noisy readings, and this scan is noise free: use with_noise(exposure_s, seed)"
+            )
+        if self.logged and self.info.get("photons") != "given":
+            raise ValueError(
+                "these are line integrals of an unknown number of photons: give photons= where the scan is made, or "
+                "the raw counts"
+            )
+        self._require_noise_model()
+        readings = noise.thinned(self.counts, self._first_index(), seed, fraction, self.quantum, self.electronic_noise)
+        exact = self.counting and not self.logged and bool((self.counts == self.counts.round()).all())
+        note = {"fraction": fraction, "seed": int(seed), "exact": exact}
+        return replace(
+            self,
+            counts=readings,
+            air=self.air * fraction,
+            surround=None if self.surround is None else self.surround * fraction,
+            exposure_s=float(self.exposure_s or 0.0) * fraction,
+            logged=False,
+            info={**self.info, "lower_dose": note},
+        )
+
     def crop(self, window: DetectorWindow) -> Scan:
         """The same scan on a part of its window; its noise is that of the whole.
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy import stats
 
-from torchpcct.counting_noise import normal, poisson
+from torchpcct.counting_noise import normal, poisson, thinned
 
 
 @pytest.mark.parametrize("mean", [0.03, 0.7, 4.0, 9.99, 10.0, 37.3, 115.0, 16070.0, 3e6])
@@ -67,3 +67,43 @@ def test_bad_seed(seed, error):
 def test_bad_index():
     with pytest.raises(ValueError, match="first_index"):
         poisson(torch.ones(2, 1), [0], seed=0)
+
+
+@pytest.mark.parametrize("fraction", [0.02, 0.25, 0.5, 0.9])
+@pytest.mark.parametrize("mean", [0.4, 7.0, 60.0, 16070.0])
+def test_thinned_poisson_counts_are_poisson_of_the_lower_dose(mean, fraction):
+    n, index = 100_000, [0]
+    full = poisson(torch.full((1, n), mean, dtype=torch.float64), index, seed=3)
+    draws = thinned(full, index, 3, fraction)
+    assert (draws == draws.round()).all()
+    assert (draws >= 0).all()
+    assert (draws <= full).all()
+    low, rest = draws.numpy().ravel(), (full - draws).numpy().ravel()
+    expected = mean * fraction
+    assert abs(low.mean() - expected) < 4.5 * np.sqrt(expected / n)
+    assert abs(low.var() - expected) < 4.5 * np.sqrt((expected + 2 * expected**2) / n)
+    values = np.unique(stats.poisson.ppf(np.linspace(0.02, 0.98, 12), expected).astype(int))
+    probability = np.diff(np.concatenate([[0], stats.poisson.cdf(values, expected), [1]]))
+    observed = np.histogram(low, bins=np.concatenate([[-1], values + 0.5, [np.inf]]))[0]
+    keep = probability * n > 10
+    chi2 = ((observed - n * probability)[keep] ** 2 / (n * probability)[keep]).sum()
+    assert chi2 < stats.chi2.ppf(1 - 1e-5, keep.sum())
+    # What stays and what goes of Poisson counts are independent, also where both were drawn with one seed.
+    assert abs(np.corrcoef(low, rest)[0, 1]) < 4.5 / np.sqrt(n)
+
+
+def test_thinned_readings_that_are_no_counts_have_the_right_moments():
+    n, fraction, mean, quantum, electronic = 200_000, 0.3, 40.0, 2.5, 3.0
+    signal = quantum * poisson(torch.full((1, n), mean, dtype=torch.float64), [0], seed=1)
+    signal += electronic * normal((1, n), [0], 1, torch.float64, purpose=1)
+    low = thinned(signal, [0], 1, fraction, torch.full_like(signal, quantum), electronic).numpy().ravel()
+    expected, variance = fraction * quantum * mean, fraction * quantum**2 * mean + electronic**2
+    assert abs(low.mean() - expected) < 4.5 * np.sqrt(variance / n)
+    # Rounding to whole quanta adds up to a quarter of quantum² · fraction².
+    assert -0.03 * variance < low.var() - variance < 0.03 * variance + 0.25 * (quantum * fraction) ** 2
+
+
+def test_a_window_is_thinned_as_the_whole():
+    counts = poisson(torch.full((6, 50), 80.0), np.arange(6) * 50, seed=11)
+    full = thinned(counts, np.arange(6) * 50, 4, 0.6)
+    assert torch.equal(thinned(counts[2:5, 7:30], np.arange(2, 5) * 50 + 7, 4, 0.6), full[2:5, 7:30])

@@ -9,7 +9,7 @@ import torch
 
 from recon import reconstruct
 from recon.fbp.inset import InsetFbp
-from torchpcct import Scan, VolumeGrid, acquire, full_turn
+from torchpcct import FanBeam, Scan, VolumeGrid, acquire, full_turn
 from torchpcct.files import seal
 from torchpcct.scanner import presets
 from torchpcct.scene.plaque import plaque_scene
@@ -209,3 +209,44 @@ def test_views_in_any_order_give_the_same_volume(clean):
     a, b = reconstruct(clean, INSET, "fbp").data, reconstruct(shuffled, INSET, "fbp").data
     torch.testing.assert_close(a, b, atol=0.02, rtol=0)
     assert full_turn(g.views).shape == (g.views,)
+
+
+def test_a_lower_dose_of_a_measured_scan(clean):
+    """As noisy as a scan that was simulated at that dose, cell by cell of many realisations; all bins by themselves."""
+    high = [clean.with_noise(2.0, k).at_dose(0.25, k) for k in range(24)]
+    low = [clean.with_noise(0.5, 100 + k) for k in range(24)]
+    assert high[0].exposure_s == pytest.approx(0.5)
+    torch.testing.assert_close(high[0].air, low[0].air)
+    torch.testing.assert_close(high[0].surround, low[0].surround)
+    assert high[0].info["lower_dose"] == {"fraction": 0.25, "seed": 0, "exact": True}
+    variance = [torch.stack([s.line_integrals() for s in scans]).var(0).mean() for scans in (high, low)]
+    n = clean.counts.numel() * 23
+    assert float(variance[0] / variance[1]) == pytest.approx(1.0, abs=4.5 * (4 / n) ** 0.5 + 0.002)
+    mean = torch.stack([s.counts for s in high]).mean() / torch.stack([s.counts for s in low]).mean()
+    assert float(mean) == pytest.approx(1.0, abs=4.5 * float(2 / low[0].counts.sum() / 24) ** 0.5)
+
+
+def test_a_lower_dose_of_what_holds_no_photons_is_refused(clean):
+    with pytest.raises(ValueError, match="with_noise"):
+        clean.at_dose(0.5)
+    noisy = clean.with_noise(1.0, 0)
+    for fraction in (0.0, 1.5, float("nan")):
+        with pytest.raises(ValueError, match="fraction must be"):
+            noisy.at_dose(fraction)
+    fan = FanBeam(full_turn(8), 600.0, 1000.0, 16, 1.0)
+    lines = torch.rand(8, 16, generator=torch.Generator().manual_seed(0))
+    with pytest.raises(ValueError, match="photons="):
+        Scan.from_line_integrals(lines, fan).at_dose(0.5)
+    known = Scan.from_line_integrals(lines, fan, photons=1e5).at_dose(0.5)
+    assert known.info["lower_dose"]["exact"] is False
+    assert float((known.line_integrals() - lines).abs().max()) < 0.1
+
+
+def test_a_lower_dose_keeps_dead_readings_dead():
+    fan = FanBeam(full_turn(8), 600.0, 1000.0, 16, 1.0)
+    counts = torch.full((8, 16), 1000.0)
+    counts[:, 3] = float("nan")
+    low = Scan.from_counts(counts, fan, air=2000.0).at_dose(0.1, 2)
+    assert low.dead is not None
+    assert low.dead[:, 3].all()
+    assert int(low.dead.sum()) == 8
