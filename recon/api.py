@@ -15,7 +15,7 @@ from recon.fbp.inset import InsetFbp
 from recon.mbir.reconstruct import reconstruct_mbir
 from recon.metal import metal_warnings
 from recon.pwls.inset_problem import reconstruct_pwls
-from torchpcct.defects import mended
+from torchpcct.defects import dead_readings, mended
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
 from torchpcct.validate import choice
@@ -72,8 +72,8 @@ def reconstruct(
 
     Returns:
         A :class:`torchpcct.Volume` (a list of them for a sequence of scans), float32 HU; its ``report`` says how it was
-        made: method, options, seconds, ``warnings``, and for iterative methods iterations and residual. In mm⁻¹ if
-        ``scan.unit`` says so.
+        made: method, options, seconds, ``warnings``, how many ``dead_readings`` were bridged, and for iterative methods
+        iterations and residual. In mm⁻¹ if ``scan.unit`` says so.
 
     Raises:
         ValueError: an unknown method, kernel or option value, a grid outside the field of view, a starved scan.
@@ -113,9 +113,15 @@ def reconstruct(
         volumes = [replace(v, data=from_hu(v.data, mu), unit=scans[0].unit) for v in volumes]
     volumes = [
         replace(
-            v, data=v.data.to(device), report={**v.report, "warnings": [*before, *v.report.get("warnings", []), *found]}
+            v,
+            data=v.data.to(device),
+            report={
+                **v.report,
+                "dead_readings": dead_readings(s),
+                "warnings": [*before, *v.report.get("warnings", []), *found],
+            },
         )
-        for v, (_, before), found in zip(volumes, whole, metal, strict=True)
+        for v, (s, before), found in zip(volumes, whole, metal, strict=True)
     ]
     return volumes[0] if isinstance(scan, Scan) else volumes
 

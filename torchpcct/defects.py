@@ -1,13 +1,14 @@
-"""Readings that cannot be: dead and hot cells, dead columns and views, single lost readings; found, masked, bridged.
+"""Readings that cannot be: dead and hot cells, dead columns and views, lost readings; found, masked, bridged.
 
 A reading of 0 where hundreds are expected has the logarithm of a ray through lead, and FBP draws it as a streak or a
 ring of thousands of HU. It cannot be noise: the Poisson probability of 0 at an expectation of 30 is 1e-13. Metal can
-darken rays down to 0, but never a single cell between bright ones, and never the same cell in most of the views.
+darken rays down to 0, too, but its shadow has edges: the cells beside it dim before it reaches them, it walks over the
+columns from view to view, and it neither comes nor goes from one view to the next.
 """
 
 from __future__ import annotations
 
-import itertools
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,13 +17,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchpcct.dead_cells import bridge
-from torchpcct.detector_window import DetectorWindow
+from torchpcct.dead_cells import MOST_DEAD, bridge
+from torchpcct.readings import dispersion
 from torchpcct.robust import MEDIAN_TO_SD
 from torchpcct.scan import Scan
 from torchpcct.threads import run
 
-__all__ = ["Defects", "find_defects", "mended"]
+__all__ = ["Defects", "dead_readings", "find_defects", "mended"]
 
 BRIGHT = 30.0
 """Expected readings from which 0 cannot be noise (probability 1e-13)."""
@@ -31,8 +32,18 @@ GAIN_ERROR = 0.1
 air of a good detector leaves 0.001."""
 _NEIGHBOURS = 4
 # Share of single lost readings from which zeros up to three wide are taken for lost, too.
-_FREQUENT = 0.01
+_FREQUENT = 0.005
 _SIGMAS = 8.0
+_LASTING = 3
+"""Views from which a cell that reads 0 without a break is dead for part of the turn, and not a lost reading."""
+_WIDTH = 6
+"""Most cells side by side that are lost together."""
+_DIMMED = 0.1
+"""Step of the logarithm of the mean reading over all views, from the second to the first cell beside a shadow that
+turns about the axis, on both sides."""
+_DIP = 1.0
+"""Step of the logarithm from the second to the first cell beside a shadow, on both sides: what blur and the thin edge
+of an opaque body leave. A bright detail three cells wide has 0.6."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +54,7 @@ class Defects:
         mask: ``(views, rows, columns)`` bool, True where a reading must not be used.
         dead_cells, hot_cells, dead_views, lost_readings: how many of each were found; lost readings are single ones
             beside the others.
+        dead_for_a_while: cells that were dead for part of the views.
     """
 
     mask: Tensor
@@ -50,6 +62,7 @@ class Defects:
     hot_cells: int
     dead_views: int
     lost_readings: int
+    dead_for_a_while: int
 
     @property
     def text(self) -> str:
@@ -58,6 +71,7 @@ class Defects:
             (self.dead_cells, "dead detector cells"),
             (self.hot_cells, "cells of a wrong gain"),
             (self.dead_views, "views without signal"),
+            (self.dead_for_a_while, "cells that were dead for part of the views"),
             (self.lost_readings, "single lost readings"),
         )
         found = ", ".join(f"{n} {what}" for n, what in parts if n)
@@ -65,19 +79,35 @@ class Defects:
         return f"{found}: {share:.2g} % of the readings were interpolated from their neighbours" if found else ""
 
 
-def find_defects(counts: Tensor, air: Tensor, first_column: Any = None) -> Defects:
+def find_defects(
+    counts: Tensor,
+    air: Tensor,
+    first_column: Any = None,
+    *,
+    known: Tensor | None = None,
+    photon: float = 1.0,
+    electronic_noise: float = 0.0,
+    gains: bool = True,
+) -> Defects:
     """Find readings that no object can cause.
 
     * a view in which 99 % of the readings are 0, while others are not;
-    * a detector cell that reads 0 in three quarters of its views, while the cells beside it are bright (more than 30);
+    * a detector cell that reads 0 in (nearly) all of its views, while the cells beside it are bright (more than 30
+      photons) and not dimmed;
+    * a cell that reads 0 for some views, alone or with up to five others, between bright cells that are not dimmed, and
+      is bright just before and after;
+    * a single 0 with bright readings on both sides;
     * a cell whose log signal lies above or below the mean of its neighbours by 10 % and eight standard errors more than
-      that of the other rows (three or more) does;
-    * a single 0 with bright readings on both sides, in its row or the next rows.
+      that of the other rows (three or more) does.
 
     Args:
-        counts: ``(views, rows, columns)`` noisy counts.
+        counts: ``(views, rows, columns)`` noisy readings, the dark taken off: 0 or less is no signal.
         air: ``(rows, detector columns)`` expected readings without the object.
         first_column: ``(views,)`` detector column of the first reading of each view (a window); None: 0.
+        known: bool, the shape of ``counts``: readings that are known to be dead, which are not found again.
+        photon: reading of one photon.
+        electronic_noise: standard deviation that the electronics add to a reading.
+        gains: look for cells of a wrong gain, too.
 
     Raises:
         ValueError: shapes that do not fit.
@@ -93,6 +123,7 @@ def find_defects(counts: Tensor, air: Tensor, first_column: Any = None) -> Defec
     first: Any = np.zeros(views, np.int64) if first_column is None else np.asarray(first_column, np.int64)
     if first.shape != (views,) or first.min() < 0 or first.max() + columns > air.shape[1]:
         raise ValueError(f"first_column must hold {views} columns of a detector with {air.shape[1]}")
+    light = BRIGHT * photon + _SIGMAS * electronic_noise
     zero = n <= 0
     view_dead = zero.mean((1, 2)) > 0.99
     if view_dead.all():
@@ -105,39 +136,50 @@ def find_defects(counts: Tensor, air: Tensor, first_column: Any = None) -> Defec
     run(levels, rows, n, first, alive, seen, dark, bright, operations=3 * alive.size * columns)
     used = seen > 0
     level = bright / np.maximum(seen, 1)
-    dead = used & (dark > 0.75 * seen)
+    dead = used & (dark > 0.98 * seen)
     good_level = np.where(dead | ~used, np.nan, level)
     # Of a dead row the neighbours are in other rows.
-    dead &= np.fmax(_beside(good_level), _beside(good_level.T).T) > BRIGHT
-    # How far a cell's log signal lies above the mean of its neighbours', over the views in which both are good.
-    above, times = np.zeros_like(seen), np.zeros_like(seen)
-    run(bends, rows, n, first, alive, dead, above, times, operations=20 * alive.size * columns)
-    # The air's own share, which no view changes.
-    expected = reference[:, 1:-1] - (reference[:, :-2] + reference[:, 2:]) / 2
-    above[:, 1:-1] -= np.where(times[:, 1:-1] > 0, times[:, 1:-1] * expected, 0.0)
+    dead &= np.fmax(_beside(good_level), _beside(good_level.T).T) > light
+    along = _dimmed(good_level, dead)
+    dead &= ~np.where(np.isnan(along), np.nan_to_num(_dimmed(good_level.T, dead.T).T), along).astype(bool)
     hot = np.zeros_like(dead)
-    if rows >= 3:
+    if gains and rows >= 3:
+        # How far a cell's log signal lies above the mean of its neighbours', over the views in which both are good.
+        above, times = np.zeros_like(seen), np.zeros_like(seen)
+        run(bends, rows, n, first, alive, dead, above, times, operations=20 * alive.size * columns)
+        # The air's own share, which no view changes.
+        expected = reference[:, 1:-1] - (reference[:, :-2] + reference[:, 2:]) / 2
+        above[:, 1:-1] -= np.where(times[:, 1:-1] > 0, times[:, 1:-1] * expected, 0.0)
         mean = above / np.maximum(times, 1)
         # The object's edges are seen by all rows alike, the gain of a cell by one.
         deviation = mean - np.median(mean, axis=0)
         some = times > 0.25 * seen.max()
         usual = MEDIAN_TO_SD * np.median(np.abs(deviation[some])) if some.any() else 0.0
-        error = np.hypot(np.sqrt(1.5 / np.maximum(level * times, 1.0)), usual)
-        hot = some & (np.abs(deviation) > np.maximum(GAIN_ERROR, _SIGMAS * error)) & (level > BRIGHT)
+        error = np.hypot(np.sqrt(1.5 * photon / np.maximum(level * times, photon)), usual)
+        hot = some & (np.abs(deviation) > np.maximum(GAIN_ERROR, _SIGMAS * error)) & (level > light)
         # The neighbours of a hot cell deviate by half as much, the other way.
         strength = np.pad(np.where(hot, np.abs(deviation), 0.0), ((0, 0), (1, 1)))
         hot &= np.abs(deviation) >= np.maximum(strength[:, :-2], strength[:, 2:])
-    mask = np.stack([lost | (dead | hot)[part] for lost, part in zip(view_dead, parts, strict=True)])
+    if known is None:
+        new = np.ones(n.shape, bool)
+    else:
+        new = ~known.numpy()
+        fresh = np.zeros_like(dead)
+        for part, those in zip(parts, new, strict=True):
+            fresh[part] |= those
+        dead, hot, view_dead = dead & fresh, hot & fresh, view_dead & new.any((1, 2))
+    mask = np.stack([lost | (dead | hot)[part] for lost, part in zip(view_dead, parts, strict=True)]) & new
+    zero &= new & ~mask
     at = np.argwhere(zero) if zero.any() else np.zeros((0, 3), np.int64)
-    at = at[~mask[tuple(at.T)]]
-    single = _isolated(n, at)
-    if len(single) > _FREQUENT * n.size:
-        # So many are no accident: neighbours on one side are often lost together.
-        single = np.unique(np.concatenate([single, _isolated(n, at, reach=3)]), axis=0)
+    # Without the dead views, which nobody is the neighbour of.
+    at = at[~view_dead[at[:, 0]]]
+    at[:, 0] = np.searchsorted(alive, at[:, 0])
+    single, lasting, cells = _unshadowed(n[alive], at, first[alive], air.shape[1], light)
+    single[:, 0] = alive[single[:, 0]]
     mask[tuple(single.T)] = True
     return Defects(
-        torch.from_numpy(mask), int(dead.sum()), int(hot.sum()), int(view_dead.sum()), len(single)
-    )  # fmt: skip
+        torch.from_numpy(mask), int(dead.sum()), int(hot.sum()), int(view_dead.sum()), len(single) - lasting, cells
+    )
 
 
 def _beside(cells: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -149,44 +191,197 @@ def _beside(cells: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.ma.filled(np.ma.median(stacked, axis=0), np.nan)
 
 
-def _isolated(n: NDArray[Any], at: NDArray[np.int64], reach: int = 1) -> NDArray[np.int64]:
+def _dimmed(level: NDArray[np.float64], dead: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Whether the live cells next to each dead one on the last axis are dimmed on both sides: 1 or 0, NaN: unknown.
+
+    Args:
+        level: mean readings, NaN where there are none.
+    """
+    found = np.full(level.shape, np.nan)
+    for r in np.flatnonzero(dead.any(1)):
+        live = np.flatnonzero(~np.isnan(level[r]))
+        at = np.flatnonzero(dead[r])
+        right = np.searchsorted(live, at)
+        known = (right > 1) & (right < live.size - 1)
+        at, right = at[known], right[known]
+        sides = [np.log(np.maximum(level[r, live[far]], 1e-9) / np.maximum(level[r, live[near]], 1e-9))
+                 for near, far in ((right - 1, right - 2), (right, right + 1))]  # fmt: skip
+        found[r, at] = np.min(sides, axis=0) > _DIMMED
+    return found
+
+
+def _isolated(n: NDArray[Any], at: NDArray[np.int64], light: float, reach: int = 1) -> NDArray[np.int64]:
     """Those of the zeros ``at`` ``(k, 3)`` whose non-zero neighbours in the row and the next rows are bright on both
     sides."""
+    values = [[_around(n, at, side * dc) for dc in range(1, reach + 1)] for side in (-1, 1)]
+    stacked = np.ma.masked_less_equal(np.stack([np.concatenate(v) for v in values]), 0.0)
+    sides = np.ma.filled(np.ma.median(stacked, axis=1), 0.0)
+    return at[(sides > light).all(0)]
+
+
+def _around(n: NDArray[Any], at: NDArray[np.int64], column: Any, view: Any = 0) -> NDArray[Any]:
+    """The readings ``column`` columns (and ``view`` views) from ``at``, in the same row and the next ones: ``(1 | 3,
+    k)``; 0 beyond the detector, NaN beyond the first and the last view."""
     limits = np.array(n.shape) - 1
-    sides = []
-    for side in (-1, 1):
-        values = []
-        for dr, dc in itertools.product((-1, 0, 1), range(1, reach + 1)):
-            p = at + np.array([0, dr, dc * side])
-            inside = ((p >= 0) & (p <= limits)).all(1)
-            q = np.clip(p, 0, limits)
-            values.append(np.where(inside, n[q[:, 0], q[:, 1], q[:, 2]], 0.0))
-        stacked = np.ma.masked_less_equal(np.stack(values), 0.0)
-        sides.append(np.ma.filled(np.ma.median(stacked, axis=0), 0.0))
-    return at[(sides[0] > BRIGHT) & (sides[1] > BRIGHT)]
+    values = []
+    for dr in (-1, 0, 1) if n.shape[1] > 1 else (0,):
+        p = at + np.stack(np.broadcast_arrays(view, dr, column), -1)
+        inside = ((p >= 0) & (p <= limits)).all(1)
+        q = np.clip(p, 0, limits)
+        found = np.where(inside, n[q[:, 0], q[:, 1], q[:, 2]], 0.0)
+        values.append(np.where((p[:, 0] < 0) | (p[:, 0] > limits[0]), np.nan, found))
+    return np.stack(values)
+
+
+def _company(n: NDArray[Any], at: NDArray[np.int64], first: NDArray[np.int64], step: int, apart: int) -> NDArray[Any]:
+    """Whether the view ``step`` from the zeros ``at`` has one within ``apart`` columns, too; True beyond the scan."""
+    there = np.clip(at[:, 0] + step, 0, len(n) - 1)
+    drift = first[at[:, 0]] - first[there]
+    found = (at[:, 0] + step < 0) | (at[:, 0] + step >= len(n))
+    for d in range(-apart, apart + 1):
+        column = at[:, 2] + d + drift
+        inside = (column >= 0) & (column < n.shape[2])
+        found |= inside & (n[there, at[:, 1], np.clip(column, 0, n.shape[2] - 1)] <= 0)
+    return found
+
+
+def _unshadowed(
+    n: NDArray[Any], at: NDArray[np.int64], first: NDArray[np.int64], columns: int, light: float
+) -> tuple[NDArray[np.int64], int, int]:
+    """Those of the zeros ``at`` ``(k, 3)`` that are no shadow; how many of them are of cells that were dead for a
+    while, and how many cells those are.
+
+    Args:
+        n: of the views that have a signal.
+        columns: of the detector.
+    """
+    if not len(at):
+        return at, 0, 0
+    # From view to view a shadow moves by so many columns at most.
+    moving = math.ceil(math.pi * columns / len(n))
+    single = _isolated(n, at, light)
+    if len(single) > _FREQUENT * n.size:
+        # So many are no accident, unless they follow each other: neighbours on one side are often lost together.
+        follow = np.mean(_company(n, single, first, -1, moving) & _company(n, single, first, 1, moving))
+        chance = (1 - (1 - np.mean(n <= 0)) ** (2 * moving + 1)) ** 2
+        if follow < chance + 0.25:
+            lost = np.unique(np.concatenate([single, _isolated(n, at, light, reach=3)]), axis=0)
+            return lost, 0, 0
+    # Cells of the detector, one after the other, each view by view: what follows without a break is one run.
+    cell = at[:, 2] + first[at[:, 0]]
+    order = np.lexsort((at[:, 0], cell, at[:, 1]))
+    at, cell = at[order], cell[order]
+    begins = np.ones(len(at), bool)
+    begins[1:] = (np.diff(at[:, 1]) != 0) | (np.diff(cell) != 0) | (np.diff(at[:, 0]) != 1)
+    starts = np.flatnonzero(begins)
+    which = np.cumsum(begins) - 1
+    lengths = np.diff(np.append(starts, len(at)))
+    reach, near, far = zip(*(_flank(n, at, side) for side in (-1, 1)), strict=True)
+    distance = np.stack(reach)
+    dip = np.min([np.log(np.maximum(f, 0.5) / np.maximum(v, 0.5)) for f, v in zip(far, near, strict=True)], axis=0)
+
+    def share(values: NDArray[Any]) -> NDArray[Any]:
+        return np.add.reduceat(values.astype(np.float64), starts) / lengths
+
+    middle = starts + lengths // 2
+    lit = (np.minimum(*near) > light) & (distance > 0).all(0)
+    # A shadow that walks has its edges in other columns while it stays on a cell.
+    still = (distance == distance[:, middle[which]]).all(0)
+    narrow = distance[:, middle].sum(0) - 1 <= _WIDTH
+    good = narrow & (share(lit) >= 0.75) & (share(still) >= 0.75) & (share(dip) <= _DIP)
+    # Before and after: as bright as its neighbours then, and no shadow has come from elsewhere and gone elsewhere.
+    moved, tested = np.ones(len(starts), bool), np.zeros(len(starts), bool)
+    for step, place in ((-1, starts), (1, starts + lengths - 1)):
+        p = at[place]
+        drift = first[p[:, 0]] - first[np.clip(p[:, 0] + step, 0, len(n) - 1)]
+        own, left, right = (
+            _middle(_around(n, p, d + drift, step)) for d in (0, -distance[0, middle], distance[1, middle])
+        )
+        inside = np.isfinite(own)
+        beside = np.minimum(np.where(left > 0, left, np.inf), np.where(right > 0, right, np.inf))
+        good &= ~inside | (own >= 0.5 * beside)
+        moved &= _company(n, p, first, step, _WIDTH + moving)
+        tested |= inside
+    good &= tested & ~moved
+    lasting = good & (lengths >= _LASTING)
+    cells = np.unique(np.stack([at[starts, 1], cell[starts]], 1)[lasting], axis=0)
+    return at[good[which]], int(lengths[lasting].sum()), len(cells)
+
+
+def _middle(values: NDArray[Any]) -> NDArray[Any]:
+    """Median of the bright ones of ``(k, places)`` at each place, 0 where there is none; NaN stays."""
+    if len(values) == 1:
+        return np.asarray(values[0])
+    found = np.ma.filled(np.ma.median(np.ma.masked_less_equal(np.nan_to_num(values), 0.0), axis=0), 0.0)
+    return np.where(np.isnan(values[1]), np.nan, found)
+
+
+def _flank(n: NDArray[Any], at: NDArray[np.int64], side: int) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """The first reading above 0 on one side of the zeros ``at``: how many columns away (0: none near), it, the next."""
+    distance = np.zeros(len(at), np.int64)
+    near, far = np.zeros(len(at)), np.zeros(len(at))
+    for d in range(1, _WIDTH + 3):
+        value = _middle(_around(n, at, side * d))
+        first = (distance == 0) & (value > 0)
+        second = (distance > 0) & (far == 0) & (value > 0)
+        near, far = np.where(first, value, near), np.where(second, value, far)
+        distance = np.where(first, d, distance)
+    return distance, near, np.where(far > 0, far, near)
 
 
 def mended(scan: Scan) -> tuple[Scan, list[str]]:
-    """A counting scan whose impossible readings are replaced, and what was done.
+    """A scan whose impossible readings are bridged by their neighbours, and what was done.
 
-    The replacements are expected counts of interpolated line integrals: they are less noisy than the readings that
-    they stand for.
+    Of a scan without window they are dead from then on (``scan.dead``): they weigh nothing. In views of which more is
+    lost than :data:`torchpcct.dead_cells.MOST_DEAD`, and in scans with a window, they are replaced by the counts that
+    the interpolated line integrals stand for, which are less noisy than those lost.
 
     Args:
-        scan: a noisy scan in counting mode by a detector with rows; any other is returned as it is.
+        scan: noisy readings of any geometry, of several slices or one; other scans (noise-free ones, line integrals,
+            energy bins) are returned as they are.
 
     Returns:
-        The scan (the same object if nothing was found), and one sentence for each finding.
+        The scan (the same object if nothing was found), its ``info`` with the number of ``dead_readings``; and one
+        sentence for what was found now or at an earlier call.
     """
-    rows = scan.geometry.has_rows
-    if scan.noise_free or scan.logged or not (scan.counting and rows) or scan.counts.ndim != 3:
-        return scan, []
-    window = scan.window or DetectorWindow.full(scan.geometry)
-    kept = scan.air[window.first_row : window.first_row + window.rows]
-    found = find_defects(scan.counts, kept, window.first_column)
+    g = scan.geometry
+    before = list(scan.info.get("mended", []))
+    if scan.noise_free or scan.logged or scan.counts.ndim > 3 or (scan.quantum is None and not scan.counting):
+        return scan, before
+    # The slices of a stack are the rows of a detector.
+    stack = g.has_rows or scan.counts.ndim == 2
+
+    def by_view(values: Tensor) -> Tensor:
+        return (values if stack else values.movedim(0, 1)).reshape(g.views, -1, values.shape[-1])
+
+    window = scan.window
+    air = scan.air if window is None else scan.air[window.first_row : window.first_row + window.rows]
+    photon = 1.0 if scan.quantum is None else float(scan.quantum.median())
+    found = find_defects(
+        by_view(scan.counts), air.reshape(-1, air.shape[-1]), None if window is None else window.first_column,
+        known=None if scan.dead is None else by_view(scan.dead.expand(scan.counts.shape)),
+        photon=max(photon, dispersion(scan.counts)) if window is None else photon,
+        electronic_noise=scan.electronic_noise, gains=g.has_rows,
+    )  # fmt: skip
     if not found.text:
-        return scan, []
-    air = scan._at_window(scan.air)
-    lines = torch.log(air) - torch.log(scan.counts + 0.5)
-    replaced = (air * torch.exp(-bridge(lines, found.mask, rows=True, most=1.0)) - 0.5).clamp_min(0.0)
-    return replace(scan, counts=torch.where(found.mask, replaced, scan.counts)), [found.text]
+        return scan, before
+    mask = found.mask if stack else found.mask.movedim(1, 0)
+    mask = mask.reshape(scan.counts.shape)
+    dead = mask if scan.dead is None else mask | scan.dead
+    p = replace(scan, dead=dead)._logarithm()
+    # Dead readings stand as 1 in p.
+    expected = torch.exp(p - bridge(p, dead, rows=g.has_rows, most=1.0))
+    replaced = (expected - 0.5 * (1.0 if scan.quantum is None else scan.quantum)).clamp_min(0.0)
+    changes: dict[str, Any] = {"counts": torch.where(mask, replaced, scan.counts)}
+    if window is None:
+        axes = (-2, -1) if g.has_rows else (-1,)
+        few = dead.float().mean(axes, keepdim=True) <= MOST_DEAD
+        changes["dead"] = (mask & few) | (torch.zeros_like(mask) if scan.dead is None else scan.dead)
+    texts = [*before, found.text]
+    return replace(scan, **changes, info={**scan.info, "mended": texts, "dead_readings": int(dead.sum())}), texts
+
+
+def dead_readings(scan: Scan) -> int:
+    """How many readings of a scan are bridged by their neighbours, after :func:`mended`."""
+    known = 0 if scan.dead is None else int(scan.dead.sum())
+    return max(known, int(scan.info.get("dead_readings", 0)))

@@ -18,7 +18,7 @@ from torchpcct.robust import MEDIAN_TO_SD
 from torchpcct.scanner.linearisation import WaterLinearisation
 from torchpcct.validate import number
 
-__all__ = ["counted", "inverse_variance", "logged", "smoothed"]
+__all__ = ["counted", "dispersion", "inverse_variance", "logged", "smoothed"]
 
 _PSEUDO_WATER = 0.02
 """Attenuation in mm⁻¹ that stands for water where a scan is not in HU: it sets the scale of priors, nothing else."""
@@ -26,6 +26,8 @@ _SILENT_VIEWS = 8
 """Cells that read nothing in so many views, or more, are dead."""
 _DARK = 1e-3
 """Cells that read no more in air than this share of the median cell are dead."""
+_DIM = 20.0
+"""Photons of a reading below which its noise is far from normal."""
 _TRANSFER_FRAMES = 4
 """Air frames that a photon transfer needs at least."""
 
@@ -243,6 +245,41 @@ def _photons(p: Tensor, mask: Tensor, geometry: Geometry) -> float:
         return 1e6
     sd = MEDIAN_TO_SD * float(live.abs().median())
     return float(min(max(1.0 / max(sd, 1e-4) ** 2, 1.0), 1e8))
+
+
+def dispersion(readings: Tensor, dead: Tensor | None = None) -> float:
+    """Variance over mean of the noise between neighbouring columns: the reading of one photon; 1 of Poisson counts.
+
+    The second difference of smooth rows is noise of six times the variance. Edges are outliers to the median; details
+    everywhere raise it, blur of the detector lowers it. Readings of a handful of photons do not tell, and are left out.
+
+    Args:
+        readings: ``(..., columns)``, the dark taken off.
+        dead: bool of the same shape, readings to leave out; or None.
+
+    Returns:
+        NaN if nothing can be said.
+    """
+    n, columns = readings.reshape(-1, readings.shape[-1]), readings.shape[-1]
+    if columns < 8:
+        return math.nan
+    step = max(1, n.numel() // 2_000_000)
+    n = n[::step].double()
+    if dead is not None:
+        n = n.masked_fill(dead.reshape(-1, columns)[::step], math.nan)
+    second = n[:, 2:] - 2.0 * n[:, 1:-1] + n[:, :-2]
+    mean = (n[:, 2:] + n[:, 1:-1] + n[:, :-2]) / 3.0
+    ratio = (second.square() / (6.0 * mean))[mean > 0]
+    level = mean[mean > 0]
+    known = torch.isfinite(ratio)
+    ratio, level = ratio[known], level[known]
+    for _ in range(2):  # first guess from all, then without the dim ones, whose noise is not normal
+        if ratio.numel() < 8:
+            return math.nan
+        found = float(ratio.median()) * MEDIAN_TO_SD**2
+        bright = level > _DIM * found
+        ratio, level = ratio[bright], level[bright]
+    return found
 
 
 def inverse_variance(mean: Tensor, quantum: Tensor, electronic_noise: float) -> Tensor:

@@ -40,6 +40,7 @@ def _is_volume(path: Path) -> bool:
 def _info(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     import yaml
 
+    from torchpcct.defects import dead_readings, mended
     from torchpcct.formats.geometry_yaml import geometry_values
     from torchpcct.formats.scans import open_scan
     from torchpcct.volume import Volume
@@ -59,7 +60,7 @@ def _info(arguments: argparse.Namespace, progress: ProgressBars) -> None:
             "kind": "scan", "readings": list(scan.counts.shape), "geometry": geometry_values(scan.geometry),
             "exposure_s": scan.exposure_s, "seed": scan.seed, "counting": scan.counting, "unit": scan.unit,
             "windowed": scan.window is not None, "mean": float(scan.counts.mean()), "zero_share": scan.zero_fraction,
-            "dead_readings": 0 if scan.dead is None else int(scan.dead.sum()), "info": dict(scan.info),
+            "dead_readings": dead_readings(mended(scan)[0]), "info": dict(scan.info),
         }  # fmt: skip
     if arguments.json:
         print(json.dumps({"file": str(path), **about}, indent=1, default=str))

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import gaussian_filter1d
 
-from torchpcct import ConeBeam, Scan, full_turn
-from torchpcct.defects import find_defects, mended
+from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, full_turn
+from torchpcct.defects import dead_readings, find_defects, mended
 from torchpcct.scanner.linearisation import WaterLinearisation
 
 VIEWS, ROWS, COLUMNS = 90, 6, 60
@@ -105,3 +106,54 @@ def test_a_scan_is_mended_and_says_so(counts):
     assert float(error.square().mean().sqrt()) < 0.12
     clean = replace(scan, counts=broken, exposure_s=None, seed=None)
     assert mended(clean)[0] is clean
+
+
+def foreign(kind, slices):
+    """Readings of every kind of scan over a dark frame of 20, sound and with cells that are dead for a while."""
+    geometry = {
+        "parallel": ParallelBeam(full_turn(VIEWS) / 2, COLUMNS, 1.0),
+        "fan": FanBeam(full_turn(VIEWS), 300.0, 500.0, COLUMNS, 1.0),
+        "cone": ConeBeam(full_turn(VIEWS), 300.0, 500.0, COLUMNS, ROWS, 1.0),
+    }[kind]
+    n = torch.from_numpy(np.random.default_rng(5).poisson(expected()) + 20.0)
+    bad = torch.zeros(n.shape, dtype=torch.bool)
+    bad[20:50, 4, 15] = bad[60:72, 4, 40:43] = bad[7, 4, 30] = bad[80:82, 4, 25:27] = bad[30:34, 1, 50] = True
+    if not geometry.has_rows:
+        n, bad = (v.movedim(1, 0) if slices else v[:, 4] for v in (n, bad))
+    options = {"air": 4020.0, "dark": 20.0, "electronic_noise": 2.0}
+    return [Scan.from_counts(v, geometry, **options) for v in (n, n.masked_fill(bad, 0.0))], bad
+
+
+@pytest.mark.parametrize(("kind", "slices"), [("parallel", False), ("parallel", True), ("fan", False), ("cone", False)])
+def test_cells_that_are_dead_for_part_of_the_turn_are_bridged_and_weigh_nothing(kind, slices):
+    (sound, broken), bad = foreign(kind, slices)
+    assert mended(sound)[0] is sound
+    fixed, said = mended(broken)
+    assert torch.equal(fixed.dead, bad)
+    assert "dead for part of the views" in said[0]
+    assert dead_readings(fixed) == int(bad.sum())
+    assert not fixed.weights()[bad].any()
+    # The logarithm of 0 was 6 off.
+    assert float((fixed.line_integrals() - sound.line_integrals())[bad].abs().max()) < 0.8
+    again, repeated = mended(fixed)
+    assert again is fixed
+    assert repeated == said
+
+
+@pytest.mark.parametrize("blur", [0.3, 0.6])
+def test_shadows_of_opaque_pins_and_plates_are_no_defects(blur):
+    """One to eight cells wide, near the axis and far from it; a plate is opaque in a few views only."""
+    views, columns, sub = 180, 160, 8
+    beta, u = full_turn(views)[:, None], ((np.arange(columns * sub) + 0.5) / sub - columns / 2)[None]
+    lines = 0.03 * np.sqrt(np.clip(70.0**2 - u**2, 0, None)) + 0 * beta
+    for distance, at, long, thick in (
+        (0.3, 0.0, 2.2, 2.2), (4.0, 1.0, 1.2, 1.2), (25.0, 2.0, 0.8, 0.8), (40.0, 3.0, 4.0, 4.0), (60.0, 4.0, 1.5, 1.5),
+        (30.0, 5.0, 12.0, 0.7), (5.0, 0.5, 9.0, 1.0),
+    ):  # fmt: skip
+        half = np.hypot(long * np.cos(beta - at), thick * np.sin(beta - at))
+        across = np.clip(1 - ((u - distance * np.sin(at - beta)) / half) ** 2, 0, None)
+        lines = lines + 30.0 * 2 * long * thick / half * np.sqrt(across)
+    shone = gaussian_filter1d(np.exp(-lines), blur * sub, axis=1).reshape(views, columns, sub).mean(-1)
+    n = np.random.default_rng(0).poisson(2e4 * shone).astype(np.float32)
+    assert (n == 0).mean() > 0.05
+    assert not find_defects(torch.from_numpy(n[:, None]), torch.full((1, columns), 2e4)).mask.any()
