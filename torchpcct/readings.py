@@ -18,7 +18,7 @@ from torchpcct.robust import MEDIAN_TO_SD
 from torchpcct.scanner.linearisation import WaterLinearisation
 from torchpcct.validate import number
 
-__all__ = ["counted", "dispersion", "inverse_variance", "logged", "smoothed"]
+__all__ = ["TRANSFER_FRAMES", "counted", "dispersion", "inverse_variance", "logged", "smoothed"]
 
 _PSEUDO_WATER = 0.02
 """Attenuation in mm⁻¹ that stands for water where a scan is not in HU: it sets the scale of priors, nothing else."""
@@ -28,7 +28,7 @@ _DARK = 1e-3
 """Cells that read no more in air than this share of the median cell are dead."""
 _DIM = 20.0
 """Photons of a reading below which its noise is far from normal."""
-_TRANSFER_FRAMES = 4
+TRANSFER_FRAMES = 4
 """Air frames that a photon transfer needs at least."""
 
 
@@ -113,10 +113,11 @@ def _dead(mask: Any, readings: Tensor, air: Tensor, geometry: Geometry) -> Tenso
     return dead | bad if bool(bad.any()) else dead
 
 
-def _photon_transfer(frames: Tensor | None, dark: Tensor) -> float:
-    """Signal per photon from the variance of air frames over their mean (Janesick 2007); 1 with too few frames."""
-    if frames is None or len(frames) < _TRANSFER_FRAMES:
-        return 1.0
+def _photon_transfer(frames: Tensor, dark: Tensor) -> float | None:
+    """Signal per photon from the variance of air frames over their mean (Janesick 2007).
+
+    None: the frames do not differ, as of averages that were stored several times.
+    """
     signal = frames - dark
     level = signal.flatten(1).median(1).values
     signal = signal / level.view(-1, *(1,) * (signal.ndim - 1)) * level.mean()  # the tube may have drifted
@@ -125,9 +126,28 @@ def _photon_transfer(frames: Tensor | None, dark: Tensor) -> float:
     ratio = (signal.var(0) / mean)[mean > 0.2 * mean.median()]
     n = len(frames) - 1
     gain = float(ratio.median()) / (1.0 - 2.0 / (9.0 * n)) ** 3
-    if not (math.isfinite(gain) and gain > 0):
-        raise ValueError("the air frames do not differ from each other: give gain=, the signal of one photon")
-    return gain
+    return gain if math.isfinite(gain) and gain > 0 else None
+
+
+def _gain_of_noise(signal: Tensor, air: Tensor, geometry: Geometry) -> float:
+    """Signal per photon that explains the noise of the readings between neighbouring columns (:func:`_photons`)."""
+    level = _views(air, geometry)
+    bad = ~((signal > 0) & (level > 0) & torch.isfinite(signal) & torch.isfinite(level))
+    lines = torch.log(torch.where(bad, 1.0, level) / torch.where(bad, 1.0, signal))
+    return float(air[air > 0].nanmedian()) / _photons(lines, bad, geometry)
+
+
+def _gain(given: Any, signal: Tensor, air: Tensor, frames: Tensor | None, dark: Tensor, geometry: Geometry) -> Any:
+    """Signal of one photon, and where it is from; see ``Scan.from_counts``."""
+    if given is None and (frames is None or len(frames) < TRANSFER_FRAMES):
+        return 1.0, "assumed"
+    if given is None:
+        found = _photon_transfer(frames, dark) if frames is not None else None
+        if found is not None:
+            return found, "photon transfer of the air frames"
+    if given is None or (isinstance(given, str) and given == "noise"):
+        return _gain_of_noise(signal, air, geometry), "noise between neighbouring columns"
+    return number("gain", given, positive=True), "given"
 
 
 def counted(
@@ -135,7 +155,7 @@ def counted(
     geometry: Geometry,
     air: Any,
     dark: Any,
-    gain: float | None,
+    gain: Any,
     flux: Any,
     dead: Any,
     electronic_noise: float | None,
@@ -147,15 +167,14 @@ def counted(
     cells = _shapes("readings", raw, geometry)
     bright, bright_frames = _frame("air", air, cells)
     black, black_frames = _frame("dark", dark, cells)
-    if gain is None:
-        gain = _photon_transfer(bright_frames, black)
-    number("gain", gain, positive=True)
+    signal = raw - _views(black, geometry)
+    gain, source = _gain(gain, signal, bright - black, bright_frames, black, geometry)
     if electronic_noise is None:
         frames = black_frames if black_frames is not None and len(black_frames) > 2 else None
         electronic_noise = 0.0 if frames is None else float(frames.var(0).mean().sqrt()) / gain
     number("electronic_noise", electronic_noise, low=0.0)
     offset = bool((black != 0).any())
-    counts, bright = (raw - _views(black, geometry)) / gain, (bright - black) / gain
+    counts, bright = signal / gain, (bright - black) / gain
     if not float(bright.nanmedian()) > 0:
         raise ValueError("air is not brighter than dark: are the two exchanged?")
     mask = _dead(dead, counts, bright, geometry)
@@ -175,7 +194,11 @@ def counted(
         "counting": not integrating,
         "electronic_noise": electronic_noise,
         "quantum": torch.ones(1).expand(counts.shape) if integrating else None,
-        "info": {"dead_readings": int(mask.expand(counts.shape).sum()), "signal_of_one_photon": gain},
+        "info": {
+            "dead_readings": int(mask.expand(counts.shape).sum()),
+            "signal_of_one_photon": gain,
+            "signal_of_one_photon_from": source,
+        },
     }
     if flux is not None:
         fields["flux"] = _flux(flux, geometry)

@@ -57,7 +57,8 @@ class Scan:
         dead: bool, the shape of ``counts``: readings that say nothing; None: there are none. They are bridged by their
             neighbours in line integrals, and weigh nothing.
         logged: the readings come from given line integrals: their logarithm is taken as it is.
-        unit: of volumes, "HU" or, where the attenuation of water is not known or means nothing, "mm^-1".
+        unit: of volumes, "HU" or, where the attenuation of water is not known or means nothing, "mm^-1". "pixel^-1":
+            the size of a cell is not known, all lengths are in cells.
 
     Scans of other scanners: :meth:`from_counts`, :meth:`from_line_integrals`, :mod:`torchpcct.formats`.
 
@@ -96,7 +97,7 @@ class Scan:
         *,
         air: Any,
         dark: Any = 0.0,
-        gain: float | None = None,
+        gain: float | str | None = None,
         flux: Any = None,
         dead: Any = None,
         electronic_noise: float | None = None,
@@ -118,6 +119,7 @@ class Scan:
                 ``(frames, …)``, or one number.
             dark: readings without beam, as ``air``.
             gain: reading of one photon. None: from the variance of four air frames or more (photon transfer), else 1.
+                "noise", and None where the frames do not differ: what explains the noise between neighbouring columns.
             flux: ``(views,)`` intensity of the source relative to ``air``; None: the same.
             dead: bool mask of cells or of readings, True where dead.
             electronic_noise: standard deviation in photons; None: from three dark frames or more, else 0.

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, Geometry
 from torchpcct.scanner.linearisation import WaterLinearisation
-from torchpcct.validate import choice, number, whole
+from torchpcct.validate import UNITS, choice, number, whole
 
 __all__ = ["check_exposure", "check_scan"]
 
@@ -66,7 +66,7 @@ def check_scan(scan: Any) -> None:
     for name, readings in (("air", scan.air), ("surround", scan.surround)):
         if readings is not None and not bool(((readings > 0) & torch.isfinite(readings)).all()):
             raise ValueError(f"{name} readings must be finite and greater than 0 in every cell: mask dead cells before")
-    choice("unit", scan.unit, ("HU", "mm^-1"))
+    choice("unit", scan.unit, UNITS)
     if scan.dead is not None and scan.dead.shape != scan.counts.shape:
         raise ValueError(f"dead has shape {tuple(scan.dead.shape)}, counts {tuple(scan.counts.shape)}")
     if scan.flux is not None and tuple(scan.flux.shape) != (g.views,):

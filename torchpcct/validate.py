@@ -8,7 +8,10 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["choice", "coverage", "number", "numbers", "per_axis", "whole"]
+__all__ = ["UNITS", "choice", "coverage", "number", "numbers", "per_axis", "whole"]
+
+UNITS = ("HU", "mm^-1", "pixel^-1")
+"""Of scans and volumes; of ``pixel^-1`` all lengths are in pixels."""
 
 
 def number(

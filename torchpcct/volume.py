@@ -23,7 +23,7 @@ from torchpcct.formats.volume_files import (
     write_nifti,
 )
 from torchpcct.geometry import VolumeGrid
-from torchpcct.validate import choice
+from torchpcct.validate import UNITS, choice
 
 __all__ = ["Volume", "check_volume_name", "from_hu", "to_hu"]
 
@@ -46,7 +46,8 @@ class Volume:
         data: ``(..., z, y, x)``, float32 or float64.
         grid: its voxel grid.
         report: how it was made: method, kernel, iterations, residual, seconds, …
-        unit: of ``data``: "HU", or "mm^-1" where the scan does not know the attenuation of water.
+        unit: of ``data``: "HU", or "mm^-1" where the scan does not know the attenuation of water, "pixel^-1" where it
+            does not know the size of its cells (lengths of the grid are in pixels then).
     """
 
     data: Tensor
@@ -59,7 +60,7 @@ class Volume:
             raise TypeError(f"data must be a floating point tensor in HU, got {type(self.data).__name__}")
         if tuple(self.data.shape[-self.grid.ndim :]) != self.grid.shape:
             raise ValueError(f"data has shape {tuple(self.data.shape)}, its grid {self.grid.shape}")
-        choice("unit", self.unit, ("HU", "mm^-1"))
+        choice("unit", self.unit, UNITS)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write ``.nii`` / ``.nii.gz`` (NIfTI-1), ``.mha`` (MetaImage), ``.h5`` (HDF5 with grid and report), or, if the

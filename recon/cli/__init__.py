@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import logging
 import shlex
 import sys
 import time
@@ -19,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from recon.cli.looking import add_info, add_view
-from recon.cli.parsing import Commands, command
+from recon.cli.parsing import Commands, as_options, command, saying
 
 # What loads torch or numba is imported by the commands: help and refusals come at once.
 from recon.cli.plaque import add_plaque
@@ -193,7 +192,7 @@ def _add_verify(commands: Commands) -> None:
     parser.add_argument("--again", nargs="*", default=[], metavar="STUDY", help="compute these studies again, in full")
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser() -> tuple[argparse.ArgumentParser, Commands]:
     parser = argparse.ArgumentParser(
         prog="torchpcct",
         description="Photon-counting CT: simulate, reconstruct, and measure what model-based reconstruction saves.",
@@ -203,16 +202,20 @@ def _parser() -> argparse.ArgumentParser:
     scans = (add_simulate, add_show_config, add_reconstruct, add_info, add_view)
     for add in (_add_compare, _add_dose_factor, _add_hardcases, _add_study, *scans, add_plaque, _add_verify):
         add(commands)
-    return parser
+    return parser, commands
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit status: 0 done, 2 refused input, 130 interrupted."""
-    options = _parser().parse_args(arguments)
+    parser, commands = _parser()
+    options = parser.parse_args(arguments)
     options.command_line = list(sys.argv[1:] if arguments is None else arguments)
-    logging.basicConfig(
-        level=logging.INFO if options.verbose else logging.WARNING, format="%(levelname)s %(name)s: %(message)s"
-    )
+    actions = commands.choices[options.command]._actions
+    with saying(actions, options.verbose) as options.warn:
+        return _run(options, actions)
+
+
+def _run(options: argparse.Namespace, actions: Any) -> int:
     progress: Any = None
     try:
         from recon.study.study import ProgressBars
@@ -222,7 +225,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise ValueError("--device cuda: PyTorch finds no CUDA device here; use --device cpu")
         options.run(options, progress)
     except (ValueError, TypeError, OSError, OverflowError, MemoryError) as error:
-        return _failed(options.command, progress, str(error) or "out of memory: use larger voxels or a smaller grid", 2)
+        text = as_options(str(error), actions) or "out of memory: use larger voxels or a smaller grid"
+        return _failed(options.command, progress, text, 2)
     except RuntimeError as error:
         if "no locator available" not in str(error):
             raise

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 # What loads torch or numba is imported by the commands: help and refusals come at once.
-from recon.cli.parsing import SCAN_ENDINGS, Commands, check_ending, without_ending
+from recon.cli.parsing import SCAN_ENDINGS, Commands, as_json, check_ending, length_of, without_ending
 from torchpcct.files import require_folder, written_whole
 from torchpcct.validate import number
 
@@ -48,10 +47,10 @@ def _info(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     path: Path = arguments.file
     if _is_volume(path):
         volume = Volume.load(path)
-        values = volume.data.double()
+        values, length = volume.data.double(), length_of(volume.unit)
         about: dict[str, Any] = {
-            "kind": "volume", "shape": list(volume.grid.shape), "spacing_mm": list(volume.grid.spacing),
-            "center_mm": list(volume.grid.center), "unit": volume.unit, "lowest": float(values.min()),
+            "kind": "volume", "shape": list(volume.grid.shape), f"spacing_{length}": list(volume.grid.spacing),
+            f"center_{length}": list(volume.grid.center), "unit": volume.unit, "lowest": float(values.min()),
             "mean": float(values.mean()), "highest": float(values.max()), "report": dict(volume.report),
         }  # fmt: skip
     else:
@@ -60,14 +59,18 @@ def _info(arguments: argparse.Namespace, progress: ProgressBars) -> None:
             "kind": "scan", "readings": list(scan.counts.shape), "geometry": geometry_values(scan.geometry),
             "exposure_s": scan.exposure_s, "seed": scan.seed, "counting": scan.counting, "unit": scan.unit,
             "windowed": scan.window is not None, "mean": float(scan.counts.mean()), "zero_share": scan.zero_fraction,
+            **({"lengths": "in pixels, the file does not know their size"} if scan.unit == "pixel^-1" else {}),
             "dead_readings": dead_readings(mended(scan)[0]), "info": dict(scan.info),
         }  # fmt: skip
     if arguments.json:
-        print(json.dumps({"file": str(path), **about}, indent=1, default=str))
+        print(as_json({"file": str(path), **about}))
         return
     for key in ("report", "info"):
         about.pop(key, None)
-    print(yaml.safe_dump({"file": str(path), **about}, sort_keys=False, allow_unicode=True), end="")
+    print(
+        yaml.safe_dump({"file": str(path), **about}, sort_keys=False, allow_unicode=True, default_flow_style=None),
+        end="",
+    )
 
 
 def add_info(commands: Commands) -> None:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 # What loads torch or numba is imported by the commands: help and refusals come at once.
-from recon.cli.parsing import SCAN_ENDINGS, Commands, check_ending, command, tell, without_ending
+from recon.cli.parsing import SCAN_ENDINGS, Commands, as_json, check_ending, command, length_of, tell, without_ending
 from torchpcct import VolumeGrid
 from torchpcct.files import require_folder
 from torchpcct.formats.volume_files import check_volume_name
@@ -25,6 +24,7 @@ __all__ = ["add_reconstruct", "add_show_config", "add_simulate"]
 _PAPER_VIEWS = 1968
 MOST_VOXELS = 2**31
 """Of a volume, 8 GiB: what is asked for beyond is a slip of the voxel size."""
+_NO_SIZE = " (the file does not know their size: --pitch MM)"
 _FBP_RATE = 1e8
 """Voxel updates of the backprojection a second on one core, for a rough estimate."""
 
@@ -276,7 +276,7 @@ def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         seconds = grid.voxels * scan.geometry.views / _FBP_RATE
         if arguments.json:
             estimate = {"file": str(arguments.out), "gib": bytes_ / 2**30, "fbp_seconds": seconds}
-            print(json.dumps({**config, "estimate": estimate}, indent=1))
+            print(as_json({**config, "estimate": estimate}))
             return
         print(yaml.safe_dump(config, sort_keys=False, allow_unicode=True))
         print(
@@ -293,11 +293,14 @@ def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     size = " × ".join(map(str, grid.shape))
     spacing = " × ".join(f"{s:.4g}" for s in grid.spacing)
     seconds = volume.report["seconds"]
-    short = f"{size} voxels of {spacing} mm, {arguments.method}, mean {mean:.4g} {volume.unit}, {seconds} s"
+    length = length_of(scan.unit)
+    noted = _NO_SIZE if length == "pixels" else ""
+    short = f"{size} voxels of {spacing} {length}{noted}, "
+    short += f"{arguments.method}, mean {mean:.4g} {volume.unit}, {seconds} s"
     for text in volume.report.get("warnings", []):
-        short += f"\n  warning: {text}"
-    tell(arguments, short, config, shape=list(grid.shape), spacing_mm=list(grid.spacing), center_mm=list(grid.center),
-         unit=volume.unit, mean_hu=mean, **volume.report)  # fmt: skip
+        arguments.warn(text)
+    place = {f"spacing_{length}": list(grid.spacing), f"center_{length}": list(grid.center)}
+    tell(arguments, short, config, shape=list(grid.shape), **place, unit=volume.unit, mean=mean, **volume.report)
 
 
 def add_reconstruct(commands: Commands) -> None:

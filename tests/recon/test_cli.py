@@ -138,6 +138,33 @@ def test_a_foreign_scan_in_one_command(tmp_path):
     assert float(volume.data[0, y - 2 : y + 3, x - 2 : x + 3].mean()) == pytest.approx(0.0, abs=15)
 
 
+def test_a_foreign_scan_without_pixel_size(tmp_path, capsys):
+    """README's own command on the best known file of the format; every refusal names options of the command line."""
+    geometry = ParallelBeam(np.arange(31) * np.pi / 30, 48, 1.0)
+    lines = line_integrals(geometry, [Ellipsoid((2.0, -3.0), 12.0, value=0.02)])
+    path = str(tmp_path / "tooth.h5")
+    with h5py.File(path, "w") as file:
+        file["exchange/data"] = np.rint(4e4 * np.exp(-lines[:, None])).astype(np.uint16)
+        file["exchange/data_white"] = np.full((5, 1, 48), 40000, np.uint16)
+        file["exchange/theta"] = np.rad2deg(geometry.angles)
+    assert main(["info", path]) == 0
+    assert "unit: pixel^-1" in capsys.readouterr().out
+    command = ["reconstruct", path, "--find-axis", "--out", str(tmp_path / "tooth.nii.gz")]
+    assert main(command) == 0
+    assert "of 1 × 1 × 1 pixels (the file does not know their size: --pitch MM)" in capsys.readouterr().out
+    report = (tmp_path / "tooth.nii.gz.json").read_text(encoding="utf-8")
+    assert '"spacing_pixels": [1.0, 1.0, 1.0],' in report  # lists on one line
+    assert "mean_hu" not in report
+    for option, value, message in (
+        ("--mu-water", "0.02", "it does not know the size of its pixels: give --pitch MM, too"),
+        ("--photons", "100", "--photons N belongs to line integrals"),
+        ("--slices", "7:", "--slices A:B must lie within the 1 rows"),
+        ("--pitch", "-1", "--pitch must be greater than 0 mm"),
+    ):
+        assert main([*command, option, value]) == 2
+        assert message in capsys.readouterr().err
+
+
 def test_names_and_grey_scale_of_their_own(tmp_path, capsys, monkeypatch):
     """Without --out in the working directory; a volume in mm⁻¹ is not drawn black; a scan is no volume."""
     monkeypatch.chdir(tmp_path)

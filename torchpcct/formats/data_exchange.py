@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import math
 import os
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from torchpcct.formats.damage import check_size, reading
 from torchpcct.geometry import ParallelBeam
+from torchpcct.readings import TRANSFER_FRAMES
 from torchpcct.scan import Scan
 from torchpcct.validate import number
 
 __all__ = ["read_data_exchange"]
 
-_MM = {"m": 1e3, "meter": 1e3, "cm": 10.0, "mm": 1.0, "um": 1e-3, "µm": 1e-3, "micron": 1e-3, "microns": 1e-3}
+_MM = {
+    **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), 1e3), "cm": 10.0, "nm": 1e-6,
+    **dict.fromkeys(("mm", "millimeter", "millimeters", "millimetre", "millimetres"), 1.0),
+    **dict.fromkeys(("um", "µm", "μm", "micron", "microns", "micrometer", "micrometers", "micrometre"), 1e-3),
+}  # fmt: skip
 _PIXEL = ("measurement/instrument/detector/pixel_size", "measurement/instrument/detector/x_pixel_size",
           "measurement/instrument/detector/pixel_size_x")  # fmt: skip
 
@@ -23,7 +30,6 @@ def read_data_exchange(
     path: str | os.PathLike[str],
     *,
     pitch: float | None = None,
-    axis: float | None = None,
     slices: slice | None = None,
     mu_water: float | None = None,
     **options: Any,
@@ -32,18 +38,19 @@ def read_data_exchange(
 
     Args:
         path: HDF5 file.
-        pitch: cell width in mm; None: the file's pixel size.
-        axis: column of the rotation axis (may be fractional); None: the detector's middle.
-            :func:`torchpcct.formats.preprocess.find_axis` finds it.
+        pitch: cell width in mm; None: the file's pixel size. If it knows none, lengths are in pixels and volumes in
+            pixel^-1.
         slices: rows to read; None: all.
-        mu_water, options: of :meth:`torchpcct.Scan.from_counts`.
+        mu_water, options: of :meth:`torchpcct.Scan.from_counts`. White frames that cannot tell what one photon reads
+            (fewer than four, or averaged before): ``gain="noise"`` unless a number is given.
 
     Returns:
-        Scan with counts ``(slices, views, columns)``.
+        Scan with counts ``(slices, views, columns)``, the rotation axis in the detector's middle
+        (:func:`torchpcct.formats.preprocess.find_axis` finds it).
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: no Data Exchange file, damaged, without angles or pixel size.
+        ValueError: no Data Exchange file, damaged, without angles; ``mu_water`` where the pixel size is not known.
     """
     import h5py
 
@@ -55,24 +62,30 @@ def read_data_exchange(
         if data.ndim != 3:
             raise ValueError(f"/exchange/data has the shape {data.shape}, expected (views, rows, columns)")
         rows = slice(None) if slices is None else slices
-        frames = {name: file[f"exchange/{name}"][:, rows] for name in ("data_white", "data_dark")
+        frames = {name: file[f"exchange/{name}"][..., rows, :] for name in ("data_white", "data_dark")
                   if f"exchange/{name}" in file}  # fmt: skip
         if "data_white" not in frames:
             raise ValueError("it has no white frames, /exchange/data_white: readings cannot be normalised")
         readings = data[:, rows]
         angles = _theta(file, data.shape[0])
+        info: dict[str, Any] = {"file": str(path), "format": "Data Exchange"}
         if pitch is None:
-            pitch = _pixel_size(file)
-        number("pitch", pitch, positive=True, unit="mm")
-        columns = data.shape[2]
-        offset = (
-            0.0 if axis is None else ((columns - 1) / 2 - number("axis", axis, low=0.0, high=columns - 1.0)) * pitch
-        )
-        geometry = ParallelBeam(angles, columns, pitch, offset)
-        return Scan.from_counts(
-            np.moveaxis(readings, 0, 1), geometry, air=frames["data_white"], dark=frames.get("data_dark", 0.0),
-            mu_water=mu_water, info={"file": str(path), "format": "Data Exchange"}, **options,
+            pitch, info["pixel_size"] = _pixel_size(file)
+        unknown = pitch is None
+        if unknown and mu_water is not None:
+            raise ValueError(f"HU need the pixel size, but {info['pixel_size']}: give pitch= with mu_water=")
+        pitch = 1.0 if pitch is None else number("pitch", pitch, positive=True, unit="mm")
+        if not readings.size:
+            raise ValueError(f"slices= must lie within the {data.shape[1]} rows of the file")
+        geometry = ParallelBeam(angles, data.shape[2], pitch)
+        white = frames["data_white"]
+        if options.get("gain") is None and (white.ndim < 3 or len(white) < TRANSFER_FRAMES):
+            options["gain"] = "noise"
+        scan = Scan.from_counts(
+            np.moveaxis(readings, 0, 1), geometry, air=white, dark=frames.get("data_dark", 0.0), mu_water=mu_water,
+            info=info, **options,
         )  # fmt: skip
+        return replace(scan, unit="pixel^-1") if unknown else scan
 
 
 def _theta(file: Any, views: int) -> Any:
@@ -86,15 +99,18 @@ def _theta(file: Any, views: int) -> Any:
     return angles if unit.startswith("rad") else np.deg2rad(angles)
 
 
-def _pixel_size(file: Any) -> float:
+def _pixel_size(file: Any) -> tuple[float | None, str]:
+    """The pixel size in mm, None if the file does not know it, and what it says of it."""
     for name in _PIXEL:
         if name in file:
             unit = _text(file[name].attrs.get("units", "m")).lower()
-            if unit not in _MM:
-                raise ValueError(f"{name} has the unit {unit!r}: give pitch= in mm")
-            return float(np.ravel(file[name][()])[0]) * _MM[unit]
-    raise ValueError("it does not know its pixel size: give pitch= in mm")
+            value = float(np.ravel(file[name][()])[0])
+            said = f"the file's pixel size is {value:g} {unit}"
+            known = unit in _MM and math.isfinite(value) and value > 0
+            return value * _MM[unit] if known else None, said
+    return None, "the file does not know its pixel size"
 
 
 def _text(value: Any) -> str:
-    return value.decode() if isinstance(value, bytes) else str(value)
+    first = np.ravel(value)[0]  # some writers make arrays of one
+    return first.decode() if isinstance(first, bytes) else str(first)

@@ -7,17 +7,21 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
+
 from torchpcct.files import is_sealed
 from torchpcct.formats.catsim import read_catsim
 from torchpcct.formats.damage import reading
 from torchpcct.formats.data_exchange import read_data_exchange
 from torchpcct.formats.dicom_ct_pd import read_dicom_ct_pd
 from torchpcct.formats.stack import read_stack
-from torchpcct.geometry import Geometry
+from torchpcct.geometry import Geometry, ParallelBeam
 from torchpcct.scan import Scan
+from torchpcct.validate import number
 from torchpcct.vector_geometry import VectorGeometry
 
-__all__ = ["check_scan_name", "open_scan"]
+__all__ = ["adapted", "check_scan_name", "open_scan"]
 
 _HDF5, _YAML, _CATSIM = (".h5", ".hdf5", ".hdf"), (".yaml", ".yml"), (".prep", ".scan")
 
@@ -32,6 +36,18 @@ def check_scan_name(path: str | os.PathLike[str]) -> None:
         )
 
 
+_COUNTS = {"gain", "flux", "dead", "electronic_noise", "linearisation", "exposure_s"}
+_LINES = {"dead", "linearisation", "exposure_s"}
+_OPTIONS = {
+    "Data Exchange": {"slices"} | _COUNTS,
+    "CatSim's readings": _COUNTS,
+    "CatSim's line integrals": _LINES | {"photons"},
+    "a DICOM-CT-PD folder": {"ignore_flying_spot"},
+}
+"""What the readers take themselves: what has to be known while reading, or is the format's own."""
+_ANY = {"axis", "pitch", "slices", "mu_water", "photons"}
+
+
 def open_scan(path: str | os.PathLike[str], geometry: Geometry | None = None, **options: Any) -> Scan:
     """A scan from a file or folder, by its ending and contents.
 
@@ -41,29 +57,124 @@ def open_scan(path: str | os.PathLike[str], geometry: Geometry | None = None, **
         geometry: of files that do not hold one (CatSim, a stack without); or, for any file, a
             :class:`~torchpcct.vector_geometry.VectorGeometry` that takes the place of the nominal one. The slices of a
             parallel stack are then the detector's rows, if it has rows.
-        options: of the format's reader.
+        options: of :func:`adapted`, for every format; of :meth:`torchpcct.Scan.from_counts` for Data Exchange, of it
+            or :meth:`torchpcct.Scan.from_line_integrals` for CatSim; ``ignore_flying_spot`` for DICOM-CT-PD.
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: an unknown ending, a damaged file, a geometry that is missing or too many.
+        ValueError: an unknown ending, a damaged file, a geometry that is missing or too many, an option that this scan
+            cannot follow.
+        TypeError: an option that the format does not take.
     """
     check_scan_name(path)
     name = Path(path)
-    if name.suffix.lower() in _CATSIM:
+    what = _format(name)
+    own = {k: v for k, v in options.items() if k in _OPTIONS.get(what, ()) and v is not None}
+    unknown = sorted(set(options) - _ANY - _OPTIONS.get(what, set()))
+    if unknown:
+        takes = sorted(_ANY | _OPTIONS.get(what, set()))
+        raise TypeError(f"{', '.join(unknown)}: no option of {what}, which takes {', '.join(takes)}")
+    return adapted(_read(name, what, geometry, own), **{k: v for k, v in options.items() if k not in own and k in _ANY})
+
+
+def _format(name: Path) -> str:
+    ending = name.suffix.lower()
+    if ending in _CATSIM:
+        return "CatSim's line integrals" if name.with_suffix(".prep").exists() else "CatSim's readings"
+    if ending in _YAML:
+        return "a .yaml stack"
+    if name.is_dir():
+        return "a DICOM-CT-PD folder"
+    return "a torchpcct scan" if _is_own(name) else "Data Exchange"
+
+
+def _read(name: Path, what: str, geometry: Geometry | None, options: dict[str, Any]) -> Scan:
+    if what.startswith("CatSim"):
         if geometry is None:
             raise ValueError(f"{name.name}: CatSim's files do not hold the geometry, give it")
         return read_catsim(name, geometry, **options)
-    if name.suffix.lower() in _YAML:
-        return read_stack(name, geometry, **options)
+    if what == "a .yaml stack":
+        return read_stack(name, geometry)
     if geometry is not None and not isinstance(geometry, VectorGeometry):
         raise ValueError(
             f"{name.name} holds its geometry: leave out geometry, or give a VectorGeometry (kind: vectors) in its place"
         )
-    if name.is_dir():
+    if what == "a DICOM-CT-PD folder":
         scan = read_dicom_ct_pd(name, **options).scan()
     else:
-        scan = Scan.load(name, **options) if _is_own(name) else read_data_exchange(name, **options)
+        scan = Scan.load(name) if what == "a torchpcct scan" else read_data_exchange(name, **options)
     return scan if geometry is None else _placed(scan, geometry)
+
+
+def adapted(
+    scan: Scan,
+    *,
+    axis: float | None = None,
+    pitch: float | None = None,
+    slices: slice | None = None,
+    mu_water: float | None = None,
+    photons: float | None = None,
+) -> Scan:
+    """The same scan with what its file does not know, or has wrong; each None: as it is.
+
+    Args:
+        scan: of any format.
+        axis: column of the rotation axis (may be fractional), of parallel beams.
+        pitch: cell width in mm, of parallel beams.
+        slices: of parallel and fan beams ``(slices, views, columns)``: those to keep.
+        mu_water: attenuation of water in mm⁻¹: volumes in HU.
+        photons: of an unattenuated reading, of scans that were given as line integrals.
+
+    Raises:
+        ValueError: a scan that has no such thing, or knows it already; a value out of range.
+        TypeError: a value of the wrong kind.
+    """
+    g = scan.geometry
+    kind = type(g).__name__
+    if slices is not None:
+        if g.has_rows or scan.counts.ndim != 3:
+            raise ValueError(f"slices= picks slices of a parallel or fan beam, this is one {kind}")
+        scan = _sliced(scan, slices)
+    if pitch is not None:
+        if not isinstance(g, ParallelBeam):
+            raise ValueError(f"pitch= is the cell width of parallel beams, this is a {kind}: its geometry says it")
+        wide = number("pitch", pitch, positive=True, unit="mm")
+        g = replace(g, pitch=wide, offset=g.offset * wide / g.pitch)
+        scan = replace(scan, geometry=g, unit="mm^-1" if scan.unit == "pixel^-1" else scan.unit)
+    if axis is not None:
+        if not isinstance(g, ParallelBeam):
+            raise ValueError(
+                f"axis= is the rotation axis of parallel beams, this is a {kind}: give its geometry an offset"
+            )
+        column = number("axis", axis, low=0.0, high=g.columns - 1.0)
+        scan = replace(scan, geometry=replace(g, offset=((g.columns - 1) / 2 - column) * g.pitch))
+    if mu_water is not None:
+        mu = number("mu_water", mu_water, positive=True, unit="mm⁻¹")
+        if scan.unit != "mm^-1":
+            known = "it does not know the size of its pixels: give pitch=, too" if scan.unit == "pixel^-1" else (
+                f"the attenuation of water, {scan.linearisation.mu_ref:.5g} mm⁻¹, is known to the scan"
+            )  # fmt: skip
+            raise ValueError(f"mu_water= does not fit this scan: {known}")
+        scan = replace(scan, linearisation=replace(scan.linearisation, mu_ref=mu), unit="HU")
+    if photons is not None:
+        if not scan.logged:
+            raise ValueError("photons= belongs to line integrals, this scan holds readings, which tell their photons")
+        air = torch.full_like(scan.air, number("photons", photons, positive=True))
+        ratio = (air / scan.air).unsqueeze(-len(g.shape))
+        scan = replace(scan, counts=scan.counts * ratio, air=air, info={**scan.info, "photons": "given"})
+    return scan
+
+
+def _text(slices: slice) -> str:
+    return ":".join("" if end is None else str(end) for end in (slices.start, slices.stop))
+
+
+def _sliced(scan: Scan, slices: slice) -> Scan:
+    kept = np.arange(scan.counts.shape[0])[slices]
+    if not kept.size:
+        raise ValueError(f"slices= must lie within the {scan.counts.shape[0]} slices of the scan, got {_text(slices)}")
+    changed = {n: None if getattr(scan, n) is None else getattr(scan, n)[kept] for n in ("quantum", "dead")}
+    return replace(scan, counts=scan.counts[kept], air=scan.air[kept], **changed)
 
 
 def _placed(scan: Scan, geometry: VectorGeometry) -> Scan:

@@ -16,6 +16,7 @@ import numpy as np
 from torchpcct.files import require_folder, written_whole
 from torchpcct.formats.damage import check_size, needed, reading
 from torchpcct.geometry import VolumeGrid
+from torchpcct.validate import UNITS
 
 __all__ = [
     "ENDINGS",
@@ -69,8 +70,8 @@ def _unit(written: str, name: str) -> str:
     Raises:
         ValueError: another unit.
     """
-    if written not in ("", "HU", "mm^-1"):
-        raise ValueError(f"its {name} gives the unit {written!r}, expected HU or mm^-1")
+    if written and written not in UNITS:
+        raise ValueError(f"its {name} gives the unit {written!r}, expected {' or '.join(UNITS)}")
     return written or "HU"
 
 
@@ -85,7 +86,7 @@ def write_nifti(path: str | os.PathLike[str], data: Any, grid: VolumeGrid, unit:
     image = nibabel.Nifti1Image(np.asarray(data, dtype=np.float32).transpose(2, 1, 0), affine)
     image.set_qform(affine, code="scanner")
     image.set_sform(affine, code="scanner")
-    image.header.set_xyzt_units("mm")
+    image.header.set_xyzt_units("unknown" if unit == "pixel^-1" else "mm")
     image.header["descrip"] = (_MADE_BY + unit).encode()
     with written_whole(path) as part:
         nibabel.save(image, part)

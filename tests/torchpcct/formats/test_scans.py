@@ -24,6 +24,7 @@ from torchpcct.formats.preprocess import _by_centroid, centred, cleaned, find_ax
 from torchpcct.formats.rtk import read_rtk, read_rtk_vectors
 from torchpcct.formats.scans import open_scan
 from torchpcct.projector.vectors import as_circular, to_vectors
+from torchpcct.volume import Volume
 
 MU = 0.02
 BODY = [Ellipsoid((2.0, -3.0), (14.0, 18.0), value=MU), Ellipsoid((6.0, 5.0), 3.0, value=MU)]
@@ -92,6 +93,72 @@ def test_data_exchange(tmp_path):
         del file["exchange/theta"]
     with pytest.raises(ValueError, match=r"tooth\.h5 cannot be read as a Data Exchange file: it has no angles"):
         open_scan(path)
+
+
+@pytest.mark.parametrize(("size", "unit"), [(None, ""), (0.0, "um"), (3.0, "furlong")])
+def test_without_a_pixel_size_lengths_are_in_pixels(tmp_path, size, unit):
+    """The best known file of the format has none."""
+    path = data_exchange(tmp_path / "tooth.h5")
+    with h5py.File(path, "a") as file:
+        del file["measurement"]
+        if size is not None:
+            file["measurement/instrument/detector/pixel_size"] = size
+            file["measurement/instrument/detector/pixel_size"].attrs["units"] = np.array([unit.encode()])
+    scan, known = open_scan(path), open_scan(path, pitch=0.5, mu_water=0.04)
+    assert (scan.unit, scan.geometry.pitch, known.unit) == ("pixel^-1", 1.0, "HU")
+    grids = [VolumeGrid((4, 32, 32), pitch) for pitch in (1.0, 0.5)]
+    pixels, hu = (reconstruct(s, g, "fbp") for s, g in zip((scan, known), grids, strict=True))
+    torch.testing.assert_close(pixels.data, 0.5 * 0.04 * (1 + hu.data / 1000), atol=1e-6, rtol=1e-4)
+    pixels.save(tmp_path / "v.nii.gz")
+    assert (pixels.unit, Volume.load(tmp_path / "v.nii.gz").unit) == ("pixel^-1", "pixel^-1")
+    with pytest.raises(ValueError, match="does not know the size of its pixels: give pitch=, too"):
+        open_scan(path, mu_water=0.04)
+
+
+@pytest.mark.parametrize("frames", ["constant", "one", "averaged"])
+def test_white_frames_that_do_not_differ(tmp_path, frames):
+    """Averages that were stored, several times or once: the photons come from the noise of the readings."""
+    rng, lines = np.random.default_rng(1), line_integrals(PARALLEL, BODY, sub=1)
+    white = np.full((2, 64), 3200.0)
+    data = 8 * rng.poisson(400 * np.exp(-np.stack([lines, lines], 1)))
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["exchange/data"] = data.astype(np.uint16)
+        file["exchange/data_white"] = {"constant": np.stack([white] * 9), "one": white[None], "averaged": white}[frames]
+        file["exchange/theta"] = np.rad2deg(PARALLEL.angles)
+    scan = open_scan(tmp_path / "a.h5", pitch=1.0)
+    assert scan.info["signal_of_one_photon"] == pytest.approx(8.0, rel=0.15)
+    assert float((scan.line_integrals().numpy() - lines).std()) < 0.1
+    assert open_scan(tmp_path / "a.h5", gain=8.0).info["signal_of_one_photon"] == 8.0
+
+
+def test_options_fit_every_format_or_are_refused_by_name(tmp_path):
+    lines = line_integrals(PARALLEL, BODY, sub=1)
+    np.save(tmp_path / "lines.npy", np.stack([lines] * 3))
+    text = {"readings": "lines.npy", "kind": "line_integrals", "geometry": geometry_values(PARALLEL)}
+    (tmp_path / "stack.yaml").write_text(yaml.safe_dump(text), encoding="utf-8")
+    Scan.from_counts(np.full(CONE.shape, 50.0), CONE, air=100.0).save(tmp_path / "own.h5")
+    lines.astype("<f4").tofile(tmp_path / "a.prep")
+    files = {"stack.yaml": {}, "own.h5": {}, "a.prep": {"geometry": PARALLEL}}
+    data_exchange(tmp_path / "tooth.h5")
+    options = {"axis": 30.0, "pitch": 2.0, "slices": slice(1, 2), "mu_water": 0.03, "photons": 1e4}
+    refused = set()
+    for name in (*files, "tooth.h5"):
+        for option, value in options.items():
+            try:
+                scan = open_scan(tmp_path / name, **files.get(name, {}), **{option: value})
+            except ValueError as error:
+                refused.add((name, option, str(error).split()[0]))
+            else:
+                g = scan.geometry
+                seen = {"axis": (g.columns - 1) / 2 - getattr(g, "offset", 0.0) / g.pitch if name != "own.h5" else 0.0,
+                        "pitch": g.pitch, "slices": slice(1, 1 + scan.counts.shape[0]), "mu_water":
+                        scan.linearisation.mu_ref, "photons": float(scan.air.max())}  # fmt: skip
+                assert seen[option] == (pytest.approx(value) if option != "slices" else value), (name, option)
+        with pytest.raises(TypeError, match=r"gian: no option of .*, which takes axis, "):
+            open_scan(tmp_path / name, gian=3.0)
+    expected = {("tooth.h5", "photons"), ("a.prep", "slices")}
+    expected |= {("own.h5", option) for option in ("axis", "pitch", "slices", "photons")}
+    assert refused == {(name, option, f"{option}=") for name, option in expected}
 
 
 def test_the_axis_is_found_and_stripes_go(tmp_path):
