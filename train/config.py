@@ -142,6 +142,8 @@ class ObjectiveConfig:
     Args:
         data: of eᵀH e.
         white: of ‖e‖², against ``data``; edge: by how much more inside and next to bodies.
+        noise_free: of ``data`` and ``white`` of the same scene without noise, against those with noise: what is left
+            there is blur and overshoot.
         contrast: of the ROI contrasts' errors.
         bias: κ at look 0 and at look 1, linear between.
         contrast_sd: an ROI contrast error, in noise units, that counts as 1.
@@ -156,6 +158,7 @@ class ObjectiveConfig:
     data: float = 60.0
     white: float = 0.2
     edge: float = 2.0
+    noise_free: float = 0.0
     contrast: float = 0.2
     bias: tuple[float, float] = (1.0, 1.0)
     contrast_sd: float = 0.15
@@ -164,7 +167,7 @@ class ObjectiveConfig:
     validation_draws: int = 6
 
     def __post_init__(self) -> None:
-        for name in ("data", "white", "edge", "contrast"):
+        for name in ("data", "white", "edge", "noise_free", "contrast"):
             _set(self, **{name: number(name, getattr(self, name), low=0.0)})
         _set(self, contrast_sd=number("contrast_sd", self.contrast_sd, positive=True))
         first, last = numbers("bias", self.bias, 2)

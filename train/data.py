@@ -45,6 +45,7 @@ class Batch:
 
     Args:
         problem: of ``2 · size`` volumes, the first draws of all scenes, then the second ones.
+        noise_free: the same of ``size`` volumes without noise.
         truth: ``(size, z, y, x)`` HU above the background.
         contrast: ``(size, rois, z, y, x)`` weights of ROI contrasts: mean over a core (or of plain tissue) less mean
             over the tissue around it, random small parts of both, last all of both; 0 where the scene offers none.
@@ -52,6 +53,7 @@ class Batch:
     """
 
     problem: NormalisedProblem
+    noise_free: NormalisedProblem
     truth: Tensor
     contrast: Tensor
     voxels: Tensor
@@ -95,8 +97,11 @@ class Data:
         scaled = (hu * exposure).reshape(-1, 1, 1, 1)
         signal = gram.apply(truth) * scaled
         b = torch.cat([signal + first, signal + second])
-        problem = NormalisedProblem.from_statistic(gram, b, torch.cat([exposure, exposure]), hu, c.voxel_mm)
-        return Batch(problem, truth, contrast, voxels)
+        noisy, clean = (
+            NormalisedProblem.from_statistic(gram, part, exposure.repeat(len(part) // len(exposure)), hu, c.voxel_mm)
+            for part in (b, signal)
+        )
+        return Batch(noisy, clean, truth, contrast, voxels)
 
     def _drawn(self, seed: int, step: int, index: int, gram: Gram) -> tuple[Tensor, ...]:
         c = self.config

@@ -6,6 +6,7 @@ terms, all from two independent noise draws of each scene with errors e₁, e₂
 * ``data``: eᵀH e per voxel, the error as the scanner would see it, which is the noise-whitened squared error;
 * ``white``: ‖e‖² per voxel, for the frequencies that the scanner does not see; more at and inside bodies, where edges
   are;
+* ``noise_free``: both of the same scene without noise, where all that is left is blur and overshoot beside edges;
 * ``contrast``: the errors d of ROI contrasts, small ones and that of a whole core, (d₁² + d₂²) / 2 + κ d₁ d₂. The
   product of two draws is an unbiased estimate of the squared bias, so κ trades variance against bias.
 
@@ -95,22 +96,35 @@ class Objective:
         low, high = c.looks
         look = low + (high - low) * torch.rand(n)
         steps = 1 if progress < self.single else None
-        scale = batch.problem.scale_hu.reshape(-1, 1, 1, 1)
-        truth = torch.cat([batch.truth, batch.truth])
-        error = model(batch.problem, torch.cat([look, look]), steps=steps) - truth / scale
-        data = (error * batch.problem.apply(error)).mean(dim=(1, 2, 3))
-        white = (error.square() * (1.0 + c.edge * _bodies(truth))).mean(dim=(1, 2, 3))
+        error, image = self._image(model, batch.problem, batch.truth.repeat(2, 1, 1, 1), look.repeat(2), steps)
+        data, white = image
         # The noise of an ROI mean falls with its size, but less than as 1/√voxels: neighbours are correlated.
         size = (20.0 / batch.voxels.clamp_min(4.0)).pow(0.25) * c.contrast_sd
         d = torch.einsum("dnzyx,nrzyx->dnr", error.unflatten(0, (2, n)), batch.contrast) / size
         variance, product = d.square().mean(0), d[0] * d[1]
-        tame = 1.0 / (1.0 + data.detach() / _TAME_ERROR)
-        total = 0.5 * c.data * (tame * (data + c.white * white)).sum()
+        total = 0.5 * self._tamed(data, white)
         tame = 1.0 / (1.0 + variance.detach() / _TAME_CONTRAST)
         kappa = (c.bias[0] + (c.bias[1] - c.bias[0]) * look)[:, None]
         total = total + c.contrast * (tame * (variance + kappa * product)).sum()
         parts = {"data": data.sum() / 2, "white": white.sum() / 2, "contrast": variance.sum(), "bias": product.sum()}
+        if c.noise_free:
+            _, (data, white) = self._image(model, batch.noise_free, batch.truth, look, steps)
+            total = total + c.noise_free * self._tamed(data, white)
+            parts["noise_free"] = (data + c.white * white).sum()
         return Loss(total, {k: float(v.detach()) for k, v in parts.items()})
+
+    def _image(
+        self, model: nn.Module, problem: NormalisedProblem, truth: Tensor, look: Tensor, steps: int | None
+    ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+        """Errors in noise units, and of each volume their mean squares as the scanner sees them, and as they are."""
+        error = model(problem, look, steps=steps) - truth / problem.scale_hu.reshape(-1, 1, 1, 1)
+        data = (error * problem.apply(error)).mean(dim=(1, 2, 3))
+        white = (error.square() * (1.0 + self.config.edge * _bodies(truth))).mean(dim=(1, 2, 3))
+        return error, (data, white)
+
+    def _tamed(self, data: Tensor, white: Tensor) -> Tensor:
+        tame = 1.0 / (1.0 + data.detach() / _TAME_ERROR)
+        return self.config.data * (tame * (data + self.config.white * white)).sum()
 
     @torch.no_grad()
     def validate(self, model: nn.Module, data: Data, seed: int = 0, look: float = DEFAULT_LOOK) -> Validation:

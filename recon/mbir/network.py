@@ -8,6 +8,11 @@ leaky ReLU, so the network is homogeneous: twice the input gives twice the outpu
 must know beside, the noise scale in HU (tissues have their HU), the look and the step, changes gains of its channels
 only.
 
+A homogeneous network shrinks what it is unsure of towards 0, and 0 is the value of the surround unless ``local_mm`` is
+given: then the network works on differences from a Gaussian mean about each voxel, and a constant that is added to the
+volume passes through, so that all tissues are alike to it. With ``turns`` the result is the mean over quarter turns and
+mirror images about z, and a scene that is turned gives the turned volume.
+
 Blocks of 2 × 2 × 2 voxels become channels first (Shi et al. 2016, CVPR, sub-voxel convolution), two more halvings
 follow (Ronneberger, Fischer, Brox 2015, U-Net): at 0.2 mm the coarsest cells have 1.6 mm, and the network sees 6 mm
 about each voxel, a whole plaque.
@@ -15,6 +20,7 @@ about each voxel, a whole plaque.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -39,16 +45,23 @@ class NetworkConfig:
     Args:
         channels: of the three levels.
         voxel_mm: size of the cubic voxels that it is for.
+        local_mm: standard deviation of the Gaussian mean that it works relative to, mm; 0: relative to the surround.
+        turns: once trained, average over the eight turns and mirror images about z.
     """
 
     channels: tuple[int, int, int] = (20, 32, 36)
     voxel_mm: float = 0.2
+    local_mm: float = 0.0
+    turns: bool = False
 
     def __post_init__(self) -> None:
         if len(self.channels) != _DEPTH:
             raise ValueError(f"channels must name {_DEPTH} levels, got {self.channels!r}")
         object.__setattr__(self, "channels", tuple(whole("channels", c, 1) for c in self.channels))
         object.__setattr__(self, "voxel_mm", number("voxel_mm", self.voxel_mm, positive=True))
+        object.__setattr__(self, "local_mm", number("local_mm", self.local_mm, low=0.0, unit="mm"))
+        if not isinstance(self.turns, bool):
+            raise TypeError(f"turns must be true or false, got {self.turns!r}")
 
 
 class Network(nn.Module):
@@ -85,6 +98,21 @@ class Network(nn.Module):
             estimate, towards: ``(batch, z, y, x)`` in noise units.
             condition: ``(batch, 3)``: ln(noise scale / 200 HU), look − ½, number of the step.
         """
+        if not self.config.local_mm:
+            return self._symmetric(estimate, towards, condition)
+        level = local_mean(estimate, self.config.local_mm / self.config.voxel_mm)
+        return level + self._symmetric(estimate - level, towards - level, condition)
+
+    def _symmetric(self, estimate: Tensor, towards: Tensor, condition: Tensor) -> Tensor:
+        # Scenes of the training are turned at random: it does not need all eight of each.
+        if self.training or not self.config.turns:
+            return self._convolved(estimate, towards, condition)
+        out = torch.zeros_like(estimate)
+        for there, back in _TURNS:
+            out += back(self._convolved(there(estimate), there(towards), condition))
+        return out / len(_TURNS)
+
+    def _convolved(self, estimate: Tensor, towards: Tensor, condition: Tensor) -> Tensor:
         shape = estimate.shape[-3:]
         period = _BLOCK * 2 ** (_DEPTH - 1)
         extra = [(-n) % period for n in shape]
@@ -98,6 +126,34 @@ class Network(nn.Module):
             fine = self.up[1](fine + _doubled(self.widen[1](middle)), condition)
             out = self.leave(fine)
         return from_blocks(out.float())[..., : shape[0], : shape[1], : shape[2]]
+
+
+def local_mean(v: Tensor, sigma: float) -> Tensor:
+    """Gaussian mean about each voxel of ``v`` ``(..., z, y, x)``, ``sigma`` in voxels; only voxels of the volume count.
+
+    A product with a small dense matrix along each axis, whose rows add up to 1: faster than a convolution with so wide
+    a kernel on volumes of some 50 voxels, and a constant stays what it is up to the border.
+    """
+    for axis in (-3, -2, -1):
+        at = torch.arange(v.shape[axis], dtype=v.dtype, device=v.device)
+        weights = torch.exp(-0.5 * ((at[:, None] - at) / sigma).square())
+        v = torch.movedim(torch.movedim(v, axis, -1) @ (weights / weights.sum(1, keepdim=True)).T, -1, axis)
+    return v
+
+
+def _turn(quarters: int, mirrored: bool) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]:
+    def there(v: Tensor) -> Tensor:
+        return torch.rot90(v.flip(-1) if mirrored else v, quarters, (-2, -1))
+
+    def back(v: Tensor) -> Tensor:
+        v = torch.rot90(v, -quarters, (-2, -1))
+        return v.flip(-1) if mirrored else v
+
+    return there, back
+
+
+_TURNS = [_turn(quarters, mirrored) for mirrored in (False, True) for quarters in range(4)]
+"""The symmetries of a square about z, each with its inverse."""
 
 
 class _Block(nn.Module):

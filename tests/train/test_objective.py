@@ -122,3 +122,27 @@ def test_bias_weighs_more_where_one_measures(data):
     even = float(Objective(ObjectiveConfig(bias=(0.0, 0.0), looks=(1, 1)))(given, batch).total)
     assert totals[0] == pytest.approx(even)
     assert totals[1] > totals[0]
+
+
+def test_the_scene_without_noise_counts_with_its_weight(data):
+    """Noise alone is an error of the noisy draws, a constant that of both; without the term nothing is computed."""
+
+    class Constant(nn.Module):
+        calls = 0
+
+        def forward(self, problem, look, steps=None):
+            self.calls += 1
+            truth = batch.truth.repeat(len(problem.beta) // batch.size, 1, 1, 1)
+            return truth / problem.scale_hu.reshape(-1, 1, 1, 1) + 0.3
+
+    batch = data.batch(0, 0, range(2))
+    assert batch.noise_free.beta.shape[0] == batch.size
+    torch.testing.assert_close(
+        batch.noise_free.beta, batch.noise_free.apply(batch.truth / batch.noise_free.scale_hu.reshape(-1, 1, 1, 1))
+    )
+    without, model = Objective(ObjectiveConfig(contrast=0.0))(Constant(), batch), Constant()
+    both = Objective(ObjectiveConfig(contrast=0.0, noise_free=0.5))(model, batch)
+    assert model.calls == 2
+    assert "noise_free" not in without.parts
+    # Two draws and the scene have the same error: half of the draws' mean on top.
+    assert float(both.total) == pytest.approx(1.5 * float(without.total), rel=1e-5)

@@ -1,9 +1,11 @@
 """The network: homogeneous, blind to nothing that it should see, any shape."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
-from recon.mbir.network import Network, NetworkConfig, from_blocks, to_blocks
+from recon.mbir.network import Network, NetworkConfig, from_blocks, local_mean, to_blocks
 
 SMALL = NetworkConfig((6, 8, 8), 0.4)
 
@@ -119,3 +121,61 @@ def test_refusals(changes, message):
 
 def test_shipped_size():
     assert sum(p.numel() for p in Network().parameters()) <= 300_000
+
+
+def with_config(network, **options):
+    """The same weights with other options."""
+    made = Network(replace(SMALL, **options)).double().requires_grad_(False).eval()
+    made.load_state_dict(network.state_dict())
+    return made
+
+
+def test_relative_to_the_local_mean_a_constant_passes_through(network):
+    """Relative to the surround it does not: what is unsure is drawn to 0."""
+    u, towards = volumes()
+    local = with_config(network, local_mm=1.6)
+    found = local(u, towards, CONDITION)
+    torch.testing.assert_close(local(u + 7.0, towards + 7.0, CONDITION), found + 7.0)
+    torch.testing.assert_close(local(3.0 * u, 3.0 * towards, CONDITION), 3.0 * found)
+    moved = network(u + 7.0, towards + 7.0, CONDITION) - 7.0
+    assert float((moved - network(u, towards, CONDITION)).abs().max()) > 0.1
+
+
+def test_local_mean_by_hand():
+    """Weights of a Gaussian over the voxels that there are; a volume of one voxel is its own mean."""
+    v = torch.zeros(1, 1, 1, 5, dtype=torch.float64)
+    v[..., 0] = 1.0
+    weights = torch.exp(-0.5 * (torch.arange(5, dtype=torch.float64) / 2.0) ** 2)
+    assert float(local_mean(v, 2.0)[..., 0]) == pytest.approx(float(1.0 / weights.sum()))
+    torch.testing.assert_close(local_mean(torch.full((1, 3, 4, 5), 2.5), 3.0), torch.full((1, 3, 4, 5), 2.5))
+    assert float(local_mean(torch.ones(1, 1, 1, 1), 8.0)) == 1.0
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("quarters", range(4))
+def test_a_turned_scene_gives_the_turned_volume(network, quarters, mirrored):
+    u, towards = volumes((2, 4, 8, 8))
+    symmetric = with_config(network, turns=True)
+
+    def turned(v):
+        return torch.rot90(v.flip(-2) if mirrored else v, quarters, (-2, -1))
+
+    found = symmetric(turned(u), turned(towards), CONDITION)
+    torch.testing.assert_close(found, turned(symmetric(u, towards, CONDITION)))
+    if quarters or mirrored:
+        alone = network(turned(u), turned(towards), CONDITION) - turned(network(u, towards, CONDITION))
+        assert float(alone.abs().max()) > 1e-3
+
+
+def test_turns_of_what_is_not_square(network):
+    """The mean over turns changes no shape."""
+    u, towards = volumes((2, 3, 7, 10))
+    assert with_config(network, turns=True, local_mm=1.0)(u, towards, CONDITION).shape == u.shape
+
+
+@pytest.mark.parametrize(
+    ("options", "error"), [({"local_mm": -1.0}, ValueError), ({"turns": 1}, TypeError), ({"local_mm": "a"}, TypeError)]
+)
+def test_options_that_mean_nothing(options, error):
+    with pytest.raises(error, match=next(iter(options))):
+        NetworkConfig(**options)
