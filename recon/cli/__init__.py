@@ -1,4 +1,4 @@
-"""Command line: ``torchpcct compare | dose-factor | hardcases | study | simulate | reconstruct | info | …``.
+"""Command line: ``torchpcct compare | dose-factor | study | simulate | reconstruct | lower-dose | info | …``.
 
 Here stand the studies and :func:`main`; :mod:`~recon.cli.scans` has the commands that make scans and volumes,
 :mod:`~recon.cli.looking` those that show files, :mod:`~recon.cli.plaque` reads tissues, :mod:`~recon.cli.config` reads
@@ -22,7 +22,7 @@ from recon.cli.parsing import Commands, as_options, command, saying
 
 # What loads torch or numba is imported by the commands: help and refusals come at once.
 from recon.cli.plaque import add_plaque
-from recon.cli.scans import add_reconstruct, add_show_config, add_simulate
+from recon.cli.scans import add_lower_dose, add_reconstruct, add_show_config, add_simulate
 from recon.study import registry
 from torchpcct import __version__
 from torchpcct.files import require_writable, written_whole
@@ -199,7 +199,7 @@ def _parser() -> tuple[argparse.ArgumentParser, Commands]:
     )
     parser.add_argument("--version", action="version", version=f"torchpcct {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    scans = (add_simulate, add_show_config, add_reconstruct, add_info, add_view)
+    scans = (add_simulate, add_show_config, add_reconstruct, add_lower_dose, add_info, add_view)
     for add in (_add_compare, _add_dose_factor, _add_hardcases, _add_study, *scans, add_plaque, _add_verify):
         add(commands)
     return parser, commands

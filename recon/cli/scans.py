@@ -1,4 +1,4 @@
-"""The commands that make files: ``simulate``, ``show-config``, ``reconstruct``."""
+"""The commands that make files: ``simulate``, ``show-config``, ``reconstruct``, ``lower-dose``."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from recon.study.study import ProgressBars
     from torchpcct.scan import Scan
 
-__all__ = ["add_reconstruct", "add_show_config", "add_simulate"]
+__all__ = ["add_lower_dose", "add_reconstruct", "add_show_config", "add_simulate"]
 
 _PAPER_VIEWS = 1968
 MOST_VOXELS = 2**31
@@ -138,6 +138,22 @@ def add_show_config(commands: Commands) -> None:
 
 
 # --- reconstruct --------------------------------------------------------------------------------------------------
+
+
+def _add_reader_options(parser: argparse.ArgumentParser) -> None:
+    """What a file may not know of its scan, see :func:`_reader_options`."""
+    parser.add_argument("scan", type=Path, help=".h5 (ours or Data Exchange), .yaml stack, CatSim, DICOM-CT-PD folder")
+    parser.add_argument(
+        "--geometry",
+        type=Path,
+        metavar="YAML",
+        help="geometry of files that do not hold it; kind: vectors, rtk, or with pose: in place of the file's own",
+    )
+    parser.add_argument("--mu-water", type=float, metavar="MM⁻¹", help="attenuation of water: result in HU")
+    parser.add_argument("--axis", type=float, metavar="COLUMN", help="rotation axis (Data Exchange)")
+    parser.add_argument("--pitch", type=float, metavar="MM", help="cell width (Data Exchange without pixel size)")
+    parser.add_argument("--photons", type=float, metavar="N", help="of an unattenuated reading (line integrals)")
+    parser.add_argument("--slices", metavar="A:B", help="rows to read (Data Exchange)")
 
 
 def _reader_options(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -310,7 +326,6 @@ def add_reconstruct(commands: Commands) -> None:
         "volume to write: .nii, .nii.gz, .mha, .h5, or no ending for a DICOM series (default SCAN_METHOD.nii.gz)",
     )  # fmt: skip
     axes = ("Z", "Y", "X")
-    parser.add_argument("scan", type=Path, help=".h5 (ours or Data Exchange), .yaml stack, CatSim, DICOM-CT-PD folder")
     parser.add_argument("--method", default="fbp", help="fbp, pwls or mbir (default fbp)")
     parser.add_argument("--kernel", help="FBP kernel: soft, standard, detail, bone, ram-lak")
     parser.add_argument("--look", type=float, help="of MBIR: 0, for viewing … 1, for measuring (default 0.5)")
@@ -321,17 +336,42 @@ def add_reconstruct(commands: Commands) -> None:
     parser.add_argument(
         "--extent", type=float, nargs=3, metavar=axes, help="edge lengths in mm (default: what is seen)"
     )
-    parser.add_argument(
-        "--geometry",
-        type=Path,
-        metavar="YAML",
-        help="geometry of files that do not hold it; kind: vectors, rtk, or with pose: in place of the file's own",
-    )
-    parser.add_argument("--mu-water", type=float, metavar="MM⁻¹", help="attenuation of water: result in HU")
-    parser.add_argument("--axis", type=float, metavar="COLUMN", help="rotation axis (Data Exchange)")
+    _add_reader_options(parser)
     parser.add_argument("--find-axis", action="store_true", help="search the rotation axis (parallel beams)")
     parser.add_argument("--clean", action="store_true", help="take out stripes and outliers (parallel and fan beams)")
-    parser.add_argument("--pitch", type=float, metavar="MM", help="cell width (Data Exchange without pixel size)")
-    parser.add_argument("--photons", type=float, metavar="N", help="of an unattenuated reading (line integrals)")
-    parser.add_argument("--slices", metavar="A:B", help="rows to read (Data Exchange)")
     _add_output(parser)
+
+
+# --- lower-dose ---------------------------------------------------------------------------------------------------
+
+
+def _lower_dose(arguments: argparse.Namespace, progress: ProgressBars) -> None:
+    number("--fraction", arguments.fraction, positive=True, high=1.0)
+    whole("--seed", arguments.seed, low=0)
+    if arguments.out is None:
+        arguments.out = Path(f"{without_ending(arguments.scan)}_{arguments.fraction:g}.h5")
+    check_ending(arguments.out, SCAN_ENDINGS)
+    require_folder(arguments.out)
+    from torchpcct.formats.geometry_yaml import geometry_values
+    from torchpcct.formats.scans import open_scan
+
+    scan = open_scan(arguments.scan, **_reader_options(arguments)).at_dose(arguments.fraction, arguments.seed)
+    scan.save(arguments.out)
+    note = scan.info["lower_dose"]
+    how = "photons thinned, exact" if note["exact"] else "mean and variance right, higher moments approximate"
+    short = f"{' × '.join(map(str, scan.counts.shape))} readings at {arguments.fraction:g} of the dose ({how})"
+    config = {"scan": str(arguments.scan), "geometry": geometry_values(scan.geometry), **note}
+    tell(arguments, short, config, readings=list(scan.counts.shape), exposure_s=scan.exposure_s, **note)
+
+
+def add_lower_dose(commands: Commands) -> None:
+    parser = command(
+        commands, "lower-dose", _lower_dose, "a measured scan as if it had been taken with less dose",
+        "Write a scan, ours or a foreign one, as it would have been at a fraction of its dose, noise included. Photon "
+        "counts are thinned, which is exact; other readings get the right mean and variance. Refused where the number "
+        "of photons is not known.",
+        "HDF5 file to write (default SCAN_FRACTION.h5)",
+    )  # fmt: skip
+    _add_reader_options(parser)
+    parser.add_argument("--fraction", type=float, required=True, metavar="F", help="of the dose, 0 < F ≤ 1")
+    parser.add_argument("--json", action="store_true", help="print the whole summary as JSON")

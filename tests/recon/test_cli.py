@@ -216,7 +216,31 @@ def test_command_line_refuses_bad_input_and_writes_nothing(tmp_path, capsys, arg
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("command", ["compare", "dose-factor", "study", "simulate", "reconstruct", "plaque"])
+def test_a_lower_dose_of_a_scan_file(tmp_path, capsys):
+    """Counts are thinned, the same by the same seed; nothing is made of line integrals of unknown photons."""
+    geometry = ParallelBeam(np.arange(60) * np.pi / 60, 40, 0.5)
+    lines = line_integrals(geometry, [Ellipsoid((0.0, 0.0), 8.0, value=0.02)])
+    scan = Scan.from_counts(np.random.default_rng(0).poisson(1e4 * np.exp(-lines)), geometry, air=1e4)
+    scan.save(tmp_path / "full.h5")
+    command = ["lower-dose", str(tmp_path / "full.h5"), "--fraction", "0.1", "--seed", "3"]
+    assert main([*command, "--out", str(tmp_path / "low.h5")]) == 0
+    assert "exact" in capsys.readouterr().out
+    low = Scan.load(tmp_path / "low.h5")
+    assert torch.equal(low.counts, scan.at_dose(0.1, 3).counts)
+    assert low.info["lower_dose"] == {"fraction": 0.1, "seed": 3, "exact": True}
+    assert float(low.counts.sum() / scan.counts.sum()) == pytest.approx(0.1, rel=0.01)
+    Scan.from_line_integrals(lines, geometry).save(tmp_path / "lines.h5")
+    command = ["lower-dose", str(tmp_path / "lines.h5"), "--fraction", "0.5", "--out", str(tmp_path / "l.h5")]
+    assert main(command) == 2
+    assert "--photons N" in capsys.readouterr().err
+    assert not (tmp_path / "l.h5").exists()
+    assert main([*command, "--photons", "1e4"]) == 0
+    assert "approximate" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "command", ["compare", "dose-factor", "study", "simulate", "reconstruct", "lower-dose", "plaque"]
+)
 def test_help(command, capsys):
     with pytest.raises(SystemExit) as stop:
         main([command, "--help"])
