@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from torchpcct.acquisition.acquire import acquire
     from torchpcct.projector import Projector
     from torchpcct.scan import Scan
+    from torchpcct.scene.voxels import VoxelScene
     from torchpcct.vector_geometry import VectorGeometry
     from torchpcct.volume import Volume
 
@@ -28,6 +29,7 @@ __all__ = [
     "VectorGeometry",
     "Volume",
     "VolumeGrid",
+    "VoxelScene",
     "acquire",
     "full_turn",
 ]
@@ -37,6 +39,7 @@ _LAZY = {
     "Scan": "torchpcct.scan",
     "VectorGeometry": "torchpcct.vector_geometry",
     "Volume": "torchpcct.volume",
+    "VoxelScene": "torchpcct.scene.voxels",
     "acquire": "torchpcct.acquisition.acquire",
 }
 

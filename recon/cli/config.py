@@ -16,7 +16,7 @@ from torchpcct.scanner import presets
 from torchpcct.scanner.scanner import Scanner
 from torchpcct.scene.bodies import Box, Ellipsoid, EllipticCylinder
 from torchpcct.scene.scene import Body, Scene
-from torchpcct.scene.voxels import VoxelScene
+from torchpcct.scene.voxels import DENSE, VoxelScene
 from torchpcct.validate import choice, number
 from torchpcct.volume import Volume
 
@@ -28,15 +28,21 @@ scene:
   kind: bodies              # plaque, thorax, water, bodies, or volume
   # plaque: the paper's; patient_diameter, core_contrast, motion_amplitude …
   # water: diameter, length, position
-  # volume: file: patient.nii.gz, energy_kev: 70 (a CT volume in HU)
+  # volume: file: patient.nii.gz (a CT volume in HU), dense: bone, iodine, water or a file of labels 0, 1, 2 (what is
+  #         above muscle), energy_kev: 70 (mean energy of the volume's scan; null: its numbers come back)
   bodies:                   # mm; parents before their children
-    - {name: patient, shape: cylinder, semi_axes: [160, 110], material: soft_tissue}
-    - {name: spine, shape: cylinder, semi_axes: 18, position: [0, -70, 0], material: spongiosa, parent: patient}
-    - name: nodule
+    - {name: patient, shape: cylinder, semi_axes: {x: 160, y: 110}, material: soft_tissue}
+    - name: spine
+      shape: cylinder
+      semi_axes: 18
+      position: {x: 0, y: -70, z: 0}    # a plain list is [x, y, z] in scene, [z, y, x] in region
+      material: spongiosa
+      parent: patient
+    - name: vessel
       shape: ellipsoid
-      semi_axes: [5, 5, 5]
-      position: [40, 20, 0]
-      material: fibrous_tissue
+      semi_axes: {x: 5, y: 5, z: 5}
+      position: {x: 40, y: 20, z: 0}
+      material: iodine 10 mg/ml in blood
       parent: patient
 scanner:
   preset: pcct              # pcct or eid
@@ -48,7 +54,7 @@ scanner:
   current_ma: 1000
 exposure_s: 1.0             # null: expected readings without noise
 seed: 0
-region: null                # or a grid to keep: {shape: [z, y, x], spacing: mm, center: [z, y, x]}
+region: null                # grid to keep: {shape: {z: 40, y: 90, x: 90}, spacing: 0.2, center: {z: 0, y: 20, x: 40}}
 tolerance_hu: 0.5           # effects below it are left out
 """
 
@@ -93,7 +99,7 @@ def read_config(path: Path, **changes: Any) -> SimulationConfig:
     scene, scene_values = _scene(values.get("scene"), folder)
     scanner, scanner_values = _scanner(values.get("scanner"))
     region = values.get("region")
-    grid = None if region is None else _made("region", VolumeGrid, _mapping("region", region, _GRID))
+    grid = None if region is None else _made("region", VolumeGrid, _mapping("region", region, _GRID), order="zyx")
     exposure, seed = values.get("exposure_s"), values.get("seed", 0)
     tolerance = number("tolerance_hu", values.get("tolerance_hu", 0.5), low=0.0, unit="HU")
     resolved = {"scene": scene_values, "scanner": scanner_values, "exposure_s": exposure, "seed": seed,
@@ -115,12 +121,29 @@ def _parameters(function: Any) -> dict[str, Any]:
     return {n: p.default for n, p in inspect.signature(function).parameters.items() if p.kind is not p.VAR_KEYWORD}
 
 
-def _made(name: str, function: Any, given: Mapping[str, Any]) -> Any:
-    """What a function or class makes of the ``given`` parameters.
+def _in_order(name: str, value: Any, order: str) -> Any:
+    """Numbers by the names of their axes as a list in the ``order`` that a function takes; anything else as it is.
+
+    Raises:
+        ValueError: other names than those of the axes.
+    """
+    if not isinstance(value, Mapping):
+        return value
+    if len(value) < 2 or not set(value) <= set(order):
+        raise ValueError(
+            f"{name} must be numbers, or a mapping of the axes {', '.join(order)} such as "
+            f"{{{', '.join(f'{a}: 0' for a in order)}}}, got {dict(value)!r}"
+        )
+    return [value[a] for a in order if a in value]
+
+
+def _made(name: str, function: Any, given: Mapping[str, Any], order: str = "xyz") -> Any:
+    """What a function or class makes of the ``given`` parameters; those given by axis come in ``order``.
 
     Raises:
         ValueError: one without a default is missing.
     """
+    given = {k: _in_order(f"{name}.{k}", v, order) for k, v in given.items()}
     missing = [n for n, d in _parameters(function).items() if d is inspect.Parameter.empty and n not in given]
     if missing:
         raise ValueError(f"{name} needs {', '.join(missing)}")
@@ -141,7 +164,7 @@ def _scene(value: Any, folder: Path) -> tuple[Scene | VoxelScene, dict[str, Any]
     given = dict(value)
     kind = choice("scene.kind", given.pop("kind", None), ("plaque", "thorax", "water", "bodies", "volume"))
     if kind == "volume":
-        return _voxels(_mapping("scene", given, ("file", "energy_kev")), folder)
+        return _voxels(_mapping("scene", given, ("file", "energy_kev", "dense")), folder)
     if kind == "bodies":
         _mapping("scene", given, ("bodies",))
         return Scene([_body(k, b) for k, b in enumerate(given.get("bodies") or [])]), {"kind": kind, **given}
@@ -170,9 +193,19 @@ def _body(k: int, value: Any) -> Body:
 def _voxels(given: dict[str, Any], folder: Path) -> tuple[VoxelScene, dict[str, Any]]:
     if "file" not in given:
         raise ValueError("a scene of kind volume needs file, a CT volume in HU")
-    energy = number("scene.energy_kev", given.get("energy_kev", 70.0), positive=True, unit="keV")
+    energy = given.get("energy_kev")
+    if energy is not None:
+        energy = number("scene.energy_kev", energy, positive=True, unit="keV")
     volume = Volume.load(folder / given["file"])
     if volume.unit != "HU":
         raise ValueError(f"{given['file']} is in {volume.unit}: a scene is made of a volume in HU")
-    scene = VoxelScene(np.asarray(volume.data), volume.grid, energies_kev=energy)
-    return scene, {"kind": "volume", "file": str((folder / given["file"]).resolve()), "energy_kev": energy}
+    dense: Any = given.get("dense", "bone")
+    said = {"kind": "volume", "file": str((folder / given["file"]).resolve()), "energy_kev": energy, "dense": dense}
+    if dense not in DENSE:
+        if not isinstance(dense, str) or not (folder / dense).exists():
+            raise ValueError(f"scene.dense must be {', '.join(DENSE)}, or a volume file of labels, got {dense!r}")
+        labels = Volume.load(folder / dense)
+        if labels.grid != volume.grid:
+            raise ValueError(f"scene.dense: the voxels of {dense} are not those of {given['file']}")
+        said["dense"], dense = str((folder / dense).resolve()), np.asarray(labels.data)
+    return VoxelScene(np.asarray(volume.data), volume.grid, energies_kev=energy, dense=dense), said

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from recon.cli.config import SimulationConfig
     from recon.study.study import ProgressBars
     from torchpcct.scan import Scan
+    from torchpcct.scene.voxels import VoxelScene
 
 __all__ = ["add_lower_dose", "add_reconstruct", "add_show_config", "add_simulate"]
 
@@ -81,7 +82,7 @@ def _simulate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         import yaml
 
         print(yaml.safe_dump(config.values, sort_keys=False, allow_unicode=True))
-        print(_voxel_plan(config) if isinstance(config.scene, VoxelScene) else plan(
+        print(_voxel_plan(config, config.scene) if isinstance(config.scene, VoxelScene) else plan(
             config.scene, config.scanner, region=config.region, tolerance_hu=config.tolerance_hu,
             rotation_s=config.exposure_s,
         ).table())  # fmt: skip
@@ -93,14 +94,25 @@ def _simulate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     scan.save(arguments.out)
     mean = float(scan.counts.mean())
     short = f"{' × '.join(map(str, scan.counts.shape))} readings, mean {mean:.4g}, {scan.info['seconds']} s"
+    if voxels:
+        short += f"; {_dense(scan.info['plan']['above_muscle'])}"
     tell(arguments, short, config.values, readings=list(scan.counts.shape), exposure_s=scan.exposure_s, seed=scan.seed,
          mean_count=mean, **scan.info)  # fmt: skip
 
 
-def _voxel_plan(config: SimulationConfig) -> str:
+def _voxel_plan(config: SimulationConfig, scene: VoxelScene) -> str:
     g = config.scanner.geometry
     readings = math.prod(g.shape)
-    return f"{readings / 1e6:.2f} M readings of a voxel volume, about {readings * 4 * 2 / 2**30:.2f} GiB"
+    return (
+        f"{readings / 1e6:.2f} M readings of a voxel volume, about {readings * 4 * 2 / 2**30:.2f} GiB\n"
+        f"{_dense(scene.above_muscle)}"
+    )
+
+
+def _dense(shares: dict[str, float]) -> str:
+    """What is above muscle, and what it is scanned as."""
+    listed = ", ".join(f"{share:.1%} of the voxels as {name}" for name, share in shares.items())
+    return f"above muscle, scanned (scene.dense): {listed}"
 
 
 def add_simulate(commands: Commands) -> None:

@@ -69,7 +69,7 @@ def test_the_example_configuration_is_complete(tmp_path, capsys):
     path = tmp_path / "example.yaml"
     path.write_text(capsys.readouterr().out, encoding="utf-8")
     config = read_config(path)
-    assert config.scene.names == ("patient", "spine", "nodule")
+    assert config.scene.names == ("patient", "spine", "vessel")
     assert set(yaml.safe_load(path.read_text())) == set(config.values)
     path.write_text(CONFIG.replace("views", "view"), encoding="utf-8")
     with pytest.raises(ValueError, match="scanner: unknown view; it takes views, mode"):
@@ -112,13 +112,70 @@ def test_scenes_by_their_kind(tmp_path):
         (
             "{kind: volume, file: v.h5}",
             VoxelScene,
-            {"kind": "volume", "file": str(tmp_path / "v.h5"), "energy_kev": 70.0},
+            {"kind": "volume", "file": str(tmp_path / "v.h5"), "energy_kev": None, "dense": "bone"},
         ),
     ):
         (tmp_path / "scene.yaml").write_text(f"scene: {text}", encoding="utf-8")
         config = read_config(tmp_path / "scene.yaml")
         assert isinstance(config.scene, kind)
         assert config.values["scene"] == said
+
+
+def test_numbers_by_the_names_of_their_axes(tmp_path):
+    """x, y, z of a body and z, y, x of a region in any order; lists as they were."""
+    (tmp_path / "named.yaml").write_text(
+        "scene: {kind: bodies, bodies: [{name: a, shape: cylinder, semi_axes: {y: 2, x: 1}, material: water, "
+        "position: {z: 3, x: 1, y: 2}}]}\nregion: {shape: {x: 4, y: 5, z: 6}, spacing: {z: 1, y: 2, x: 2}, "
+        "center: {x: 1, y: 2, z: 3}}",
+        encoding="utf-8",
+    )
+    (tmp_path / "listed.yaml").write_text(
+        "scene: {kind: bodies, bodies: [{name: a, shape: cylinder, semi_axes: [1, 2], material: water, "
+        "position: [1, 2, 3]}]}\nregion: {shape: [6, 5, 4], spacing: [1, 2, 2], center: [3, 2, 1]}",
+        encoding="utf-8",
+    )
+    named, listed = (read_config(tmp_path / f"{name}.yaml") for name in ("named", "listed"))
+    assert named.region == listed.region == VolumeGrid((6, 5, 4), (1, 2, 2), (3, 2, 1))
+    assert named.scene["a"] == listed.scene["a"]
+    assert named.scene["a"].shape.position == (1, 2, 3)
+    for text, said in (
+        (
+            "{kind: water, position: {x: 1, y: 2, w: 3}}",
+            "scene.position must be numbers, or a mapping of the axes x, y",
+        ),
+        ("{kind: water, position: {x: 1, z: 3}}", "position must be 3 numbers"),
+    ):
+        (tmp_path / "bad.yaml").write_text(f"scene: {text}", encoding="utf-8")
+        with pytest.raises(ValueError, match=said):
+            read_config(tmp_path / "bad.yaml")
+
+
+def test_what_is_above_muscle_in_a_volume_is_said_and_chosen(tmp_path, capsys):
+    """Bone unless iodine, water or labels are asked for; the command line says which share was scanned as what."""
+    hu = torch.full((2, 10, 10), -1000.0)
+    hu[:, 4:8, 4:8] = 40.0
+    hu[:, 4, 4:8] = 300.0
+    Volume(hu, VolumeGrid((2, 10, 10), 4.0)).save(tmp_path / "v.h5")
+    labels = torch.zeros(hu.shape)
+    labels[:, :, :6] = 1.0
+    Volume(labels, VolumeGrid((2, 10, 10), 4.0)).save(tmp_path / "labels.h5")
+    Volume(labels, VolumeGrid((2, 10, 10), 3.0)).save(tmp_path / "coarse.h5")
+    path, scanner = tmp_path / "scene.yaml", "\nscanner: {preset: pcct, views: 4, rows: 1, columns: 60}"
+    for dense, said in (
+        ("", "4.0% of the voxels as bone"),
+        (", dense: iodine", "4.0% of the voxels as iodine"),
+        (", dense: labels.h5", "2.0% of the voxels as bone, 2.0% of the voxels as iodine, 0.0% of the voxels as water"),
+    ):
+        path.write_text(f"scene: {{kind: volume, file: v.h5{dense}}}{scanner}", encoding="utf-8")
+        assert main(["simulate", "--config", str(path), "--dry-run", "--out", str(tmp_path / "s.h5")]) == 0
+        assert said in capsys.readouterr().out
+    assert main(["simulate", "--config", str(path), "--out", str(tmp_path / "s.h5")]) == 0
+    assert said in capsys.readouterr().out
+    assert read_config(tmp_path / "s.h5.yaml").values["scene"]["dense"] == str(tmp_path / "labels.h5")
+    for dense, said in (("gold", "scene.dense must be bone, iodine, water"), ("coarse.h5", "not those of v.h5")):
+        path.write_text(f"scene: {{kind: volume, file: v.h5, dense: {dense}}}", encoding="utf-8")
+        with pytest.raises(ValueError, match=said):
+            read_config(path)
 
 
 def test_a_foreign_scan_in_one_command(tmp_path):

@@ -53,6 +53,7 @@ def acquire_voxels(
     start = time.perf_counter()
     g: ConeBeam = scanner.geometry
     energies, spectra, air = signal_spectra(scanner)
+    scene = scene.read_by(energies, spectra[: scanner.detector.bins, g.columns // 2].sum(0))
     coefficients, basis = compress(scene.contrast(energies), tolerance=_TOLERANCE)
     maps = torch.from_numpy(scene.mixed(coefficients))
     fine = replace(g, columns=g.columns * sub_columns, pitch=(g.pitch[0], g.pitch[1] / sub_columns))
@@ -81,7 +82,13 @@ def acquire_voxels(
     info = {
         "scanner": scanner.name,
         "scene": list(scene.names),
-        "plan": {"basis_maps": len(basis), "sub_columns": sub_columns, "left_out": _LEFT_OUT, "clipped": scene.clipped},
+        "plan": {
+            "basis_maps": len(basis),
+            "sub_columns": sub_columns,
+            "left_out": _LEFT_OUT,
+            "clipped": scene.clipped,
+            "above_muscle": scene.above_muscle,
+        },
         "seconds": round(time.perf_counter() - start, 2),
     }
     return Scan(

@@ -13,6 +13,7 @@ from torchpcct.scene.bodies import Box, Ellipsoid, EllipticCylinder, Shape, rota
 from torchpcct.scene.motion import SinusoidalMotion
 from torchpcct.scene.scene import Body, Scene
 from torchpcct.scene.tubes import BulgedTube, NarrowedTube
+from torchpcct.scene.voxels import VoxelScene
 
 if TYPE_CHECKING:
     from torchpcct.scene.chords import chord_lengths
@@ -27,6 +28,7 @@ __all__ = [
     "Scene",
     "Shape",
     "SinusoidalMotion",
+    "VoxelScene",
     "chord_lengths",
     "rotation_matrix",
 ]

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from torchpcct import VolumeGrid, acquire
+import recon
+from torchpcct import VolumeGrid, VoxelScene, acquire
 from torchpcct.scanner import presets
 from torchpcct.scene import Body, EllipticCylinder, Scene
-from torchpcct.scene.materials import MATERIALS
-from torchpcct.scene.voxels import BODY_TISSUES, VoxelScene
+from torchpcct.scene.materials import MATERIALS, material
+from torchpcct.scene.voxels import BODY_TISSUES, DENSE
 
 GRID = VolumeGrid((3, 100, 100), (2.0, 1.0, 1.0))
 
@@ -76,7 +77,64 @@ def test_water_voxels_read_their_thickness():
     assert torch.equal(noisy.counts, scan.with_noise(1.0, 2).counts)
 
 
+def test_numbers_come_back_from_a_polychromatic_scan():
+    """Fat, lung, muscle, and above it iodine, bone and dense water in rods of 10 mm, told apart by labels: 5 HU."""
+    rods = [(-100, "bone"), (-700, "bone"), (100, "iodine"), (250, "iodine"), (400, "iodine"), (200, "bone"),
+            (350, "bone"), (400, "water")]  # fmt: skip
+    grid = VolumeGrid((1, 164, 164), (6.0, 1.0, 1.0))
+    y, x = grid.axes[1][:, None], grid.axes[2][None, :]
+    hu = np.where(np.hypot(x, y) < 80.0, 40.0, -1000.0) * np.ones(grid.shape)
+    dense = np.zeros(grid.shape, dtype=np.uint8)
+    places = [(50 * np.cos(k * np.pi / 4), 50 * np.sin(k * np.pi / 4)) for k in range(len(rods))]
+    for (number, name), (px, py) in zip(rods, places, strict=True):
+        inside = np.hypot(x - px, y - py) < 5.0
+        hu[:, inside], dense[:, inside] = number, DENSE.index(name)
+    s = presets.pcct(views=360, energy_bin_kev=4.0)
+    s = s.replace(geometry=replace(s.geometry, rows=1, columns=440, pitch=(0.7, 0.7)))
+    scene = VoxelScene(hu, grid, dense=dense)
+    scan = acquire(scene, s)
+    volume = recon.reconstruct(scan, VolumeGrid((1, 240, 240), 0.5), "fbp", kernel="standard")
+    y, x = volume.grid.axes[1][:, None], volume.grid.axes[2][None, :]
+    for (number, name), (px, py) in zip(rods, places, strict=True):
+        found = float(volume.data[0][torch.from_numpy(np.hypot(x - px, y - py) < 2.6)].mean())
+        assert found == pytest.approx(number, abs=5.0), name
+    shares = scan.info["plan"]["above_muscle"]
+    assert shares["iodine"] == pytest.approx((dense == 1).mean(), rel=1e-6)
+    assert scene.water_diameter == pytest.approx(163, abs=1)  # 160 mm of muscle
+    # A volume with a spectrum of its own keeps it: 300 HU of iodine at 70 keV are brighter at 100 kVp.
+    told = VoxelScene(hu, grid, energies_kev=70.0, dense="iodine")
+    assert told.read_by([50.0, 60.0], [1.0, 1.0]) is told
+
+
+@pytest.mark.parametrize("dense", DENSE)
+def test_what_is_above_muscle_is_the_users_choice(dense):
+    """300 HU at 70 keV, read at 50 keV: a mixture by volume of two materials, computed by hand."""
+    low, high = {
+        "bone": (MATERIALS["spongiosa"], MATERIALS["cortical_bone"]),
+        "iodine": (MATERIALS["skeletal_muscle"], material("iodine 200 mg/ml in blood")),
+        "water": (MATERIALS["skeletal_muscle"], MATERIALS["water"].with_density(5.0)),
+    }[dense]
+    share = (300 - low.hu(70.0)) / (high.hu(70.0) - low.hu(70.0))
+    expected = low.hu(50.0) + share * (high.hu(50.0) - low.hu(50.0))
+    assert expected == pytest.approx({"bone": 496, "iodine": 585, "water": 304}[dense], abs=1)
+    for given in (dense, np.full((1, 1, 1), DENSE.index(dense))):
+        s = VoxelScene(np.full((1, 1, 1), 300.0), VolumeGrid((1, 1, 1), 1.0), energies_kev=70.0, dense=given)
+        water, air = (MATERIALS[m].attenuation([50.0]) for m in ("water", "air"))
+        read = 1000 * (float(s.mixed(s.contrast([50.0]))[0, 0, 0, 0] + air[0]) / water[0] - 1)
+        assert read == pytest.approx(expected, abs=0.01)
+
+
 def test_bad_voxel_scenes_are_refused():
+    for dense, said in (
+        ("gold", "unknown dense 'gold': use one of bone, iodine, water"),
+        (np.zeros((2, 2, 2)), r"dense needs the shape \(z, y, x\)"),
+        (np.full(GRID.shape, 3), "dense must hold 0 bone, 1 iodine, 2 water"),
+        (None, "dense must be one of bone, iodine, water, or a whole number"),
+    ):
+        with pytest.raises((ValueError, TypeError), match=said):
+            VoxelScene(np.zeros(GRID.shape), GRID, dense=dense)
+    with pytest.raises(ValueError, match="give dense or tissues, not both"):
+        VoxelScene(np.zeros(GRID.shape), GRID, dense="iodine", tissues=("air", "water"))
     with pytest.raises(ValueError, match=r"shape \(z, y, x\) of its grid"):
         VoxelScene(np.zeros((2, 2, 2)), GRID)
     with pytest.raises(ValueError, match="300 voxels are NaN"):
