@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.fbp.angular_weights import angular_weights
-from recon.fbp.backproject import BackprojectionPlan
+from recon.fbp.backproject import BackprojectionPlan, backproject
+from recon.fbp.fbp import filter_windowed
 from recon.fbp.filter_plan import FilterPlan
 from recon.fbp.inset import InsetFbp
 from torchpcct.detector_window import DetectorWindow
@@ -27,7 +28,14 @@ from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.roi import RoiMean
 from torchpcct.scan import Scan
 
-__all__ = ["RoiAdjoints", "functional_covariance", "line_integral_variance", "roi_adjoints", "roi_covariance"]
+__all__ = [
+    "RoiAdjoints",
+    "functional_covariance",
+    "line_integral_variance",
+    "roi_adjoints",
+    "roi_covariance",
+    "voxel_covariance",
+]
 
 FILTER_MARGIN_COLUMNS = 32
 """Columns on either side of the shadow whose noise is counted. The filter's tail falls as 1 / n², its square as
@@ -173,6 +181,38 @@ def functional_covariance(fbp: InsetFbp, functionals: Tensor, ray_covariance: Te
     seen = w.with_rows(fbp.shadow.first_row, fbp.shadow.rows)
     (h,) = _filtered(fbp, traces, seen, 1.0)
     return np.stack([_gram(h, c) for c in w.crop(ray_covariance, seen)], axis=-1)
+
+
+def voxel_covariance(clean: Scan, fbp: InsetFbp, exposure_s: float, voxel: Sequence[int]) -> Tensor:
+    """Exact covariance in HU² of one voxel with all voxels: one adjoint pass and one reconstruction.
+
+    Args:
+        clean: noise-free windowed scan.
+        fbp: of one grid with one kernel.
+        exposure_s: of the noise; covariances fall as its inverse.
+        voxel: ``(z, y, x)`` index.
+
+    Returns:
+        ``grid.shape``, float32.
+
+    Raises:
+        ValueError: several grids or kernels, a scan that is noisy or not windowed.
+    """
+    if len(fbp.grids) != 1 or len(fbp.kernels) != 1 or clean.window is None:
+        raise ValueError("the covariance of a voxel needs FBP of one grid with one kernel, and a windowed scan")
+    (grid,), window = fbp.grids, clean.window
+    variance = line_integral_variance(clean, exposure_s).to(torch.float32)
+    hu = 1000.0 / fbp.linearisation.mu_ref
+
+    def reconstruct(lines: Tensor) -> Tensor:
+        filtered = filter_windowed(lines, fbp.geometry, window, fbp.kernels, fbp.shadow)
+        return backproject(filtered, fbp.geometry, grid, fbp.shadow)[0] * hu
+
+    leaf = torch.zeros_like(variance, requires_grad=True)
+    with torch.enable_grad():
+        (h,) = torch.autograd.grad(reconstruct(leaf)[tuple(voxel)], leaf)
+    with torch.no_grad():
+        return reconstruct(h * variance)
 
 
 def _traces(fbp: InsetFbp, grid: VolumeGrid, rois: Sequence[RoiMean], clean: Scan) -> tuple[int, Tensor]:

@@ -21,9 +21,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.fbp.backproject import backproject
-from recon.fbp.exact_noise import line_integral_variance, roi_adjoints
-from recon.fbp.fbp import filter_windowed
+from recon.fbp.exact_noise import line_integral_variance, roi_adjoints, voxel_covariance
 from recon.fbp.inset import InsetFbp
 from recon.study.dose_factor.exact_linear import exact_linear, statistic_covariance
 from recon.study.dose_factor.readings import Readings
@@ -76,19 +74,7 @@ def fbp_figures(scenes: Sequence[StudyScene], readings: Readings, kernel: str) -
     adjoints = roi_adjoints(clean, fbp, [readings.functionals()])  # type: ignore[list-item]
     covariance = adjoints.joint_covariance(clean, NOISE_FREE_EXPOSURE_S)
     del adjoints
-    assert clean.window is not None
-    window, variance = clean.window, line_integral_variance(clean, NOISE_FREE_EXPOSURE_S).to(torch.float32)
-    hu = 1000.0 / clean.linearisation.mu_ref
-
-    def reconstruct(lines: Tensor) -> Tensor:
-        filtered = filter_windowed(lines, clean.geometry, window, [kernel], fbp.shadow)
-        return backproject(filtered, clean.geometry, grid, fbp.shadow)[0] * hu
-
-    leaf = torch.zeros_like(variance, requires_grad=True)
-    with torch.enable_grad():
-        (h,) = torch.autograd.grad(reconstruct(leaf)[readings.middle], leaf)
-    with torch.no_grad():
-        spread = reconstruct(h * variance)
+    spread = voxel_covariance(clean, fbp, NOISE_FREE_EXPOSURE_S, readings.middle)
     return {**_of_scenes(readings, volumes), **_noise(readings, covariance, spread)}
 
 

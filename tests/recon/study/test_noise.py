@@ -8,7 +8,8 @@ import pytest
 import torch
 from tiny_studies import assert_report_is_whole
 
-from recon.fbp.exact_noise import roi_adjoints, roi_covariance
+from recon.fbp.exact_noise import roi_adjoints, roi_covariance, voxel_covariance
+from recon.fbp.inset import InsetFbp
 from recon.study import registry
 from recon.study.noise.claims import CLAIMS
 from recon.study.noise.few_runs import (
@@ -22,6 +23,7 @@ from recon.study.noise.few_runs import (
 )
 from recon.study.noise.settings import Settings
 from recon.study.paper import facts as paper
+from recon.study.paper.plaque_scan import Functional
 from recon.study.paper.tables import published, table_checks
 from torchpcct.metrics.bootstrap import resampling
 
@@ -76,6 +78,22 @@ def test_adjoint_vectors_of_the_grids_share_one_window(measured):
         whole.crop(adjoints.window)
     with pytest.raises(ValueError, match="windowed"):
         roi_adjoints(whole, scanned.fbp, scanned.pairs)
+
+
+def test_covariance_of_a_voxel_is_that_of_two_functionals(measured):
+    scanned = measured.scanned
+    fbp = InsetFbp(scanned.clean, scanned.grids[:1], ["soft"])
+    (grid,) = fbp.grids
+    here = tuple(n // 2 for n in grid.shape)
+    there = (here[0], here[1] + 1, here[2] - 2)
+    found = voxel_covariance(scanned.clean, fbp, 2.0, here)
+    assert found.shape == grid.shape
+    singles = torch.zeros(2, *grid.shape, dtype=torch.float64)
+    singles[0][here] = singles[1][there] = 1.0
+    ((exact,),) = roi_covariance(scanned.clean, fbp, [[Functional(w) for w in singles]], 2.0)
+    assert [float(found[here]), float(found[there])] == pytest.approx(exact[0].tolist(), rel=1e-3)
+    with pytest.raises(ValueError, match="one grid with one kernel"):
+        voxel_covariance(scanned.clean, scanned.fbp, 2.0, here)
 
 
 def test_noise_falls_with_the_square_root_of_dose(measured):
