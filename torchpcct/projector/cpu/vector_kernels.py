@@ -5,7 +5,9 @@ In every slab of voxels the cell's parallelogram is projected onto the slab's mi
 rectangle along the grid's axes that has its centre and its second moments: sides √(u² + v²) of the projected steps
 along either axis. Of an upright detector that is the parallelogram itself, and the distance-driven model of
 :mod:`~torchpcct.projector.cpu.cone_kernels`; of a turned one the corners differ, the mean and the width do not. The
-reading is the mean over the rectangle times the path through the slab, summed over slabs.
+reading is the mean over the rectangle times the path through the slab, summed over slabs. A long cell that is rolled
+lies along a diagonal, which no rectangle along the axes does (aspect 20: 32 % of the peak off): its reading is the mean
+of so many parts that each part's rectangle fits.
 
 Forward runs in parallel over views, the adjoint over blocks of slabs, one axis after the other: no two threads write to
 one place, and every sum has a fixed order.
@@ -27,6 +29,11 @@ SLAB_BLOCK = 16
 """Slabs of one task of the adjoint."""
 NEAREST = 1e-6
 """Slabs closer to the source than this part of the way to the detector are behind it."""
+_MOST_PARTS = 256
+"""Of a cell, along either step."""
+_SLOPE, _SMALL = 0.2, 0.1
+"""A rectangle along the axes will do where the footprint's mixed second moment is below so much of the geometric mean
+of the other two, or below so much of a voxel's."""
 _POINT = 1e-9
 """A rectangle narrower than this part of a voxel is a point."""
 _small = njit(**INNER)
@@ -58,6 +65,28 @@ def _overlap(low, high, k, width):
     if width < _POINT:
         return 1.0
     return (min(high, k + 1.0) - max(low, float(k))) / width
+
+
+@_small
+def _parts(pose, ray, parallel, axis, lower, spacing, shape):
+    """Parts along u and along v into which a cell is cut, so that rectangles along the axes stand for them."""
+    a, b = (axis + 2) % 3, (axis + 1) % 3
+    d = ray[1, axis]
+    scale = 1.0 if parallel else min(max((lower[axis] + shape[axis] * spacing[axis] / 2 - ray[0, axis]) / d, 0.0), 1.0)
+    u, v = pose[2, axis] / d, pose[3, axis] / d
+    ua, ub = (pose[2, a] - ray[1, a] * u) / spacing[a] * scale, (pose[2, b] - ray[1, b] * u) / spacing[b] * scale
+    va, vb = (pose[3, a] - ray[1, a] * v) / spacing[a] * scale, (pose[3, b] - ray[1, b] * v) / spacing[b] * scale
+    parts_u = parts_v = 1
+    while max(parts_u, parts_v) < _MOST_PARTS:
+        pa, pb, qa, qb = ua / parts_u, ub / parts_u, va / parts_v, vb / parts_v
+        across = abs(pa * pb + qa * qb)
+        if across <= max(_SMALL, _SLOPE * math.sqrt((pa * pa + qa * qa) * (pb * pb + qb * qb))):
+            break
+        if abs(pa * pb) >= abs(qa * qb):
+            parts_u += 1
+        else:
+            parts_v += 1
+    return parts_u, parts_v
 
 
 @_small
@@ -105,16 +134,40 @@ def _cell(pose, ray, parallel, axis, lower, spacing, shape, strides, r0, r1, fla
 
 
 @_small
+def _whole_cell(pose, i, j, ray, part, parallel, axis, lower, spacing, shape, strides, r0, r1, flat, value, gather):
+    """:func:`_cell` of all parts of the cell whose ray is in ``ray``; ``ray`` and ``part (4, 3)`` are overwritten."""
+    parts_u, parts_v = _parts(pose, ray, parallel, axis, lower, spacing, shape)
+    if parts_u * parts_v == 1:
+        return _cell(pose, ray, parallel, axis, lower, spacing, shape, strides, r0, r1, flat, value, gather)
+    for k in range(3):
+        part[0, k], part[1, k] = pose[0, k], pose[1, k]
+        part[2, k], part[3, k] = pose[2, k] / parts_u, pose[3, k] / parts_v
+    share = 1.0 / (parts_u * parts_v)
+    total = 0.0
+    for p in range(parts_v):
+        for q in range(parts_u):
+            at_i = i + (p + 0.5) / parts_v - 0.5
+            at_j = j + (q + 0.5) / parts_u - 0.5
+            _start(part, at_i * parts_v, at_j * parts_u, parallel, ray)
+            total += share * _cell(
+                part, ray, parallel, axis, lower, spacing, shape, strides, r0, r1, flat, value * share, gather
+            )
+    return total
+
+
+@_small
 def _project_view(pose, parallel, lower, spacing, shape, strides, flat, data):
     rows, columns = data.shape
-    ray = np.empty((2, 3))
+    ray, part = np.empty((2, 3)), np.empty((4, 3))
     for i in range(rows):
         for j in range(columns):
-            _start(pose, i - (rows - 1) / 2, j - (columns - 1) / 2, parallel, ray)
+            at_i, at_j = i - (rows - 1) / 2, j - (columns - 1) / 2
+            _start(pose, at_i, at_j, parallel, ray)
             axis = _main_axis(ray, spacing)
-            data[i, j] = _cell(
-                pose, ray, parallel, axis, lower, spacing, shape, strides, 0, shape[axis], flat, 0.0, True
-            )
+            data[i, j] = _whole_cell(
+                pose, at_i, at_j, ray, part, parallel, axis, lower, spacing, shape, strides, 0, shape[axis], flat, 0.0,
+                True,
+            )  # fmt: skip
 
 
 @njit(nogil=True, cache=True)
@@ -135,14 +188,15 @@ def project_vectors(begin, end, poses, parallel, lower, spacing, shape, strides,
 @_small
 def _gather_slabs(poses, parallel, lower, spacing, shape, strides, data, axis, r0, r1, flat):
     views, rows, columns = data.shape
-    ray = np.empty((2, 3))
+    ray, part = np.empty((2, 3)), np.empty((4, 3))
     for n in range(views):
         for i in range(rows):
             for j in range(columns):
-                _start(poses[n], i - (rows - 1) / 2, j - (columns - 1) / 2, parallel, ray)
+                at_i, at_j = i - (rows - 1) / 2, j - (columns - 1) / 2
+                _start(poses[n], at_i, at_j, parallel, ray)
                 if _main_axis(ray, spacing) == axis:
-                    _cell(
-                        poses[n], ray, parallel, axis, lower, spacing, shape, strides, r0, r1, flat,
+                    _whole_cell(
+                        poses[n], at_i, at_j, ray, part, parallel, axis, lower, spacing, shape, strides, r0, r1, flat,
                         float(data[n, i, j]), False,
                     )  # fmt: skip
 
