@@ -2,18 +2,41 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
+import functools
 import glob
 import hashlib
+import io
 import os
+import platform
+import re
+import secrets
+import shutil
+import signal
 import tempfile
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-__all__ = ["VERSION", "read_hdf5", "require_folder", "require_writable", "seal", "write_hdf5", "written_whole"]
+__all__ = [
+    "LEFTOVER",
+    "VERSION",
+    "WriteError",
+    "clear_folder",
+    "read_hdf5",
+    "require_folder",
+    "require_writable",
+    "seal",
+    "write_hdf5",
+    "written_whole",
+]
 
+LEFTOVER = re.compile(r"\.(?P<process>\d+)-(?P<machine>[0-9a-f]{6})-[0-9a-f]{8}\.part\.")
+"""Names of what is being written begin so: the process, where it runs, and a number of this write alone."""
 _BLOCK = 512
 _ABANDONED_S = 60.0
 _MAGIC = b"torchpcct, HDF5 from byte 512, SHA-256 of it: "
@@ -43,42 +66,164 @@ def require_writable(folder: str | os.PathLike[str]) -> None:
         raise type(error)(f"cannot write into {path} ({error.strerror or error}): name another folder") from error
 
 
-def _sweep(target: Path) -> None:
-    """Remove temporary files of ``target`` that processes of this machine left behind when they were killed."""
-    for part in target.parent.glob(f".*.part.{glob.escape(target.name)}"):
-        owner = part.name[1:].split(".", 1)[0]
-        if not owner.isdigit() or time.time() - part.stat().st_mtime < _ABANDONED_S:
-            continue
-        try:
-            os.kill(int(owner), 0)
-        except ProcessLookupError:
-            part.unlink(missing_ok=True)
-        except OSError:  # of another user: alive
-            pass
+class WriteError(OSError):
+    """A file could not be written, say to a full disk; nothing of it is left, and what was there before is."""
+
+
+def _write_error(path: Path, cause: Exception) -> WriteError:
+    """In one sentence: libraries make pages of the system's error, with its words somewhere."""
+    text = str(cause).strip()
+    number = getattr(cause, "errno", None)
+    number = number or next((n for n in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) if os.strerror(n) in text), None)
+    why = os.strerror(number) if number else (text.splitlines() or [type(cause).__name__])[0]
+    error = WriteError(f"cannot write {path}: {why}")
+    error.errno = number
+    return error
+
+
+@functools.cache
+def _machine() -> str:
+    """Six digits of where a process number means one process: this machine, or this container."""
+    try:
+        space = os.readlink("/proc/self/ns/pid")
+    except OSError:
+        space = ""
+    return hashlib.sha256(f"{platform.node()} {space}".encode()).hexdigest()[:6]
+
+
+def _part(target: Path, process: int) -> Path:
+    """A new temporary name; with the target's ending, as some writers choose the format by it."""
+    return target.with_name(f".{process}-{_machine()}-{secrets.token_hex(4)}.part.{target.name}")
+
+
+def _abandoned(part: Path, seconds: float = 0.0) -> bool:
+    """Whether the writer of a temporary file is dead, by all that can be known here: that of another machine is not.
+
+    Args:
+        part: temporary file or folder.
+        seconds: for which nothing has been written to it.
+    """
+    owner = LEFTOVER.match(part.name)
+    if owner is None or owner["machine"] != _machine():
+        return False
+    try:
+        if time.time() - part.stat().st_mtime < seconds:
+            return False
+        os.kill(int(owner["process"]), 0)
+    except ProcessLookupError:
+        return True
+    except OSError:  # of another user: alive; or gone, by its own writer
+        pass
+    return False
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def clear_folder(folder: str | os.PathLike[str]) -> None:
+    """Remove a folder and all in it, but what other processes or threads are writing at this moment."""
+    for place, _, names in os.walk(folder, topdown=False):
+        for name in names:
+            if not LEFTOVER.match(name) or _abandoned(Path(place, name)):
+                Path(place, name).unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # not empty: somebody writes
+            os.rmdir(place)
 
 
 @contextmanager
-def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a temporary name beside ``path``; on success flush it to the disk and rename it to ``path``.
+def written_whole(path: str | os.PathLike[str], *failures: type[Exception]) -> Iterator[Path]:
+    """Yield a temporary name beside ``path``, for a file or a folder; flush what is there to the disk, rename it.
 
-    Whoever reads ``path`` at any moment, also after a crash, finds the old content or the new one, whole. On any
-    failure the temporary file is removed; one that a killed process left is removed by the next write, a minute later.
+    Whoever reads ``path`` at any moment, also after a crash, finds the old content or the new one, whole; so do any
+    number of processes and threads that write it at once. On any failure what is temporary is removed; what a killed
+    process left is removed by the next write of the same name, a minute later. A folder takes the place of none, or of
+    an empty one.
+
+    Args:
+        path: to write.
+        failures: what the writer raises where it cannot write, beside ``OSError``.
 
     Raises:
         FileNotFoundError: the folder of ``path`` does not exist.
+        WriteError: the system refuses to write.
     """
     target = Path(path)
     require_folder(target)
-    _sweep(target)
-    # Keep the ending: some writers choose the format by it.
-    part = target.with_name(f".{os.getpid()}.part.{target.name}")
+    for left in target.parent.glob(f".*.part.{glob.escape(target.name)}"):
+        if _abandoned(left, _ABANDONED_S):
+            _remove(left)
+    part = _part(target, os.getpid())
     try:
         yield part
         _sync(part)
         os.replace(part, target)
         _sync(target.parent)
+    except WriteError:
+        raise
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"cannot write {target}: its folder has been removed") from error
+    except Exception as error:
+        if not isinstance(error, (OSError, *failures)):
+            raise
+        raise _write_error(target, error) from error
     finally:
-        part.unlink(missing_ok=True)
+        _remove(part)
+
+
+class _Unfailing(io.FileIO):
+    """A file for HDF5, which crashes when it closes a file that it could not write, or at the end of the program.
+
+    The first failure is kept in ``failure``; all that is written after it goes nowhere.
+    """
+
+    failure: BaseException | None = None
+
+    def write(self, data: Any, /) -> int:
+        rest = memoryview(data).cast("B")
+        size = len(rest)
+        try:
+            while len(rest) and self.failure is None:
+                rest = rest[super().write(rest) :]
+        except BaseException as error:
+            self.failure = error
+        return size
+
+    def truncate(self, size: int | None = None, /) -> int:
+        try:
+            return super().truncate(size)
+        except BaseException as error:
+            self.failure = self.failure or error
+            return size or 0
+
+    def readinto(self, buffer: Any, /) -> int:
+        there = super().readinto(buffer) or 0
+        buffer[there:] = bytes(len(buffer) - there)
+        return len(buffer)
+
+
+@contextmanager
+def _signals_wait() -> Iterator[None]:
+    """Put off what Python does at signals (Ctrl-C) to the end of a block: an exception in the middle of what HDF5 asks
+    of a file would be a write that is lost without a word."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # Python serves signals in the main thread only
+        return
+    came: list[tuple[int, Any]] = []
+    found = {int(n): signal.getsignal(n) for n in signal.valid_signals()}
+    handlers = {n: handler for n, handler in found.items() if callable(handler) and not isinstance(handler, int)}
+    try:
+        for n in handlers:
+            signal.signal(n, lambda number, frame: came.append((number, frame)))
+        yield
+    finally:
+        for n, handler in handlers.items():
+            signal.signal(n, handler)
+        for number, frame in came:
+            handlers[number](number, frame)
 
 
 @contextmanager
@@ -88,16 +233,27 @@ def write_hdf5(path: str | os.PathLike[str], kind: str) -> Iterator[Any]:
     HDF5 checks neither its data nor its structure, and a damaged structure can make it wait forever. So the first 512
     bytes, which HDF5 leaves to the user, hold the SHA-256 of all the others: :func:`read_hdf5` compares it before HDF5
     sees the file.
+
+    Raises:
+        FileNotFoundError: the folder of ``path`` does not exist.
+        WriteError: the system refuses to write.
     """
     import h5py
 
     with written_whole(path) as part:
-        try:
-            with h5py.File(part, "w", userblock_size=_BLOCK) as file:
-                file.attrs["format"] = f"torchpcct-{kind}"
-                yield file
-        except RuntimeError as error:  # what HDF5 makes of a full disk when it closes a file
-            raise OSError(f"cannot write {path}: {error}") from error
+        with _signals_wait(), _Unfailing(part, "w+b") as raw:
+            try:
+                with h5py.File(raw, "w", userblock_size=_BLOCK) as file:
+                    cache = file.id.get_mdc_config()  # no structure is thrown out, to be read back from nowhere
+                    cache.evictions_enabled, cache.incr_mode, cache.flash_incr_mode, cache.decr_mode = False, 0, 0, 0
+                    file.id.set_mdc_config(cache)
+                    file.attrs["format"] = f"torchpcct-{kind}"
+                    yield file
+            except Exception:  # HDF5 may stumble over what it could not write
+                if raw.failure is None:
+                    raise
+            if raw.failure is not None:
+                raise raw.failure
         seal(part)
 
 
@@ -161,6 +317,9 @@ def read_hdf5(path: str | os.PathLike[str], kind: str) -> Iterator[Any]:
 
 def _sync(path: Path) -> None:
     # A rename can reach the disk before the content does: without this, a power cut may leave an empty file.
+    if LEFTOVER.match(path.name) and path.is_dir():
+        for inside in path.iterdir():
+            _sync(inside)
     try:
         handle = os.open(path, os.O_RDONLY)
     except OSError:  # folders cannot be opened on some systems, which sync them by themselves

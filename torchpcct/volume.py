@@ -66,7 +66,8 @@ class Volume:
         """Write ``.nii`` / ``.nii.gz`` (NIfTI-1), ``.mha`` (MetaImage), ``.h5`` (HDF5 with grid and report), or, if the
         name has no ending, a folder with a DICOM series in HU.
 
-        x, y, z of the scanner become right, anterior, superior. MetaImage and DICOM need the extra ``io``.
+        x, y, z of the scanner become right, anterior, superior. MetaImage and DICOM need the extra ``io``. A 2-D image
+        is written as :meth:`slices` makes it, but to HDF5, which keeps it as it is.
 
         Raises:
             ValueError: another ending, a batch of volumes (save them one by one), or what the format cannot hold.
@@ -80,7 +81,16 @@ class Volume:
             self._save_hdf5(path)
         else:
             write = {"NIfTI": write_nifti, "MetaImage": write_meta_image, "DICOM": write_dicom}[form]
-            write(path, self.data.detach().cpu().numpy(), self.grid, self.unit)
+            slices = self.slices()
+            write(path, slices.data.detach().cpu().numpy(), slices.grid, self.unit)
+
+    def slices(self) -> Volume:
+        """The same with axes z, y, x: a 2-D image as one slice at z = 0, as thick as its pixels are wide."""
+        if self.grid.ndim == 3:
+            return self
+        g = self.grid
+        grid = VolumeGrid((1, *g.shape), (g.spacing[-1], *g.spacing), (0.0, *g.center))
+        return Volume(self.data.unsqueeze(-3), grid, self.report, self.unit)
 
     def _save_hdf5(self, path: str | os.PathLike[str]) -> None:
         with write_hdf5(path, "volume") as file:
@@ -92,7 +102,9 @@ class Volume:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Volume:
-        """Read a volume of any format that :meth:`save` writes; the report comes back from HDF5 only.
+        """Read a volume of any format that :meth:`save` writes, or one DICOM image (``.dcm``, ``.ima``, no ending).
+
+        The report comes back from HDF5 only.
 
         Raises:
             FileNotFoundError: no such file or folder.

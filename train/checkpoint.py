@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,11 +10,12 @@ from typing import Any
 from torch import Tensor
 
 from recon.mbir.weights_io import TensorFileError, read_tensors, write_tensors
+from torchpcct.files import LEFTOVER
 
 __all__ = ["CHECKPOINT_FORMAT", "Store"]
 
 CHECKPOINT_FORMAT = "torchpcct training checkpoint 2"
-LEFTOVER = re.compile(r"\.\d+\.part\.|checkpoint\.next\.")
+UNFINISHED = "checkpoint.next."
 
 
 class Store:
@@ -31,7 +31,7 @@ class Store:
 
     def save(self, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> None:
         """Write the checkpoint; the one in place becomes the previous one."""
-        fresh = self.current.with_name("checkpoint.next.safetensors")
+        fresh = self.current.with_name(UNFINISHED + "safetensors")
         write_tensors(fresh, CHECKPOINT_FORMAT, tensors, metadata)
         # Killed between the two renames, the run goes on from the previous checkpoint, which is then the newest one
         # that had been completed. Renames that a power cut undoes lose a checkpoint, but never both.
@@ -58,5 +58,5 @@ class Store:
     def clean(self) -> None:
         """Remove temporary files that a killed process left behind."""
         for path in self.current.parent.iterdir():
-            if LEFTOVER.match(path.name):
+            if LEFTOVER.match(path.name) or path.name.startswith(UNFINISHED):
                 path.unlink(missing_ok=True)

@@ -8,7 +8,6 @@ import hashlib
 import importlib
 import json
 import logging
-import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -17,13 +16,15 @@ from typing import Any, TypeVar, cast
 import numpy as np
 import torch
 
-from torchpcct.files import VERSION, written_whole
+from torchpcct.files import VERSION, clear_folder, written_whole
 
 __all__ = ["Pieces", "Store", "packed", "unpacked"]
 
 log = logging.getLogger(__name__)
 
 
+_TRIES = 10
+"""To write a piece, where others clear its folder; it is only kept for later, and a study goes on without."""
 _MARK = "\nSHA-256 "
 """Parts the key from the checksum of the arrays. Pieces of earlier versions have none, and are taken as they are."""
 
@@ -76,14 +77,19 @@ class Store:
             except Exception as error:  # a damaged archive can fail in any way
                 log.warning("%s cannot be read (%s): computed again", path, error)
         arrays = compute()
-        self.path(name)  # again: computing took long enough for someone to tidy up
-        with written_whole(path) as part:
-            np.savez(part, key=np.array(key + _MARK + _digest(key, arrays)), **arrays)
+        sealed = {"key": np.array(key + _MARK + _digest(key, arrays)), **arrays}
+        for _ in range(_TRIES):
+            try:
+                with written_whole(self.path(name + ".npz")) as part:  # its folder again, which others may clear
+                    np.savez(part, **sealed)
+                break
+            except FileNotFoundError as error:
+                log.info("cleared while it was written: %s", error)
         return arrays
 
     def drop(self, name: str) -> None:
         """Forget what lies below a piece's name: its parts, of no use once the piece is there."""
-        shutil.rmtree(self.folder / name, ignore_errors=True)
+        clear_folder(self.folder / name)
 
 
 T = TypeVar("T")
@@ -132,7 +138,7 @@ class Pieces:
     @classmethod
     def clear(cls, folder: str | Path) -> None:
         """Remove the pieces of a finished study."""
-        shutil.rmtree(Path(folder) / cls.FOLDER, ignore_errors=True)
+        clear_folder(Path(folder) / cls.FOLDER)
 
 
 @functools.cache

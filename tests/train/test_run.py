@@ -136,7 +136,7 @@ def test_crash_at_any_write(tmp_path, uninterrupted, crash_before):
         ("card.md", 1),
     ):
         # As a killed process leaves them.
-        for leftover in ("checkpoint.next.safetensors", ".123.part.card.md"):
+        for leftover in ("checkpoint.next.safetensors", ".123-0a1b2c-00000000.part.card.md"):
             (out / leftover).write_bytes(b"half")
         crash_before(out, name, n, resume=True)
     run(out, resume=True)

@@ -6,20 +6,23 @@ so the same point carries the opposite sign there; every reader shows the same v
 
 from __future__ import annotations
 
+import gzip
 import os
+import shutil
 import zlib
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from torchpcct.files import require_folder, written_whole
+from torchpcct.files import require_folder, require_writable, written_whole
 from torchpcct.formats.damage import check_size, needed, reading
 from torchpcct.geometry import VolumeGrid
 from torchpcct.validate import UNITS
 
 __all__ = [
     "ENDINGS",
+    "check_target",
     "check_volume_name",
     "format_of",
     "read_dicom",
@@ -33,13 +36,16 @@ __all__ = [
 ENDINGS = {"NIfTI": (".nii", ".nii.gz"), "MetaImage": (".mha",), "HDF5": (".h5", ".hdf5")}
 """Of files; a name without ending is a folder for a DICOM series."""
 
+_DICOM = (".dcm", ".ima")
 _STRAIGHT = 1e-4
 _MADE_BY = "torchpcct, "
 _HU_RANGE = (-32768, 32767)
+_ROUNDED = 1e-9
+"""Relative, of a decimal string of ten digits."""
 
 
 def format_of(path: str | os.PathLike[str]) -> str:
-    """Name of the format that the ending of ``path`` stands for.
+    """Name of the format that the ending of ``path`` stands for; a file of one DICOM image is "DICOM", too.
 
     Raises:
         ValueError: none.
@@ -48,20 +54,59 @@ def format_of(path: str | os.PathLike[str]) -> str:
     for form, endings in ENDINGS.items():
         if name.endswith(endings):
             return form
-    if not Path(path).suffix and Path(path).name not in ("", ".", ".."):
+    if Path(path).suffix.lower() in _DICOM or (not Path(path).suffix and Path(path).name not in ("", ".", "..")):
         return "DICOM"
     known = ", ".join(e for endings in ENDINGS.values() for e in endings)
     raise ValueError(f"unknown volume format {Path(path).name!r}: use {known}, or no ending for a DICOM series")
 
 
 def check_volume_name(path: str | os.PathLike[str]) -> None:
-    """Raise ``ValueError`` unless the ending of ``path`` names a volume format; none: a folder for a DICOM series."""
-    format_of(path)
+    """Raise ``ValueError`` unless the ending of ``path`` names a volume format that is written; none: a folder for a
+    DICOM series."""
+    if format_of(path) == "DICOM" and Path(path).suffix.lower() in _DICOM:
+        raise ValueError(f"{Path(path).name!r} would be one slice: a DICOM series is a folder, a name without ending")
 
 
-def _three_axes(grid: VolumeGrid, name: str) -> None:
-    if grid.ndim != 3:
-        raise ValueError(f"{name} needs a 3-D volume; save a 2-D image as .h5")
+def check_target(path: str | os.PathLike[str], voxels: int, unit: str) -> None:
+    """Find out whether a volume can be written, before it is computed.
+
+    Args:
+        path: file or folder to write.
+        voxels: of the volume.
+        unit: HU or mm^-1.
+
+    Raises:
+        ValueError: an unknown ending, a folder in the place of a file, a series into a folder that holds something, or
+            in another unit than HU.
+        OSError: nothing can be written there, or less than the volume needs.
+        ImportError: the package that writes the format is not installed.
+    """
+    check_volume_name(path)
+    require_folder(path)
+    target, form = Path(path), format_of(path)
+    if form == "DICOM":
+        needed("pydicom")
+        _check_series(target, unit)
+    elif target.is_dir():
+        raise ValueError(f"{target} is a folder: name a file to write")
+    elif form == "MetaImage":
+        needed("SimpleITK")
+    require_writable(target.parent)
+    compressed = form == "MetaImage" or target.suffix == ".gz"
+    least = 0 if compressed else voxels * (2 if form == "DICOM" else 4)
+    free = shutil.disk_usage(target.parent).free
+    if least > free:
+        raise OSError(f"{target} needs {least / 2**30:.2f} GiB, {free / 2**30:.2f} GiB are free: name another folder")
+
+
+def _check_series(folder: Path, unit: str) -> None:
+    """Raise ``ValueError`` unless a CT series can be written to a new or empty folder."""
+    if unit != "HU":
+        raise ValueError(f"a DICOM CT series holds HU, this volume is in {unit}: save it as .nii.gz, .mha or .h5")
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"{folder} is a file: name a new folder, or .nii.gz, .mha or .h5")
+    if folder.is_dir() and any(folder.iterdir()):
+        raise ValueError(f"{folder} is not empty: series in one folder mix, name a new one")
 
 
 def _unit(written: str, name: str) -> str:
@@ -79,7 +124,6 @@ def write_nifti(path: str | os.PathLike[str], data: Any, grid: VolumeGrid, unit:
     """Write NIfTI-1, float32, mm, RAS, with qform and sform (scanner coordinates); the unit stands in ``descrip``."""
     import nibabel
 
-    _three_axes(grid, "NIfTI")
     affine = np.diag([*grid.spacing[::-1], 1.0])
     affine[:3, 3] = [axis[0] for axis in grid.axes[::-1]]
     # NIfTI stores (x, y, z).
@@ -88,8 +132,12 @@ def write_nifti(path: str | os.PathLike[str], data: Any, grid: VolumeGrid, unit:
     image.set_sform(affine, code="scanner")
     image.header.set_xyzt_units("unknown" if unit == "pixel^-1" else "mm")
     image.header["descrip"] = (_MADE_BY + unit).encode()
-    with written_whole(path) as part:
-        nibabel.save(image, part)
+    with written_whole(path) as part, part.open("wb") as raw:
+        if not str(path).endswith(".gz"):
+            image.to_stream(raw)
+        else:
+            with gzip.GzipFile("", "wb", compresslevel=1, fileobj=raw, mtime=0) as packed:  # the same for the same
+                image.to_stream(packed)
 
 
 def read_nifti(path: str | os.PathLike[str]) -> tuple[Any, VolumeGrid, str]:
@@ -102,6 +150,10 @@ def read_nifti(path: str | os.PathLike[str]) -> tuple[Any, VolumeGrid, str]:
     import nibabel
 
     with reading(path, "NIfTI"):
+        if str(path).endswith(".gz"):
+            with gzip.open(path) as file:  # to its end, where its checksum stands: NiBabel stops after the last voxel
+                while file.read(2**24):
+                    pass
         image: Any = nibabel.load(path)
         check_size(image.shape, "the volume")
         if len(image.shape) != 3:
@@ -128,7 +180,6 @@ def _grid(shape: tuple[int, ...], spacing: Any, first: Any) -> VolumeGrid:
 
 def write_meta_image(path: str | os.PathLike[str], data: Any, grid: VolumeGrid, unit: str) -> None:
     """Write a MetaImage (``.mha``, float32) by SimpleITK; the unit stands in the field ``Unit``."""
-    _three_axes(grid, "MetaImage")
     sitk = needed("SimpleITK")
     image = sitk.GetImageFromArray(np.ascontiguousarray(np.asarray(data, dtype=np.float32)))
     image.SetSpacing(tuple(reversed(grid.spacing)))
@@ -136,7 +187,7 @@ def write_meta_image(path: str | os.PathLike[str], data: Any, grid: VolumeGrid, 
     image.SetOrigin((-x, -y, z))
     image.SetDirection((-1, 0, 0, 0, -1, 0, 0, 0, 1))
     image.SetMetaData("Unit", unit)
-    with written_whole(path) as part:
+    with written_whole(path, RuntimeError) as part:
         sitk.WriteImage(image, str(part), True)
 
 
@@ -177,30 +228,28 @@ def _check_compressed(content: bytes) -> None:
 
 
 def write_dicom(folder: str | os.PathLike[str], data: Any, grid: VolumeGrid, unit: str) -> None:
-    """Write a CT series in HU, one file a slice (int16, rescale slope 1, intercept 0), into a new or empty folder.
+    """Write a CT series in HU, one file a slice, into a new or empty folder, which appears whole or not at all.
+
+    int16, intercept 0, slope 1, or where values lie beyond int16 the least slope that holds them.
 
     Raises:
-        ValueError: a volume in mm⁻¹, values that are not finite or beyond int16, a folder that holds files.
+        ValueError: a volume in mm⁻¹, values that are not finite, a folder that holds files.
     """
-    _three_axes(grid, "DICOM")
     pydicom = needed("pydicom")
     from pydicom.dataset import FileMetaDataset
     from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, generate_uid
 
-    if unit != "HU":
-        raise ValueError(f"a DICOM CT series holds HU, this volume is in {unit}: save it as .nii.gz, .mha or .h5")
+    _check_series(Path(folder), unit)
     values = np.asarray(data, dtype=np.float64)
-    if not np.isfinite(values).all() or values.min() < _HU_RANGE[0] or values.max() > _HU_RANGE[1]:
-        raise ValueError("DICOM holds whole HU from -32768 to 32767: the volume has values beyond, or NaN")
-    target = Path(folder)
-    require_folder(target)
-    target.mkdir(exist_ok=True)
-    if any(target.iterdir()):
-        raise ValueError(f"{target} is not empty: series in one folder mix, name a new one")
-    stored = np.rint(values).astype("<i2")
+    if not np.isfinite(values).all():
+        raise ValueError("DICOM holds finite HU, the volume has NaN or infinite values: save it as .nii.gz or .h5")
+    slope = float(_ds(max(1.0, values.max() / _HU_RANGE[1], values.min() / _HU_RANGE[0]) * (1 + _ROUNDED)))
+    slope = 1.0 if slope < 1 + 2 * _ROUNDED else slope
+    stored = np.rint(values / slope).astype("<i2")
     study, series, frame = (generate_uid() for _ in range(3))
     x, y, z = (float(axis[0]) for axis in grid.axes[::-1])
     dz, dy, dx = grid.spacing
+    images = []
     for k, image in enumerate(stored):
         meta = FileMetaDataset()
         meta.TransferSyntaxUID, meta.MediaStorageSOPClassUID = ExplicitVRLittleEndian, CTImageStorage
@@ -220,11 +269,15 @@ def write_dicom(folder: str | os.PathLike[str], data: Any, grid: VolumeGrid, uni
         d.Rows, d.Columns = image.shape
         d.SamplesPerPixel, d.PhotometricInterpretation = 1, "MONOCHROME2"
         d.BitsAllocated, d.BitsStored, d.HighBit, d.PixelRepresentation = 16, 16, 15, 1
-        d.RescaleSlope, d.RescaleIntercept, d.RescaleType = "1", "0", "HU"
+        d.RescaleSlope, d.RescaleIntercept, d.RescaleType = _ds(slope), "0", "HU"
+        d.ImagesInAcquisition = len(stored)
         d.WindowCenter, d.WindowWidth, d.KVP, d.AcquisitionNumber = "40", "400", "", ""
         d.PixelData = image.tobytes()
-        with written_whole(target / f"{k + 1:04d}.dcm") as part:
-            d.save_as(part, enforce_file_format=True)
+        images.append(d)
+    with written_whole(os.path.realpath(folder)) as part:
+        part.mkdir()
+        for k, d in enumerate(images):
+            d.save_as(part / f"{k + 1:04d}.dcm", enforce_file_format=True)
 
 
 def _ds(value: float) -> str:
@@ -232,58 +285,76 @@ def _ds(value: float) -> str:
     return f"{value:.10g}"
 
 
-def read_dicom(folder: str | os.PathLike[str]) -> tuple[Any, VolumeGrid, str]:
-    """Data ``(z, y, x)`` float32, grid and unit (HU) of a DICOM CT series in a folder.
+def read_dicom(path: str | os.PathLike[str]) -> tuple[Any, VolumeGrid, str]:
+    """Data ``(z, y, x)`` float32, grid and unit (HU) of a DICOM CT series in a folder, or of one image's file.
+
+    Slices that lack within a series are found by their places, those at its ends only in series of ours, which know
+    how many there are. One slice is as thick as it says, else 1 mm.
 
     Raises:
-        FileNotFoundError: no such folder, or no files in it.
-        ValueError: damaged files, several series, missing slices, oblique axes.
+        FileNotFoundError: no such file or folder, or no files in it.
+        ValueError: damaged files, several series, missing or doubled slices, oblique axes.
         ImportError: pydicom is not installed.
     """
     pydicom = needed("pydicom")
-    root = Path(folder)
-    paths = sorted(p for p in root.iterdir() if p.is_file() and not p.name.startswith(".")) if root.is_dir() else []
+    root = Path(path)
+    paths = sorted(p for p in root.iterdir() if p.is_file() and not p.name.startswith(".")) if root.is_dir() else [root]
     if not paths:
-        raise FileNotFoundError(f"no DICOM files in {folder}")
+        raise FileNotFoundError(f"no DICOM files in {path}")
     slices = []
-    for path in paths:
-        with reading(path, "a DICOM image"):
-            d = pydicom.dcmread(path)
+    for file in paths:
+        with reading(file, "a DICOM image"):
+            d = pydicom.dcmread(file)
             check_size((len(paths), d.Rows, d.Columns), "the series")
             pixels = d.pixel_array.astype(np.float32) * np.float32(d.RescaleSlope) + np.float32(d.RescaleIntercept)
-            slices.append((
+            ours = root.is_dir() and str(d.get("Manufacturer", "")) == _MADE_BY.strip(", ")
+            slices.append(_Slice(
                 str(d.SeriesInstanceUID), tuple(float(v) for v in d.ImageOrientationPatient),
                 np.array([float(v) for v in d.ImagePositionPatient]), tuple(float(v) for v in d.PixelSpacing), pixels,
+                float(d.get("SliceThickness") or 1.0), int(d.get("ImagesInAcquisition") or 0) if ours else 0,
             ))  # fmt: skip
-    with reading(folder, "a DICOM series"):
+    with reading(path, "a DICOM series"):
         return *_joined(slices), "HU"
 
 
-def _joined(slices: list[Any]) -> tuple[Any, VolumeGrid]:
-    series, orientation, _, pixel, image = slices[0]
+class _Slice(NamedTuple):
+    series: str
+    orientation: tuple[float, ...]
+    position: Any
+    pixel: tuple[float, ...]
+    image: Any
+    thickness: float
+    of: int
+    """Slices of its series, 0: unknown."""
+
+
+def _joined(slices: list[_Slice]) -> tuple[Any, VolumeGrid]:
+    series, orientation, _, pixel, image, thickness, count = slices[0]
     for other in slices[1:]:
-        if other[0] != series:
+        if other.series != series:
             raise ValueError("it holds several series: keep each in a folder of its own")
-        if other[1] != orientation or other[3] != pixel or other[4].shape != image.shape:
+        if other.orientation != orientation or other.pixel != pixel or other.image.shape != image.shape:
             raise ValueError("its slices differ in orientation, spacing or size")
     row, column = np.array(orientation[:3]), np.array(orientation[3:])
     if abs(abs(row[0]) - 1) > _STRAIGHT or abs(abs(column[1]) - 1) > _STRAIGHT:
         raise ValueError("its slices are not axial: resample it to straight axes first")
-    slices.sort(key=lambda s: float(s[2][2]))
-    z = np.array([float(s[2][2]) for s in slices])
+    slices.sort(key=lambda s: float(s.position[2]))
+    z = np.array([float(s.position[2]) for s in slices])
     gaps = np.diff(z)
     if gaps.size and (gaps.min() <= 0 or np.ptp(gaps) > 0.01 * float(np.median(gaps))):
         at = int(np.argmax(np.abs(gaps - np.median(gaps))))
         raise ValueError(f"slices lack or repeat between z = {z[at]:g} and {z[at + 1]:g} mm")
-    drift = np.abs(np.array([s[2][:2] for s in slices]) - slices[0][2][:2]).max()
+    if count and count != len(slices):
+        raise ValueError(f"it holds {len(slices)} of the {count} slices of its series")
+    drift = np.abs(np.array([s.position[:2] for s in slices]) - slices[0].position[:2]).max()
     if drift > 0.01 * min(pixel):
         raise ValueError("its slices are shifted against each other (gantry tilt)")
-    data = np.stack([s[4] for s in slices])
-    x, y = -slices[0][2][0], -slices[0][2][1]  # LPS to RAS
+    data = np.stack([s.image for s in slices])
+    x, y = -slices[0].position[0], -slices[0].position[1]  # LPS to RAS
     dy, dx = pixel
     if row[0] > 0:  # columns run to the left: ours to the right
         data, x = data[..., ::-1], x - (data.shape[2] - 1) * dx
     if column[1] > 0:
         data, y = data[:, ::-1], y - (data.shape[1] - 1) * dy
-    dz = float(np.median(gaps)) if gaps.size else 1.0
+    dz = float(np.median(gaps)) if gaps.size else thickness
     return np.ascontiguousarray(data), _grid(data.shape, (dx, dy, dz), (x, y, z[0]))
