@@ -51,6 +51,10 @@ _L = "torchpcct/scanner/linearisation.py"
 _A = "recon/fbp/angular_weights.py"
 _V = "torchpcct/vector_geometry.py"
 _VG = "tests/torchpcct/projector/test_vector_geometry.py::"
+_TURN = _VG + "test_roll_tilt_and_slant_turn_right_handed"
+_FILTERS, _YAML, _DATA = "torchpcct/scanner/filters.py", "torchpcct/formats/geometry_yaml.py", "train/data.py"
+_SC, _ALL = "tests/torchpcct/formats/test_scans.py::", "tests/train/test_data.py::test_scenes_of_a_batch_differ"
+_VOX = "tests/torchpcct/acquisition/test_voxels.py::"
 _TISSUE = "recon/mbir/tissues.py"
 _M = "tests/recon/mbir/test_tissues.py::"
 _METAL = "tests/recon/test_metal.py::"
@@ -251,6 +255,35 @@ FAULTS = (
           "tests/recon/pwls/test_pwls.py::test_distance_is_right_where_the_model_converges_slowly"),
     Fault("indefinite frequencies pass", "recon/gram/positive_definite.py", "    run(damp, todo.size",
           "    _ = (damp, todo.size", "tests/recon/gram/test_gram.py::test_spectra_become_definite_whatever_they_are"),
+    Fault("bowtie straight between its nodes", _FILTERS,
+          "curve = PchipInterpolator(np.r_[-nodes[:0:-1], nodes], np.r_[values[:0:-1], values])",
+          "curve = lambda at: np.interp(at, nodes, values)",
+          "tests/torchpcct/scanner/test_scanner_parts.py::test_bowtie_between_its_nodes_by_hand"),
+    Fault("roll the other way", _V, "_with(2, _rotated(u, normal, roll), 3, _rotated(v, normal, roll))",
+          "_with(2, _rotated(u, normal, -roll), 3, _rotated(v, normal, -roll))", _TURN),
+    Fault("tilt the other way", _V, "_rotated(v, u, tilt)", "_rotated(v, u, -tilt)", _TURN),
+    Fault("slant the other way", _V, "_rotated(u, v, slant)", "_rotated(u, v, -slant)", _TURN),
+    Fault("a pose turned the other way", _YAML, "name[:-4]: np.deg2rad(", "name[:-4]: -np.deg2rad(", _TURN),
+    Fault("angles begin at 0", _YAML, "np.deg2rad(start + step * np.arange(count))",
+          "np.deg2rad(step * np.arange(count))", _SC + "test_angles_start_where_they_are_said_to"),
+    Fault("all scenes of a batch alike", _DATA, "own = seed_of(seed, step, index)", "own = seed_of(seed, step)", _ALL),
+    Fault("all scenes of a batch the first", _DATA, "gram) for i in indices]",
+          "gram) for i in [indices[0]] * len(indices)]", _ALL),
+    Fault("all scenes of the pool alike", _DATA, 'seed_of("scene", seed, number)', 'seed_of("scene", seed)', _ALL),
+    Fault("microns are millimetres", "torchpcct/formats/data_exchange.py", '"microns", "micrometer"', '"micrometer"',
+          _SC + "test_pixel_sizes_in_every_unit"),
+    Fault("a micron is a nanometre", "torchpcct/formats/data_exchange.py", '"micrometre"), 1e-3)',
+          '"micrometre"), 1e-6)', _SC + "test_pixel_sizes_in_every_unit"),
+    Fault("long cells are not cut into parts", "torchpcct/projector/cpu/vector_kernels.py", "_MOST_PARTS = 256",
+          "_MOST_PARTS = 1", _VG + "test_long_cells_that_are_rolled"),
+    Fault("iodine scanned as bone", "torchpcct/scene/voxels.py", '"iodine": ("iodine 200 mg/ml in blood",)',
+          '"iodine": BODY_TISSUES[4:]', _VOX + "test_what_is_above_muscle_is_the_users_choice"),
+    Fault("numbers at 70 keV whatever the scanner", "torchpcct/scene/voxels.py", "if not self.scanners_own:",
+          "if True:", _VOX + "test_numbers_come_back_from_a_polychromatic_scan"),
+    Fault("axes by name in the wrong order", "recon/cli/config.py", "[value[a] for a in order if a in value]",
+          "[value[a] for a in value]", "tests/recon/test_cli.py::test_numbers_by_the_names_of_their_axes"),
+    Fault("g/ml for mg/ml", "torchpcct/scene/materials.py", "most = 1000.0 * dissolved", "most = dissolved",
+          "tests/torchpcct/scene/test_materials.py::test_a_concentration_of_iodine_by_its_name"),
 )  # fmt: skip
 
 

@@ -30,6 +30,18 @@ def test_pure_function_of_seed_step_and_index(data):
     assert not torch.equal(whole.truth, data.batch(3, 8, range(4)).truth)
 
 
+def test_scenes_of_a_batch_differ(data):
+    """In what they show, whichever way they are mirrored, in their exposure and in their noise."""
+    for step in range(3):
+        batch = data.batch(2, step, range(4))
+        sorted_values = batch.truth.flatten(1).sort(1).values
+        exposures = batch.problem.scale_hu[:4]
+        noise = (batch.problem.beta[:4] - batch.noise_free.beta).flatten(1)
+        assert torch.pdist(sorted_values).min() > 1.0
+        assert torch.pdist(exposures.reshape(4, 1)).min() > 0.0
+        assert torch.corrcoef(noise).fill_diagonal_(0.0).abs().max() < 0.5
+
+
 def test_statistic_is_signal_and_two_draws_of_noise(data):
     """What is not H u has the covariance H, whose quadratic forms are known, and is independent in both draws."""
     batch = data.batch(0, 1, range(6))

@@ -115,6 +115,29 @@ def test_without_a_pixel_size_lengths_are_in_pixels(tmp_path, size, unit):
         open_scan(path, mu_water=0.04)
 
 
+def test_pixel_sizes_in_every_unit(tmp_path):
+    path = data_exchange(tmp_path / "tooth.h5")
+    for mm, units in (
+        (1e3, "m meter meters metre metres"), (10.0, "cm"), (1.0, "mm millimeter millimeters millimetre millimetres"),
+        (1e-3, "um µm μm micron microns micrometer micrometers micrometre"), (1e-6, "nm"),
+    ):  # fmt: skip
+        for unit in units.split():
+            with h5py.File(path, "a") as file:
+                file["measurement/instrument/detector/pixel_size"].attrs["units"] = unit
+                file["measurement/instrument/detector/pixel_size"][()] = 0.7 / mm
+            assert open_scan(path).geometry.pitch == pytest.approx(0.7), unit
+
+
+def test_angles_start_where_they_are_said_to(tmp_path):
+    """In a geometry and in a stack's description: 30°, 32°, …"""
+    written = {"kind": "parallel", "angles_deg": {"start": 30, "step": 2, "count": 4}, "columns": 5, "pitch": 1.0}
+    np.save(tmp_path / "lines.npy", np.zeros((4, 5)))
+    text = {"readings": "lines.npy", "kind": "line_integrals", "geometry": written}
+    (tmp_path / "stack.yaml").write_text(yaml.safe_dump(text), encoding="utf-8")
+    for geometry in (geometry_of(written), open_scan(tmp_path / "stack.yaml").geometry):
+        assert np.rad2deg(geometry.angles) == pytest.approx([30, 32, 34, 36])
+
+
 @pytest.mark.parametrize("frames", ["constant", "one", "averaged"])
 def test_white_frames_that_do_not_differ(tmp_path, frames):
     """Averages that were stored, several times or once: the photons come from the noise of the readings."""

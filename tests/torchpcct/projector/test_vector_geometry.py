@@ -11,6 +11,7 @@ from analytic import Gaussian, line_integrals, rasterize, vector_lines
 
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Projector, VectorGeometry, VolumeGrid, full_turn
 from torchpcct.detector_window import DetectorWindow
+from torchpcct.formats.geometry_yaml import geometry_of
 from torchpcct.projector.tables import Tables, VectorTables
 from torchpcct.vector_geometry import helical_motion
 
@@ -138,6 +139,19 @@ def test_flips_and_shifts_are_those_of_the_readings():
     torch.testing.assert_close(one[:, 2:, :-1], y[:, :-2, 1:], rtol=0, atol=1e-10)
     part = [4, 1]
     torch.testing.assert_close(Projector(g.select(part), grid)(x), y[part])
+
+
+def test_roll_tilt_and_slant_turn_right_handed():
+    """The source on +x: the normal u × v points at it; roll takes u = +y to v = +z, tilt v to the normal, slant u off
+    it."""
+    a, c, s = math.radians(20.0), math.cos(math.radians(20.0)), math.sin(math.radians(20.0))
+    cone = {"kind": "cone", "angles_deg": [0], "sod": 50, "sdd": 90, "columns": 4, "rows": 3, "pitch": 1.0}
+    for name, u, v in (
+        ("roll", (0, c, s), (0, -s, c)), ("tilt", (0, 1, 0), (s, 0, c)), ("slant", (-s, c, 0), (0, 0, 1)),
+    ):  # fmt: skip
+        turned = VectorGeometry.of(geometry_of(cone)).turned(**{name: a})
+        np.testing.assert_allclose(turned.vectors[0, 6:], (*u, *v), atol=1e-12, err_msg=name)
+        np.testing.assert_allclose(geometry_of({**cone, "pose": {f"{name}_deg": 20}}).vectors, turned.vectors)
 
 
 def test_a_whole_turn_of_roll_is_none():

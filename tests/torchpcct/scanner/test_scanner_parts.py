@@ -115,6 +115,16 @@ def test_large_bowtie_meets_its_table_and_is_symmetric():
     assert bowtie.thickness(0.6) == bowtie.thickness(0.48)
 
 
+def test_bowtie_between_its_nodes_by_hand():
+    """Monotone cubic of Fritsch and Butland: the slope at a node is the harmonic mean of its neighbours', 0 at a turn.
+
+    Nodes of 0, 1, 4 mm every 0.1 rad: slopes 0, 2 · 10 · 30 / 40 = 15 at the first two, so half way between them
+    (0 + 1) / 2 + 0.1 / 8 · (0 - 15) mm. A straight line would say 0.5.
+    """
+    bowtie = Bowtie(material("aluminium"), (0.0, 0.1, 0.2), (0.0, 1.0, 4.0))
+    assert bowtie.thickness([-0.05, 0.05]) == pytest.approx(0.3125, abs=1e-9)
+
+
 @given(st.lists(st.floats(0, 50), min_size=2, max_size=8))
 @settings(max_examples=50, deadline=None)
 def test_bowtie_interpolation_never_overshoots(values):
