@@ -17,6 +17,7 @@ from typing import Any, Self
 import yaml
 
 from recon.mbir.network import NetworkConfig
+from torchpcct.formats.damage import yaml_values
 from torchpcct.validate import number, numbers, whole
 from train.scenes.scene import SceneConfig
 
@@ -259,10 +260,7 @@ class TrainConfig:
         Raises:
             ValueError: not a mapping of known keys to values of the right kind and range; the message names the key.
         """
-        try:
-            values = yaml.safe_load(text)
-        except yaml.YAMLError as error:
-            raise ValueError(f"not YAML: {error}") from error
+        values = yaml_values(text)
         config: Self = _section(cls, {} if values is None else values, "")
         return config
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
+from torchpcct.formats.damage import read_yaml
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scanner import presets
 from torchpcct.scanner.scanner import Scanner
@@ -90,10 +90,7 @@ def read_config(path: Path, **changes: Any) -> SimulationConfig:
         FileNotFoundError: no such file.
         ValueError, TypeError: no mapping, unknown names, bad values; the message names them.
     """
-    try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is no YAML: {error}") from error
+    values = read_yaml(path, "a configuration")
     values = {**_mapping(str(path), values, _KEYS), **{k: v for k, v in changes.items() if v is not None}}
     folder = path.parent
     scene, scene_values = _scene(values.get("scene"), folder)
@@ -109,7 +106,9 @@ def read_config(path: Path, **changes: Any) -> SimulationConfig:
 
 def _mapping(name: str, value: Any, keys: Any) -> dict[str, Any]:
     if not isinstance(value, Mapping):
-        raise TypeError(f"{name} must be a mapping with {', '.join(keys)}, got {value!r}; see torchpcct show-config")
+        raise TypeError(
+            f"{name} must be a mapping with {', '.join(keys)}, got {value!r:.200}; see torchpcct show-config"
+        )
     unknown = [str(k) for k in value if k not in keys]
     if unknown:
         raise ValueError(f"{name}: unknown {', '.join(unknown)}; it takes {', '.join(keys)}")

@@ -35,14 +35,28 @@ Commands = Any
 
 
 def command(
-    commands: Commands, name: str, run: Callable[..., None], help: str, description: str, out: str, **more: Any
+    commands: Commands,
+    name: str,
+    run: Callable[..., None],
+    help: str,
+    description: str,
+    out: str,
+    *,
+    required: bool = False,
+    seed: int | None = 0,
 ) -> argparse.ArgumentParser:
-    """A command with the options of all commands; ``out`` is the help of ``--out``, ``more`` its default or need."""
+    """A command with the options of all commands.
+
+    Args:
+        out: help of ``--out``; required: whether it has no default.
+        seed: default of ``--seed``; None: the configuration's.
+    """
     parser: argparse.ArgumentParser = commands.add_parser(name, help=help, description=description)
     parser.set_defaults(run=run)
-    parser.add_argument("--seed", type=int, default=0, help="first seed of the noise, ≥ 0 (default 0)")
+    default = "the configuration's, or 0" if seed is None else f"{seed}"
+    parser.add_argument("--seed", type=int, default=seed, help=f"first seed of the noise, ≥ 0 (default {default})")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where volumes are kept (default cpu)")
-    parser.add_argument("--out", type=Path, metavar="PATH", help=out, **more)
+    parser.add_argument("--out", type=Path, metavar="PATH", help=out, required=required)
     parser.add_argument("--no-progress", action="store_true", help="no progress bars")
     parser.add_argument("-v", "--verbose", action="store_true", help="log what the library does")
     return parser

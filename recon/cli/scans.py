@@ -50,17 +50,18 @@ def _paper(arguments: argparse.Namespace) -> SimulationConfig:
         "scene": {"kind": "plaque"},
         "scanner": {"preset": "pcct", "views": views},
         "exposure_s": arguments.exposure,
-        "seed": arguments.seed,
+        "seed": arguments.seed or 0,
         "region": kept,
         "tolerance_hu": 0.5,
     }
-    return SimulationConfig(scene, presets.pcct(views=views), region, arguments.exposure, arguments.seed, 0.5, values)
+    return SimulationConfig(scene, presets.pcct(views=views), region, arguments.exposure, values["seed"], 0.5, values)
 
 
 def _simulate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     check_ending(arguments.out, SCAN_ENDINGS)
     require_folder(arguments.out)
-    whole("--seed", arguments.seed, low=0)
+    if arguments.seed is not None:
+        whole("--seed", arguments.seed, low=0)
     if arguments.views is not None:
         whole("--views", arguments.views)
     if arguments.exposure is not None:
@@ -76,7 +77,7 @@ def _simulate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     else:
         if arguments.views is not None or arguments.whole:
             raise ValueError("--views and --whole are the plaque scan's: put views and region into the configuration")
-        config = read_config(arguments.config, exposure_s=arguments.exposure, seed=arguments.seed or None)
+        config = read_config(arguments.config, exposure_s=arguments.exposure, seed=arguments.seed)
     voxels = isinstance(config.scene, VoxelScene)
     if arguments.dry_run:
         import yaml
@@ -120,7 +121,7 @@ def add_simulate(commands: Commands) -> None:
         commands, "simulate", _simulate, "simulate a scan to an HDF5 file",
         "Simulate a scan of any scene (--config, see show-config) or, without one, of the paper's plaque by the "
         "deep-silicon PCCT, and write it to HDF5, with what was done beside (.json, .yaml).",
-        "HDF5 file to write", required=True,
+        "HDF5 file to write", required=True, seed=None,
     )  # fmt: skip
     parser.add_argument("--config", type=Path, metavar="YAML", help="scene, scanner and exposure")
     parser.add_argument("--exposure", type=float, metavar="S", help="exposure in s (default: noise free)")
@@ -181,12 +182,12 @@ def _reader_options(arguments: argparse.Namespace) -> dict[str, Any]:
             raise ValueError(f"--slices must be first:last, got {arguments.slices!r}") from None
         options["slices"] = slice(first, last)
     if arguments.geometry is not None:
-        import yaml
-
+        from torchpcct.formats.damage import read_yaml, reading
         from torchpcct.formats.geometry_yaml import geometry_of
 
-        values = yaml.safe_load(arguments.geometry.read_text(encoding="utf-8"))
-        options["geometry"] = geometry_of(values, arguments.geometry.parent)
+        values = read_yaml(arguments.geometry, "a geometry")
+        with reading(arguments.geometry, "a geometry"):
+            options["geometry"] = geometry_of(values, arguments.geometry.parent)
     return options
 
 

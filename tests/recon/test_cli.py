@@ -103,6 +103,14 @@ def test_configurations_that_are_none_are_refused(tmp_path, text, said):
         read_config(tmp_path / "scene.yaml")
 
 
+def test_the_seed_is_the_options_if_there_is_one_and_0_is_one(tmp_path, capsys):
+    (tmp_path / "scene.yaml").write_text(CONFIG, encoding="utf-8")
+    command = ["simulate", "--config", str(tmp_path / "scene.yaml"), "--dry-run", "--out", str(tmp_path / "a.h5")]
+    for given, found in (([], 5), (["--seed", "0"], 0), (["--seed", "7"], 7)):
+        assert main([*command, *given]) == 0
+        assert f"seed: {found}\n" in capsys.readouterr().out
+
+
 def test_scenes_by_their_kind(tmp_path):
     """Water, the paper's plaque and a volume in HU, with the defaults in what the scan keeps."""
     Volume(torch.zeros(2, 2, 2), VolumeGrid((2, 2, 2), 1.0)).save(tmp_path / "v.h5")

@@ -56,7 +56,7 @@ def test_sections_from_plain_values():
         ("bfloat16: 1", "bfloat16 must be true or false"),
         ("data: {pool: 0}", "data: pool must be at least 1"),
         ("- 3", "mapping"),
-        ("a: [", "not YAML"),
+        ("a: [", "no YAML"),
     ],
 )
 def test_bad_values_name_the_key(text, message, tmp_path):

@@ -72,7 +72,7 @@ def geometry_of(values: Any, folder: Path = Path()) -> Geometry:
         ValueError, TypeError: missing, unknown or bad values.
     """
     if not isinstance(values, Mapping):
-        raise TypeError(f"geometry must be a mapping with kind, angles_deg, columns, pitch …, got {values!r}")
+        raise TypeError(f"geometry must be a mapping with kind, angles_deg, columns, pitch …, got {values!r:.200}")
     given = dict(values)
     kind = choice("geometry.kind", given.pop("kind", None), (*_KINDS, *_VECTORS))
     own = (_OWN | _VECTORS)[kind]
@@ -105,7 +105,7 @@ def _posed(circle: Any, pose: Any, folder: Path) -> VectorGeometry:
     """A circular scan whose detector is displaced and turned, or whose table travels."""
     known = (*_TURNED, *_SHIFTED, *_HELIX)
     if not isinstance(pose, Mapping) or not set(pose) <= set(known):
-        raise ValueError(f"geometry.pose must be a mapping of {', '.join(known)}, got {pose!r}")
+        raise ValueError(f"geometry.pose must be a mapping of {', '.join(known)}, got {pose!r:.200}")
     numbers = {name: _table(f"pose.{name}", value, folder) for name, value in pose.items()}
     helix = {name: numbers[name] for name in _HELIX if name in numbers}
     if "start" in helix and "feed" not in helix:
@@ -119,7 +119,9 @@ def _angles(value: Any, folder: Path) -> Any:
     if isinstance(value, Mapping):
         unknown = sorted(map(str, set(value) - {"start", "step", "count"}))
         if unknown or not {"step", "count"} <= set(value):
-            raise ValueError(f"angles_deg must be {{start, step, count}}, a list or a file's name, got {dict(value)!r}")
+            raise ValueError(
+                f"angles_deg must be {{start, step, count}}, a list or a file's name, got {dict(value)!r:.200}"
+            )
         count = whole("angles_deg.count", value["count"])
         step = number("angles_deg.step", value["step"], unit="°")
         start = number("angles_deg.start", value.get("start", 0.0), unit="°")

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from torchpcct.formats.damage import check_size, needed, reading
+from torchpcct.formats.damage import check_size, needed, read_yaml, reading
 from torchpcct.formats.geometry_yaml import geometry_of
 from torchpcct.geometry import Geometry
 from torchpcct.scan import Scan
@@ -82,11 +82,9 @@ def read_stack(path: str | os.PathLike[str], geometry: Geometry | None = None) -
         FileNotFoundError: a file is missing.
         ValueError, TypeError: a damaged file, missing, unknown or bad values.
     """
-    import yaml
-
     folder = Path(path).parent
+    text = read_yaml(path, "the description of a scan")
     with reading(path, "the description of a scan"):
-        text = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
         if not isinstance(text, Mapping):
             raise ValueError("it is no mapping with readings, kind and geometry")
         given = dict(text)

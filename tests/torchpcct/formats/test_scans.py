@@ -17,7 +17,10 @@ from pydicom.dataset import FileMetaDataset
 from pydicom.uid import ExplicitVRLittleEndian, generate_uid
 
 from recon import reconstruct
+from recon.cli import main
+from recon.cli.config import read_config
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, VolumeGrid, full_turn
+from torchpcct.formats.damage import read_yaml
 from torchpcct.formats.dicom_ct_pd import read_dicom_ct_pd
 from torchpcct.formats.geometry_yaml import geometry_of, geometry_values
 from torchpcct.formats.preprocess import _by_centroid, centred, cleaned, find_axis, without_outliers, without_stripes
@@ -390,3 +393,38 @@ def test_rtk_matrices(tmp_path):
 def test_unknown_endings_are_refused_first(tmp_path):
     with pytest.raises(ValueError, match=r"unknown scan format 'a\.raw'"):
         open_scan(tmp_path / "a.raw")
+
+
+LAUGHS = "\n".join(["a0: &a0 [x, x]", *(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]" for k in range(1, 12))])
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (LAUGHS, "stands for more than 1048576 values"),
+        ("[" * 60 + "]" * 60, "nested more than 32 deep"),
+        ("a: &a [1, *a]", r"alias \*a stands for nothing, or for what it is a part of"),
+        ("a: " + "1:" * 40000 + "1", "more than 16384 characters"),
+        ("# " + "x" * 2**24, "more than 16777216 characters"),
+        ("a: [", "it is no YAML: .* in line 2"),
+        ("a: !!python/object:os.system {}", "it is no YAML"),
+        (b"a: \xff\xfe".decode("latin-1"), None),
+    ],
+)
+def test_yaml_of_users_is_bounded(tmp_path, text, said):
+    """Twelve lines of aliases to aliases hung every reader, and a bad geometry ended in a traceback."""
+    path = tmp_path / "a.yaml"
+    path.write_bytes(text.encode("latin-1" if said is None else "utf-8"))
+    readers = [lambda: read_yaml(path, "a geometry"), lambda: open_scan(path), lambda: read_config(path)]
+    for read in readers:
+        with pytest.raises(ValueError, match=f"a.yaml cannot be read as .*: .*{said or 'codec'}"):
+            read()
+    assert main(["reconstruct", str(tmp_path), "--geometry", str(path), "--out", str(tmp_path / "v.h5")]) == 2
+
+
+def test_yaml_with_anchors_is_read(tmp_path):
+    (tmp_path / "a.yaml").write_text(
+        "a: &a {b: [1, 2]}\nc: *a\nd: &e 3\nf: [*e, *e]\ng: {<<: *a, h: 4}", encoding="utf-8"
+    )
+    values = read_yaml(tmp_path / "a.yaml", "values")
+    assert values == {"a": {"b": [1, 2]}, "c": {"b": [1, 2]}, "d": 3, "f": [3, 3], "g": {"b": [1, 2], "h": 4}}
