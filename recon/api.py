@@ -10,7 +10,7 @@ from typing import Any, overload
 
 import torch
 
-from recon.fbp.coverage import centre_warnings, sampling_warnings
+from recon.fbp.coverage import consistency_warnings, sampling_warnings
 from recon.fbp.inset import InsetFbp
 from recon.mbir.reconstruct import reconstruct_mbir
 from recon.metal import metal_warnings
@@ -64,8 +64,10 @@ def reconstruct(
         options: of the method.
 
     Readings that no object can cause (dead or hot cells, dead views, lost readings: :mod:`torchpcct.defects`) are
-    interpolated before; the report's ``warnings`` say so. FBP tests whether opposite rays agree, and warns of a wrong
-    rotation centre; PWLS and MBIR test what they leave of the data. Metal is named (:mod:`recon.metal`), not corrected.
+    interpolated before; the report's ``warnings`` say so. Scans that contradict themselves or their description
+    (centre, fan angles, steps between views, roll, rows that end inside the object, readings that are no line
+    integrals) are named there, too (:func:`recon.fbp.coverage.consistency_warnings`); PWLS and MBIR test what they
+    leave of the data besides. Metal is named (:mod:`recon.metal`), not corrected.
 
     The number of threads does not change a bit of an inset's FBP and PWLS. FBP of whole rows and MBIR, where torch's
     matrix products and convolutions decide about the order of sums, agree within 0.01 HU.
@@ -106,7 +108,8 @@ def reconstruct(
         [] if method == "mbir" or s.unit != "HU" else metal_warnings(v.data)
         for s, v in zip(scans, volumes, strict=True)
     ]
-    for text in {text for texts in metal for text in texts}:
+    checked = [consistency_warnings(s, grid) for s in scans]
+    for text in dict.fromkeys(text for texts in (*checked, *metal) for text in texts):
         _LOG.warning("%s", text)
     if scans[0].unit != "HU":
         mu = scans[0].linearisation.mu_ref
@@ -118,10 +121,10 @@ def reconstruct(
             report={
                 **v.report,
                 "dead_readings": dead_readings(s),
-                "warnings": [*before, *v.report.get("warnings", []), *found],
+                "warnings": [*before, *wrong, *v.report.get("warnings", []), *found],
             },
         )
-        for v, (s, before), found in zip(volumes, whole, metal, strict=True)
+        for v, (s, before), wrong, found in zip(volumes, whole, checked, metal, strict=True)
     ]
     return volumes[0] if isinstance(scan, Scan) else volumes
 
@@ -137,11 +140,8 @@ def _fbp(scans: Sequence[Scan], grid: VolumeGrid, progress: Progress | None, ker
     volumes = []
     for i, s in enumerate(scans):
         data = run(s)[0][0].to(torch.float32)
-        found = centre_warnings(s, grid)
-        for text in found:
-            _LOG.warning("%s", text)
         seconds = time.perf_counter() - start
-        report = {"method": "fbp", "kernel": kernel, "seconds": round(seconds, 3), "warnings": [*warnings, *found]}
+        report = {"method": "fbp", "kernel": kernel, "seconds": round(seconds, 3), "warnings": list(warnings)}
         volumes.append(Volume(data, grid, report))
         start = time.perf_counter()
         if progress is not None:

@@ -8,13 +8,15 @@ from typing import Any
 
 import numpy as np
 
+from recon.fbp.angular_weights import angular_weights, is_offset
 from recon.fbp.any_orbit import straighten
+from recon.fbp.detector_edges import cut_off
 from torchpcct.detector_window import shadow
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid, view_step
 from torchpcct.scan import Scan
 from torchpcct.vector_geometry import VectorGeometry
 
-__all__ = ["centre_warnings", "check_rows", "refuse_helix", "sampling_warnings"]
+__all__ = ["check_rows", "consistency_warnings", "refuse_helix", "sampling_warnings"]
 
 STREAK_CELLS = 10.0
 """Distance between the paths of neighbouring views at the border of the field of view, in cells at the axis, from which
@@ -23,6 +25,8 @@ _CENTRE_MARGIN = 8
 """Columns beside a grid's shadow that the test of the rotation centre looks at."""
 
 
+_EVEN = 0.1
+"""Relative change over the views of what a row ends at, from which it is no air that is described too bright."""
 _STEADY, _TRAVEL = 0.98, 0.25
 """A motion along z that a straight line explains to this share of its variance, by more than this share of the height
 that the rows cover at the axis, is a table's travel."""
@@ -115,17 +119,21 @@ def sampling_warnings(geometry: Geometry) -> list[str]:
     ]
 
 
-def centre_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
-    """Whether the opposite rays of a scan disagree (:mod:`torchpcct.metrics.opposite_rays`).
+def consistency_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
+    """Whether a scan contradicts itself or its description, whatever reconstructs it.
+
+    Opposite rays (:mod:`torchpcct.metrics.opposite_rays`); where they agree, the moments of the views
+    (:mod:`torchpcct.metrics.moments`) of a whole field; and rows that end inside the object.
 
     Args:
         scan: counting or energy integrating, without energy bins; of several slices the middle one is looked at.
         grid: what is reconstructed.
 
     Returns:
-        Warnings; empty if nothing is found, or no opposite rays were measured.
+        Warnings; empty if nothing is found, or nothing can be compared.
     """
-    from torchpcct.metrics.opposite_rays import centre_test  # loads scipy.stats
+    from torchpcct.metrics.moments import moment_test
+    from torchpcct.metrics.opposite_rays import geometry_test  # loads scipy.stats
 
     window, about = scan.window, (0.0, 0.0)
     if window is not None:
@@ -133,7 +141,10 @@ def centre_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
         scan = scan.crop(window)
     lines, geometry = scan.line_integrals(), scan.geometry
     if isinstance(geometry, VectorGeometry):
-        circle = straighten(lines, geometry)
+        try:
+            circle = straighten(lines, geometry)
+        except ValueError:  # nearly no circle: only an iterative method takes it
+            return []
         if circle.motion is not None:  # of sources beside the circle opposite rays need not meet
             return []
         lines, geometry = circle.sinogram, circle.geometry
@@ -141,4 +152,32 @@ def centre_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
         lines = lines[lines.shape[0] // 2]
     if window is not None:
         lines = lines - window.take(scan.surround_line_integrals())
-    return list(centre_test(lines, geometry, window, about).findings)
+        return list(geometry_test(lines, geometry, window, about).findings)
+    found = list(geometry_test(lines, geometry).findings)
+    try:
+        weights = angular_weights(geometry)
+    except ValueError:  # FBP refuses these views, other methods need not
+        weights = np.ones((geometry.views, 1))
+    sides = cut_off(lines, geometry, weights)
+    if any(sides):
+        found.append(_cut_text(lines, sides))
+    elif not found and not is_offset(geometry):
+        found += moment_test(lines, geometry).findings
+    return found
+
+
+def _cut_text(lines: Any, sides: tuple[bool, bool]) -> str:
+    ends = [lines[..., k].reshape(lines.shape[0], -1).mean(1) for k, cut in ((0, sides[0]), (-1, sides[1])) if cut]
+    level = max(float(end.mean()) for end in ends)
+    if all(sides) and all(float(end.std()) < _EVEN * level for end in ends):
+        return (
+            f"no row ends in air: its line integrals are {level:.2g} at both ends in all views alike: air is "
+            f"{math.exp(level):.2g} times too bright (measured with another exposure or gain, or readings saturate), "
+            "or the object reaches beyond the detector all around"
+        )
+    where = " and the ".join(name for name, cut in (("first", sides[0]), ("last", sides[1])) if cut)
+    return (
+        f"the rows end inside the object at the {where} column (line integrals of {level:.2g} on average there): what "
+        "lies beyond is not known, so values are off by a smooth background, most near the edge of the field of view; "
+        "differences between neighbours are not"
+    )

@@ -8,7 +8,6 @@ equals the FBP of the whole rows.
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
@@ -21,7 +20,6 @@ from recon.fbp.angular_weights import angular_weights
 from recon.fbp.any_orbit import Straightened, ideal_circle, straighten
 from recon.fbp.backproject import backproject
 from recon.fbp.coverage import check_rows
-from recon.fbp.detector_edges import cut_off
 from recon.fbp.fbp import filter_sinogram, filter_windowed, straightened_fbp
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import ConeBeam, Geometry, VolumeGrid
@@ -109,7 +107,8 @@ class InsetFbp:
     """FBP of one or several grids from scans that share geometry, window and surround.
 
     A counting-mode scan is reconstructed in HU: call the object with it. A stack of parallel or fan-beam slices needs
-    3-D grids with as many voxels along z. Rows that end inside the object are continued by water, with a warning.
+    3-D grids with as many voxels along z. Rows that end inside the object are continued by water
+    (:func:`recon.fbp.coverage.consistency_warnings` says so).
     Channels of line integrals (energy bins,
     basis materials) on the scan's window go to :meth:`images`.
 
@@ -249,11 +248,4 @@ class InsetFbp:
         if self.window is not None:
             return [to_hu(v, water) for v in self.images(lines)]
         straight = self._straight(lines)
-        if any(cut_off(straight.sinogram, self.circle, angular_weights(self.circle))):
-            warnings.warn(
-                f"the rows end inside the object: they are continued by a medium of {water:g} mm⁻¹. CT numbers are "
-                "estimates, least certain near the edge of the field of view",
-                UserWarning,
-                stacklevel=3,
-            )
         return [to_hu(v, water) for v in self._whole(straight, water)]

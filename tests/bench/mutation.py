@@ -179,7 +179,7 @@ FAULTS = (
           _O + "test_each_pair_of_rays_counts_once"),
     Fault("no tolerance of the centre", _OPP, "CENTRE_TOLERANCE = 0.1", "CENTRE_TOLERANCE = 0.0",
           _O + "test_an_error_within_the_tolerance_is_measured_but_no_finding"),
-    Fault("centre untested", "recon/api.py", "found = centre_warnings(s, grid)", "found: list[str] = []",
+    Fault("centre untested", "recon/api.py", "[consistency_warnings(s, grid) for s in scans]", "[[] for _ in scans]",
           _R + "test_fbp_of_a_wrong_rotation_centre_is_named"),
     Fault("pieces of other settings", "recon/study/store.py", "if found == key:", "if True:", _SAME),
     Fault("pieces of another version", "recon/study/store.py", 'f"{settings!r} {_source()}"', 'f"{settings!r}"', _SAME),

@@ -11,9 +11,9 @@ from small_scan import CENTER, GRID, SCENE, scanner
 
 from recon import fbp, reconstruct
 from recon.fbp.angular_weights import angular_weights
-from recon.fbp.coverage import centre_warnings, check_rows, sampling_warnings
+from recon.fbp.coverage import check_rows, consistency_warnings, sampling_warnings
 from recon.fbp.fbp import interleave
-from torchpcct import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, acquire, full_turn
+from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, VolumeGrid, acquire, full_turn
 from torchpcct.scene import Body, EllipticCylinder, Scene
 
 
@@ -161,10 +161,54 @@ def test_a_dead_column_and_a_dead_view_are_mended_and_named(clean, method):
     assert float((mended.data - good.data).square().mean().sqrt()) < noise
 
 
+BODIES = ((90.0, 60.0, 8.0, -5.0, 0.02), (12.0, 9.0, 50.0, 10.0, 0.03), (20.0, 15.0, -30.0, 8.0, -0.015))
+
+
+def _ellipse_scan(views, columns):
+    """A fan-beam scan of an ellipse with a bone and a hole in it, 1e5 photons."""
+    g = FanBeam(full_turn(views), 500.0, 900.0, columns, 480.0 / columns)
+    direction = g.angles[:, None] + math.pi - g.fan_angles
+    total = np.zeros(direction.shape)
+    for a, b, x, y, mu in BODIES:
+        dx, dy = x - g.sod * np.cos(g.angles)[:, None], y - g.sod * np.sin(g.angles)[:, None]
+        distance = np.cos(direction) * dy - np.sin(direction) * dx
+        width = (a * np.sin(direction)) ** 2 + (b * np.cos(direction)) ** 2
+        total += 2 * mu * a * b * np.sqrt(np.maximum(width - distance**2, 0.0)) / width
+    return g, np.random.default_rng(0).poisson(1e5 * np.exp(-total)).astype(np.float32)
+
+
+def _said(readings, geometry, method):
+    scan = Scan.from_counts(readings, geometry, air=1e5, mu_water=0.02)
+    return " ".join(reconstruct(scan, VolumeGrid((24, 32), 6.8), method).report["warnings"])
+
+
+def test_wrong_descriptions_and_readings_are_named():
+    """Each was wrong without a word; a sound scan says nothing."""
+    g, counts = _ellipse_scan(180, 200)
+    words = {
+        "steps between the views": (counts, replace(g, angles=0.98 * g.angles)),
+        "(sdd)": (counts, replace(g, sdd=1.03 * g.sdd)),
+        "counted the other way": (counts[:, ::-1].copy(), g),
+        "first and the last column": (counts[:, 60:140], replace(g, columns=80)),
+        "the sum of a view's line integrals": (counts * np.exp(0.1 - 0.1e-5 * counts), g),
+        "no row ends in air": (counts / 2, g),
+    }
+    assert _said(counts, g, "fbp") == ""
+    for text, wrong in words.items():
+        assert text in _said(*wrong, "fbp")
+
+
+@pytest.mark.parametrize("method", ["pwls", "mbir"])
+def test_iterative_methods_name_what_is_cut_off(method):
+    """Both take what the detector does not show for free: values were -28 to 22 HU off by MBIR, without a word."""
+    g, counts = _ellipse_scan(90, 60)
+    assert "first and the last column" in _said(counts[:, 15:45], replace(g, columns=30), method)
+
+
 def test_fbp_of_a_wrong_rotation_centre_is_named(clean):
     """Half a column was 50 HU rms without a word; a right centre says nothing."""
     noisy = clean.with_noise(20.0, 0)
-    assert centre_warnings(noisy, GRID) == []
+    assert consistency_warnings(noisy, GRID) == []
     g = noisy.geometry
     wrong = replace(noisy, geometry=replace(g, offset=(g.offset[0], g.offset[1] + g.pitch[1] / 2)))
     found = reconstruct(wrong, GRID, "fbp").report["warnings"]

@@ -1,22 +1,39 @@
-"""Does a full turn agree with itself? Opposite rays see one line, so a wrong rotation centre shows without an image.
+"""Does a full turn agree with itself? Opposite rays see one line, so a wrong description shows without an image.
 
-The ray of source angle β and fan angle γ is met again by that of β + π − 2γ and −γ. If the columns are described ε
-above where they are, the two lie 2ε apart (the consistency condition behind the moments of Helgason and Ludwig, of
-which the first is the sinusoid of the centre of mass). Their difference r is regressed on the slope t of the readings
-along the columns, r = −2 ε t + noise. The slopes of the two rays have independent noise, so the product of one's,
-smoothed, and the other's, raw, neither shrinks nor stretches the estimate (instrumental variables, Durbin 1954, Rev.
-Int. Stat. Inst. 22:23). Its error is that of the sums
-over blocks of views, which knows nothing of how noisy a reading is: the test statistic is Student's.
+The ray of source angle β and fan angle γ is met again by that of β + π − 2γ and −γ (the consistency condition behind
+the moments of Helgason and Ludwig). Read there D(β + a, γ + e) instead of D(β, γ), the difference is, to first order,
+
+    r = −a ∂D/∂β − e ∂D/∂γ + noise,
+
+and each error of the description has its own a and e:
+
+* columns described ε above where they are: e = −2ε (of a detector rolled by θ ε = θ v changes with the row's height v);
+* fan angles (pitch over sdd) too small by the factor 1 + κ: a = 2κγ, nothing in the middle, most at the edges;
+* steps between the views too small by the factor 1 + s: a = s (β' − β), β' the described angle of the opposite ray.
+
+r is regressed on each pattern. The slopes of the two rays have independent noise, so the product of one's, smoothed,
+and the other's, raw, neither shrinks nor stretches the estimate (instrumental variables, Durbin 1954, Rev. Int. Stat.
+Inst. 22:23). Its error is that of the sums over blocks of views, which knows nothing of how noisy a reading is: the
+test statistic is Student's. The cause that explains most of r is named. Where none does, the share of r in what changes
+from view to view says whether the rays have anything in common; products of neighbouring columns are free of noise.
 
 An object that moves during the turn stands elsewhere when the opposite ray comes: ε then changes with β. Of a movement
 c(β) along the columns, opposite rays show c(β) + c(β + π), so once in a turn looks like an object that stands elsewhere
 and is none of our business; twice in a turn is what is tested, a wave cos 2β, sin 2β of ε.
+
+What no opposite rays can show, since the described scan is that of another object, a right one: the angle of the first
+view (the object turned), sod (the object scaled, its attenuation the other way; so are parallel rays' pitch), both the
+direction of rotation and that of the columns (the object mirrored; of parallel rays each alone), a displacement of the
+object, and all that happens to both rays alike: water's attenuation, gain and bowtie if air was measured with them,
+spectrum and pile-up (:mod:`torchpcct.metrics.moments` sees those in bodies that are not round).
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -29,19 +46,31 @@ from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, view_step
 from torchpcct.validate import coverage
 
-__all__ = ["CENTRE_TOLERANCE", "CentreTest", "centre_test"]
+__all__ = ["CENTRE_TOLERANCE", "CentreTest", "GeometryTest", "centre_test", "geometry_test"]
 
 CENTRE_TOLERANCE = 0.1
 """Error of the centre in columns that is no finding: alignment, and what interpolation between the views leaves."""
+SCALE_TOLERANCE, STEP_TOLERANCE = 0.003, 0.001
+"""Relative errors of the fan angles and of the steps between views that are none: what mechanics leave."""
 FALSE_ALARMS = 0.005
 """Share of scans with an error of :data:`CENTRE_TOLERANCE` that are taken for wrong; of faultless ones it is less."""
 _BLOCKS = 24
 # Readings whose opposites are looked up; more only cost time.
-_MOST = 1_000_000
+_MOST = 500_000
 # Views beside an opposite angle that are farther apart than so many usual steps do not stand for it.
 _GAP_STEPS = 3.0
 _ROWS, _COLUMNS = 9, (5, 25)
 """Readings over which the slope is smoothed: a few columns for small errors, many for those of several columns."""
+_DIFFER, _STRANGERS = 0.03, 0.3
+"""Mean square of the difference over that of what changes from view to view: from the first one opposite rays differ,
+from the second one they have nothing to do with each other."""
+_FLAT_CELLS, _PLANE_CELLS = 2.0, 1.0
+"""Rows count whose opposite rays part by less, along z: for shifts of the columns, and for turns of the views."""
+_INTERPOLATED = 0.5
+"""What a cause explains at least, of what interpolation leaves: a sound scan of few readings 0.2, errors of 1 % 1.3."""
+_LARGEST = 0.3
+"""Relative errors and angles in rad beyond which nothing is linear: no cause is named for what is larger."""
+_FINE_STEP_RAD = math.radians(2.5)
 
 Floats = NDArray[np.float64]
 
@@ -69,6 +98,26 @@ class CentreTest:
 _UNKNOWN = CentreTest(math.nan, math.inf, math.nan, 1.0, ())
 
 
+@dataclass(frozen=True)
+class GeometryTest:
+    """Result of :func:`geometry_test`.
+
+    Attributes:
+        sizes: cause → its estimated size, if it were the only one: ``centre`` in columns (described too high),
+            ``scale`` (fan angles described too small, relative), ``step`` (steps between views described too small,
+            relative), ``roll`` in rad. Causes that this scan cannot show are missing.
+        errors: cause → standard error of its size.
+        mismatch: mean square of the difference over that of what changes from view to view, noise taken off: 0 of a
+            sound scan, 1 of rays that have nothing to do with each other; NaN: not known.
+        findings: the likeliest cause in words; empty: nothing at the stated rate of false alarms.
+    """
+
+    sizes: Mapping[str, float]
+    errors: Mapping[str, float]
+    mismatch: float
+    findings: tuple[str, ...]
+
+
 def centre_test(
     lines: Tensor,
     geometry: Geometry,
@@ -76,7 +125,7 @@ def centre_test(
     about: tuple[float, float] = (0.0, 0.0),
     false_alarms: float = FALSE_ALARMS,
 ) -> CentreTest:
-    """Compare the opposite rays of a scan, of a cone beam those near the plane of the source.
+    """Measure the rotation centre by the opposite rays of a scan, of a cone beam by those near the plane of the source.
 
     Args:
         lines: line integrals ``(views, [rows,] columns)`` of any unit, on ``window``, what all views share taken off.
@@ -93,57 +142,142 @@ def centre_test(
         ValueError: a wrong shape, NaN or Inf, a rate outside (0, 1).
     """
     coverage("false_alarms", false_alarms)
-    window = DetectorWindow.full(geometry) if window is None else window
-    expected = window.shape if isinstance(geometry, ConeBeam) else (window.views, window.columns)
-    if tuple(lines.shape) != expected or window.views != geometry.views:
-        raise ValueError(f"lines must have the shape {expected}, got {tuple(lines.shape)}")
-    values = lines.detach().to("cpu", torch.float32).reshape(window.shape)
-    if not bool(torch.isfinite(values).all()):
-        raise ValueError("lines hold NaN or Inf: bridge dead readings before (torchpcct.dead_cells.bridge)")
-    if isinstance(geometry, ConeBeam):
-        window, values = _flat_part(geometry, window, values)
-    if values.shape[1] == 0:
-        return _UNKNOWN
-    rays = _Rays(geometry, window, about)
-    stride = max(1, math.ceil(values.numel() / _MOST))
-    base = np.argsort(geometry.angles % (2 * math.pi), kind="stable")[::stride]
-    here = values[torch.from_numpy(base)]
-    opposite, known = rays.opposite(values, base)
-    difference = here - opposite
-    turn = 2.0 * geometry.angles[base]
+    pairs = _Pairs.of(lines, geometry, window, about)
+    return _UNKNOWN if pairs is None else _centre(pairs, false_alarms)[0]
+
+
+def geometry_test(
+    lines: Tensor,
+    geometry: Geometry,
+    window: DetectorWindow | None = None,
+    about: tuple[float, float] = (0.0, 0.0),
+    false_alarms: float = FALSE_ALARMS,
+) -> GeometryTest:
+    """Test the description of a scan by its opposite rays: centre, fan angles, steps between views, roll.
+
+    Args:
+        lines, geometry, window, about: see :func:`centre_test`.
+        false_alarms: share of scans whose errors are as large as tolerated that raise an alarm.
+
+    Returns:
+        The test; of several causes the one that explains most is named.
+
+    Raises:
+        ValueError: a wrong shape, NaN or Inf, a rate outside (0, 1).
+    """
+    coverage("false_alarms", false_alarms)
+    pairs = _Pairs.of(lines, geometry, window, about)
+    if pairs is None:
+        return GeometryTest({}, {}, math.nan, ())
+    # What a cone's rays lie apart along z looks like an error of the angles, not like one of the centre.
+    plane = pairs if window is not None or pairs.rays.flat else _Pairs.of(lines, geometry, window, about, _PLANE_CELLS)
+    centre, explained = _centre(pairs, false_alarms / 3.0)
+    ranked = [(explained / pairs.here.numel(), text) for text in centre.findings]
+    sizes, errors = {}, {}
+    if math.isfinite(centre.columns):
+        sizes["centre"], errors["centre"] = centre.columns, centre.error
+    causes = [(pairs, "roll"), *((plane, name) for name in ("scale", "step") if plane is not None)]
+    for of, name in causes:
+        cause = of.cause(name)
+        if cause is None:
+            continue
+        pattern, tolerance = cause
+        tried = [of.fit(pattern, tolerance, columns) for columns in _COLUMNS]
+        fits = [f for f in tried if f is not None]
+        if not fits:
+            continue
+        # The wider slopes reach farther, the narrower ones see smaller errors.
+        level = false_alarms / (3.0 * len(causes) * len(_COLUMNS))
+        best = next((f for f in reversed(fits) if f.found(level, tolerance, _LARGEST)), fits[0])
+        sizes[name], errors[name] = best.size, best.error
+        if best.found(level, tolerance, _LARGEST) and best.explained > _INTERPOLATED * of.interpolated:
+            ranked.append((best.explained / of.here.numel(), _TEXTS[name](best.size, best.error)))
+    mismatch, differ = (math.nan, 0) if plane is None else plane.mismatch(false_alarms / 3.0)
+    mirrored = plane is not None and differ > 0 and plane.agrees_mirrored(min(_DIFFER, mismatch / 4.0))
+    if mirrored or differ == 2 or (differ and not ranked):
+        ranked = [(math.inf, _mismatch_text(mismatch, differ == 2, mirrored))]
+    return GeometryTest(sizes, errors, mismatch, tuple(text for _, text in sorted(ranked, reverse=True)[:1]))
+
+
+def _scale_text(size: float, error: float) -> str:
+    small, pitch, sdd = ("small", "larger", "smaller") if size > 0 else ("large", "smaller", "larger")
+    return (
+        f"opposite rays disagree: the fan angles are described about {100 * abs(size):.2g} ± {100 * error:.1g} % too "
+        f"{small}: the column pitch is {pitch} than described, the distance source-detector (sdd) {sdd}, or the "
+        "detector is not flat or curved as described; sizes and values in the volume are wrong by as much"
+    )
+
+
+def _step_text(size: float, error: float) -> str:
+    return (
+        f"opposite rays disagree: the steps between the views are described about {100 * abs(size):.2g} ± "
+        f"{100 * error:.1g} % too {'small' if size > 0 else 'large'}: the range of the angles is wrong (a full turn?), "
+        "or views are missing"
+    )
+
+
+def _roll_text(size: float, error: float) -> str:
+    return (
+        f"opposite rays disagree, in higher rows the other way than in lower ones: the detector is rolled by about "
+        f"{math.degrees(abs(size)):.2g} ± {math.degrees(error):.1g}° against the rotation axis"
+    )
+
+
+_TEXTS = {"scale": _scale_text, "step": _step_text, "roll": _roll_text}
+
+
+def _mismatch_text(mismatch: float, strangers: bool, mirrored: bool) -> str:
+    share = f"{100 * math.sqrt(mismatch):.0f} % of what changes from view to view"
+    if mirrored:
+        return (
+            f"opposite rays disagree by {share}, but not with the columns counted the other way: reverse the columns, "
+            "or the sign of the angles"
+        )
+    if strangers:
+        return (
+            f"opposite rays have little in common (they disagree by {share}): the angles of the views (sign, range, "
+            "order), the order of the columns or the axes of the data are wrong"
+        )
+    return f"opposite rays disagree by {share}: the object moved, or the order or the angles of some views are wrong"
+
+
+def _centre(pairs: _Pairs, false_alarms: float) -> tuple[CentreTest, float]:
+    """The centre's test, and how much of the squared difference its error explains."""
     found = []
     for columns in _COLUMNS:
-        smooth, raw = ([_slope(v, *size) for v in (here, opposite)] for size in ((_ROWS, columns), (1, columns // 5)))
-        # A slope reaches over neighbours: all of them must have an opposite.
-        whole = -F.max_pool2d((-known.float())[:, None], (1, 2 * columns + 1), 1, (0, columns))[:, 0] > 0.5
-        score = torch.where(whole, -difference * (smooth[0] + smooth[1]) / 2, 0.0).double().sum((1, 2)).numpy()
-        power = torch.where(whole, smooth[0] * raw[1] + smooth[1] * raw[0], 0.0).double().sum((1, 2)).numpy()
-        used = np.flatnonzero(whole.flatten(1).any(1).numpy())
-        if used.size < _BLOCKS:
-            continue
-        parts = (score, power, power * np.cos(turn), power * np.sin(turn))
-        sums = [np.array([v[b].sum() for b in np.array_split(used, _BLOCKS)]) for v in parts]
-        found.append(_tested(sums[0], sums[1], np.stack(sums[1:], 1), false_alarms / len(_COLUMNS)))
-    return next((f for f in found if f.findings), found[0] if found else _UNKNOWN)
+        sums = pairs.sums(pairs.centre(), columns)
+        if sums is not None:
+            score, power = sums
+            turn = 2.0 * pairs.angles
+            waves = [_blocks(power * wave(turn), pairs.used(columns)) for wave in (np.cos, np.sin)]
+            score, power = (_blocks(v, pairs.used(columns)) for v in sums)
+            test = _tested(score, power, np.stack([power, *waves], 1), false_alarms / len(_COLUMNS))
+            found.append((test, 0.0 if math.isnan(test.columns) else test.columns**2 * float(power.sum())))
+    return next((f for f in found if f[0].findings), found[0] if found else (_UNKNOWN, 0.0))
 
 
-def _flat_part(geometry: ConeBeam, window: DetectorWindow, values: Tensor) -> tuple[DetectorWindow, Tensor]:
-    """The rows whose opposite rays part by less than two cells over what the window shows."""
-    row, column = geometry.pitch
-    reach = window.columns * column / geometry.magnification / 2
-    flat = np.abs(geometry.row_positions) <= max(1.0, 2.0 * geometry.sod / reach) * row
-    kept = np.flatnonzero(flat[window.first_row : window.first_row + window.rows])
-    if kept.size == 0:
-        return window, values[:, :0]
-    first, count = int(kept[0]), int(kept[-1] - kept[0] + 1)
-    return window.with_rows(window.first_row + first, count), values[:, first : first + count]
+@dataclass(frozen=True)
+class _Fit:
+    """Size of one cause, its standard error, p-value against the tolerance, and the squared difference explained."""
+
+    size: float
+    error: float
+    p_value: float
+    explained: float
+
+    def found(self, level: float, tolerance: float, most: float = math.inf) -> bool:
+        # Where nearly nothing is to be seen the slopes' product is noise, and the size anything.
+        return self.p_value < level and max(tolerance, 2.0 * self.error) < abs(self.size) < most
 
 
-def _tested(score: Floats, power: Floats, waves: Floats, false_alarms: float) -> CentreTest:
+def _blocks(values: Floats, used: NDArray[np.int64]) -> Floats:
+    return np.array([values[b].sum() for b in np.array_split(used, _BLOCKS)])
+
+
+def _fitted(score: Floats, power: Floats, tolerance: float) -> _Fit:
+    """Regression of the blocks' scores on their powers, and Student's test of a size beyond ``tolerance``."""
     from scipy import stats
 
-    if power.sum() <= 0.0:
-        return _UNKNOWN
     size = float(score.sum() / power.sum())
 
     def deviation(of: float) -> tuple[float, float]:
@@ -151,24 +285,262 @@ def _tested(score: Floats, power: Floats, waves: Floats, false_alarms: float) ->
         spread = float(left.std(ddof=1)) * math.sqrt(left.size)
         return float(left.sum()), max(spread, float(np.finfo(np.float64).tiny))
 
-    error = deviation(size)[1] / float(power.sum())
-    total, spread = deviation(math.copysign(CENTRE_TOLERANCE, size))
+    total, spread = deviation(math.copysign(tolerance, size))
     beyond = max(math.copysign(1.0, size) * total / spread, 0.0)
-    centre = float(min(1.0, 2.0 * stats.t.sf(beyond, score.size - 1)))
+    p = float(min(1.0, 2.0 * stats.t.sf(beyond, score.size - 1)))
+    return _Fit(size, deviation(size)[1] / float(power.sum()), p, size**2 * float(power.sum()))
+
+
+Pattern = tuple[Tensor, str]
+"""Factor of the slope, and which slope: along the ``"columns"`` or the ``"angles"``."""
+
+
+class _Pairs:
+    """Readings, those of their opposite rays, and the slopes of both."""
+
+    def __init__(self, rays: _Rays, values: Tensor) -> None:
+        self.rays, self._values = rays, values
+        angles = rays.geometry.angles
+        self._order = np.argsort(angles % (2 * math.pi), kind="stable")
+        self._at = np.arange(0, angles.size, max(1, math.ceil(values.numel() / _MOST)))
+        self.base = self._order[self._at]
+        self.angles = angles[self.base]
+        self.here, self.opposite, self.known = self._look(self.base)
+        self.difference = self.here - self.opposite
+        self._slopes: dict[tuple[str, int], tuple[Any, ...]] = {}
+        self._whole: dict[int, Tensor] = {}
+        self._beside: Any = None
+
+    @classmethod
+    def of(
+        cls,
+        lines: Tensor,
+        geometry: Geometry,
+        window: DetectorWindow | None,
+        about: tuple[float, float],
+        cells: float = _FLAT_CELLS,
+    ) -> _Pairs | None:
+        """None where no row lies near the plane of the source."""
+        window = DetectorWindow.full(geometry) if window is None else window
+        expected = window.shape if isinstance(geometry, ConeBeam) else (window.views, window.columns)
+        if tuple(lines.shape) != expected or window.views != geometry.views:
+            raise ValueError(f"lines must have the shape {expected}, got {tuple(lines.shape)}")
+        values = lines.detach().to("cpu", torch.float32).reshape(window.shape)
+        if not bool(torch.isfinite(values).all()):
+            raise ValueError("lines hold NaN or Inf: bridge dead readings before (torchpcct.dead_cells.bridge)")
+        if isinstance(geometry, ConeBeam):
+            window, values = _flat_part(geometry, window, values, cells)
+            if not values.shape[1]:
+                return None
+            geometry, window, values = _joined_rows(geometry, window, values)
+        return cls(_Rays(geometry, window, about), values)
+
+    def _look(self, views: NDArray[np.int64]) -> tuple[Tensor, Tensor, Tensor]:
+        return self._values[torch.from_numpy(views)], *self.rays.opposite(self._values, views)
+
+    def centre(self) -> Pattern:
+        return torch.full((1,), 2.0), "columns"
+
+    def cause(self, name: str) -> tuple[Pattern, float] | None:
+        """Pattern and tolerance of one cause beside the centre; None: the scan cannot show it."""
+        g, w = self.rays.geometry, self.rays.window
+        if name == "roll":
+            if not isinstance(g, ConeBeam) or w.rows < 3:
+                return None
+            height = g.row_positions[w.first_row : w.first_row + w.rows]
+            height = torch.from_numpy(height - height.mean())[:, None].float() / g.pitch[1]
+            return (2.0 * height, "columns"), CENTRE_TOLERANCE / float(height.max())
+        gamma = self.rays.fan_angles(self.base)
+        if name == "scale":
+            factor, tolerance = 2.0 * gamma, SCALE_TOLERANCE
+        else:
+            turn = self.angles[:, None] % (2 * math.pi)
+            across = (turn + math.pi - (0.0 if self.rays.parallel else 2.0) * gamma) % (2 * math.pi)
+            factor, tolerance = across - turn + 0.0 * gamma, STEP_TOLERANCE
+        if name == "scale" and self.rays.parallel:
+            return None
+        return (torch.from_numpy(factor)[:, None].float(), "angles"), tolerance
+
+    def whole(self, columns: int) -> Tensor:
+        """A slope reaches over neighbours: all of them must have an opposite."""
+        if columns not in self._whole:
+            known = -self.known.float()[:, None]
+            self._whole[columns] = -F.max_pool2d(known, (1, 2 * columns + 1), 1, (0, columns))[:, 0] > 0.5
+        return self._whole[columns]
+
+    def used(self, columns: int) -> NDArray[np.int64]:
+        return np.flatnonzero(self.whole(columns).flatten(1).any(1).numpy())
+
+    def slopes(self, along: str, columns: int) -> tuple[Any, ...]:
+        """Smoothed slopes of both rays, raw ones of both, and where they are known."""
+        if (along, columns) not in self._slopes:
+            pairs = [
+                [_slope(v, *size) for v in (self.here, self.opposite)] for size in ((_ROWS, columns), (1, columns // 5))
+            ]
+            known = self.whole(columns)
+            if along == "angles":
+                (before, behind), step, rate = self.beside()
+                for size, slopes in zip(((_ROWS, columns), (1, columns // 5)), pairs, strict=True):
+                    for k, slope in enumerate(slopes):
+                        turned = _smooth(behind[k] - before[k], *size) / step
+                        slopes[k] = turned - rate * slope
+                known = known & before[2] & behind[2]
+            self._slopes[along, columns] = (*pairs, known)
+        return self._slopes[along, columns]
+
+    def beside(self) -> Any:
+        """The views before and behind, the angle between them, and the columns that a window moves per rad."""
+        if self._beside is None:
+            n, turn = self._order.size, self.rays.geometry.angles % (2 * math.pi)
+            ends = [self._order[(self._at + k) % n] for k in (-1, 1)]
+            step = (turn[ends[1]] - turn[ends[0]]) % (2 * math.pi)
+            good = (step > 1e-9) & (step <= 2.0 * _GAP_STEPS * view_step(self.rays.geometry.angles))
+            step = np.where(good, step, 1.0)
+            first = self.rays.window.first_column
+            rate = (first[ends[1]] - first[ends[0]]) / step
+            looked = [self._look(e) for e in ends]
+            mask = torch.from_numpy(good)[:, None, None]
+            sides = [(*part[:2], part[2] & mask) for part in looked]
+            self._beside = sides, *(torch.from_numpy(v)[:, None, None].float() for v in (step, rate))
+        return self._beside
+
+    def sums(self, pattern: Pattern, columns: int) -> tuple[Floats, Floats] | None:
+        """Score and power of a pattern in every view; None: too few views."""
+        if self.used(columns).size < _BLOCKS:
+            return None
+        factor, along = pattern
+        smooth, raw, known = self.slopes(along, columns)
+        score = -self.difference * factor * (smooth[0] + smooth[1]) / 2
+        power = factor.square() * (smooth[0] * raw[1] + smooth[1] * raw[0]) / 2
+        score, power = (torch.where(known, v, 0.0).double().sum((1, 2)).numpy() for v in (score, power))
+        return score, power
+
+    def fit(self, pattern: Pattern, tolerance: float, columns: int) -> _Fit | None:
+        sums = self.sums(pattern, columns)
+        if sums is None:
+            return None
+        score, power = (_blocks(v, self.used(columns)) for v in sums)
+        return _fitted(score, power, tolerance) if power.sum() > 0 else None
+
+    def _between_views(self) -> Tensor:
+        """How far readings lie from the mean of those in the views before and behind."""
+        (before, behind), *_ = self.beside()
+        difference: Tensor = self.here - (before[0] + behind[0]) / 2
+        return difference
+
+    @cached_property
+    def interpolated(self) -> float:
+        """What linear interpolation between views and columns leaves of a difference, summed squares, noise taken off.
+
+        The second difference is eight times the error in the middle between two readings, 120 times its mean square.
+        """
+        n = self._order.size
+        bend = self.here[..., 2:] - 2.0 * self.here[..., 1:-1] + self.here[..., :-2]
+        beside = self._values[torch.from_numpy(self._order[(self._at + 1) % n])]
+        other = beside[..., 2:] - 2.0 * beside[..., 1:-1] + beside[..., :-2]
+        along = float(torch.where(self.known[..., 1:-1], bend * other, 0.0).double().sum())
+        turned = 4.0 * float(_product(self._between_views(), self.known).sum())
+        return max(along, 0.0) / 120.0 + max(turned, 0.0) / 120.0
+
+    def mismatch(self, false_alarms: float) -> tuple[float, int]:
+        """Share of the difference in what changes from view to view, and whether it is 1: too large, 2: nearly all."""
+        from scipy import stats
+
+        used = np.flatnonzero(self.known.flatten(1).any(1).numpy())
+        if used.size < _BLOCKS:
+            return math.nan, 0
+        between = self._between_views()
+        seen = self.known.float().sum(0).clamp_min(1.0)
+
+        def change(v: Tensor) -> Tensor:
+            return v - torch.where(self.known, v, 0.0).sum(0) / seen
+
+        different, stray, *changing = (
+            _blocks(_product(v, self.known), used)
+            for v in (self.difference, between, change(self.here), change(self.opposite))
+        )
+        signal = changing[0] + changing[1]
+        if signal.sum() <= 0:
+            return math.nan, 0
+        share = float(different.sum() / signal.sum())
+        # What interpolation between views leaves is no finding: a view from its neighbours is off by more than that.
+        sampled = float(stray.sum() / signal.sum())
+
+        def beyond(value: Floats, limit: float) -> bool:
+            left = value - limit * signal
+            spread = max(float(left.std(ddof=1)) * math.sqrt(left.size), float(np.finfo(np.float64).tiny))
+            return float(stats.t.sf(float(left.sum()) / spread, left.size - 1)) < false_alarms / 3
+
+        grade = sum(beyond(different, max(limit, 2.0 * sampled)) for limit in (_DIFFER, _STRANGERS))
+        # Views that their neighbours do not foretell, in steps that they should: out of order.
+        if not grade and view_step(self.rays.geometry.angles) < _FINE_STEP_RAD:
+            grade = 2 * (beyond(different, _STRANGERS) and beyond(stray, _STRANGERS))
+        return max(share, 0.0), grade
+
+    def agrees_mirrored(self, most: float) -> bool:
+        """Whether the rays disagree by less than ``most`` if the columns are counted the other way."""
+        g, w = self.rays.geometry, self.rays.window
+        if w.columns != g.columns:
+            return False
+        other, known = self.rays.opposite(self._values.flip(-1), self.base)
+        difference = _product(self.here.flip(-1) - other, known).sum()
+        here = self.here.flip(-1)
+        return bool(difference < most * 2.0 * _product(here - here.mean(0), known).sum())
+
+
+def _product(values: Tensor, known: Tensor) -> Floats:
+    """Sum of the products of close columns in every view, whose noise is independent: squares without noise.
+
+    Interpolation between columns makes next ones share a reading, not those three apart.
+    """
+    both = known[..., 3:] & known[..., :-3]
+    products: Floats = torch.where(both, values[..., 3:] * values[..., :-3], 0.0).double().sum((1, 2)).numpy()
+    return products
+
+
+def _flat_part(
+    geometry: ConeBeam, window: DetectorWindow, values: Tensor, cells: float
+) -> tuple[DetectorWindow, Tensor]:
+    """The rows whose opposite rays part by less than so many cells over what the window shows."""
+    row, column = geometry.pitch
+    reach = window.columns * column / geometry.magnification / 2
+    flat = np.abs(geometry.row_positions) <= max(0.5 * cells, cells * geometry.sod / reach) * row * (1 + 1e-9)
+    kept = np.flatnonzero(flat[window.first_row : window.first_row + window.rows])
+    if kept.size == 0:
+        return window, values[:, :0]
+    first, count = int(kept[0]), int(kept[-1] - kept[0] + 1)
+    return window.with_rows(window.first_row + first, count), values[:, first : first + count]
+
+
+def _joined_rows(geometry: ConeBeam, window: DetectorWindow, values: Tensor) -> Any:
+    """Means over neighbouring rows, so many that the readings are :data:`_MOST` if three rows are left of them."""
+    join = min(math.ceil(values.numel() / _MOST), max(window.rows // 3, 1))
+    rows, (pitch, column) = window.rows // join, geometry.pitch
+    values = values[:, : rows * join].unflatten(1, (rows, join)).mean(2)
+    first = geometry.row_positions[window.first_row]
+    middle = float(first + (rows * join - 1) / 2 * pitch)
+    wider = replace(geometry, rows=rows, pitch=(join * pitch, column), offset=(middle, geometry.offset[1]))
+    return wider, window.with_rows(0, rows), values
+
+
+def _tested(score: Floats, power: Floats, waves: Floats, false_alarms: float) -> CentreTest:
+    if power.sum() <= 0.0:
+        return _UNKNOWN
+    fit = _fitted(score, power, CENTRE_TOLERANCE)
     swing, swinging = _swing(score, waves)
     findings = []
-    if centre < false_alarms / 2 and abs(size) > CENTRE_TOLERANCE:
+    if fit.found(false_alarms / 2, CENTRE_TOLERANCE):
         findings.append(
-            f"opposite rays disagree: the geometry puts the columns about {abs(size):.2f} ± {error:.2g} columns too "
-            f"{'high' if size > 0 else 'low'}: the rotation centre (the detector's column offset) is wrong, or the "
-            "object moved"
+            f"opposite rays disagree: the geometry puts the columns about {abs(fit.size):.2f} ± {fit.error:.2g} "
+            f"columns too {'high' if fit.size > 0 else 'low'}: the rotation centre (the detector's column offset) is "
+            "wrong, or the object moved"
         )
     if swinging < false_alarms / 2:
         findings.append(
             f"opposite rays disagree by {swing:.2f} columns to either side in the course of a turn: the object moved, "
             "or the angles of the views are wrong"
         )
-    return CentreTest(size, error, swing, min(1.0, 2.0 * min(centre, swinging)), tuple(findings))
+    return CentreTest(fit.size, fit.error, swing, min(1.0, 2.0 * min(fit.p_value, swinging)), tuple(findings))
 
 
 def _swing(score: Floats, waves: Floats) -> tuple[float, float]:
@@ -194,13 +566,22 @@ def _swing(score: Floats, waves: Floats) -> tuple[float, float]:
 
 def _slope(values: Tensor, rows: int, columns: int) -> Tensor:
     """Central difference along the columns, averaged over ``rows`` (of a smaller stack less) × ``columns`` (odd)."""
-    rows = min(rows, 2 * ((values.shape[1] - 1) // 2) + 1)
-    kernel = torch.zeros(1, 1, rows, columns + 2)
+    kernel = torch.zeros(columns + 2)
     for k in range(columns):
-        kernel[..., k] -= 0.5
-        kernel[..., k + 2] += 0.5
-    padded = F.pad(values[:, None], ((columns + 1) // 2,) * 2 + (rows // 2,) * 2, mode="replicate")
-    return F.conv2d(padded, kernel / (rows * columns))[:, 0]
+        kernel[k] -= 0.5
+        kernel[k + 2] += 0.5
+    return _convolved(values, rows, kernel / columns)
+
+
+def _smooth(values: Tensor, rows: int, columns: int) -> Tensor:
+    """Mean over ``rows`` (of a smaller stack less) × ``columns`` (odd)."""
+    return _convolved(values, rows, torch.full((columns,), 1.0 / columns))
+
+
+def _convolved(values: Tensor, rows: int, kernel: Tensor) -> Tensor:
+    rows = min(rows, 2 * ((values.shape[1] - 1) // 2) + 1)
+    padded = F.pad(values[:, None], (kernel.numel() // 2,) * 2 + (rows // 2,) * 2, mode="replicate")
+    return F.conv2d(padded, kernel.expand(1, 1, rows, -1) / rows)[:, 0]
 
 
 class _Rays:
@@ -210,10 +591,17 @@ class _Rays:
         self.geometry, self.window = geometry, window
         self.parallel = isinstance(geometry, ParallelBeam)
         u = geometry.column_positions
+        self.flat = not isinstance(geometry, ConeBeam)
         self.start, self.step = float(u[0]), float(u[1] - u[0]) if u.size > 1 else 1.0
         self.rows = geometry.row_positions if isinstance(geometry, ConeBeam) else np.zeros(1)
         y, x = about
         self.radius, self.polar = math.hypot(x, y), math.atan2(y, x)
+
+    def fan_angles(self, views: NDArray[np.int64]) -> Floats:
+        """Of the readings of some views, ``(views, columns)`` rad; parallel: position in mm."""
+        g = self.geometry
+        found: Floats = (g.column_positions if self.parallel else g.fan_angles)[self.window.column_indices[views]]
+        return found
 
     def path(self, beta: Floats) -> tuple[Floats, Floats]:
         """Fan angle (parallel: position in mm) of the point that is followed, and its depth from the source."""
@@ -230,7 +618,7 @@ class _Rays:
         Each pair counts once, with its ray of positive fan angle.
         """
         g, w = self.geometry, self.window
-        gamma = (g.column_positions if self.parallel else g.fan_angles)[w.column_indices[base]]
+        gamma = self.fan_angles(base)
         turn = g.angles % (2 * math.pi)
         order = np.argsort(turn, kind="stable")
         beta = turn[base][:, None] + math.pi - (0.0 if self.parallel else 2.0) * gamma

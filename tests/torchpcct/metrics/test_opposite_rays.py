@@ -9,10 +9,19 @@ import torch
 
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, full_turn
 from torchpcct.detector_window import DetectorWindow
-from torchpcct.metrics.opposite_rays import CENTRE_TOLERANCE, FALSE_ALARMS, _Rays, centre_test
+from torchpcct.metrics.opposite_rays import (
+    CENTRE_TOLERANCE,
+    FALSE_ALARMS,
+    SCALE_TOLERANCE,
+    STEP_TOLERANCE,
+    _Rays,
+    centre_test,
+    geometry_test,
+)  # fmt: skip
 
 VIEWS, RODS = 180, ((12.0, -7.0, 6.0, 0.02), (12.0, -7.0, 3.0, 0.01), (-20.0, 15.0, 9.0, 0.015))
 """Rods along z: x, y, radius in mm, attenuation in mm⁻¹."""
+WIDE = (*RODS, (25.0, -12.0, 6.0, 0.02), (-18.0, -20.0, 5.0, 0.02), (5.0, 28.0, 3.0, 0.03))
 GEOMETRIES = {
     "parallel": ParallelBeam(full_turn(VIEWS), 90, 1.0, 0.25),
     "fan": FanBeam(full_turn(VIEWS), 300.0, 500.0, 128, 1.0, 0.25, "curved"),
@@ -142,6 +151,78 @@ def test_without_opposite_rays_or_anything_to_see_nothing_is_found():
         found = centre_test(lines, geometry)
         assert found.findings == ()
         assert found.p_value > FALSE_ALARMS
+
+
+@pytest.mark.parametrize("kind", ["fan", "flat", "cone"])
+@pytest.mark.parametrize("kappa", [-0.03, 0.04])
+def test_fan_angles_of_a_wrong_size_are_found_and_measured(kind, kappa):
+    """Was silent: sdd 3 % wrong, a thorax 200 HU off."""
+    g = GEOMETRIES[kind]
+    found = geometry_test(_lines(g, WIDE), replace(g, sdd=g.sdd * (1 + kappa)))
+    assert found.sizes["scale"] == pytest.approx(kappa, rel=0.35)
+    assert "sdd" in found.findings[0]
+    assert f"too {'small' if kappa > 0 else 'large'}" in found.findings[0]
+    assert len(found.findings) == 1
+
+
+@pytest.mark.parametrize("kind", ["parallel", "fan", "cone"])
+@pytest.mark.parametrize("part", [1.0, 0.8])
+def test_steps_between_views_of_a_wrong_size_are_found_and_measured(kind, part):
+    """Was silent: angle step -2 %."""
+    g = GEOMETRIES[kind].select(slice(round(part * VIEWS)))
+    found = geometry_test(_lines(g, WIDE), replace(g, angles=0.98 * g.angles))
+    assert found.sizes["step"] == pytest.approx(1 / 0.98 - 1, rel=0.35)
+    assert "steps between the views" in found.findings[0]
+    assert len(found.findings) == 1
+
+
+def test_a_rolled_detector_is_found_and_measured():
+    """Was silent by every method: 2°, which is 0.3 columns of 1 mm at the outer of 17 rows."""
+    g = replace(GEOMETRIES["cone"], rows=17, offset=(0.0, 0.0))
+    lines = _lines(g, WIDE)
+    for k, height in enumerate(g.row_positions):
+        lines[:, k] = _lines(_moved(g, -math.radians(2.0) * height), WIDE)[:, k]
+    found = geometry_test(lines, g)
+    assert math.degrees(found.sizes["roll"]) == pytest.approx(2.0, rel=0.2)
+    assert "rolled" in found.findings[0]
+    assert abs(found.sizes["centre"]) < CENTRE_TOLERANCE
+
+
+def test_a_sound_scan_has_no_finding_and_small_sizes():
+    for kind in GEOMETRIES:
+        g = GEOMETRIES[kind]
+        found = geometry_test(_lines(g, WIDE), g)
+        assert found.findings == ()
+        assert found.mismatch < 0.01
+        assert abs(found.sizes["step"]) < STEP_TOLERANCE / 4
+        assert abs(found.sizes.get("scale", 0.0)) < SCALE_TOLERANCE
+
+
+def test_rays_that_have_nothing_in_common_are_named():
+    """Columns or angles of the other sign, views out of order, a half turn given as a whole one: all were silent."""
+    g = GEOMETRIES["fan"]
+    lines = _lines(g, WIDE)
+    half = g.select(slice(VIEWS // 2))
+    wrong = (
+        (lines.flip(-1), g), (lines, replace(g, angles=-g.angles)),
+        (lines[np.random.default_rng(0).permutation(VIEWS)], g),
+        (_lines(half, WIDE), replace(half, angles=full_turn(VIEWS // 2))),
+    )  # fmt: skip
+    texts = [geometry_test(*case).findings[0] for case in wrong]
+    assert ["counted the other way" in text for text in texts] == [True, True, False, False]
+    assert ["little in common" in text for text in texts] == [False, False, True, True]
+
+
+def test_what_opposite_rays_cannot_show_raises_no_alarm():
+    """The angle of the first view; sod; parallel rays' pitch and direction: another object's scan, described right."""
+    g, parallel = GEOMETRIES["flat"], GEOMETRIES["parallel"]
+    mirrored = replace(parallel, offset=-parallel.offset)
+    for lines, other in (
+        (_lines(g, WIDE), replace(g, angles=g.angles + 0.3)), (_lines(g, WIDE), replace(g, sod=1.03 * g.sod)),
+        (_lines(parallel, WIDE), replace(parallel, pitch=1.03, offset=0.2575)),
+        (_lines(parallel, WIDE).flip(-1), mirrored),
+    ):  # fmt: skip
+        assert geometry_test(lines, other).findings == ()
 
 
 def test_bad_input():

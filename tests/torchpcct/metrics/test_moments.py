@@ -1,0 +1,88 @@
+"""Moments of the views: constant weight, frequency of the centre of mass; found where opposite rays cannot tell."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from torchpcct import ConeBeam, FanBeam, ParallelBeam, full_turn
+from torchpcct.metrics.moments import STEP_TOLERANCE, WEIGHT_TOLERANCE, moment_test
+
+ELLIPSE = (90.0, 60.0, 8.0, -5.0, 0.02)
+"""Semi-axes and centre in mm, attenuation in mm⁻¹."""
+GEOMETRIES = {
+    "parallel": ParallelBeam(full_turn(180), 200, 1.25),
+    "half": ParallelBeam(full_turn(180) / 2, 200, 1.25, 0.8),
+    "fan": FanBeam(full_turn(180), 500.0, 900.0, 256, 1.8, 0.45),
+    "short": FanBeam(full_turn(180)[:125], 500.0, 900.0, 256, 1.8, 0.0, "curved"),
+    "cone": ConeBeam(full_turn(180), 500.0, 900.0, 256, 3, 1.8),
+}
+
+
+def _lines(g, photons=1e5):
+    a, b, x, y, mu = ELLIPSE
+    beta = g.angles[:, None]
+    parallel = isinstance(g, ParallelBeam)
+    direction = beta + math.pi - (0.0 * g.column_positions if parallel else g.fan_angles)
+    if parallel:
+        distance = -x * np.sin(beta) + y * np.cos(beta) - g.column_positions
+    else:
+        dx, dy = x - g.sod * np.cos(beta), y - g.sod * np.sin(beta)
+        distance = np.cos(direction) * dy - np.sin(direction) * dx
+    width = a * a * np.sin(direction) ** 2 + b * b * np.cos(direction) ** 2
+    p = 2 * mu * a * b * np.sqrt(np.maximum(width - distance**2, 0.0)) / width
+    p += np.random.default_rng(0).standard_normal(p.shape) * np.exp(p / 2) / math.sqrt(photons)
+    lines = torch.from_numpy(p.astype(np.float32))
+    return lines[:, None].expand(g.shape).clone() if isinstance(g, ConeBeam) else lines
+
+
+@pytest.mark.parametrize("kind", GEOMETRIES)
+def test_a_sound_scan_has_the_same_weight_from_all_sides(kind):
+    g = GEOMETRIES[kind]
+    found = moment_test(_lines(g), g)
+    assert found.findings == ()
+    assert found.weight < WEIGHT_TOLERANCE / 4
+    assert math.isnan(found.step) or abs(found.step) < STEP_TOLERANCE / 2
+
+
+@pytest.mark.parametrize("kind", GEOMETRIES)
+def test_readings_that_are_no_line_integrals_are_found(kind):
+    """Pile-up of 10 % was silent by every method: a counter of dead time reads n exp(-0.1 n / n in air)."""
+    g = GEOMETRIES[kind]
+    p = _lines(g)
+    piled_up = p + 0.1 * (torch.exp(-p) - 1.0)
+    scattered = -torch.log((torch.exp(-p) + 0.01) / 1.01)
+    for wrong in (piled_up, scattered):
+        found = moment_test(wrong, g)
+        assert "the sum of a view's line integrals changes" in found.findings[0]
+        assert found.weight > WEIGHT_TOLERANCE
+
+
+def test_the_range_of_a_half_turn_is_measured():
+    """No ray of a half turn of parallel rays is met again."""
+    g = GEOMETRIES["half"]
+    for factor in (0.98, 1.03):
+        found = moment_test(_lines(g, 1e7), replace(g, angles=factor * g.angles))
+        assert found.step == pytest.approx(1 / factor - 1, rel=0.15)
+        assert f"too {'small' if factor < 1 else 'large'}" in found.findings[0]
+
+
+def test_what_the_moments_cannot_show_raises_no_alarm():
+    """A round body weighs the same from all sides whatever the readings are; air, a few views, a part of a turn."""
+    g = GEOMETRIES["parallel"]
+    t = g.column_positions / 80.0
+    p = torch.from_numpy(3.0 * np.sqrt(np.maximum(1 - t**2, 0.0))).float().expand(g.shape)
+    part = GEOMETRIES["half"].select(slice(60))
+    few = g.select(slice(None, None, 20))
+    cases = ((p + 0.1 * (torch.exp(-p) - 1), g), (torch.zeros(g.shape), g), (_lines(part), part), (_lines(few), few))
+    assert all(moment_test(*case).findings == () for case in cases)
+
+
+def test_bad_input():
+    g = GEOMETRIES["fan"]
+    with pytest.raises(ValueError, match="must have the shape"):
+        moment_test(torch.zeros(3, 4), g)
+    with pytest.raises(ValueError, match="NaN or Inf"):
+        moment_test(torch.full(g.shape, math.nan), g)
