@@ -163,10 +163,14 @@ def _add_reader_options(parser: argparse.ArgumentParser) -> None:
         help="geometry of files that do not hold it; kind: vectors, rtk, or with pose: in place of the file's own",
     )
     parser.add_argument("--mu-water", type=float, metavar="MM⁻¹", help="attenuation of water: result in HU")
-    parser.add_argument("--axis", type=float, metavar="COLUMN", help="rotation axis (Data Exchange)")
-    parser.add_argument("--pitch", type=float, metavar="MM", help="cell width (Data Exchange without pixel size)")
-    parser.add_argument("--photons", type=float, metavar="N", help="of an unattenuated reading (line integrals)")
-    parser.add_argument("--slices", metavar="A:B", help="rows to read (Data Exchange)")
+    parser.add_argument("--axis", type=float, metavar="COLUMN", help="that the rotation axis projects onto")
+    parser.add_argument(
+        "--pitch", type=float, metavar="MM", help="cell width of parallel beams (of files that do not know it)"
+    )
+    parser.add_argument(
+        "--photons", type=float, metavar="N", help="of an unattenuated reading, of scans given as line integrals"
+    )
+    parser.add_argument("--slices", metavar="A:B", help="slices of parallel and fan beams to read")
 
 
 def _reader_options(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -286,9 +290,12 @@ def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     check_scan_name(arguments.scan)
     scan = open_scan(arguments.scan, **_reader_options(arguments))
     if arguments.find_axis:
-        from torchpcct.formats.preprocess import centred  # algotom
+        from torchpcct.formats.preprocess import centred, find_axis
 
-        scan = centred(scan)
+        axis = find_axis(scan)
+        scan = centred(scan, axis)
+        if not arguments.json:
+            print(f"{axis} (found from {axis.how})")
     if arguments.clean:
         from torchpcct.formats.preprocess import cleaned
 
@@ -350,7 +357,11 @@ def add_reconstruct(commands: Commands) -> None:
         "--extent", type=float, nargs=3, metavar=axes, help="edge lengths in mm (default: what is seen)"
     )
     _add_reader_options(parser)
-    parser.add_argument("--find-axis", action="store_true", help="search the rotation axis (parallel beams)")
+    parser.add_argument(
+        "--find-axis",
+        action="store_true",
+        help="find the rotation axis: of a full turn, or half a turn of parallel rays",
+    )
     parser.add_argument("--clean", action="store_true", help="take out stripes and outliers (parallel and fan beams)")
     _add_output(parser)
 

@@ -216,7 +216,9 @@ def test_a_foreign_scan_without_pixel_size(tmp_path, capsys):
     assert "unit: pixel^-1" in capsys.readouterr().out
     command = ["reconstruct", path, "--find-axis", "--out", str(tmp_path / "tooth.nii.gz")]
     assert main(command) == 0
-    assert "of 1 × 1 × 1 pixels (the file does not know their size: --pitch MM)" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "axis at column 23." in said
+    assert "of 1 × 1 × 1 pixels (the file does not know their size: --pitch MM)" in said
     report = (tmp_path / "tooth.nii.gz.json").read_text(encoding="utf-8")
     assert '"spacing_pixels": [1.0, 1.0, 1.0],' in report  # lists on one line
     assert "mean_hu" not in report

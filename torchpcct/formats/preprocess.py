@@ -1,77 +1,47 @@
-"""Preparation of parallel-beam sinograms: rotation axis (by algotom), stripes, outliers."""
+"""Preparation of scans: rotation axis, stripes, outliers."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from torchpcct.dead_cells import bridge
-from torchpcct.formats.damage import needed
-from torchpcct.geometry import ParallelBeam
+from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam
+from torchpcct.metrics.rotation_axis import RotationAxis, at_axis, rotation_axis
 from torchpcct.robust import MEDIAN_TO_SD
 from torchpcct.scan import Scan
 
 __all__ = ["centred", "cleaned", "find_axis", "without_outliers", "without_stripes"]
 
 
-def _algotom(module: str) -> object:
-    needed("algotom")
-    return needed(f"algotom.prep.{module}")
+def find_axis(scan: Scan) -> RotationAxis:
+    """The column of the rotation axis with its error: of a full turn of any beam, or half a turn of parallel rays.
 
-
-def find_axis(scan: Scan) -> float:
-    """Column of the rotation axis, of the middle slice, by Vo's method (Opt. Express 22, 19078, 2014).
-
-    Vo's search is good to a quarter of a column. If air is seen beside the object in all views, the object's centroid
-    refines it: it runs through the views as a sine about the axis (Helgason and Ludwig's condition of first order).
+    Of several slices the one with the most to be seen is looked at (:mod:`torchpcct.metrics.rotation_axis`).
 
     Raises:
-        ValueError: not a parallel beam, or views that do not cover 180°.
+        ValueError: a part of the detector, a geometry view by view, energy bins; too few opposite rays, or nothing to
+            be seen.
     """
     g = scan.geometry
-    if not isinstance(g, ParallelBeam):
-        raise ValueError(f"the axis is found from parallel rays, this is a {type(g).__name__}")
-    turn = np.mod(g.angles - g.angles[0], 2 * math.pi)
-    half = np.flatnonzero(turn <= math.pi + 1e-6)
-    order = half[np.argsort(turn[half])]
-    step = float(np.median(np.diff(turn[order]))) if order.size > 1 else math.pi
-    if turn[order[-1]] < math.pi - 2 * step:
-        raise ValueError(f"the views cover {math.degrees(turn[order[-1]]):.0f}° of the 180° that the search needs")
+    if not isinstance(g, ParallelBeam | FanBeam | ConeBeam) or scan.window is not None or scan.counts.ndim > 3:
+        raise ValueError("the axis is found from all columns of a parallel, fan or cone beam on a circle")
     lines = scan.line_integrals()
-    middle = (lines[lines.shape[0] // 2] if lines.ndim == 3 else lines).double().numpy()
-    found = float(_algotom("calculation").find_center_vo(middle[order], dsp=False, ncore=1))  # type: ignore[attr-defined]
-    finer = _by_centroid(middle, g.angles)
-    return finer if finer is not None and abs(finer - found) <= 1.0 else found
+    if lines.ndim > len(g.shape):
+        lines = lines[int(lines.flatten(1).var(1).argmax())]
+    return rotation_axis(lines, g)
 
 
-def _by_centroid(lines: NDArray[np.float64], angles: NDArray[np.float64]) -> float | None:
-    """Axis of a sinogram ``(views, columns)`` whose object is seen whole, else None."""
-    columns = lines.shape[1]
-    margin = max(1, columns // 50)
-    mass = lines.sum(1)
-    edges = np.abs(np.concatenate([lines[:, :margin], lines[:, -margin:]], 1).mean(1))
-    if columns < 8 or mass.min() <= 0 or float((edges > 0.05 * lines.max(1)).mean()) > 0.02:
-        return None
-    centroid = (lines @ np.arange(columns)) / mass
-    waves = np.stack([np.ones_like(angles), np.cos(angles), np.sin(angles)], 1)
-    kept = np.ones(len(angles), bool)
-    for _ in range(5):  # views that a lost reading has pulled aside are left out
-        fit = np.linalg.lstsq(waves[kept], centroid[kept], rcond=None)[0]
-        off = np.abs(centroid - waves @ fit)
-        kept = off <= 5.0 * MEDIAN_TO_SD * np.median(off) + 1e-9
-    return float(fit[0])
-
-
-def centred(scan: Scan, axis: float | None = None) -> Scan:
-    """The same parallel scan with its rotation axis at a column (None: :func:`find_axis`)."""
-    g: ParallelBeam = scan.geometry
-    column = find_axis(scan) if axis is None else axis
-    return replace(scan, geometry=replace(g, offset=((g.columns - 1) / 2 - column) * g.pitch))
+def centred(scan: Scan, axis: float | RotationAxis | None = None) -> Scan:
+    """The same scan with its rotation axis at a column; None: :func:`find_axis`, noted in ``info``."""
+    found = find_axis(scan) if axis is None else axis
+    if not isinstance(found, RotationAxis):
+        return replace(scan, geometry=at_axis(scan.geometry, found))
+    said = {"column": found.column, "error": found.error, "found_from": found.how}
+    return replace(scan, geometry=at_axis(scan.geometry, found.column), info={**scan.info, "axis": said})
 
 
 def cleaned(scan: Scan, *, snr: float = 3.0, threshold: float = 0.08) -> Scan:

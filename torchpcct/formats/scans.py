@@ -17,6 +17,7 @@ from torchpcct.formats.data_exchange import read_data_exchange
 from torchpcct.formats.dicom_ct_pd import read_dicom_ct_pd
 from torchpcct.formats.stack import read_stack
 from torchpcct.geometry import Geometry, ParallelBeam
+from torchpcct.metrics.rotation_axis import at_axis
 from torchpcct.scan import Scan
 from torchpcct.validate import number
 from torchpcct.vector_geometry import VectorGeometry
@@ -119,7 +120,7 @@ def adapted(
 
     Args:
         scan: of any format.
-        axis: column of the rotation axis (may be fractional), of parallel beams.
+        axis: column that the rotation axis projects onto (may be fractional).
         pitch: cell width in mm, of parallel beams.
         slices: of parallel and fan beams ``(slices, views, columns)``: those to keep.
         mu_water: attenuation of water in mm⁻¹: volumes in HU.
@@ -142,12 +143,9 @@ def adapted(
         g = replace(g, pitch=wide, offset=g.offset * wide / g.pitch)
         scan = replace(scan, geometry=g, unit="mm^-1" if scan.unit == "pixel^-1" else scan.unit)
     if axis is not None:
-        if not isinstance(g, ParallelBeam):
-            raise ValueError(
-                f"axis= is the rotation axis of parallel beams, this is a {kind}: give its geometry an offset"
-            )
-        column = number("axis", axis, low=0.0, high=g.columns - 1.0)
-        scan = replace(scan, geometry=replace(g, offset=((g.columns - 1) / 2 - column) * g.pitch))
+        if isinstance(g, VectorGeometry) or scan.window is not None:
+            raise ValueError(f"axis= needs the whole detector of a scan on a circle, this is a {kind}")
+        scan = replace(scan, geometry=at_axis(g, number("axis", axis, low=0.0, high=g.columns - 1.0)))
     if mu_water is not None:
         mu = number("mu_water", mu_water, positive=True, unit="mm⁻¹")
         if scan.unit != "mm^-1":

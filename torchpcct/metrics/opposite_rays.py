@@ -46,7 +46,7 @@ from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, view_step
 from torchpcct.validate import coverage
 
-__all__ = ["CENTRE_TOLERANCE", "CentreTest", "GeometryTest", "centre_test", "geometry_test"]
+__all__ = ["CENTRE_TOLERANCE", "CentreTest", "GeometryTest", "OppositeRays", "centre_test", "geometry_test"]
 
 CENTRE_TOLERANCE = 0.1
 """Error of the centre in columns that is no finding: alignment, and what interpolation between the views leaves."""
@@ -298,7 +298,7 @@ Pattern = tuple[Tensor, str]
 class _Pairs:
     """Readings, those of their opposite rays, and the slopes of both."""
 
-    def __init__(self, rays: _Rays, values: Tensor) -> None:
+    def __init__(self, rays: OppositeRays, values: Tensor) -> None:
         self.rays, self._values = rays, values
         angles = rays.geometry.angles
         self._order = np.argsort(angles % (2 * math.pi), kind="stable")
@@ -333,7 +333,7 @@ class _Pairs:
             if not values.shape[1]:
                 return None
             geometry, window, values = _joined_rows(geometry, window, values)
-        return cls(_Rays(geometry, window, about), values)
+        return cls(OppositeRays(geometry, window, about), values)
 
     def _look(self, views: NDArray[np.int64]) -> tuple[Tensor, Tensor, Tensor]:
         return self._values[torch.from_numpy(views)], *self.rays.opposite(self._values, views)
@@ -584,7 +584,7 @@ def _convolved(values: Tensor, rows: int, kernel: Tensor) -> Tensor:
     return F.conv2d(padded, kernel.expand(1, 1, rows, -1) / rows)[:, 0]
 
 
-class _Rays:
+class OppositeRays:
     """Where the opposite of a reading lies: view, row and column, all fractional."""
 
     def __init__(self, geometry: Any, window: DetectorWindow, about: tuple[float, float]) -> None:

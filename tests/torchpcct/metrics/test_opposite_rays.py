@@ -14,7 +14,7 @@ from torchpcct.metrics.opposite_rays import (
     FALSE_ALARMS,
     SCALE_TOLERANCE,
     STEP_TOLERANCE,
-    _Rays,
+    OppositeRays,
     centre_test,
     geometry_test,
 )  # fmt: skip
@@ -104,7 +104,9 @@ def test_the_order_of_the_views_does_not_matter():
 def test_each_pair_of_rays_counts_once():
     """Twice, the stated error would be too small by √2."""
     g = GEOMETRIES["flat"]  # no offset: the opposite of a column is its mirror image
-    _, known = _Rays(g, DetectorWindow.full(g), (0.0, 0.0)).opposite(torch.zeros(VIEWS, 1, 128), np.arange(VIEWS))
+    _, known = OppositeRays(g, DetectorWindow.full(g), (0.0, 0.0)).opposite(
+        torch.zeros(VIEWS, 1, 128), np.arange(VIEWS)
+    )
     assert bool((known | known.flip(-1)).all())
     assert not bool((known & known.flip(-1)).any())
 

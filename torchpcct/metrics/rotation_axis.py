@@ -1,0 +1,264 @@
+"""Where is the rotation axis? Found from the readings, with an error that contains the truth.
+
+* Opposite rays that were measured see one line: of a full turn of any beam, or what a scan covers twice
+  (:mod:`torchpcct.metrics.opposite_rays`). What all views of a full turn share is taken off before: the mean over the
+  turn is the same on both sides of the axis, gains of single cells are not.
+* Of half a turn of parallel rays the ends meet: the first views, mirrored, go on where the last ones stop.
+* There, too, the centroid of an object that is seen whole runs through the views as a sine about the axis (Helgason and
+  Ludwig's condition of first order). Gains of single cells pull it aside in all views alike, so that they are part of
+  its error.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional as F
+
+from torchpcct.detector_window import DetectorWindow
+from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, view_step
+from torchpcct.metrics.opposite_rays import OppositeRays, centre_test
+from torchpcct.robust import MEDIAN_TO_SD
+
+__all__ = ["RotationAxis", "at_axis", "axis_column", "rotation_axis"]
+
+LEAST, LEAST_HALF = 0.02, 0.05
+"""Error in columns below which none is stated, of opposite rays and of half a turn: interpolation between views."""
+_SIGMAS = 3.0
+_COARSE_VIEWS, _COARSE_STEPS = 48, 64
+_REACH = 0.45
+"""Part of the detector's width, to either side of its middle, where the axis is looked for."""
+_COMPARED = 0.1
+_BLOCKS = 16
+_TIED = 1.7
+"""Both ends compare the same readings, which counts them twice (√2), and smoothing ties neighbouring blocks: measured
+on 120 simulated half turns."""
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RotationAxis:
+    """Result of :func:`rotation_axis`.
+
+    Attributes:
+        column: onto which the rotation axis projects, fractional, counted from 0.
+        error: three standard errors, at least :data:`LEAST` or :data:`LEAST_HALF`.
+        how: what it was found from.
+    """
+
+    column: float
+    error: float
+    how: str
+
+    def __str__(self) -> str:
+        digits = max(0, min(3, math.ceil(-math.log10(self.error) - 1e-9)))
+        up = math.ceil(self.error * 10**digits - 1e-9) / 10**digits
+        return f"axis at column {self.column:.{digits}f} ± {up:.{digits}f}"
+
+
+def axis_column(geometry: Any) -> float:
+    """Column onto which the rotation axis projects, as the geometry describes it."""
+    pitch, offset = _of_columns(geometry)
+    return float((geometry.columns - 1) / 2 - offset / pitch)
+
+
+def at_axis(geometry: Any, column: float) -> Any:
+    """The geometry whose axis projects onto ``column``."""
+    pitch, _ = _of_columns(geometry)
+    offset = ((geometry.columns - 1) / 2 - column) * pitch
+    return replace(geometry, offset=(geometry.offset[0], offset) if isinstance(geometry, ConeBeam) else offset)
+
+
+def _of_columns(geometry: Any) -> tuple[float, float]:
+    if isinstance(geometry, ConeBeam):
+        return geometry.pitch[1], geometry.offset[1]
+    return geometry.pitch, geometry.offset
+
+
+def rotation_axis(lines: Tensor, geometry: Geometry) -> RotationAxis:
+    """The column of the rotation axis; where the geometry has it does not matter.
+
+    Args:
+        lines: line integrals ``(views, [rows,] columns)`` of any unit, finite, views in any order.
+        geometry: parallel, fan or cone beam on a circle.
+
+    Raises:
+        ValueError: too few opposite rays (less than half a turn of parallel rays, a fan or cone beam that meets
+            hardly any line twice), or nothing to be seen.
+    """
+    g: Any = geometry
+    shares = _shares(g.angles)
+    shared = 0.0 if shares is None else torch.tensordot(torch.from_numpy(shares).to(lines), lines, 1)
+    found = _by_opposites(lines - shared, g)
+    if found is not None:
+        # Of a part of a turn what single cells have wrong stays, and is alike in all views.
+        return _stated(found[0], found[1] * (1.0 if shares is not None else 2.0), LEAST, "opposite rays")
+    if not isinstance(g, ParallelBeam):
+        raise ValueError(
+            "hardly any line was measured twice, which tells the axis of a fan or cone beam: a full turn does"
+        )
+    turn = np.mod(g.angles - g.angles[0], 2 * math.pi)
+    half = np.flatnonzero(turn <= math.pi + 1e-4)
+    order = half[np.argsort(turn[half], kind="stable")]
+    ends = math.pi - float(turn[order[-1]])
+    if order.size < 3 or ends > 2.0 * view_step(g.angles) + 1e-4:
+        raise ValueError(f"the views cover {math.degrees(turn[order[-1]]):.0f}° of the 180° that the search needs")
+    values = lines.detach().cpu().double().numpy()
+    column, error = _by_ends(values[order], turn[order])
+    whole = _by_centroid(values, g.angles)
+    if whole is None or abs(whole[0] - column) > 5.0 * math.hypot(error, whole[1]) + 1.0:
+        return _stated(column, error, LEAST_HALF, "the ends of the half turn")
+    trust = np.maximum([error, whole[1]], 1e-6) ** -2.0
+    column = float(trust @ [column, whole[0]] / trust.sum())
+    return _stated(
+        column, float(trust.sum() ** -0.5), LEAST_HALF, "the ends of the half turn and the object's centroid"
+    )
+
+
+def _stated(column: float, error: float, least: float, how: str) -> RotationAxis:
+    if not (math.isfinite(column) and math.isfinite(error)):
+        raise ValueError("the readings do not tell the axis: there is nothing in them but noise")
+    return RotationAxis(column, max(_SIGMAS * error, least), how)
+
+
+def _shares(angles: Floats) -> Floats | None:
+    """The part of a full turn that each view stands for; None if they do not cover it."""
+    turn = np.mod(angles, 2 * math.pi)
+    order = np.argsort(turn, kind="stable")
+    gaps = np.diff(turn[order], append=turn[order[0]] + 2 * math.pi)
+    if gaps.max() > 2.5 * 2 * math.pi / angles.size:
+        return None
+    shares = np.empty_like(turn)
+    shares[order] = (gaps + np.roll(gaps, 1)) / (4 * math.pi)
+    return shares
+
+
+def _by_opposites(lines: Tensor, geometry: Any) -> tuple[float, float] | None:
+    """Column and its standard error; None where hardly any ray has an opposite."""
+    column = _coarse(lines, geometry)
+    if column is None:
+        return None
+    error = math.inf
+    for _ in range(12):
+        test = centre_test(lines, at_axis(geometry, column))
+        if not math.isfinite(test.columns):
+            return None if math.isinf(error) else (column, error)
+        error = test.error
+        step = min(max(test.columns, -2.0), 2.0)
+        column += step  # described too high by so much: the axis lies at a higher column
+        if abs(step) < max(0.05 * error, 1e-3):
+            break
+    return column, error
+
+
+def _coarse(lines: Tensor, geometry: Any) -> float | None:
+    """The column at which opposite rays resemble each other most, to about one; of a cone beam in one row."""
+    window = DetectorWindow.full(geometry)
+    values = lines.detach().to("cpu", torch.float32).reshape(window.shape)
+    row = 0
+    if isinstance(geometry, ConeBeam):
+        row, geometry = int(np.argmin(np.abs(geometry.row_positions))), geometry.central_fan
+    columns = geometry.columns
+    width = max(1, columns // _COARSE_STEPS) | 1
+    middle = F.avg_pool1d(values[:, row][:, None], width, 1, width // 2, count_include_pad=False)
+    base = np.argsort(geometry.angles % (2 * math.pi), kind="stable")
+    base = base[:: max(1, base.size // _COARSE_VIEWS)]
+    here, window = middle[torch.from_numpy(base)], DetectorWindow.full(geometry)
+
+    def likeness(column: float) -> float:
+        opposite, known = OppositeRays(at_axis(geometry, column), window, (0.0, 0.0)).opposite(middle, base)
+        return float((here * opposite)[known].sum()) if int(known.sum()) > columns // 4 else -math.inf
+
+    best, reach = (columns - 1) / 2, int(_REACH * columns) // width
+    steps = [width, 1] if width > 1 else [1]
+    for step in steps:
+        tried = best + step * np.arange(-reach, reach + 1)
+        found = [likeness(c) for c in tried]
+        if not max(found) > -math.inf:
+            return None
+        best, reach = float(tried[int(np.argmax(found))]), width
+    return best
+
+
+def _by_ends(lines: Floats, turn: Floats) -> tuple[float, float]:
+    """Column and standard error of a half turn ``(views, columns)`` in the order of ``turn``.
+
+    The first views are continued backwards to where the last one stands, mirrored, and the last ones forwards.
+    """
+    from scipy.interpolate import CubicSpline
+    from scipy.ndimage import gaussian_filter1d
+
+    columns = lines.shape[1]
+    at = np.arange(columns)
+    step = float(np.median(np.diff(turn)))
+    lack = (math.pi - turn[-1]) / step
+    # Between two views what lies off the axis moves by up to step × radius: finer structure says nothing.
+    width = max(2.0, 0.25 * step * columns) / 2.355
+    ends = gaussian_filter1d(lines[[0, 1, -2, -1]], width, axis=-1, mode="nearest")
+    onward = [(1 + lack) * ends[0] - lack * ends[1], (1 + lack) * ends[3] - lack * ends[2]]
+    mirrors = [CubicSpline(at, ends[3]), CubicSpline(at, ends[0])]
+
+    def compared(column: float) -> tuple[Floats, Floats, Floats, Floats]:
+        """Of the readings that have a counterpart: differences, slopes, their power, squares of the readings."""
+        there = 2 * column - at
+        inside = (there >= 0) & (there <= columns - 1)
+        parts = []
+        for o, m in zip(onward, mirrors, strict=True):
+            # Noise of the two slopes is independent: their product does not know it (instrumental variables).
+            here, slope = np.gradient(o), m(there, 1)
+            parts.append([o - m(there), slope - here, -4.0 * slope * here, o**2 + m(there) ** 2])
+        differences, slopes, power, levels = (np.where(inside, np.stack(v), 0.0) for v in zip(*parts, strict=True))
+        return differences, slopes, power, levels
+
+    most = 2.0 * float((ends[[0, 3]] ** 2).sum())
+
+    def unlike(column: float) -> float:
+        differences, _, _, levels = compared(column)
+        # Air is like air: a part of what the ends show must be compared.
+        return float((differences**2).sum() / levels.sum()) if levels.sum() > _COMPARED * most else math.inf
+
+    reach = int(_REACH * columns)
+    column = min((columns - 1) / 2 + np.arange(-reach, reach + 1), key=unlike)
+    for _ in range(12):
+        differences, slopes, power, _ = compared(column)
+        total = float(power.sum())
+        if total <= 0:
+            return math.nan, math.inf
+        move = float((differences * slopes).sum()) / total
+        column += min(max(move, -2.0), 2.0)
+        if abs(move) < 1e-4:
+            break
+    scores = [float(b.sum()) for b in np.array_split(slopes * differences - move * power, _BLOCKS, axis=-1)]
+    return float(column), _TIED * math.sqrt(np.square(scores).sum() * _BLOCKS / (_BLOCKS - 1)) / total
+
+
+def _by_centroid(lines: Floats, angles: Floats) -> tuple[float, float] | None:
+    """Column and standard error of a sinogram ``(views, columns)`` whose object is seen whole, else None."""
+    columns = lines.shape[1]
+    margin = max(1, columns // 50)
+    mass = lines.sum(1)
+    edges = np.abs(np.concatenate([lines[:, :margin], lines[:, -margin:]], 1).mean(1))
+    if columns < 8 or mass.min() <= 0 or float((edges > 0.05 * lines.max(1)).mean()) > 0.02:
+        return None
+    at = np.arange(columns)
+    centroid = (lines @ at) / mass
+    waves = np.stack([np.ones_like(angles), np.cos(angles), np.sin(angles)], 1)
+    kept = np.ones(len(angles), bool)
+    for _ in range(5):  # views that a lost reading has pulled aside are left out
+        fit = np.linalg.lstsq(waves[kept], centroid[kept], rcond=None)[0]
+        off = centroid - waves @ fit
+        kept = np.abs(off) <= 5.0 * MEDIAN_TO_SD * np.median(np.abs(off)) + 1e-9
+    used = waves[kept]
+    variance = float(np.square(off[kept]).sum()) / max(len(used) - 3, 1)
+    noise = math.sqrt(np.linalg.inv(used.T @ used)[0, 0] * variance)
+    mean = lines.mean(0)
+    second = mean[2:] - 2.0 * mean[1:-1] + mean[:-2]
+    cells = MEDIAN_TO_SD * float(np.median(np.abs(second))) / math.sqrt(6.0)
+    return float(fit[0]), math.hypot(noise, cells * float(np.linalg.norm(at - fit[0])) / float(mass.mean()))
