@@ -27,6 +27,7 @@ __all__ = [
     "VERSION",
     "WriteError",
     "clear_folder",
+    "is_own_hdf5",
     "read_hdf5",
     "require_folder",
     "require_writable",
@@ -270,6 +271,17 @@ def is_sealed(path: str | os.PathLike[str]) -> bool:
     """Whether a file begins with the checksum of :func:`write_hdf5`, right or wrong."""
     with open(path, "rb") as file:
         return file.read(len(_MAGIC)) == _MAGIC
+
+
+def is_own_hdf5(path: str | os.PathLike[str], kind: str) -> bool:
+    """Whether an HDF5 file is of the format ``torchpcct-KIND``, sound or not."""
+    import h5py
+
+    try:
+        with h5py.File(path, "r") as file:
+            return bool(file.attrs.get("format") == f"torchpcct-{kind}")
+    except (OSError, RuntimeError, ValueError, KeyError):
+        return False
 
 
 def _check_seal(path: str | os.PathLike[str], kind: str) -> None:

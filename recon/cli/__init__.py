@@ -18,14 +18,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from recon.cli.looking import add_info, add_view
-from recon.cli.parsing import Commands, as_options, command, saying
+from recon.cli.parsing import Commands, as_options, check_results, command, saying
 
 # What loads torch or numba is imported by the commands: help and refusals come at once.
 from recon.cli.plaque import add_plaque
 from recon.cli.scans import add_lower_dose, add_reconstruct, add_show_config, add_simulate
 from recon.study import registry
 from torchpcct import __version__
-from torchpcct.files import require_writable, written_whole
+from torchpcct.files import WriteError, require_writable, written_whole
 from torchpcct.validate import whole
 
 if TYPE_CHECKING:
@@ -43,6 +43,8 @@ def _run_study(name: str, settings: Any, arguments: argparse.Namespace, progress
         whole("--seed", settings.seed, low=0)
     folder = arguments.out or Path("out") / name
     require_writable(folder)
+    names = (name, registry.folder(name).replace("_", "-"))
+    check_results(arguments, folder, lambda report: report.get("study") in names, "report.json", "report.md", "*.png")
     minutes = {part: seconds / 60 for part, seconds in settings.estimated_seconds().items()}
     if minutes:
         listed = ", ".join(f"{part} {value:.1f}" for part, value in minutes.items())
@@ -206,7 +208,7 @@ def _parser() -> tuple[argparse.ArgumentParser, Commands]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; returns the exit status: 0 done, 2 refused input, 130 interrupted."""
+    """Run a command; returns the exit status: 0 done, 1 not written (a full disk), 2 refused input, 130 interrupted."""
     parser, commands = _parser()
     options = parser.parse_args(arguments)
     options.command_line = list(sys.argv[1:] if arguments is None else arguments)
@@ -224,7 +226,9 @@ def _run(options: argparse.Namespace, actions: Any) -> int:
         if options.device == "cuda" and not _cuda():
             raise ValueError("--device cuda: PyTorch finds no CUDA device here; use --device cpu")
         options.run(options, progress)
-    except (ValueError, TypeError, OSError, OverflowError, MemoryError) as error:
+    except WriteError as error:
+        return _failed(options.command, progress, str(error), 1)
+    except (ValueError, TypeError, OSError, ImportError, OverflowError, MemoryError) as error:
         text = as_options(str(error), actions) or "out of memory: use larger voxels or a smaller grid"
         return _failed(options.command, progress, text, 2)
     except RuntimeError as error:

@@ -7,8 +7,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 # What loads torch or numba is imported by the commands: help and refusals come at once.
-from recon.cli.parsing import SCAN_ENDINGS, Commands, as_json, check_ending, length_of, without_ending
-from torchpcct.files import require_folder, written_whole
+from recon.cli.parsing import (
+    SCAN_ENDINGS,
+    Commands,
+    add_force,
+    as_json,
+    check_ending,
+    check_output,
+    is_picture,
+    length_of,
+    without_ending,
+)
+from torchpcct.files import written_whole
 from torchpcct.validate import number
 
 if TYPE_CHECKING:
@@ -29,11 +39,19 @@ def _is_volume(path: Path) -> bool:
 
         with reading(path, "HDF5"), h5py.File(path, "r") as file:
             return str(file.attrs.get("format")) == "torchpcct-volume"
-    if path.is_dir():  # a series, or projections
+    if path.is_dir() or _is_dicom(path):  # a series or an image, or projections
         from torchpcct.formats.dicom_ct_pd import holds_projections
 
         return not holds_projections(path)
     return str(path).endswith((".nii", ".nii.gz", ".mha"))
+
+
+def _is_dicom(path: Path) -> bool:
+    """Whether a file is DICOM, by its ending or, without one, by its beginning."""
+    if path.suffix or not path.is_file():
+        return path.suffix.lower() in (".dcm", ".ima") and path.is_file()
+    with path.open("rb") as file:
+        return file.read(132)[128:] == b"DICM"
 
 
 def _info(arguments: argparse.Namespace, progress: ProgressBars) -> None:
@@ -84,7 +102,7 @@ def _view(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     if arguments.out is None:
         arguments.out = Path(f"{without_ending(arguments.file)}.png")
     check_ending(arguments.out, _PICTURE_ENDINGS)
-    require_folder(arguments.out)
+    check_output(arguments, is_picture, arguments.file)
     if arguments.window is not None:
         number("--window", arguments.window, positive=True)
     if arguments.file.exists() and not _is_volume(arguments.file):
@@ -135,8 +153,9 @@ def _grey_scale(values: Any, level: float | None, window: float | None) -> tuple
 def add_view(commands: Commands) -> None:
     parser = commands.add_parser("view", help="a slice of a volume as a picture", description="Draw a slice.")
     parser.set_defaults(run=_view, device="cpu", no_progress=True, verbose=False)
-    parser.add_argument("file", type=Path, help="volume: .nii, .nii.gz, .mha, .h5 or a folder of a DICOM series")
+    parser.add_argument("file", type=Path, help="volume: .nii, .nii.gz, .mha, .h5, .dcm or a DICOM folder")
     parser.add_argument("--out", type=Path, metavar="PATH", help="picture: .png, .pdf or .svg (default VOLUME.png)")
+    add_force(parser)
     parser.add_argument("--plane", choices=("z", "y", "x"), default="z", help="axis across the slice (default z)")
     parser.add_argument("--slice", type=int, metavar="K", help="index along it (default: the middle)")
     parser.add_argument("--level", type=float, help="centre of the grey scale (default 40 HU, mm⁻¹: of the values)")

@@ -13,15 +13,19 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from torchpcct.files import written_whole
+from torchpcct.files import WriteError, require_folder, require_writable, written_whole
 
 __all__ = [
     "SCAN_ENDINGS",
     "Commands",
+    "add_force",
     "as_json",
     "as_options",
     "check_ending",
+    "check_output",
+    "check_results",
     "command",
+    "is_picture",
     "length_of",
     "saying",
     "tell",
@@ -29,6 +33,8 @@ __all__ = [
 ]
 
 SCAN_ENDINGS = (".h5", ".hdf5")
+_BESIDE = (".json", ".yaml")
+"""Endings of summary and configuration, which :func:`tell` adds to the name of the result."""
 
 Commands = Any
 """What ``add_subparsers`` gives; argparse does not publish its type."""
@@ -57,6 +63,7 @@ def command(
     parser.add_argument("--seed", type=int, default=seed, help=f"first seed of the noise, ≥ 0 (default {default})")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where volumes are kept (default cpu)")
     parser.add_argument("--out", type=Path, metavar="PATH", help=out, required=required)
+    add_force(parser)
     parser.add_argument("--no-progress", action="store_true", help="no progress bars")
     parser.add_argument("-v", "--verbose", action="store_true", help="log what the library does")
     return parser
@@ -142,10 +149,84 @@ def tell(arguments: argparse.Namespace, short: str, config: dict[str, Any], **su
 
     file: Path = arguments.out
     text = as_json({"file": str(file), **summary})
-    for ending, content in ((".json", text), (".yaml", yaml.safe_dump(config, sort_keys=False, allow_unicode=True))):
-        with written_whole(file.with_name(file.name + ending)) as part:
-            part.write_text(content.rstrip() + "\n", encoding="utf-8")
+    done = yaml.safe_dump(config, sort_keys=False, allow_unicode=True)
+    for ending, content in zip(_BESIDE, (text, done), strict=True):
+        try:
+            with written_whole(file.with_name(file.name + ending)) as part:
+                part.write_text(content.rstrip() + "\n", encoding="utf-8")
+        except WriteError as error:
+            raise WriteError(f"{error}; {file} itself is written") from error
     print(text if arguments.json else f"{file}: {short}")
+
+
+def add_force(parser: argparse.ArgumentParser) -> None:
+    """The option ``--force`` of a command that writes."""
+    parser.add_argument("--force", action="store_true", help="replace a file that another command or software has made")
+
+
+def check_output(
+    arguments: argparse.Namespace, is_own: Callable[[Path], bool], *inputs: str | Path | None, beside: bool = False
+) -> None:
+    """See, before anything is computed, that ``--out`` can be written and that nothing of the user's is lost by it.
+
+    Args:
+        is_own: whether an existing file is one that this command would have made.
+        inputs: files that the command reads, by whatever name.
+        beside: whether :func:`tell` writes beside it.
+
+    Raises:
+        ValueError: an input, also by another name, or without ``--force`` something else is there already; a folder.
+        OSError: there is no such folder, or nothing can be written into it.
+    """
+    out: Path = arguments.out
+    require_folder(out)
+    require_writable(out.parent)
+    summary, config = (out.with_name(out.name + ending) for ending in _BESIDE)
+    for path in (out, summary, config) if beside else (out,):
+        if not path.exists():
+            continue
+        if any(one is not None and Path(one).exists() and path.samefile(one) for one in inputs):
+            raise ValueError(f"--out {out} would write onto {path}, which is read: name another file")
+        own = is_own(path) if path is out else "file" in _json(summary)
+        if path.is_dir() and not own:
+            raise ValueError(f"{path} is a folder: name a file to write")
+        if not (own or arguments.force):
+            raise ValueError(
+                f"{path} exists and was not made by torchpcct {arguments.command}: name another file, or --force"
+            )
+
+
+def check_results(
+    arguments: argparse.Namespace, folder: Path, is_own: Callable[[dict[str, Any]], bool], *patterns: str
+) -> None:
+    """The same for a folder of results: files of these names are replaced if its ``report.json`` is of this command.
+
+    Raises:
+        ValueError: without ``--force``, files of another origin. OSError: nothing can be written there.
+    """
+    require_writable(next(p for p in (folder, *folder.absolute().parents) if p.exists()))
+    there = sorted({path.name for pattern in patterns for path in folder.glob(pattern)})
+    if there and not is_own(_json(folder / "report.json")) and not arguments.force:
+        raise ValueError(
+            f"{folder} holds {', '.join(there[:3])}{' …' if there[3:] else ''}, not made by torchpcct "
+            f"{arguments.command}: name another folder, or --force"
+        )
+
+
+def is_picture(path: Path) -> bool:
+    """Whether a file begins as its ending says: PNG, PDF or SVG."""
+    with path.open("rb") as file:
+        head = file.read(512)
+    return {".png": head.startswith(b"\x89PNG"), ".pdf": head.startswith(b"%PDF")}.get(path.suffix, b"<svg" in head)
+
+
+def _json(path: Path) -> dict[str, Any]:
+    """A JSON object in a file; empty if there is none."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def check_ending(path: Path, endings: tuple[str, ...]) -> None:

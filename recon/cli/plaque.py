@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 # What loads torch or numba is imported by the command: help and refusals come at once.
-from recon.cli.parsing import Commands, command
+from recon.cli.parsing import Commands, check_results, command
 from torchpcct import VolumeGrid
 from torchpcct.validate import number
 
@@ -20,6 +20,9 @@ __all__ = ["add_plaque"]
 
 
 def _plaque(arguments: argparse.Namespace, progress: ProgressBars) -> None:
+    folder = arguments.out or Path("out") / "plaque"
+    names = ("report.md", "report.json", "tissues.nii.gz", "image.nii.gz", "plaque.png")
+    check_results(arguments, folder, lambda report: "presence" in report, *names)
     voxel = number("--voxel", arguments.voxel, positive=True, unit="mm")
     from recon import reconstruct
     from recon.plaque.beside import fbp_deviations
@@ -52,7 +55,7 @@ def _plaque(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     deviations = {}
     if scan.window is not None and scan.surround is not None:
         deviations["soft FBP"] = fbp_deviations(scan, grid, reading.regions)
-    files = save(reading, arguments.out or Path("out") / "plaque", others, deviations)
+    files = save(reading, folder, others, deviations)
     print(table(reading, others, deviations))
     print(f"{seconds}. Written: {', '.join(map(str, files))}")
 

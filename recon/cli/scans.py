@@ -8,10 +8,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 # What loads torch or numba is imported by the commands: help and refusals come at once.
-from recon.cli.parsing import SCAN_ENDINGS, Commands, as_json, check_ending, command, length_of, tell, without_ending
+from recon.cli.parsing import (
+    SCAN_ENDINGS,
+    Commands,
+    as_json,
+    check_ending,
+    check_output,
+    command,
+    length_of,
+    tell,
+    without_ending,
+)
 from torchpcct import VolumeGrid
-from torchpcct.files import require_folder
-from torchpcct.formats.volume_files import check_volume_name
+from torchpcct.files import is_own_hdf5
+from torchpcct.formats.volume_files import check_target, is_own_volume
 from torchpcct.validate import choice, number, numbers, whole
 
 if TYPE_CHECKING:
@@ -59,7 +69,7 @@ def _paper(arguments: argparse.Namespace) -> SimulationConfig:
 
 def _simulate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     check_ending(arguments.out, SCAN_ENDINGS)
-    require_folder(arguments.out)
+    check_output(arguments, _is_scan, arguments.config, beside=True)
     if arguments.seed is not None:
         whole("--seed", arguments.seed, low=0)
     if arguments.views is not None:
@@ -78,6 +88,7 @@ def _simulate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         if arguments.views is not None or arguments.whole:
             raise ValueError("--views and --whole are the plaque scan's: put views and region into the configuration")
         config = read_config(arguments.config, exposure_s=arguments.exposure, seed=arguments.seed)
+        check_output(arguments, _is_scan, config.values["scene"].get("file"), beside=True)
     voxels = isinstance(config.scene, VoxelScene)
     if arguments.dry_run:
         import yaml
@@ -99,6 +110,10 @@ def _simulate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         short += f"; {_dense(scan.info['plan']['above_muscle'])}"
     tell(arguments, short, config.values, readings=list(scan.counts.shape), exposure_s=scan.exposure_s, seed=scan.seed,
          mean_count=mean, **scan.info)  # fmt: skip
+
+
+def _is_scan(path: Path) -> bool:
+    return is_own_hdf5(path, "scan")
 
 
 def _voxel_plan(config: SimulationConfig, scene: VoxelScene) -> str:
@@ -202,14 +217,14 @@ def _grid(scan: Scan, arguments: argparse.Namespace) -> VolumeGrid:
     from torchpcct.geometry import ConeBeam, ParallelBeam
     from torchpcct.vector_geometry import VectorGeometry
 
-    voxel = arguments.voxel
+    voxel, lengths, place = arguments.voxel, *_of_axes(scan, arguments)
     if scan.window is not None:
         from recon.study.paper.plaque_scan import INSET_MM
         from torchpcct.scene.plaque import PAPER_POSITION
 
         voxel = voxel or 0.25
-        shape = tuple(math.ceil(e / voxel - 1e-6) for e in arguments.extent or INSET_MM)
-        return VolumeGrid(shape, voxel, tuple(arguments.center or PAPER_POSITION[::-1]))
+        shape = tuple(math.ceil(e / voxel - 1e-6) for e in lengths or INSET_MM)
+        return VolumeGrid(shape, voxel, tuple(place or PAPER_POSITION[::-1]))
     g: Any = scan.geometry
     if isinstance(g, VectorGeometry):
         distance, heights, _ = g.border_rays()
@@ -222,21 +237,49 @@ def _grid(scan: Scan, arguments: argparse.Namespace) -> VolumeGrid:
         cell, radius = pitch / g.magnification, g.sod * math.sin(float(np.abs(g.fan_angles).max()))
     voxel = voxel or cell
     side = 2.0 * radius
-    extent = list(arguments.extent or [0.0, side, side])
-    center = list(arguments.center or [0.0, 0.0, 0.0])
+    extent, center = lengths or [0.0, side, side], place or [0.0, 0.0, 0.0]
     plane = [max(1, math.ceil(e / voxel - 1e-6)) for e in extent[1:]]
     if isinstance(g, VectorGeometry) and g.has_rows:
         # What views above and below see together: a helix covers more than its rows.
         low, high = float(heights.min()), float(heights.max())
         orbit = math.inf if g.parallel else float(np.hypot(*g.poses[:, 0, :2].T).mean())
         height = extent[0] or high - low - float(np.median(np.ptp(heights, axis=1))) * radius / orbit
-        center[0] = center[0] if arguments.center else 0.5 * (low + high)
+        center[0] = center[0] if place else 0.5 * (low + high)
         return VolumeGrid((max(1, math.floor(height / voxel)), *plane), voxel, tuple(center))
     if isinstance(g, ConeBeam):
         height = extent[0] or g.rows * g.pitch[0] / g.magnification * (1.0 - radius / g.sod)
         return VolumeGrid((max(1, math.floor(height / voxel)), *plane), voxel, tuple(center))
     slices = tuple(scan.counts.shape[:-2])
     return VolumeGrid((*slices, *plane), voxel, tuple(center[3 - len(slices) - 2 :]))
+
+
+def _of_axes(scan: Scan, arguments: argparse.Namespace) -> tuple[list[float] | None, list[float] | None]:
+    """``--extent`` and ``--center`` as z, y, x, where they are given.
+
+    Raises:
+        ValueError: two numbers of a volume; a height of slices that are those of the readings.
+    """
+    flat = not scan.geometry.has_rows
+    if arguments.extent is not None and (len(arguments.extent) == 2) != flat:
+        raise ValueError(
+            "--extent takes two numbers, Y X: this scan's slices are those of its readings"
+            if flat else "--extent takes three numbers, Z Y X, in this scan"
+        )  # fmt: skip
+    single = flat and scan.counts.ndim == 2
+    if arguments.center is not None and len(arguments.center) == (3 if single else 2) and (single or not flat):
+        raise ValueError(f"--center takes {'two numbers, Y X' if single else 'three numbers, Z Y X'}, in this scan")
+    return _three(arguments.extent), _three(arguments.center)
+
+
+def _three(given: list[float] | None) -> list[float] | None:
+    return given and [0.0] * (3 - len(given)) + given
+
+
+def _length(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no length in mm (a file stands before this option)") from None
 
 
 def _require_voxels(shape: tuple[int, ...]) -> None:
@@ -268,14 +311,16 @@ def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     options = _method_options(arguments)
     if arguments.out is None:
         arguments.out = Path(f"{without_ending(arguments.scan)}_{arguments.method}.nii.gz")
-    require_folder(arguments.out)
-    check_volume_name(arguments.out)
+    check_target(arguments.out)
+    check_output(arguments, is_own_volume, arguments.scan, arguments.geometry, beside=True)
     if arguments.voxel is not None:
         number("--voxel", arguments.voxel, positive=True, unit="mm")
-    if arguments.extent is not None:
-        numbers("--extent", arguments.extent, 3, positive=True, unit="mm")
-    if arguments.center is not None:
-        numbers("--center", arguments.center, 3, unit="mm")
+    for name, limits in (("extent", {"positive": True}), ("center", {})):
+        given = getattr(arguments, name)
+        if given is not None:
+            if len(given) not in (2, 3):
+                raise ValueError(f"--{name} takes three numbers, Z Y X, of slices two, Y X; got {len(given)}")
+            numbers(f"--{name}", given, unit="mm", **limits)
     if arguments.voxel is not None:
         _require_voxels(tuple(math.ceil(e / arguments.voxel) for e in arguments.extent or (1.0, 1.0, 1.0)))
     if not arguments.scan.exists():
@@ -302,6 +347,7 @@ def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         scan = cleaned(scan)
     grid = _grid(scan, arguments)
     _require_voxels(grid.shape)
+    check_target(arguments.out, grid.voxels, scan.unit)
     config = {
         "scan": str(arguments.scan), "geometry": geometry_values(scan.geometry), "method": arguments.method,
         "grid": {"shape": list(grid.shape), "spacing": list(grid.spacing), "center": list(grid.center)},
@@ -324,8 +370,9 @@ def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         scan, grid, arguments.method, progress=progress.of(arguments.method), device=arguments.device, **options
     )
     progress.close()
+    volume = volume.slices()
     volume.save(arguments.out)
-    mean = float(volume.data.mean())
+    grid, mean = volume.grid, float(volume.data.mean())
     size = " × ".join(map(str, grid.shape))
     spacing = " × ".join(f"{s:.4g}" for s in grid.spacing)
     seconds = volume.report["seconds"]
@@ -352,9 +399,12 @@ def add_reconstruct(commands: Commands) -> None:
     parser.add_argument("--tissues", action="store_true", help="MBIR with the tissues of the vessel in the inset")
     parser.add_argument("--point", type=float, nargs=3, metavar=axes, help="where a reader sees its plaque, mm")
     parser.add_argument("--voxel", type=float, metavar="MM", help="voxel size (default: the detector's; inset: 0.25)")
-    parser.add_argument("--center", type=float, nargs=3, metavar=axes, help="centre in mm (default: axis or plaque)")
+    own = "of a scan of slices Y X alone"
     parser.add_argument(
-        "--extent", type=float, nargs=3, metavar=axes, help="edge lengths in mm (default: what is seen)"
+        "--center", type=_length, nargs="+", metavar="MM", help=f"centre, Z Y X (default: axis or plaque); {own}"
+    )
+    parser.add_argument(
+        "--extent", type=_length, nargs="+", metavar="MM", help=f"edge lengths, Z Y X (default: what is seen); {own}"
     )
     _add_reader_options(parser)
     parser.add_argument(
@@ -375,7 +425,7 @@ def _lower_dose(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     if arguments.out is None:
         arguments.out = Path(f"{without_ending(arguments.scan)}_{arguments.fraction:g}.h5")
     check_ending(arguments.out, SCAN_ENDINGS)
-    require_folder(arguments.out)
+    check_output(arguments, _is_scan, arguments.scan, arguments.geometry, beside=True)
     from torchpcct.formats.geometry_yaml import geometry_values
     from torchpcct.formats.scans import open_scan
 

@@ -1,17 +1,25 @@
 """The command line under bad input and bad circumstances: at once, in words, and nothing left behind."""
 
 import io
+import json
 import os
+import resource
+import shutil
 import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
+import h5py
+import nibabel
 import numpy as np
 import pytest
+import torch
 
 from recon.cli import main
 from recon.study.store import Store
+from torchpcct import ParallelBeam, Scan, Volume, VolumeGrid
 from torchpcct.files import _part, require_writable, written_whole
 
 ROOT = Path(__file__).parent.parent.parent
@@ -148,3 +156,142 @@ def test_a_package_that_nobody_can_write_names_numbas_variable(monkeypatch):
         torchpcct._check_cache("/usr/lib/torchpcct", "/nobody/.cache/numba")
     monkeypatch.setenv("NUMBA_CACHE_DIR", "/tmp")
     torchpcct._check_cache("/usr/lib/torchpcct", "/nobody/.cache/numba")
+
+
+@pytest.fixture(scope="module")
+def lines(tmp_path_factory):
+    """A scan of one slice and one of two slices in a folder, to be copied."""
+    folder = tmp_path_factory.mktemp("lines")
+    geometry = ParallelBeam(np.arange(24) * np.pi / 24, 12, 1.0)
+    one = np.tile(0.1 * (np.abs(np.arange(12) - 5.5) < 3), (24, 1))
+    two = np.stack([one, one])
+    Scan.from_line_integrals(one, geometry, photons=1e4).save(folder / "one.h5")
+    Scan.from_line_integrals(two, geometry, photons=1e4, mu_water=0.02).save(folder / "two.h5")
+    return folder
+
+
+def _contents(folder):
+    return {p.name: p.read_bytes() for p in folder.iterdir()}
+
+
+def test_no_command_writes_onto_what_it_reads(tmp_path, lines, capsys):
+    shutil.copy(lines / "one.h5", tmp_path / "one.h5")
+    shutil.copy(lines / "one.h5", tmp_path / "v.h5.yaml")  # any content: it is never read
+    (tmp_path / "link.h5").symlink_to("one.h5")
+    os.link(tmp_path / "one.h5", tmp_path / "hard.h5")
+    (tmp_path / "a.h5.yaml").write_text("scene: {kind: water}", encoding="utf-8")
+    Volume(torch.zeros(2, 2, 2), VolumeGrid((2, 2, 2), 1.0)).save(tmp_path / "patient.h5")
+    (tmp_path / "b.yaml").write_text("scene: {kind: volume, file: patient.h5}", encoding="utf-8")
+    before = _contents(tmp_path)
+    for command in (
+        "reconstruct one.h5 --out one.h5",
+        "reconstruct one.h5 --out link.h5",
+        "reconstruct link.h5 --out one.h5",
+        "reconstruct one.h5 --out hard.h5",
+        "reconstruct one.h5 --geometry v.h5.yaml --out v.h5",
+        "lower-dose one.h5 --fraction 0.5 --out link.h5",
+        "simulate --config a.h5.yaml --out a.h5",
+        "simulate --config b.yaml --out patient.h5",
+        "view one.h5 --out b.png",
+    ):
+        words = [str(tmp_path / w) if w.endswith((".h5", ".yaml", ".png")) else w for w in command.split()]
+        if words[0] == "view":
+            os.link(tmp_path / "one.h5", tmp_path / "b.png")
+            before = _contents(tmp_path)
+        assert main([*words, "--force"]) == 2, command
+        assert "which is read: name another file" in capsys.readouterr().err
+        assert _contents(tmp_path) == before
+
+
+def test_files_of_others_are_replaced_by_force_only(tmp_path, lines, capsys):
+    scan = str(lines / "two.h5")
+    nibabel.save(nibabel.Nifti1Image(np.zeros((2, 2, 2), np.float32), np.eye(4)), tmp_path / "patient.nii.gz")
+    with h5py.File(tmp_path / "tooth.h5", "w") as file:
+        file["exchange/data"] = np.zeros(3)
+    (tmp_path / "w.mha.json").write_text('{"mine": 1}', encoding="utf-8")
+    (tmp_path / "x.nii.yaml").write_text("mine: 1", encoding="utf-8")
+    (tmp_path / "picture.png").write_text("no picture", encoding="utf-8")
+    (tmp_path / "study").mkdir()
+    (tmp_path / "study" / "report.md").write_text("mine", encoding="utf-8")
+    (tmp_path / "d.nii").mkdir()
+    before = _contents(tmp_path / "study")
+    for words, said in (
+        (["reconstruct", scan, "--out", "patient.nii.gz"], "patient.nii.gz exists and was not made by torchpcct recon"),
+        (["reconstruct", scan, "--out", "tooth.h5"], "tooth.h5 exists and was not made by torchpcct reconstruct: name"),
+        (["reconstruct", scan, "--out", "w.mha"], "w.mha.json exists"),
+        (["reconstruct", scan, "--out", "x.nii"], "x.nii.yaml exists"),
+        (["reconstruct", scan, "--out", "d.nii"], "is a folder"),
+        (["simulate", "--out", "tooth.h5"], "tooth.h5 exists and was not made by torchpcct simulate"),
+        (["lower-dose", scan, "--fraction", "0.5", "--out", "tooth.h5"], "not made by torchpcct lower-dose"),
+        (["view", scan, "--out", "picture.png"], "picture.png exists and was not made"),
+        (["study", "noise", "--quick", "--out", "study"], "study holds report.md, not made by torchpcct study"),
+        (["compare", "--quick", "--out", "study"], "not made by torchpcct compare: name another folder, or --force"),
+        (["plaque", scan, "--out", "study"], "study holds report.md, not made by torchpcct plaque"),
+    ):
+        words[-1] = str(tmp_path / words[-1])
+        assert main(words) == 2, words
+        assert said in capsys.readouterr().err
+    assert _contents(tmp_path / "study") == before
+    for name in ("patient.nii.gz", "w.mha", "x.nii"):
+        command = ["reconstruct", scan, "--out", str(tmp_path / name)]
+        assert main([*command, "--force"]) == 0
+        assert main(command) == 0  # ours by now
+        assert Volume.load(tmp_path / name).grid.shape[0] == 2
+
+
+def test_a_result_that_cannot_be_written_is_found_before_it_is_computed(tmp_path, lines, capsys, monkeypatch):
+    monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=100_000))
+    monkeypatch.setattr("recon.api.reconstruct", lambda *_, **__: pytest.fail("computed"))
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "a").write_text("")
+    one, two = str(lines / "one.h5"), str(lines / "two.h5")
+    for words, said in (
+        ([one, "--out", "series"], "a DICOM CT series holds HU, this volume is in mm^-1"),
+        ([two, "--out", "full"], "is not empty: series in one folder mix"),
+        ([two, "--out", "slice.dcm"], "a DICOM series is a folder"),
+        ([one, "--extent", "2", "4", "4", "--out", "a.h5"], "--extent takes two numbers, Y X"),
+        ([one, "--center", "2", "4", "4", "--out", "a.h5"], "--center takes two numbers, Y X"),
+        ([one, "--extent", "4", "--out", "a.h5"], "of slices two, Y X; got 1"),
+        ([two, "--voxel", "0.01", "--extent", "3", "3", "--out", "a.h5"], "a.h5 needs 0.00 GiB, 0.00 GiB are free"),
+    ):
+        assert main(["reconstruct", *words[:-1], str(tmp_path / words[-1])]) == 2, words
+        assert said in capsys.readouterr().err
+    assert [p.name for p in tmp_path.iterdir()] == ["full"]
+
+
+def test_one_slice_is_a_volume_of_one_slice(tmp_path, lines):
+    for name in ("v.nii.gz", "v.mha", "v.h5"):
+        grid = ["--voxel", "0.5", "--extent", "4", "5", "--center", "1", "2"]
+        assert main(["reconstruct", str(lines / "one.h5"), *grid, "--out", str(tmp_path / name)]) == 0
+        found = Volume.load(tmp_path / name).grid
+        np.testing.assert_allclose([*found.shape, *found.spacing, *found.center], [1, 8, 10, 0.5, 0.5, 0.5, 0, 1, 2])
+        assert json.loads((tmp_path / f"{name}.json").read_text())["shape"] == [1, 8, 10]
+    grid = ["--extent", "4", "4", "--center", "7", "0", "0"]
+    assert main(["reconstruct", str(lines / "two.h5"), *grid, "--out", str(tmp_path / "series")]) == 0
+    assert Volume.load(tmp_path / "series").grid.center == (7.0, 0.0, 0.0)
+
+
+def test_a_dicom_slice_is_shown(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    data = 300 * torch.arange(2.0 * 6 * 5).reshape(2, 6, 5) / 60
+    Volume(data, VolumeGrid((2, 6, 5), (2.5, 1.0, 1.0))).save("series")
+    shutil.copy("series/0002.dcm", "IM2")
+    for name in ("series/0002.dcm", "IM2"):
+        assert main(["info", name]) == 0
+        assert "shape: [1, 6, 5]\nspacing_mm: [2.5, 1.0, 1.0]" in capsys.readouterr().out
+        assert main(["view", name]) == 0
+    assert sorted(p.name for p in tmp_path.glob("*.png")) == ["0002.png", "IM2.png"]
+
+
+def test_a_full_disk_is_one_sentence_and_status_1(tmp_path, lines, capsys):
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (300, limits[1]))
+    try:
+        for name in ("v.h5", "v.nii.gz", "v.mha", "series"):
+            assert main(["reconstruct", str(lines / "two.h5"), "--out", str(tmp_path / name)]) == 1
+            said = capsys.readouterr().err
+            assert f"torchpcct reconstruct: cannot write {tmp_path / name}: " in said
+            assert len(said.splitlines()) == 1
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert list(tmp_path.iterdir()) == []

@@ -91,16 +91,16 @@ def _value(file: Any, name: str, default: Any = None) -> Any:
     return np.atleast_1d(np.asarray(value, dtype=np.float64))
 
 
-def holds_projections(folder: str | os.PathLike[str]) -> bool:
-    """Whether the first DICOM file of a folder is a projection (tag of the detector's rows), not an image.
+def holds_projections(path: str | os.PathLike[str]) -> bool:
+    """Whether a DICOM file, or the first one of a folder, is a projection (tag of the detector's rows), not an image.
 
     Raises:
         FileNotFoundError: no DICOM files. ValueError: a damaged one. ImportError: pydicom is not installed.
     """
     pydicom = needed("pydicom")
-    path = _files(folder)[0]
-    with reading(path, "DICOM"):
-        return _TAGS["rows"] in pydicom.dcmread(path, stop_before_pixels=True)
+    first = Path(path) if Path(path).is_file() else _files(path)[0]
+    with reading(first, "DICOM"):
+        return _TAGS["rows"] in pydicom.dcmread(first, stop_before_pixels=True)
 
 
 def _files(folder: str | os.PathLike[str]) -> list[Path]:

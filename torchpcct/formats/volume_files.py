@@ -6,6 +6,7 @@ so the same point carries the opposite sign there; every reader shows the same v
 
 from __future__ import annotations
 
+import errno
 import gzip
 import os
 import shutil
@@ -15,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from torchpcct.files import require_folder, require_writable, written_whole
+from torchpcct.files import is_own_hdf5, require_folder, require_writable, written_whole
 from torchpcct.formats.damage import check_size, needed, reading
 from torchpcct.geometry import VolumeGrid
 from torchpcct.validate import UNITS
@@ -25,6 +26,7 @@ __all__ = [
     "check_target",
     "check_volume_name",
     "format_of",
+    "is_own_volume",
     "read_dicom",
     "read_meta_image",
     "read_nifti",
@@ -67,7 +69,7 @@ def check_volume_name(path: str | os.PathLike[str]) -> None:
         raise ValueError(f"{Path(path).name!r} would be one slice: a DICOM series is a folder, a name without ending")
 
 
-def check_target(path: str | os.PathLike[str], voxels: int, unit: str) -> None:
+def check_target(path: str | os.PathLike[str], voxels: int = 0, unit: str = "HU") -> None:
     """Find out whether a volume can be written, before it is computed.
 
     Args:
@@ -97,6 +99,24 @@ def check_target(path: str | os.PathLike[str], voxels: int, unit: str) -> None:
     free = shutil.disk_usage(target.parent).free
     if least > free:
         raise OSError(f"{target} needs {least / 2**30:.2f} GiB, {free / 2**30:.2f} GiB are free: name another folder")
+
+
+def is_own_volume(path: str | os.PathLike[str]) -> bool:
+    """Whether a file is a volume that this software has written, as far as its header says.
+
+    For the folder of a series it is true: :func:`check_target` wants an empty one.
+    """
+    form = format_of(path)
+    if form == "DICOM":
+        return Path(path).is_dir()
+    if form == "HDF5":
+        return is_own_hdf5(path, "volume")
+    try:
+        with gzip.open(path) if str(path).endswith(".gz") else open(path, "rb") as file:
+            header = file.read(2**12)
+    except (OSError, EOFError, zlib.error):
+        return False
+    return (_MADE_BY.encode() in header[:348]) if form == "NIfTI" else b"\nUnit = " in header
 
 
 def _check_series(folder: Path, unit: str) -> None:
@@ -189,6 +209,10 @@ def write_meta_image(path: str | os.PathLike[str], data: Any, grid: VolumeGrid, 
     image.SetMetaData("Unit", unit)
     with written_whole(path, RuntimeError) as part:
         sitk.WriteImage(image, str(part), True)
+        try:  # ITK does not look whether the disk has taken the last of it
+            _check_compressed(part.read_bytes(), ours=True)
+        except (ValueError, zlib.error) as error:
+            raise OSError(errno.ENOSPC, "only a part of it was taken") from error
 
 
 def read_meta_image(path: str | os.PathLike[str]) -> tuple[Any, VolumeGrid, str]:
@@ -212,11 +236,18 @@ def read_meta_image(path: str | os.PathLike[str]) -> tuple[Any, VolumeGrid, str]
         return data, _grid(data.shape, image.GetSpacing(), (-x, -y, z)), unit
 
 
-def _check_compressed(content: bytes) -> None:
-    """Raise where the compressed voxels of a MetaImage are damaged: ITK fills what it cannot unpack with anything."""
+def _check_compressed(content: bytes, ours: bool = False) -> None:
+    """Raise where the compressed voxels of a MetaImage are damaged: ITK fills what it cannot unpack with anything.
+
+    Args:
+        content: of the file.
+        ours: that there are no compressed voxels is damage, too.
+    """
     mark = b"ElementDataFile = LOCAL\n"
     header, found, packed = content.partition(mark)
     if not found or b"CompressedData = True" not in header:
+        if ours:
+            raise ValueError("its header ends too early")
         return
     unpack = zlib.decompressobj()
     while packed and not unpack.eof:
