@@ -17,6 +17,7 @@ from recon.metal import metal_warnings
 from recon.pwls.inset_problem import reconstruct_pwls
 from torchpcct.defects import dead_readings, mended
 from torchpcct.geometry import VolumeGrid
+from torchpcct.reading_checks import reading_warnings
 from torchpcct.scan import Scan
 from torchpcct.validate import choice
 from torchpcct.volume import Volume, from_hu
@@ -64,10 +65,11 @@ def reconstruct(
         options: of the method.
 
     Readings that no object can cause (dead or hot cells, dead views, lost readings: :mod:`torchpcct.defects`) are
-    interpolated before; the report's ``warnings`` say so. Scans that contradict themselves or their description
-    (centre, fan angles, steps between views, roll, rows that end inside the object, readings that are no line
-    integrals) are named there, too (:func:`recon.fbp.coverage.consistency_warnings`); PWLS and MBIR test what they
-    leave of the data besides. Metal is named (:mod:`recon.metal`), not corrected.
+    interpolated before; the report's ``warnings`` say so, and what else the readings say against their description (an
+    offset, saturation, transmissions, no light: :mod:`torchpcct.reading_checks`). Scans that contradict themselves or
+    their description (centre, fan angles, steps between views, roll, rows that end inside the object, readings that are
+    no line integrals) are named there, too (:func:`recon.fbp.coverage.consistency_warnings`); PWLS and MBIR test what
+    they leave of the data besides. Metal is named (:mod:`recon.metal`), not corrected.
 
     The number of threads does not change a bit of an inset's FBP and PWLS. FBP of whole rows and MBIR, where torch's
     matrix products and convolutions decide about the order of sums, agree within 0.01 HU.
@@ -93,7 +95,7 @@ def reconstruct(
                 "raise the exposure or bin the readings"
             )
     choice("method", method, METHODS)
-    whole = [mended(s) for s in scans]
+    whole = [(s, [*texts, *reading_warnings(s)]) for s, texts in map(mended, scans)]
     scans = [s for s, _ in whole]
     for text in {text for _, texts in whole for text in texts}:
         _LOG.warning("%s", text)

@@ -87,7 +87,6 @@ def find_defects(
     known: Tensor | None = None,
     photon: float = 1.0,
     electronic_noise: float = 0.0,
-    gains: bool = True,
 ) -> Defects:
     """Find readings that no object can cause.
 
@@ -107,7 +106,6 @@ def find_defects(
         known: bool, the shape of ``counts``: readings that are known to be dead, which are not found again.
         photon: reading of one photon.
         electronic_noise: standard deviation that the electronics add to a reading.
-        gains: look for cells of a wrong gain, too.
 
     Raises:
         ValueError: shapes that do not fit.
@@ -143,7 +141,7 @@ def find_defects(
     along = _dimmed(good_level, dead)
     dead &= ~np.where(np.isnan(along), np.nan_to_num(_dimmed(good_level.T, dead.T).T), along).astype(bool)
     hot = np.zeros_like(dead)
-    if gains and rows >= 3:
+    if rows >= 3:
         # How far a cell's log signal lies above the mean of its neighbours', over the views in which both are good.
         above, times = np.zeros_like(seen), np.zeros_like(seen)
         run(bends, rows, n, first, alive, dead, above, times, operations=20 * alive.size * columns)
@@ -348,25 +346,30 @@ def mended(scan: Scan) -> tuple[Scan, list[str]]:
     before = list(scan.info.get("mended", []))
     if scan.noise_free or scan.logged or scan.counts.ndim > 3 or (scan.quantum is None and not scan.counting):
         return scan, before
-    # The slices of a stack are the rows of a detector.
-    stack = g.has_rows or scan.counts.ndim == 2
-
-    def by_view(values: Tensor) -> Tensor:
-        return (values if stack else values.movedim(0, 1)).reshape(g.views, -1, values.shape[-1])
-
-    window = scan.window
+    window, dead = scan.window, scan.dead
     air = scan.air if window is None else scan.air[window.first_row : window.first_row + window.rows]
     photon = 1.0 if scan.quantum is None else float(scan.quantum.median())
-    found = find_defects(
-        by_view(scan.counts), air.reshape(-1, air.shape[-1]), None if window is None else window.first_column,
-        known=None if scan.dead is None else by_view(scan.dead.expand(scan.counts.shape)),
-        photon=max(photon, dispersion(scan.counts)) if window is None else photon,
-        electronic_noise=scan.electronic_noise, gains=g.has_rows,
-    )  # fmt: skip
+    options: dict[str, Any] = {
+        "photon": max(photon, dispersion(scan.counts, g.has_rows)) if window is None else photon,
+        "electronic_noise": scan.electronic_noise,
+    }
+    if g.has_rows:
+        first = None if window is None else window.first_column
+        found = find_defects(scan.counts, air, first, known=dead, **options)
+        mask = found.mask
+    else:
+        # Slices of a stack need not be neighbours.
+        counts, cells = scan.counts.reshape(-1, g.views, 1, g.columns), air.reshape(-1, 1, g.columns)
+        known = [None] * len(counts) if dead is None else list(dead.reshape(counts.shape))
+        slices = [find_defects(n, a, known=k, **options) for n, a, k in zip(counts, cells, known, strict=True)]
+        mask = torch.stack([f.mask for f in slices]).reshape(scan.counts.shape)
+        found = Defects(
+            mask, sum(f.dead_cells for f in slices), sum(f.hot_cells for f in slices),
+            max(f.dead_views for f in slices), sum(f.lost_readings for f in slices),
+            sum(f.dead_for_a_while for f in slices),
+        )  # fmt: skip
     if not found.text:
         return scan, before
-    mask = found.mask if stack else found.mask.movedim(1, 0)
-    mask = mask.reshape(scan.counts.shape)
     dead = mask if scan.dead is None else mask | scan.dead
     p = replace(scan, dead=dead)._logarithm()
     # Dead readings stand as 1 in p.

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from torchpcct.geometry import Geometry
@@ -18,7 +20,7 @@ from torchpcct.robust import MEDIAN_TO_SD
 from torchpcct.scanner.linearisation import WaterLinearisation
 from torchpcct.validate import number
 
-__all__ = ["TRANSFER_FRAMES", "counted", "dispersion", "inverse_variance", "logged", "smoothed"]
+__all__ = ["TRANSFER_FRAMES", "counted", "dispersion", "inverse_variance", "log_bias", "logged", "smoothed"]
 
 _PSEUDO_WATER = 0.02
 """Attenuation in mm⁻¹ that stands for water where a scan is not in HU: it sets the scale of priors, nothing else."""
@@ -26,7 +28,14 @@ _SILENT_VIEWS = 8
 """Cells that read nothing in so many views, or more, are dead."""
 _DARK = 1e-3
 """Cells that read no more in air than this share of the median cell are dead."""
-_DIM = 20.0
+FEWEST, MANY = 0.3, 10.0
+"""Expected counts between which the logarithm is corrected: see :func:`log_bias`."""
+_AVERAGED = 10.0
+"""Readings that :func:`smoothed` averages over in effect, of a sinogram; of a cone beam 26."""
+_FEW, _NO_PHOTONS, _NO_COUNTS = 1000.0, 0.1, 2.0
+"""Readings in air below which half a photon matters; variance over mean below which what was read are no photons;
+readings in air that cannot be counts: transmissions."""
+DIM = 20.0
 """Photons of a reading below which its noise is far from normal."""
 TRANSFER_FRAMES = 4
 """Air frames that a photon transfer needs at least."""
@@ -140,6 +149,12 @@ def _gain_of_noise(signal: Tensor, air: Tensor, geometry: Geometry) -> float:
 def _gain(given: Any, signal: Tensor, air: Tensor, frames: Tensor | None, dark: Tensor, geometry: Geometry) -> Any:
     """Signal of one photon, and where it is from; see ``Scan.from_counts``."""
     if given is None and (frames is None or len(frames) < TRANSFER_FRAMES):
+        level = float(air.nanmedian())
+        noise = dispersion(signal, geometry.has_rows) if 0 < level < _FEW else 1.0
+        if noise < _NO_PHOTONS:
+            return max(noise, 1e-8 * level), "noise between neighbours"
+        if math.isnan(noise) and 0 < level < _NO_COUNTS:
+            return 1e-6 * level, "assumed of transmissions"
         return 1.0, "assumed"
     if given is None:
         found = _photon_transfer(frames, dark) if frames is not None else None
@@ -270,37 +285,37 @@ def _photons(p: Tensor, mask: Tensor, geometry: Geometry) -> float:
     return float(min(max(1.0 / max(sd, 1e-4) ** 2, 1.0), 1e8))
 
 
-def dispersion(readings: Tensor, dead: Tensor | None = None) -> float:
-    """Variance over mean of the noise between neighbouring columns: the reading of one photon; 1 of Poisson counts.
+def dispersion(readings: Tensor, rows: bool) -> float:
+    """Variance over mean of the noise between neighbours: the reading of one photon; 1 of Poisson counts.
 
-    The second difference of smooth rows is noise of six times the variance. Edges are outliers to the median; details
-    everywhere raise it, blur of the detector lowers it. Readings of a handful of photons do not tell, and are left out.
+    The second difference of smooth readings is noise of six times the variance. Edges are outliers to the median;
+    details everywhere raise it, so that the smaller one counts of those along the columns and along the views. Readings
+    of a handful of photons do not tell, and are left out, as those of 0.
 
     Args:
-        readings: ``(..., columns)``, the dark taken off.
-        dead: bool of the same shape, readings to leave out; or None.
+        readings: ``(..., views, [rows,] columns)``, the dark taken off.
+        rows: whether the last axis but one is the detector's rows.
 
     Returns:
         NaN if nothing can be said.
     """
-    n, columns = readings.reshape(-1, readings.shape[-1]), readings.shape[-1]
-    if columns < 8:
-        return math.nan
-    step = max(1, n.numel() // 2_000_000)
-    n = n[::step].double()
-    if dead is not None:
-        n = n.masked_fill(dead.reshape(-1, columns)[::step], math.nan)
+    found = [_dispersion(values) for values in (readings, readings.movedim(-3 if rows else -2, -1))]
+    known = [f for f in found if math.isfinite(f)]
+    return min(known) if known else math.nan
+
+
+def _dispersion(readings: Tensor) -> float:
+    n = readings.reshape(-1, readings.shape[-1])
+    n = n[:: max(1, readings.numel() // 2_000_000)].double()
     second = n[:, 2:] - 2.0 * n[:, 1:-1] + n[:, :-2]
-    mean = (n[:, 2:] + n[:, 1:-1] + n[:, :-2]) / 3.0
-    ratio = (second.square() / (6.0 * mean))[mean > 0]
-    level = mean[mean > 0]
-    known = torch.isfinite(ratio)
-    ratio, level = ratio[known], level[known]
-    for _ in range(2):  # first guess from all, then without the dim ones, whose noise is not normal
+    level = (n[:, 2:] + n[:, 1:-1] + n[:, :-2]) / 3.0
+    live = (n[:, 2:] > 0) & (n[:, 1:-1] > 0) & (n[:, :-2] > 0)
+    level, ratio = level[live], (second.square() / (6.0 * level))[live]
+    for _ in range(2):  # a first guess from all, then without the dim ones, whose noise is not normal
         if ratio.numel() < 8:
             return math.nan
         found = float(ratio.median()) * MEDIAN_TO_SD**2
-        bright = level > _DIM * found
+        bright = level > DIM * found
         ratio, level = ratio[bright], level[bright]
     return found
 
@@ -312,6 +327,32 @@ def inverse_variance(mean: Tensor, quantum: Tensor, electronic_noise: float) -> 
     """
     mean = mean.clamp(min=0.0)
     return mean.square().div_(torch.maximum(mean * quantum + electronic_noise**2, quantum * quantum / 2))
+
+
+@lru_cache(maxsize=1)
+def _log_bias() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """ln m, and what the logarithm of Poisson counts, E ln(n + ½), lies above it; from the sum over all n."""
+    m = np.geomspace(FEWEST, MANY, 200)
+    n = np.arange(int(MANY + 12 * math.sqrt(MANY)))[:, None]
+    factorial = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, len(n))))])[:, None]
+    probability = np.exp(n * np.log(m) - m - factorial)
+    return np.log(m), (probability * np.log(n + 0.5)).sum(0) - np.log(m)
+
+
+def log_bias(mean: Tensor) -> Tensor:
+    """Mean of ln(n + ½) less the logarithm of the mean, of Poisson counts n.
+
+    0.03 at two counts, 0.17 at one, 0.8 at :data:`FEWEST`: it takes the darkest rays for brighter than they are.
+
+    Args:
+        mean: expected counts, estimated from some ten readings (:func:`smoothed`). Above :data:`MANY` the bias is 0;
+            below :data:`FEWEST` it is that of so many, for the estimate itself says no more.
+    """
+    known, bias = _log_bias()
+    # The logarithm of the estimate is biased, too: ½ a count in those that it was made of.
+    m = (mean + 0.5 / _AVERAGED).double()
+    found = np.interp(np.log(m.clamp(FEWEST, MANY).numpy()), known, bias)
+    return torch.from_numpy(np.where((m < MANY).numpy(), found, 0.0)).to(mean.dtype)
 
 
 def smoothed(values: Tensor, dead: Tensor | None, rows: bool) -> Tensor:

@@ -17,7 +17,7 @@ from torchpcct.dead_cells import bridge
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.files import read_hdf5
 from torchpcct.geometry import ConeBeam, Geometry
-from torchpcct.readings import counted, inverse_variance, logged, smoothed
+from torchpcct.readings import MANY, counted, inverse_variance, log_bias, logged, smoothed
 from torchpcct.scan_checks import check_exposure, check_scan
 from torchpcct.scan_file import scan_fields, write_scan
 from torchpcct.scanner.linearisation import WaterLinearisation
@@ -120,6 +120,7 @@ class Scan:
             dark: readings without beam, as ``air``.
             gain: reading of one photon. None: from the variance of four air frames or more (photon transfer), else 1.
                 "noise", and None where the frames do not differ: what explains the noise between neighbouring columns.
+                None, and readings with far less noise than photons: they are transmissions; the same.
             flux: ``(views,)`` intensity of the source relative to ``air``; None: the same.
             dead: bool mask of cells or of readings, True where dead.
             electronic_noise: standard deviation in photons; None: from three dark frames or more, else 0.
@@ -312,16 +313,32 @@ class Scan:
         """Water-linearised line integrals of the stored readings, shape and dtype of ``counts``, dimensionless.
 
         ``ln(air) − ln(counts + ½)`` for counts (½ removes the bias of the logarithm to second order in 1 / counts
-        and keeps zero counts finite), ``ln(air) − ln(counts)`` for expectations; then the scanner's water correction,
-        so that a path through t mm of water reads ``mu_ref · t``. The shift of an energy-integrating signal S is
-        variance / (2 S) = q / 2 + electronic noise² / (2 S); starved readings are held at q / 2, which a counting
+        and keeps zero counts finite; below three counts the rest follows from the neighbours' mean,
+        :func:`torchpcct.readings.log_bias`), ``ln(air) − ln(counts)`` for expectations; then the scanner's water
+        correction, so that a path through t mm of water reads ``mu_ref · t``. The shift of an energy-integrating signal
+        S is variance / (2 S) = q / 2 + electronic noise² / (2 S); starved readings are held at q / 2, which a counting
         detector with quanta of q would read at zero counts.
 
         Raises:
             ValueError: a noisy energy-integrating scan that does not hold ``quantum``.
         """
-        p = self.linearisation.apply(self._logarithm(), self.window)
+        p = self._logarithm()
+        if not (self.noise_free or self.logged) and self.electronic_noise == 0.0:
+            self._unbias(p)
+        p = self.linearisation.apply(p, self.window)
         return p if self.dead is None else bridge(p, self.dead, self.geometry.has_rows)
+
+    def _unbias(self, p: Tensor) -> None:
+        """Add to ``p``, in place, what few counts leave of the logarithm's bias."""
+        quanta = self.counts if self.quantum is None else self.counts / self.quantum
+        if float(quanta.amin()) < MANY:
+            p += log_bias(self._expected(quanta))
+
+    def _expected(self, readings: Tensor) -> Tensor:
+        """Expected readings: those of a known surround, or the mean over the neighbours of each."""
+        if self.surround is not None:
+            return self._at_window(self.surround).expand(readings.shape)
+        return smoothed(readings, self.dead, self.geometry.has_rows)
 
     def _logarithm(self) -> Tensor:
         """``ln(air) − ln(readings)`` before the water correction; dead readings hold anything finite."""

@@ -1,0 +1,123 @@
+"""Wrong descriptions of the readings: each comes out right, or is named; sound scans are not."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+import torch
+from analytic import Ellipsoid, line_integrals
+
+from recon import reconstruct
+from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, VolumeGrid, full_turn
+from torchpcct.defects import mended
+from torchpcct.reading_checks import reading_warnings
+from torchpcct.readings import log_bias, smoothed
+
+MU, AIR = 0.02, 1e5
+BODY = [
+    Ellipsoid((2.0, -3.0), (80.0, 100.0), value=MU),
+    Ellipsoid((30.0, 20.0), (12.0, 12.0), value=MU),
+    Ellipsoid((-30.0, -40.0), (10.0, 15.0), value=-0.6 * MU),
+]
+FAN = FanBeam(full_turn(240), 600.0, 1100.0, 160, 3.0)
+GRID = VolumeGrid((80, 80), 3.0)
+LINES = line_integrals(FAN, BODY, sub=1)
+SHONE = np.exp(-LINES)
+
+
+def counted(shone=SHONE, air=AIR, seed=0):
+    return np.random.default_rng(seed).poisson(air * shone).astype(float)
+
+
+def water(volume):
+    """Mean HU of the water in the middle."""
+    y, x = np.meshgrid(*GRID.axes, indexing="ij")
+    at = np.hypot(y - 2, x + 3) < 22
+    return float(volume.data[torch.from_numpy(at)].mean())
+
+
+def said(readings, **description):
+    return reading_warnings(mended(Scan.from_counts(readings, FAN, mu_water=MU, **description))[0])
+
+
+def test_transmissions_are_no_counts():
+    """Half a photon more made -790 HU of water; percentages -50 HU."""
+    n = counted()
+    for whole in (1.0, 100.0):
+        scan = Scan.from_counts(whole * n / AIR, FAN, air=whole, mu_water=MU)
+        assert abs(water(reconstruct(scan, GRID, "fbp"))) < 3
+        assert float(scan.air.mean()) == pytest.approx(AIR, rel=0.15)  # the photons, from the noise
+        assert reading_warnings(scan) == []
+        torch.testing.assert_close(
+            scan.weights(), Scan.from_counts(n, FAN, air=AIR, mu_water=MU).weights(), rtol=0.15, atol=0
+        )
+    low = counted(air=60.0)  # counts stay what they are
+    assert torch.equal(Scan.from_counts(low, FAN, air=60.0).counts, torch.from_numpy(low).float())
+
+
+def test_the_logarithm_of_few_counts_is_not_biased():
+    rng = np.random.default_rng(0)
+    for mean in (0.5, 1.0, 2.0, 5.0, 30.0):
+        n = torch.from_numpy(rng.poisson(mean, (60, 2000)).astype(np.float32))
+        lines = torch.log(n + 0.5) - log_bias(smoothed(n, None, False))
+        assert float(lines.mean()) == pytest.approx(np.log(mean), abs=0.04)  # 0.48 at half a count, 0.17 at one
+    few = 0.2 * AIR**0.5 / SHONE.mean() / 4
+    scan = Scan.from_counts(counted(air=few), FAN, air=few, mu_water=MU)
+    assert 8 < float(scan.counts.mean()) < 20
+    assert abs(water(reconstruct(scan, GRID, "fbp"))) < 30  # -75 HU
+
+
+WRONG = {
+    "an offset below both": (lambda: counted() + 2000.0, {"air": AIR + 2000.0}, "over an offset of"),
+    "an offset below the readings": (lambda: counted() + 2000.0, {"air": AIR}, "over an offset of"),
+    "scatter": (lambda: counted(SHONE + 0.05), {"air": AIR}, r"beside the object are 4\.[89] % brighter"),
+    "full well": (lambda: np.minimum(counted(), 0.5 * AIR), {"air": AIR}, "the detector is saturated"),
+    "full well in air, too": (lambda: np.minimum(counted(), 0.5 * AIR), {"air": 0.5 * AIR}, "detector is saturated"),
+    "line integrals": (lambda: LINES.clip(0), {"air": 1.0}, "line integrals given as counts"),
+    "line integrals, scaled": (lambda: 1000 * LINES.clip(0), {"air": 1e4}, "darkest .* given as counts"),
+    "another beam's air": (counted, {"air": 0.5 * AIR}, "more than 1.5 times as bright as air"),
+    "no light": (lambda: counted(air=6.0), {"air": 6.0}, r"leave less than 0\.3 photons"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_a_wrong_description_is_named(what):
+    readings, description, expected = WRONG[what]
+    found = said(readings(), **description)
+    assert len(found) == 1
+    assert re.search(expected, found[0])
+
+
+@pytest.mark.filterwarnings("ignore:the rows end inside")
+def test_transmissions_given_as_line_integrals_are_named_by_every_method(caplog):
+    scan = Scan.from_line_integrals(counted() / AIR, FAN, mu_water=MU)
+    for method in ("fbp", "pwls"):
+        caplog.clear()
+        assert "given as line integrals" in reconstruct(scan, GRID, method).report["warnings"][0]
+        assert caplog.text.count("given as line integrals") == 1
+
+
+@pytest.mark.parametrize("air", [30.0, 1e3, 1e5])
+@pytest.mark.parametrize("kind", ["parallel", "fan", "cone", "cut off", "metal", "bowtie", "blurred", "lines"])
+def test_sound_scans_are_not_accused(kind, air):
+    rng, profile, bodies = np.random.default_rng(3), np.ones(96), list(BODY)
+    g = {
+        "parallel": ParallelBeam(full_turn(120) / 2, 96, 2.4),
+        "cone": ConeBeam(full_turn(90), 600.0, 1100.0, 96, 3, (4.0, 4.6)),
+        "cut off": FanBeam(full_turn(120), 600.0, 1100.0, 96, 2.5),
+    }.get(kind, FanBeam(full_turn(120), 600.0, 1100.0, 96, 4.6))
+    if kind == "metal":
+        bodies += [Ellipsoid((-30.0, 30.0), (6.0, 9.0), value=2.0), Ellipsoid((40.0, -20.0), (2.5, 2.5), value=5.0)]
+    if kind == "bowtie":
+        profile = np.exp(-2.0 * np.linspace(-1, 1, 96) ** 2) * rng.uniform(0.9, 1.1, 96)
+    n = rng.poisson(air * profile * np.exp(-0.7 * line_integrals(g, bodies, sub=1))).astype(float)
+    if kind == "blurred":
+        n = 0.25 * np.roll(n, 1, -1) + 0.5 * n + 0.25 * np.roll(n, -1, -1)
+    if kind == "lines":
+        scan = Scan.from_line_integrals(-np.log((n + 0.5) / air), g)
+    else:
+        scan = Scan.from_counts(n, g, air=np.broadcast_to(air * profile, g.shape[1:]))
+    fixed, found = mended(scan)
+    assert (found, reading_warnings(fixed)) == ([], [])

@@ -1,0 +1,230 @@
+"""What readings say about themselves: too bright, clipped, over an offset, next to nothing left, or no counts at all.
+
+The description of a scan can be wrong in ways that no shape or sign shows, and FBP reconstructs it all the same: water
+of -750 HU from transmissions given as counts. What speaks against a description is in the readings: air beside the
+object reads as air does; photons have the noise of photons, which an offset has not; a full well reads the same again
+and again; and no body is darkest at its edge. What the readings do not show, nobody can know from them: a wrong
+``mu_water`` or pitch, a dark offset or scatter behind a round body in the middle.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchpcct.readings import DIM, FEWEST, smoothed
+from torchpcct.robust import MEDIAN_TO_SD
+from torchpcct.scan import Scan
+
+__all__ = ["reading_warnings"]
+
+AIR_TOLERANCE = 0.015
+"""Line integral of air below which the beam, or its calibration, is not that of the scan; 0.5 HU in 30 cm of water."""
+STARVED_SHARE = 0.05
+"""Share of readings without light from which a volume is wrong for it."""
+CLIPPED_SHARE = 0.005
+"""Share of clipped readings from which a volume is wrong for it."""
+OFFSET_SHARE, OFFSET_SIGMAS = 0.05, 4.5
+"""Offset, over the darkest readings, from which it is named; and how well it must be known."""
+_LEAST_COLUMNS, _LEAST_VIEWS = 24, 16
+_MOST = 4_000_000
+
+
+def reading_warnings(scan: Scan) -> list[str]:
+    """What the readings of a noisy scan say against its description.
+
+    Args:
+        scan: of any geometry, without energy bins. What was acquired with a known surround is only tested for light.
+
+    Returns:
+        One sentence for each finding; empty if there is none.
+    """
+    g = scan.geometry
+    if scan.noise_free or scan.counts.ndim > len(g.shape) + (not g.has_rows):
+        return []
+    dim = [] if scan.logged else _without_light(scan)
+    if scan.window is not None or g.columns < _LEAST_COLUMNS or g.views < _LEAST_VIEWS:
+        return dim
+    stack = g.has_rows or scan.counts.ndim == 2
+
+    def by_view(values: Tensor) -> NDArray[np.float64]:
+        """``(views, rows, columns)``, some of the rows, NaN where dead."""
+        live = values if scan.dead is None else values.masked_fill(scan.dead, math.nan)
+        shaped = (live if stack else live.movedim(0, 1)).reshape(g.views, -1, g.columns)
+        return shaped[:, :: max(1, math.ceil(values.numel() / _MOST))].double().numpy()
+
+    lines = by_view(scan._logarithm())
+    inverted = _no_counts(lines)
+    if inverted:  # nothing else is to be believed then
+        return inverted
+    if scan.logged:
+        return _brighter_than_air(lines)
+    counts = by_view(scan.counts)
+    quantum = 1.0 if scan.quantum is None else float(scan.quantum.median())
+    # Of transmissions the noise says nothing of the photons in each cell.
+    unknown = str(scan.info.get("signal_of_one_photon_from")).startswith("noise")
+    offset = [] if unknown else _offset(counts, quantum)
+    return dim + (_clipped(counts) or offset or _brighter_than_air(lines))
+
+
+def _without_light(scan: Scan) -> list[str]:
+    quanta = scan.counts if scan.quantum is None else scan.counts / scan.quantum
+    if float(quanta.amin()) >= FEWEST:
+        return []
+    expected = scan._expected(quanta)
+    if scan.surround is None:
+        expected = smoothed(expected, scan.dead, scan.geometry.has_rows)
+    share = float((expected < FEWEST).float().mean())
+    if share <= STARVED_SHARE:
+        return []
+    return [
+        f"{100 * share:.2g} % of the rays leave less than {FEWEST:g} photons a reading: how dark they are the data do "
+        "not say, and what they pass reads too low; raise the exposure, or bin the readings"
+    ]
+
+
+def _no_counts(lines: NDArray[np.float64]) -> list[str]:
+    """Whether the object is brighter than what surrounds it."""
+    bright = float((lines < -math.log(1.5)).mean())
+    if bright > 0.05:
+        return [
+            f"{100 * bright:.0f} % of the readings are more than 1.5 times as bright as air: air, gain or flux are not "
+            "those of the scan, or these are line integrals given as counts (Scan.from_line_integrals takes them)"
+        ]
+    quarter = lines.shape[-1] // 4
+    ends = min(float(np.nanmean(side)) for side in _ends(lines))
+    middle = float(np.nanmedian(lines[..., quarter:-quarter]))
+    if ends > max(1.3 * middle + 0.1, 0.5 * float(np.nanquantile(lines[::4], 0.9))):
+        return [
+            f"the rays at both ends of the rows are the darkest (line integrals of {ends:.2g}, in the middle "
+            f"{middle:.2g}): these are transmissions or counts given as line integrals, or line integrals given as "
+            "counts"
+        ]
+    return []
+
+
+def _brighter_than_air(lines: NDArray[np.float64]) -> list[str]:
+    """Whether the rays beside the object read more than air does."""
+    # The darker end of each view; views differ by the tube, so that the spread is theirs.
+    view = np.max(np.stack([_mean(side, (1, 2)) for side in _ends(lines)]), axis=0)
+    view = view[np.isfinite(view)]
+    if not view.size:
+        return []
+    size, spread = float(view.mean()), float(view.std()) / math.sqrt(view.size)
+    if not size < -max(AIR_TOLERANCE, 5.0 * spread):
+        return []
+    return [
+        f"the rays beside the object are {100 * math.expm1(-size):.2g} % brighter than air: an offset (dark=) or "
+        "scatter adds to the readings, or the beam is not that of the air frame (flux=); the object reads too low"
+    ]
+
+
+def _ends(lines: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The outermost columns on either side that are alive."""
+    live = np.flatnonzero(np.isfinite(lines).any((0, 1)))
+    edge = max(2, lines.shape[-1] // 50)
+    return lines[..., live[:edge]], lines[..., live[-edge:]]
+
+
+def _mean(values: NDArray[np.float64], axes: tuple[int, ...]) -> NDArray[np.float64]:
+    known = np.isfinite(values)
+    number = known.sum(axes)
+    total = np.where(known, values, 0.0).sum(axes)
+    return np.where(number > 0, total / np.maximum(number, 1), np.nan)
+
+
+def _clipped(counts: NDArray[np.float64]) -> list[str]:
+    """Readings that stop at the detector's full well: the highest of a cell comes again and again."""
+    columns = counts.shape[-1]
+    views = counts.shape[0]
+    highest = np.nanmax(np.where(np.isnan(counts), -np.inf, counts), axis=0)
+    at_top = counts >= highest
+    often = at_top.sum(0) >= max(5, 0.05 * views)
+    share = float((at_top & often & (highest > 0)).sum()) / counts.size
+    if share < CLIPPED_SHARE:
+        return []
+    # Below, there must be noise: white, of more than one step of the digits, and more than the highest readings have.
+    second = counts[..., 2:] - 2.0 * counts[..., 1:-1] + counts[..., :-2]
+    flat = at_top & often
+    free = ~(flat[..., 2:] | flat[..., 1:-1] | flat[..., :-2]) & np.isfinite(second)
+    both = free[..., 1:] & free[..., :-1]
+    level = counts[..., 1:-1]
+    upper = free & (level > 0.5 * np.nanmedian(level[free])) if free.any() else free
+    if upper.sum() < 100 or both.sum() < 100:
+        return []
+    a, b = second[..., 1:][both], second[..., :-1][both]
+    limit = 5.0 * np.median(np.abs(a)) + 1e-300  # edges are no noise
+    small = (np.abs(a) < limit) & (np.abs(b) < limit)
+    white = float((a * b)[small].sum() / max(float(np.sqrt((a * a)[small].sum() * (b * b)[small].sum())), 1e-300))
+    noise = MEDIAN_TO_SD * float(np.median(np.abs(second[upper]))) / math.sqrt(6.0)
+    digits = [np.diff(np.unique(counts[:, r, c])) for r in (0,) for c in range(0, columns, max(1, columns // 16))]
+    step = float(np.median([d.min() for d in digits if d.size])) if any(d.size for d in digits) else 0.0
+    if white > -0.1 or noise < 2.0 * step:
+        return []
+    return [
+        f"{100 * share:.2g} % of the readings stop at the highest value of their cell: the detector is saturated, and "
+        "the thin parts of the object read too low; lower the exposure (or give readings= with those masked by dead=)"
+    ]
+
+
+def _offset(counts: NDArray[np.float64], quantum: float) -> list[str]:
+    """Readings over an offset: their noise is that of fewer photons than they count.
+
+    The variance of readings m, from the differences between views, is F (m - D) + c m²: F is the signal of a
+    photon, D the offset, and c what details of the object add (Janesick 2007, with the object in the beam).
+    """
+    # From view to view: there details change least, and cells of a scintillator share no light.
+    mean, variance, number = _transfer(np.moveaxis(counts, 0, -1), np.nanquantile(counts, _CLASSES))
+    many = (number >= 100) & (variance > 0) & (mean > 0)
+    if many.sum() < _LEAST_CLASSES:
+        return []
+    many[many] = mean[many] > DIM * np.median(variance[many] / mean[many])
+    while many.sum() >= _LEAST_CLASSES:
+        m, v = mean[many], variance[many]
+        # Of n values of which three share a reading, by the distance of their quartiles.
+        error = v * 3.5 / np.sqrt(number[many])
+        design = np.stack([m, -np.ones_like(m), m * m], 1)
+        scale = np.abs(design).max(0)
+        weighted = design / scale / error[:, None]
+        inverse = np.linalg.pinv(weighted.T @ weighted)
+        fit = inverse @ (weighted.T @ (v / error))
+        left = v / error - weighted @ fit
+        if left.max() < 4.0:
+            break
+        many[np.flatnonzero(many)[int(left.argmax())]] = False  # edges
+    else:
+        return []
+    photon, product, spread = fit[0] / scale[0], fit[1] / scale[1], math.sqrt(inverse[1, 1]) / scale[1]
+    # Else it is not the noise of photons that was found.
+    explained = 0.3 < photon / quantum < 1.5 and float(np.square(left).mean()) < 2.0 and m[-1] > 3.0 * m[0]
+    if not explained or product < OFFSET_SIGMAS * spread or product / photon < OFFSET_SHARE * m[0]:
+        return []
+    return [
+        f"the darkest readings have less noise than photons can have: as over an offset of {product / photon:.2g} (the "
+        f"darkest read {m[0]:.2g}); give dark=, and air= of the same detector, or the object reads too low"
+    ]
+
+
+_CLASSES, _LEAST_CLASSES = np.linspace(0.0, 1.0, 25), 12
+
+
+def _transfer(
+    n: NDArray[np.float64], edges: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    """Mean, variance (between neighbours on the last axis) and number of the readings between ``edges``."""
+    second = n[..., 2:] - 2.0 * n[..., 1:-1] + n[..., :-2]
+    mean = (n[..., 2:] + n[..., 1:-1] + n[..., :-2]) / 3.0
+    known = np.isfinite(second)
+    second, mean = second[known], mean[known]
+    at = np.clip(np.searchsorted(edges, mean, side="right") - 1, 0, len(edges) - 2)
+    order = np.argsort(at, kind="stable")
+    parts = np.split(order, np.searchsorted(at[order], np.arange(1, len(edges) - 1)))
+    # Over √m, so that the dimmer ones of a class do not count for more.
+    second /= np.sqrt(np.maximum(6.0 * mean, 1e-300))
+    found = [(mean[p].mean(), (np.subtract(*np.quantile(second[p], (0.75, 0.25))) / 1.349) ** 2 * mean[p].mean())
+             if p.size else (0.0, 0.0) for p in parts]  # fmt: skip
+    m, v = np.array(found).T
+    return m, v, np.array([p.size for p in parts])
