@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 # What loads torch or numba is imported by the command: help and refusals come at once.
 from recon.cli.parsing import Commands, check_results, command
 from torchpcct import VolumeGrid
-from torchpcct.validate import number
+from torchpcct.files import require_writable
+from torchpcct.validate import number, numbers, whole
 
 if TYPE_CHECKING:
     from recon.study.study import ProgressBars
@@ -24,11 +25,18 @@ def _plaque(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     names = ("report.md", "report.json", "tissues.nii.gz", "image.nii.gz", "plaque.png")
     check_results(arguments, folder, lambda report: "presence" in report, *names)
     voxel = number("--voxel", arguments.voxel, positive=True, unit="mm")
+    number("--point-sd", arguments.point_sd, positive=True, unit="mm")
+    whole("--particles", arguments.particles, 50)
+    whole("--seed", arguments.seed, 0)
+    for name in ("point", "center", "extent"):
+        if getattr(arguments, name) is not None:
+            numbers(f"--{name}", getattr(arguments, name), 3, positive=name == "extent", unit="mm")
     from recon import reconstruct
     from recon.plaque.beside import fbp_deviations
     from recon.plaque.data import TissueData
     from recon.plaque.reading import read_plaque
     from recon.plaque.report import save, table
+    from recon.plaque.start import require_within
     from recon.plaque.vessel_prior import VesselPrior
     from recon.pwls.inset_problem import InsetProblem
     from recon.study.paper.plaque_scan import INSET_MM
@@ -36,9 +44,13 @@ def _plaque(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     from torchpcct.scene.plaque import PAPER_POSITION
 
     believed = VesselPrior(tuple(arguments.wall or VesselPrior.wall), tuple(arguments.fibrous or VesselPrior.fibrous))
-    scan = Scan.load(arguments.scan)
     shape = tuple(math.ceil(e / voxel - 1e-6) for e in arguments.extent or INSET_MM)
     grid = VolumeGrid(shape, voxel, tuple(arguments.center or PAPER_POSITION[::-1]))
+    if arguments.point is not None:
+        require_within(arguments.point, grid)
+    folder = arguments.out or Path("out") / "plaque"
+    require_writable(folder)
+    scan = Scan.load(arguments.scan)
     start = time.perf_counter()
     problem = InsetProblem(scan, grid)
     data = TissueData.of_scan(scan, problem)
@@ -78,7 +90,7 @@ def add_plaque(commands: Commands) -> None:
             f"--{tissue}", type=float, nargs=2, metavar=("HU", "SD"),
             help="its value before the data (default: what is usual; the report says it)",
         )  # fmt: skip
-    parser.add_argument("--beside", nargs="*", default=[], metavar="METHOD", help="also read these: pwls mbir")
+    parser.add_argument("--beside", nargs="*", default=[], choices=("pwls", "mbir"), help="also read these")
     parser.add_argument("--voxel", type=float, default=0.2, metavar="MM", help="voxel size (default 0.2)")
     parser.add_argument("--center", type=float, nargs=3, metavar=axes, help="centre in mm (default: the plaque)")
     parser.add_argument("--extent", type=float, nargs=3, metavar=axes, help="edge lengths in mm (default: the inset)")

@@ -199,7 +199,11 @@ def follow(
         ends.append(ended)
     found = np.array([*halves[1][::-1], middle, *halves[0]])
     if len(found) < 6:
-        raise ValueError(f"the bright region at {np.round(start, 2).tolist()} mm is no vessel: it has no direction")
+        raise ValueError(
+            f"the bright region at {np.round(start, 1).tolist()} mm (z, y, x) is no vessel that can be read: it has no "
+            "direction, or is shorter than 5 mm. Rings of metal (a stent), bone and noise are as bright; give a point "
+            "in a lumen with contrast agent"
+        )
     line = Centreline(smooth_line(found))
     profile = np.linspace(-2.0, line.length + 2.0, int((line.length + 4.0) / 0.05))
     values = ndimage.map_coordinates(volume, ((line.point(profile) - origin) / step).T, order=1, mode="nearest")

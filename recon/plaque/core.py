@@ -99,8 +99,6 @@ class CoreSpace:
         self.frames = vessel.lumen_at.frame
         self.deep = deep
         grid = vessel.grid
-        self._lookup = np.full(grid.shape, -1, np.int64)
-        self._lookup[tuple(vessel.index.T)] = np.arange(len(vessel.index))
         self._origin, self._step = np.array([a[0] for a in grid.axes]), np.array(grid.spacing)
         kept = np.ones(len(fit.parameters), bool)
         residual, gradient, hessian, energy = fit.residual, fit.gradient, fit.hessian, fit.energy
@@ -139,9 +137,9 @@ class CoreSpace:
     def locate(self, centres: Floats) -> NDArray[np.int64]:
         """Index of the vessel's voxel at each centre ``(m, 3)``; −1 outside of it."""
         index = np.rint((centres - self._origin) / self._step).astype(np.int64)
-        inside = np.all((index >= 0) & (index < self._lookup.shape), axis=1)
+        inside = np.all((index >= 0) & (index < self.vessel.lookup.shape), axis=1)
         index[~inside] = 0
-        return np.where(inside, self._lookup[tuple(index.T)], -1)
+        return np.where(inside, self.vessel.lookup[tuple(index.T)], -1)
 
     def log_prior(self, shapes: Floats) -> Floats:
         """``(m,)``, up to the constant that :attr:`log_places` holds; −inf where there is no layer."""

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import logsumexp
 from threadpoolctl import threadpool_limits
 
 from recon.plaque.core import CorePrior, CoreSpace
 from recon.plaque.data import TissueData
 from recon.plaque.figures import Estimate, draws_of, estimate
 from recon.plaque.particles import Cloud, lead
-from recon.plaque.quality import misfit, texture
+from recon.plaque.quality import STRIKING, Leftover, beside, leftover, misfit, texture
 from recon.plaque.start import find_vessel
 from recon.plaque.vessel import FAT, FIBROUS, Fit, Vessel
 from recon.plaque.vessel_prior import VesselPrior
@@ -29,6 +30,8 @@ Floats = NDArray[np.float64]
 CERTAIN = 0.95
 """Presence probability below which no contrast is given."""
 
+_MISFIT = 4.0
+"""Standard deviations of the residual's mean square."""
 CALCIFIED_HU = 300.0
 """A body of more contrast is a calcification."""
 _CALCIFICATION = CorePrior(1000.0, (0.25, 0.25, 0.4), 0.5, 0.25, 0.05, 0.7)
@@ -36,6 +39,11 @@ _LOOK = 400
 _LEAST_LOG = 8.0
 """Log evidence of a trial body that makes it worth looking for a calcification."""
 _MOST_BODIES = 3
+_BESIDE, _INSIDE = "a second vessel, a branch, muscle", "more plaque bodies, a stent, another shape"
+_ROUNDS = 2
+"""Times that what stands beside the vessel is estimated and taken off the data."""
+_APART = 0.2
+"""A second core shares at most so much of its volume with the first."""
 _PURE, _FEW, _LESS_PURE = 0.95, 8, 0.8
 """Share of a tissue in voxels that are read in other volumes; where there are too few, the second."""
 
@@ -47,24 +55,27 @@ class PlaqueReading:
     Attributes:
         grid: of the data.
         presence: probability that there is a plaque body of another value than the fibrous tissue.
+        second_core: probability of one more core, apart from the first; 0 where the first is not certain.
         calcifications: number of calcified bodies.
-        figures: name → :class:`recon.plaque.figures.Estimate`; the contrast is missing where presence is below
-            :data:`CERTAIN`.
+        figures: name → :class:`recon.plaque.figures.Estimate`; the core's are missing where presence is below
+            :data:`CERTAIN`, those of all plaque bodies where the tissues do not explain the data.
         refused: name → why a figure is missing.
-        given_core: the core's figures if it is there, however likely that is: for studies of the method, not to be
-            quoted where :attr:`presence` is low.
+        given_core: the figures of core and calcifications if they are there, however likely that is: for studies of
+            the method, not to be quoted where they are refused.
         regions: tissue → ``grid.shape`` float32 share of each voxel (posterior mean; the core's if it is there).
         image: ``grid.shape`` float32 HU, the fitted tissues, the core included.
         image_without: the same of the vessel fitted without a core.
         layer: ``grid.shape`` float32, share of each voxel in that vessel's fibrous layer, calcifications left out.
         chi2: mean square of the residual on the vessel's voxels, but for those at its ends inside of the volume, over
             its expectation; chi2_sd: its standard deviation under the model.
+        left: what stands out most of what the tissues leave of the data.
         texture_hu: standard deviation of a texture of 0.3 mm that the residual shows; texture_high_hu: its 95 % limit.
         info: settings, and how the fit went.
     """
 
     grid: VolumeGrid
     presence: float
+    second_core: float
     calcifications: int
     figures: Mapping[str, Estimate]
     refused: Mapping[str, str]
@@ -75,18 +86,47 @@ class PlaqueReading:
     layer: NDArray[np.float32]
     chi2: float
     chi2_sd: float
+    left: Leftover
     texture_hu: float
     texture_high_hu: float
     info: Mapping[str, Any] = field(default_factory=dict)
 
     @property
+    def explained(self) -> bool:
+        """Whether the tissues explain the data; where they do not, no figure of a plaque body is given."""
+        return self.left.score <= STRIKING and abs(self.chi2 - 1.0) <= _MISFIT * self.chi2_sd
+
+    @property
+    def certain(self) -> bool:
+        """Whether the data prove a core."""
+        return self.explained and self.presence >= CERTAIN
+
+    @property
+    def mean_contrast(self) -> float:
+        """Posterior mean of the contrast fibrous − core over a core that is there and one that is not, HU."""
+        return self.presence * self.given_core["contrast"].value
+
+    @property
     def warnings(self) -> list[str]:
         """What speaks against the model."""
         found = []
-        if abs(self.chi2 - 1.0) > 4.0 * self.chi2_sd:
+        if self.left.score > STRIKING:
+            z, y, x = self.left.at_mm
+            found.append(
+                f"{'beside' if self.left.beside else 'in'} the vessel, at ({z:.1f}, {y:.1f}, {x:.1f}) mm (z, y, x), "
+                f"the data show {self.left.hu:+.0f} HU ({self.left.score:.0f} standard deviations of the noise) that "
+                f"one vessel in fat does not explain: {_BESIDE if self.left.beside else _INSIDE}? Figures of plaque "
+                "bodies are refused; do not trust the others"
+            )
+        if abs(self.chi2 - 1.0) > _MISFIT * self.chi2_sd:
             found.append(
                 f"the residual is {self.chi2:.2f} of what noise leaves ({self.chi2_sd:.2f} standard deviation): "
                 "there is something here that the model does not have; do not trust the intervals"
+            )
+        if self.second_core >= CERTAIN:
+            found.append(
+                f"a second core is there with a probability of {self.second_core:.2f}: the figures are those of one, "
+                "and the fitted tissues show fibrous tissue in place of the other"
             )
         return found
 
@@ -172,6 +212,15 @@ def read_plaque(
     start = find_vessel(data.pilot(), data.grid, None if where is None else np.array(where))
     vessel = Vessel(data, start, vessel_prior)
     fit = vessel.fit(vessel.first_guess(), expected=True)
+    for _ in range(_ROUNDS):
+        foreign = beside(data, vessel, fit)
+        if foreign is None:
+            break
+        cleared = replace(data, b=data.b - data.apply(foreign))
+        vessel = Vessel(
+            cleared, find_vessel(cleared.pilot(), data.grid, None if where is None else np.array(where)), vessel_prior
+        )
+        fit = vessel.fit(vessel.first_guess(), expected=True)
     fit = _calcified(vessel, fit, particles, rng)
     core = CorePrior(point=place, point_sd=point_sd)
     return _read(vessel, fit, core, particles, prior, rng, seed)
@@ -244,7 +293,7 @@ def _read(
     cloud = lead(cloud.points, space.target, again.target, rng, log_evidence=first)
     space = again
     odds = math.log(prior / (1 - prior)) if 0 < prior < 1 else math.copysign(math.inf, prior - 0.5)
-    presence = 1.0 / (1.0 + math.exp(-min(max(cloud.log_evidence + odds, -700.0), 700.0)))
+    presence = _probability(cloud.log_evidence + odds)
     shares = space.shares(cloud.points)
     tau = texture(vessel, fit, rng)
     draws = draws_of(vessel, fit, space, cloud.points, shares, tau, rng)
@@ -253,25 +302,50 @@ def _read(
     plaque = {"contrast": "HU", "core": "HU", "core volume": "mm³", "cap thickness": "mm"}
     given = {n: estimate(draws[n], unit) for n, unit in plaque.items()}
     figures = {n: estimate(draws[n], unit) for n, unit in names.items() if n in draws}
-    refused = dict.fromkeys(plaque, _doubt(presence, given["contrast"]))
-    if not any(refused.values()):
-        figures, refused = figures | given, {}
-    if calcifications:
-        index = [vessel.size + k for k in range(calcifications)]
-        for k, i in enumerate(index):
-            sd = math.sqrt(fit.covariance[i, i])
-            value = fit.parameters[i] + fit.parameters[FIBROUS]
-            figures[f"calcification {k + 1}"] = Estimate(value, value - 1.96 * sd, value + 1.96 * sd, sd, "HU")
     square, spread = misfit(vessel, fit)
-    return PlaqueReading(
-        vessel.grid, presence, calcifications, figures, refused, given,
+    left = leftover(vessel, fit)
+    for k in range(calcifications):
+        i = vessel.size + k
+        sd, value = math.sqrt(fit.covariance[i, i]), fit.parameters[i] + fit.parameters[FIBROUS]
+        given[f"calcification {k + 1}"] = Estimate(value, value - 1.96 * sd, value + 1.96 * sd, sd, "HU")
+    second = _second_core(vessel, fit, shares.mean(0), space, rng) if presence >= CERTAIN else 0.0
+    reading = PlaqueReading(
+        vessel.grid, presence, second, calcifications, figures, {}, given,
         _regions(vessel, fit, space, shares, calcifications), _image(vessel, fit), _image(vessel, plain),
-        _on_grid(vessel, _layer(plain)), square, spread, tau.sd_hu, tau.high_hu,
+        _on_grid(vessel, _layer(plain)), square, spread, left, tau.sd_hu, tau.high_hu,
         {"particles": particles, "seed": seed, "log_evidence": cloud.log_evidence, "log_evidence_first": first,
          "point": prior_of_core.point, "vessel_prior": asdict(vessel.prior),
          "source": vessel.data.source, "voxels": len(vessel.index),
          "core_center_mm": cloud.points[:, :3].mean(0).tolist(), "prior": prior},
     )  # fmt: skip
+    why = "" if reading.explained else "the tissues do not explain the data, see the warning"
+    doubt = why or _doubt(presence, given["contrast"])
+    refused = {name: doubt if name in plaque else why for name in given if (doubt if name in plaque else why)}
+    shown = {name: e for name, e in given.items() if name not in refused}
+    return replace(reading, figures=figures | shown, refused=refused)
+
+
+def _probability(log_odds: float) -> float:
+    return 1.0 / (1.0 + math.exp(-min(max(log_odds, -700.0), 700.0)))
+
+
+def _second_core(
+    vessel: Vessel, fit: Fit, core: NDArray[np.float32], space: CoreSpace, rng: np.random.Generator
+) -> float:
+    """Probability of one more core than the fit has, as likely as none before the data: trials all over the layer.
+
+    Trials that overlap the first core count as none: they would mend its shape.
+    """
+    more = CoreSpace(vessel, fit, CorePrior())
+    shares = more.shares(more.draw_prior(_LOOK, rng))
+    first = np.zeros(len(vessel.index), np.float32)
+    first[space.chosen] = core
+    volume = shares.sum(1)
+    apart = (volume > 0.0) & (shares @ first[more.chosen] < _APART * volume)
+    log = np.zeros(len(shares))
+    if apart.any():
+        log[apart] = more.evidence(shares[apart]).log
+    return _probability(float(logsumexp(log)) - math.log(len(log)))
 
 
 def _on_grid(vessel: Vessel, values: Floats, outside: float = 0.0) -> NDArray[np.float32]:

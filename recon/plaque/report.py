@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -36,8 +37,10 @@ def table(reading: PlaqueReading, others: Mapping[str, Any] | None = None, devia
     read = {name: reading.read(volume) for name, volume in (others or {}).items()}
     lines = [
         f"Plaque body: P = {reading.presence:.3f}"
-        + ("" if reading.presence >= CERTAIN else f" (less than {CERTAIN}: its figures are refused)")
-        + (f"; calcifications: {reading.calcifications}" if reading.calcifications else ""),
+        + (f" (less than {CERTAIN}: its figures are refused)" if reading.presence < CERTAIN else "")
+        + (f"; calcifications: {reading.calcifications}" if reading.calcifications else "")
+        if reading.explained
+        else "Plaque body: none can be told: the tissues do not explain the data, see the warning",
         "",
         " | ".join(["| figure", "tissues as unknowns [95 %]", *(f"{name}, same regions" for name in read)]) + " |",
         "|---" * (2 + len(read)) + "|",
@@ -53,6 +56,13 @@ def table(reading: PlaqueReading, others: Mapping[str, Any] | None = None, devia
         lines.append(" | ".join([f"| {name}", *cells]) + " |")
     for name, why in reading.refused.items():
         lines.append(" | ".join([f"| {name}", f"refused: {why}", *("–" for _ in read)]) + " |")
+    if reading.explained:
+        lines += [
+            "",
+            f"Contrast over a core that is there and one that is not: {reading.mean_contrast:.0f} HU. A contrast is "
+            "given where the data prove a core, so rather where noise has enlarged it: on average those given are too "
+            "large.",
+        ]
     lines += [
         "",
         f"Read from a {reading.info['source']}. Residual: {reading.chi2:.3f} ± {reading.chi2_sd:.3f} of what noise "
@@ -76,8 +86,7 @@ def picture(reading: PlaqueReading, others: Mapping[str, Any] | None = None) -> 
     index = [int(np.clip(round((c - a[0]) / s), 0, n - 1))
              for c, a, s, n in zip(centre, grid.axes, grid.spacing, grid.shape, strict=True)]  # fmt: skip
     (z0, z1), (y0, y1), (x0, x1) = ((a[0] - s / 2, a[-1] + s / 2) for a, s in zip(grid.axes, grid.spacing, strict=True))
-    certain = reading.presence >= CERTAIN
-    shown = {k: v for k, v in _COLOURS.items() if k in reading.regions and (k != "core" or certain)}
+    shown = {k: v for k, v in _COLOURS.items() if k in reading.regions and (k != "core" or reading.certain)}
     rows = []
     for cut, extent in (((index[0],), (x0, x1, y0, y1)), ((slice(None), index[1]), (x0, x1, z0, z1))):
         outlines = tuple((reading.regions[k][cut] > 0.5, colour) for k, colour in shown.items())
@@ -104,11 +113,14 @@ def save(
     folder.mkdir(parents=True, exist_ok=True)
     names = ["fat", "wall", "fibrous", "lumen", "core", "calcification"]
     shares = [reading.regions.get(n, np.zeros(reading.grid.shape, np.float32)) for n in names]
-    if reading.presence < CERTAIN:
+    if not reading.certain:
         shares[2], shares[4] = shares[2] + shares[4], 0 * shares[4]
     labels = np.argmax(np.stack(shares), 0).astype(np.float32)
     data = {
         "presence": reading.presence,
+        "second_core": reading.second_core,
+        "explained": reading.explained,
+        "mean_contrast_hu": reading.mean_contrast,
         "calcifications": reading.calcifications,
         "figures": {n: e.as_dict() for n, e in reading.figures.items()},
         "refused": dict(reading.refused),
@@ -116,6 +128,7 @@ def save(
         "same_regions_sd": {name: dict(v) for name, v in (deviations or {}).items()},
         "chi2": reading.chi2,
         "chi2_sd": reading.chi2_sd,
+        "left": asdict(reading.left),
         "texture_hu": reading.texture_hu,
         "texture_high_hu": reading.texture_high_hu,
         "warnings": reading.warnings,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
@@ -10,13 +12,18 @@ from recon.plaque.centreline import Centreline, follow, sections, smooth_line
 from recon.plaque.vessel import Start
 from torchpcct.geometry import VolumeGrid
 
-__all__ = ["find_vessel"]
+__all__ = ["find_vessel", "require_within"]
 
 Floats = NDArray[np.float64]
 
 _BALL_MM = 1.8
 """Larger than any lumen's radius."""
 _LEAST_STEP_HU = 120.0
+_LEAST_LUMEN_HU = 180.0
+"""Where the lumen reads less, its outline is that of the noise: fibrous tissue has up to 150 HU."""
+_LEAST_LENGTH_MM = 2.0
+_LEAST_SECTIONS = 4
+"""A line needs so many points."""
 
 
 def find_vessel(pilot: Floats, grid: VolumeGrid, point: Floats | None) -> Start:
@@ -28,7 +35,8 @@ def find_vessel(pilot: Floats, grid: VolumeGrid, point: Floats | None) -> Start:
         point: ``(3,)`` z, y, x mm, or None.
 
     Raises:
-        ValueError: a point outside of the grid, no lumen brighter than its surroundings.
+        ValueError: a point outside of the grid, no lumen brighter than its surroundings, a bright thing that cannot be
+            followed as a vessel.
     """
     origin, step = np.array([a[0] for a in grid.axes]), np.array(grid.spacing)
     fat = float(np.median(pilot))
@@ -43,9 +51,8 @@ def find_vessel(pilot: Floats, grid: VolumeGrid, point: Floats | None) -> Start:
     if point is None:
         wanted = int(np.argmax(np.bincount(labels.ravel())[1:])) + 1
     else:
+        require_within(point, grid)
         at = (point - origin) / step
-        if np.any(at < -0.5) or np.any(at > np.array(grid.shape) - 0.5):
-            raise ValueError(f"the point {point.tolist()} mm (z, y, x) lies outside of the volume")
         near, places = ndimage.distance_transform_edt(labels == 0, sampling=step, return_indices=True)
         index = tuple(np.clip(np.rint(at).astype(int), 0, np.array(grid.shape) - 1))
         if near[index] > 4.0:
@@ -58,6 +65,11 @@ def find_vessel(pilot: Floats, grid: VolumeGrid, point: Floats | None) -> Start:
         # The part of the lumen beside the point.
         voxels = origin + np.argwhere(lumen) * step
         middle = voxels[np.argsort(np.linalg.norm(voxels - point, axis=1))[:50]].mean(0)
+    if blood < _LEAST_LUMEN_HU:
+        raise ValueError(
+            f"the brightest tissue at {np.round(middle, 1).tolist()} mm (z, y, x) reads {blood:.0f} HU: the outline of "
+            f"a lumen is determined only with contrast agent (at least {_LEAST_LUMEN_HU:.0f} HU)"
+        )
     half = 0.5 * (blood + 100.0)
     line, ends = follow(pilot, grid, half, middle, _BALL_MM)
     low, high = max(ends[0], -0.5), min(ends[1], line.length + 0.5)
@@ -65,6 +77,7 @@ def find_vessel(pilot: Floats, grid: VolumeGrid, point: Floats | None) -> Start:
     at = tuple(np.clip(np.rint((middle - origin) / step).astype(int), 0, np.array(grid.shape) - 1))
     own = region == region[at] if region[at] else region > 0
     s, centres, radii = sections(own, grid, line, low, high)
+    _require(len(s) >= _LEAST_SECTIONS, middle, "its bright sections are too few or too small")
     lumen_line = Centreline(smooth_line(centres))
     shift = lumen_line.coordinates(line.point(np.array([0.0])))
     ends = ends + float(shift.s[0])
@@ -72,8 +85,29 @@ def find_vessel(pilot: Floats, grid: VolumeGrid, point: Floats | None) -> Start:
     outside, _ = ndimage.label(pilot > wall)
     vessel = outside == outside[at]
     low, high = max(ends[0], -0.5), min(ends[1], lumen_line.length + 0.5)
+    _require(high - low >= _LEAST_LENGTH_MM, middle, f"its lumen is followed over {max(high - low, 0.0):.1f} mm only")
     s2, centres2, radii2 = sections(ndimage.binary_fill_holes(vessel), grid, lumen_line, low, high)
+    _require(len(s2) >= _LEAST_SECTIONS, middle, "its outer wall is not seen")
     outer_line = Centreline(smooth_line(centres2))
     s = lumen_line.coordinates(centres).s
     s2 = outer_line.coordinates(centres2).s
     return Start(lumen_line, outer_line, ends, ((s, radii), (s2, radii2)), (fat, blood))
+
+
+def require_within(point: Any, grid: VolumeGrid) -> None:
+    """Refuse (ValueError) a point ``(3,)`` z, y, x mm outside of a volume."""
+    low = np.array([a[0] for a in grid.axes]) - 0.5 * np.array(grid.spacing)
+    if np.any(np.asarray(point) < low) or np.any(np.asarray(point) > low + np.array(grid.extent)):
+        raise ValueError(
+            f"the point {np.asarray(point).tolist()} mm (z, y, x) lies outside of the volume, which reaches from "
+            f"{np.round(low, 2).tolist()} to {np.round(low + np.array(grid.extent), 2).tolist()} mm"
+        )
+
+
+def _require(seen: bool, at: Floats, why: str) -> None:
+    """Refuse (ValueError) what cannot be followed as a vessel."""
+    if not seen:
+        raise ValueError(
+            f"the bright region at {np.round(at, 1).tolist()} mm (z, y, x) is no vessel that can be read: {why}. Metal "
+            "(a stent), bone and noise are as bright; give a point in a lumen with contrast agent"
+        )

@@ -159,6 +159,8 @@ class Vessel:
         along = start.lumen.coordinates(points[wide]).s
         flat = wide[(along > start.ends[0] - _MARGIN_MM) & (along < start.ends[1] + _MARGIN_MM)]
         self.index = np.stack(np.unravel_index(flat, grid.shape), 1).astype(np.int64)
+        self.lookup = np.full(grid.shape, -1, np.int64)  # position of each of the grid's voxels in the index
+        self.lookup.ravel()[flat] = np.arange(len(flat))
         self.points = points[flat]
         self.half = np.array(grid.spacing) / 2
         self.outer_at = Coordinates(near.s[flat], near.rho[flat], near.theta[flat], near.frame[flat])

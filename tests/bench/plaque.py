@@ -165,6 +165,7 @@ class Draws:
                 "truth": true,
                 "calcifications": reading.calcifications,
                 "warnings": len(reading.warnings),
+                "left": reading.left.score,
                 "chi2": reading.chi2,
                 "chi2_sd": reading.chi2_sd,
                 "texture_hu": reading.texture_hu,

@@ -16,15 +16,16 @@ LUMEN_OFF, CORE_OFF, CORE_MM = -0.3, 1.15, (0.35, 0.8, 0.9)
 HARD_AT, HARD_MM = (0.75, 1.1), (0.25, 0.2, 0.6)
 
 
-def labels(points):
+def labels(points, cores=(0.0,)):
     """0 fat, 1 wall, 2 fibrous, 3 lumen, 4 core, 5 calcification at points (z, y, x) about the inset's centre; the axis
-    tilts in y."""
+    tilts in y, ``cores`` are positions along it in mm."""
     z, y, x = np.moveaxis(points, -1, 0)
     across, along = (y - TILT * z) / np.hypot(1, TILT), (z + TILT * y) / np.hypot(1, TILT)
     out = (np.hypot(across, x) < INNER_MM + WALL_MM).astype(int)
     out[np.hypot(across, x) < INNER_MM] = 2
-    core = sum((v / s) ** 2 for v, s in zip((x - CORE_OFF, across, along), CORE_MM, strict=True)) < 1
-    out[core & (out == 2)] = 4
+    for middle in cores:
+        core = sum((v / s) ** 2 for v, s in zip((x - CORE_OFF, across, along - middle), CORE_MM, strict=True)) < 1
+        out[core & (out == 2)] = 4
     out[np.hypot(across, x - LUMEN_OFF) < LUMEN_MM] = 3
     off = (x - HARD_AT[0], across + HARD_AT[1], along - 1.0)
     hard = sum((v / s) ** 2 for v, s in zip(off, HARD_MM, strict=True)) < 1
@@ -32,9 +33,10 @@ def labels(points):
     return out
 
 
-def image(grid, contrast, samples=5, hard=0.0):
-    """``grid.shape`` HU; the core is ``contrast`` HU below the fibrous tissue, the calcification ``hard`` above it."""
-    table = np.array([*VALUES.values(), VALUES["fibrous"] - contrast, VALUES["fibrous"] + hard])
+def image(grid, contrast, samples=5, hard=0.0, cores=(0.0,), **values):
+    """``grid.shape`` HU; the core is ``contrast`` HU below the fibrous tissue, the calcification ``hard`` above it;
+    ``values`` are of other tissues than :data:`VALUES`."""
+    table = np.array([*{**VALUES, **values}.values(), VALUES["fibrous"] - contrast, VALUES["fibrous"] + hard])
     axes = [a - c for a, c in zip(grid.axes, grid.center, strict=True)]
     sub = (np.arange(samples) + 0.5) / samples - 0.5
     out = np.zeros(grid.shape)
@@ -43,7 +45,7 @@ def image(grid, contrast, samples=5, hard=0.0):
             for dx in sub:
                 shift = np.array([dz, dy, dx]) * grid.spacing
                 points = np.stack(np.meshgrid(*(a + d for a, d in zip(axes, shift, strict=True)), indexing="ij"), -1)
-                out += table[labels(points)]
+                out += table[labels(points, cores)]
     return torch.from_numpy(out / samples**3).float()
 
 

@@ -34,6 +34,20 @@ def test_refuses_a_point_outside(tmp_path, capsys):
     assert not (tmp_path / "reading").exists()
 
 
-def test_refuses_a_belief_that_is_none(tmp_path, capsys):
-    assert main(["plaque", str(tmp_path / "scan.h5"), "--wall", "50", "0", "--no-progress"]) == 2
-    assert "standard deviation of wall" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("option", "why"),
+    [("--wall 50 0", "standard deviation of wall"), ("--beside zzz", "invalid choice: 'zzz'"),
+     ("--particles 3", "--particles must be at least 50"), ("--point-sd 0", "--point-sd must be greater than 0"),
+     ("--point 1 nan 2", "--point[1] must be finite"), ("--extent 1 -2 3", "--extent[1] must be greater than 0"),
+     ("--seed -1", "--seed must be at least 0"), ("--out {tmp}/scan.h5", "is a file")],
+)  # fmt: skip
+def test_arguments_are_refused_before_the_scan_is_read(tmp_path, capsys, monkeypatch, option, why):
+    monkeypatch.setattr("torchpcct.scan.Scan.load", lambda path: pytest.fail("the scan was read"))
+    (tmp_path / "scan.h5").write_bytes(b"")
+    arguments = ["plaque", str(tmp_path / "scan.h5"), "--no-progress", *option.format(tmp=tmp_path).split()]
+    try:
+        status = main(arguments)
+    except SystemExit as error:  # argparse's own
+        status = error.code
+    assert status == 2
+    assert why in capsys.readouterr().err

@@ -1,13 +1,16 @@
 """What the model lacks: texture is measured, a calcification becomes a body, a foreign body is warned of."""
 
+from dataclasses import replace
+
 import drawn_vessel
 import numpy as np
 import pytest
 import torch
 from scipy import ndimage
 
-from recon.plaque import read_plaque
-from recon.plaque.quality import LENGTH_MM, misfit, texture
+from recon.plaque import read_plaque, reading
+from recon.plaque.quality import LENGTH_MM, STRIKING, Leftover, misfit, texture
+from recon.plaque.report import table
 from recon.plaque.start import find_vessel
 from recon.plaque.vessel import Vessel
 
@@ -42,12 +45,12 @@ def test_texture_is_told_from_none(gram):
 
 
 def test_a_calcification_becomes_a_body_and_not_a_core(gram):
-    reading = read_plaque(drawn_vessel.data(gram, drawn_vessel.image(gram.grid, 0.0, 3, 1200.0), 5), particles=150)
-    assert reading.calcifications >= 1  # a coarse grid may make two bodies of it
-    assert abs(reading.chi2 - 1) < 4 * reading.chi2_sd
-    assert reading.presence < 0.95
-    assert reading.figures["calcification 1"].value > 400
-    at = np.argwhere(reading.regions["calcification"] > 0.3).mean(0)
+    found = read_plaque(drawn_vessel.data(gram, drawn_vessel.image(gram.grid, 0.0, 3, 1200.0), 5), particles=150)
+    assert found.calcifications >= 1  # a coarse grid may make two bodies of it
+    assert abs(found.chi2 - 1) < 4 * found.chi2_sd
+    assert found.presence < 0.95
+    assert found.figures["calcification 1"].value > 400
+    at = np.argwhere(found.regions["calcification"] > 0.3).mean(0)
     place = np.array([a[0] for a in gram.grid.axes]) - gram.grid.center + at * 0.3
     # The vessel tilts: 1 mm along it moves its axis by about the tilt in y.
     y = drawn_vessel.TILT - drawn_vessel.HARD_AT[1]
@@ -61,3 +64,93 @@ def test_what_the_model_does_not_have_is_warned_of(gram):
     wrong = misfit(*fitted(gram, volume, 6))
     assert abs(right[0] - 1) < 4 * right[1]
     assert wrong[0] - 1 > 4 * wrong[1]
+
+
+def tube(grid, at, radius):
+    """``grid.shape`` share of a tube along z through (y, x) mm about the grid's centre."""
+    _, y, x = np.meshgrid(*(a - c for a, c in zip(grid.axes, grid.center, strict=True)), indexing="ij", sparse=True)
+    edge = (radius - np.hypot(y - at[0], x - at[1])) / grid.spacing[0]
+    return torch.from_numpy(np.clip(edge + 0.5, 0.0, 1.0) + np.zeros(grid.shape)).float()
+
+
+def with_tube(gram, at):
+    """A vessel without a core, and a second one along z."""
+    volume = drawn_vessel.image(gram.grid, 0.0, samples=3)
+    for radius, hu in ((0.9, 140.0), (0.7, 350.0)):
+        volume = volume + hu * tube(gram.grid, at, radius)
+    return volume
+
+
+@pytest.fixture(scope="module")
+def both(gram):
+    """A second vessel in the corner of the inset."""
+    return read_plaque(drawn_vessel.data(gram, with_tube(gram, (2.6, -2.6)), 7), particles=60)
+
+
+def test_a_second_vessel_apart_is_taken_off_the_data(both):
+    assert both.explained
+    assert both.warnings == []
+    assert both.calcifications == 0
+    assert "contrast" not in both.figures
+    assert both.figures["lumen"].value == pytest.approx(drawn_vessel.VALUES["lumen"], abs=10)
+
+
+def test_beside_a_second_vessel_that_is_not_known_nothing_of_a_plaque_is_claimed(gram, monkeypatch):
+    """The fit takes what it sees of it for plaque bodies."""
+    monkeypatch.setattr(reading, "_ROUNDS", 0)
+    at = (0.0, 3.4)
+    found = read_plaque(drawn_vessel.data(gram, with_tube(gram, at), 7), particles=60)
+    assert found.left.score > STRIKING
+    assert found.left.beside
+    assert np.hypot(*(np.array(found.left.at_mm[1:]) - gram.grid.center[1:] - at)) < 1.2
+    assert "beside the vessel" in found.warnings[0]
+    assert set(found.figures).isdisjoint(found.given_core)
+    assert set(found.refused) == set(found.given_core)
+    assert "none can be told" in table(found)
+
+
+def test_noise_alone_is_not_striking_anywhere_in_the_volume(gram):
+    data = drawn_vessel.data(gram, torch.zeros(gram.grid.shape))
+    scores = np.array([data.scores(gram.noise(generator=torch.Generator().manual_seed(k)) * drawn_vessel.HU, (0.4, 1.2))
+                       for k in range(20)])  # fmt: skip
+    assert np.abs(scores).max() < STRIKING
+    assert scores.std() == pytest.approx(1.0, abs=0.15)
+    assert scores[:, [0, -1]].std() < 1.4
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [({"lumen": 40.0}, "only with contrast agent"), ({"lumen": 150.0}, "only with contrast agent"),
+     ("stent", "no vessel that can be read"), ("rings", "no direction, or is shorter than 5 mm. Rings of metal"),
+     ("short", "no direction, or is shorter")],
+)  # fmt: skip
+def test_what_is_no_enhanced_vessel_is_refused_in_words(gram, change, why):
+    """A stent was refused by SciPy's own words, a short bright piece by a division by zero."""
+    volume = drawn_vessel.image(gram.grid, 0.0, samples=2, **(change if isinstance(change, dict) else {}))
+    off = torch.arange(len(volume))[:, None, None] - (len(volume) - 1) / 2
+    inside = tube(gram.grid, (0.0, drawn_vessel.LUMEN_OFF), 1.1)
+    shell = inside - tube(gram.grid, (0.0, drawn_vessel.LUMEN_OFF), 0.9)
+    if change == "stent":
+        volume = volume + 9000.0 * shell * (off.abs() < 10)
+    elif change == "rings":
+        volume = volume + 25000.0 * shell * (off.abs() % 5 == 2.5)
+    elif change == "short":
+        volume = torch.where((off.abs() > 4) & (volume > 100.0), 100.0, volume)
+    with pytest.raises(ValueError, match=why):
+        read_plaque(drawn_vessel.data(gram, volume, 8), particles=60)
+
+
+def test_a_second_core_is_said(gram):
+    found = [
+        read_plaque(drawn_vessel.data(gram, drawn_vessel.image(gram.grid, 200.0, 3, cores=cores), 9), particles=60)
+        for cores in ((-1.5, 1.5), (-1.5,))
+    ]
+    assert [r.presence > 0.95 for r in found] == [True, True]
+    assert found[0].second_core > 0.95 > 0.6 > found[1].second_core
+    assert any("a second core" in text for text in found[0].warnings)
+    assert found[1].warnings == []
+    two = found[0]
+    assert two.mean_contrast == pytest.approx(two.presence * two.given_core["contrast"].value)
+    foreign = replace(two, left=Leftover(9.0, 50.0, (0.0, 1.0, 2.0), False))
+    assert not foreign.certain
+    assert "in the vessel, at (0.0, 1.0, 2.0) mm" in foreign.warnings[0]
