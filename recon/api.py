@@ -10,7 +10,7 @@ from typing import Any, overload
 
 import torch
 
-from recon.fbp.coverage import consistency_warnings, sampling_warnings
+from recon.fbp.coverage import consistency_warnings, sampling_warnings, view_notes
 from recon.fbp.inset import InsetFbp
 from recon.mbir.reconstruct import reconstruct_mbir
 from recon.metal import metal_warnings
@@ -139,11 +139,13 @@ def _fbp(scans: Sequence[Scan], grid: VolumeGrid, progress: Progress | None, ker
     warnings = [*run.warnings, *sampling_warnings(run.circle)]
     for text in warnings:
         _LOG.warning("%s", text)
-    volumes = []
+    volumes, notes = [], view_notes(run.circle)
     for i, s in enumerate(scans):
         data = run(s)[0][0].to(torch.float32)
         seconds = time.perf_counter() - start
         report = {"method": "fbp", "kernel": kernel, "seconds": round(seconds, 3), "warnings": list(warnings)}
+        if notes:
+            report["notes"] = notes
         volumes.append(Volume(data, grid, report))
         start = time.perf_counter()
         if progress is not None:

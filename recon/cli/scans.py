@@ -214,6 +214,7 @@ def _grid(scan: Scan, arguments: argparse.Namespace) -> VolumeGrid:
     """The grid that was asked for; else the plaque's inset for a windowed scan, the field of view for any other."""
     import numpy as np
 
+    from recon.fbp.angular_weights import is_offset, view_steps
     from torchpcct.geometry import ConeBeam, ParallelBeam
     from torchpcct.vector_geometry import VectorGeometry
 
@@ -235,6 +236,8 @@ def _grid(scan: Scan, arguments: argparse.Namespace) -> VolumeGrid:
     else:
         pitch = g.pitch[1] if isinstance(g, ConeBeam) else g.pitch
         cell, radius = pitch / g.magnification, g.sod * math.sin(float(np.abs(g.fan_angles).max()))
+        if is_offset(g) and view_steps(g.angles)[2] < 2.0 * math.pi:
+            radius = g.fov_radius  # of a short scan the lines that the short side measures, too
     voxel = voxel or cell
     side = 2.0 * radius
     extent, center = lengths or [0.0, side, side], place or [0.0, 0.0, 0.0]
@@ -380,6 +383,7 @@ def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     noted = _NO_SIZE if length == "pixels" else ""
     short = f"{size} voxels of {spacing} {length}{noted}, "
     short += f"{arguments.method}, mean {mean:.4g} {volume.unit}, {seconds} s"
+    short += "".join(f"\n  {text}" for text in volume.report.get("notes", []))
     for text in volume.report.get("warnings", []):
         arguments.warn(text)
     place = {f"spacing_{length}": list(grid.spacing), f"center_{length}": list(grid.center)}

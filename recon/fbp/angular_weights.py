@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam
+from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
 
 __all__ = ["angular_weights", "check_gaps", "is_offset", "offset_share", "parker_share", "view_steps"]
 
@@ -24,8 +24,8 @@ Floats = NDArray[np.float64]
 
 #: A gap between neighbouring views counts as the end of the scan when it exceeds this many median steps.
 OPEN_GAP_STEPS = 3.0
-#: Views closer than this, in rad, are repetitions of one view.
-SAME_VIEW_RAD = 1e-9
+#: Views closer than this share of the mean step are repetitions of one view (angles are stored with few digits).
+SAME_VIEW = 0.02
 #: A detector is an offset one if it reaches farther to one side by more than this share of its width.
 OFFSET_SHARE = 0.02
 #: A parallel-beam scan may lack this angle in rad before it is refused; below it the neighbours fill in.
@@ -55,9 +55,10 @@ def view_steps(
     wrapped = np.mod(angles, period)
     order = np.argsort(wrapped, kind="stable")
     ordered = wrapped[order]
-    group = np.concatenate([[0], np.cumsum(np.diff(ordered) > SAME_VIEW_RAD)])
+    same = SAME_VIEW * period / angles.size
+    group = np.concatenate([[0], np.cumsum(np.diff(ordered) > same)])
     distinct = ordered[np.concatenate([[True], np.diff(group) > 0])]
-    if distinct.size > 1 and distinct[0] + period - distinct[-1] <= SAME_VIEW_RAD:
+    if distinct.size > 1 and distinct[0] + period - distinct[-1] <= same:
         group[group == group[-1]] = 0  # 0 and the period are the same view
         distinct = distinct[:-1]
     gaps = np.append(np.diff(distinct), distinct[0] + period - distinct[-1])  # gap after each distinct view
@@ -93,7 +94,7 @@ def check_gaps(angles: Floats, period: float = 2.0 * math.pi) -> None:
     """
     ordered = np.sort(np.mod(angles, period))
     gaps = np.append(np.diff(ordered), ordered[0] + period - ordered[-1])
-    gaps = gaps[gaps > SAME_VIEW_RAD]
+    gaps = gaps[gaps > SAME_VIEW * period / angles.size]
     usual = float(np.median(gaps)) if gaps.size > 1 else period
     # The widest gap may be the scan's end, if it is far wider than the steps.
     widest = np.sort(gaps)[::-1]
@@ -101,8 +102,8 @@ def check_gaps(angles: Floats, period: float = 2.0 * math.pi) -> None:
     if max(usual, min(inner, period)) > WIDEST_STEP_RAD + 1e-9 and inner <= OPEN_GAP_STEPS * usual:
         raise ValueError(
             f"{gaps.size} distinct view{'s' * (gaps.size > 1)} in steps of up to {math.degrees(inner):.0f}° are too "
-            f"few for filtered backprojection (at most {math.degrees(WIDEST_STEP_RAD):.0f}°): add views, or pass "
-            "`weights`"
+            f"few for filtered backprojection (at most {math.degrees(WIDEST_STEP_RAD):.0f}°): add views, or "
+            'reconstruct by "pwls" or "mbir"'
         )
     if inner > OPEN_GAP_STEPS * usual:
         lacking = (
@@ -110,7 +111,7 @@ def check_gaps(angles: Floats, period: float = 2.0 * math.pi) -> None:
             f"is {math.degrees(usual):.2f}°"
         )
         if inner > INNER_GAP_RAD:
-            raise ValueError(f"{lacking}; reconstruct iteratively, interpolate the views, or pass `weights`")
+            raise ValueError(f"{lacking}; reconstruct by 'pwls' or 'mbir', or interpolate the views")
         _LOG.warning("%s: the views beside it stand for those that lack", lacking)
 
 
@@ -171,11 +172,19 @@ def offset_share(position: Floats) -> Floats:
     return 0.5 * (1.0 + np.sin(0.5 * math.pi * phase))
 
 
-def angular_weights(geometry: Geometry) -> Floats:
+def _reach(grid: VolumeGrid) -> float:
+    """How far a grid reaches from the axis in mm, the corners of one that is centred on it left aside."""
+    far = math.hypot(*grid.center[-2:])
+    y, x = grid.extent[-2:]
+    return far + (math.hypot(y, x) if far > 1e-6 * max(y, x) else max(y, x)) / 2
+
+
+def angular_weights(geometry: Geometry, grid: VolumeGrid | None = None) -> Floats:
     """Weights of all readings: the angle of each view times the share of each column.
 
     Args:
         geometry: parallel, fan or cone beam. Views may come in any order, irregularly spaced and repeated.
+        grid: what is reconstructed: a short scan of an offset detector is complete within its short side.
 
     Returns:
         ``(views, columns)``, or ``(views, 1)`` where all columns share one weight; float64, rad.
@@ -196,7 +205,8 @@ def angular_weights(geometry: Geometry) -> Floats:
         steps, _, span = view_steps(geometry.angles, math.pi, PARALLEL_GAP_RAD)
         if span < math.pi:
             raise ValueError(
-                f"the views cover {math.degrees(span):.1f}°, but parallel rays need 180°: add views, or pass `weights`"
+                f"the views cover {math.degrees(span):.1f}°, but parallel rays need 180°: add views, or "
+                'reconstruct by "pwls" or "mbir"'
             )
         return steps[:, None]
     if not isinstance(geometry, FanBeam | ConeBeam):
@@ -206,19 +216,26 @@ def angular_weights(geometry: Geometry) -> Floats:
     gamma = geometry.fan_angles
     if span >= 2.0 * math.pi:
         return steps[:, None] * (offset_share(gamma) if is_offset(geometry) else 0.5)
-    if is_offset(geometry):
-        raise ValueError(
-            f"the detector is offset (fan {math.degrees(gamma[0]):.1f}° … {math.degrees(gamma[-1]):.1f}°), which needs "
-            f"a full turn, but the views cover {math.degrees(span):.1f}°: add views, crop the long side, or pass "
-            "`weights`"
-        )
     half_fan = 0.5 * (span - math.pi)
     reach = float(np.abs(gamma).max())
+    if is_offset(geometry):
+        field = geometry.fov_radius
+        if grid is None or _reach(grid) > field * (1.0 + 1e-6):
+            raise ValueError(
+                f"the detector is offset (fan {math.degrees(gamma[0]):.1f}° … {math.degrees(gamma[-1]):.1f}°), which "
+                f"needs a full turn, but the views cover {math.degrees(span):.1f}°: reconstruct no more than "
+                f"{field:.4g} mm about the axis (the detector's short side), add views, or "
+                'reconstruct by "pwls" or "mbir"'
+            )
+        reach = float(min(-gamma[0], gamma[-1]))
     slack = float(steps.max())  # the scan's ends are known to about one step
     if half_fan < reach - slack:
         raise ValueError(
             f"the views cover {math.degrees(span):.1f}°, but this fan needs 180° + {math.degrees(2 * reach):.1f}° = "
-            f"{math.degrees(math.pi + 2 * reach):.1f}°: add views, or pass `weights`"
+            f"{math.degrees(math.pi + 2 * reach):.1f}°: add views, or "
+            'reconstruct by "pwls" or "mbir"'
         )
     beta = np.mod(geometry.angles - start, 2.0 * math.pi)
-    return steps[:, None] * parker_share(beta[:, None], gamma[None, :], max(half_fan, reach))
+    virtual = max(half_fan, reach)
+    # Beyond the short side of an offset detector lines are measured once, if at all: no line of the field.
+    return steps[:, None] * parker_share(beta[:, None], np.clip(gamma, -virtual, virtual)[None, :], virtual)

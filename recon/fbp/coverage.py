@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from recon.fbp.angular_weights import angular_weights, is_offset
+from recon.fbp.angular_weights import SAME_VIEW, angular_weights, is_offset
 from recon.fbp.any_orbit import straighten
 from recon.fbp.detector_edges import cut_off
 from torchpcct.detector_window import shadow
@@ -16,7 +16,7 @@ from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid, vie
 from torchpcct.scan import Scan
 from torchpcct.vector_geometry import VectorGeometry
 
-__all__ = ["check_rows", "consistency_warnings", "refuse_helix", "sampling_warnings"]
+__all__ = ["check_rows", "consistency_warnings", "refuse_helix", "sampling_warnings", "view_notes"]
 
 STREAK_CELLS = 10.0
 """Distance between the paths of neighbouring views at the border of the field of view, in cells at the axis, from which
@@ -92,6 +92,24 @@ def check_rows(geometry: Geometry, grid: VolumeGrid, motion: Any = None) -> list
                 f"{reach}"
             )
     return found
+
+
+def view_notes(geometry: Geometry) -> list[str]:
+    """What is unusual about the views and right nevertheless: both ends of a turn, or half a turn, among them.
+
+    Args:
+        geometry: of the scan, views in the order in which they were taken.
+    """
+    first, last = float(geometry.angles[0]), float(geometry.angles[-1])
+    turn = math.pi if isinstance(geometry, ParallelBeam) and abs(last - first) < 1.5 * math.pi else 2.0 * math.pi
+    beyond = abs(abs(last - first) - turn)
+    if geometry.views < 3 or beyond > SAME_VIEW * turn / geometry.views:
+        return []
+    how = ", mirrored" if turn < 4.0 else ""
+    return [
+        f"the views reach from {math.degrees(first):.5g}° to {math.degrees(last):.5g}°, both ends included: the last "
+        f"repeats the first{how}, and the two share one step of {math.degrees(view_step(geometry.angles)):.3g}°"
+    ]
 
 
 def sampling_warnings(geometry: Geometry) -> list[str]:

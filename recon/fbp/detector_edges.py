@@ -28,6 +28,7 @@ G = TypeVar("G", bound=Geometry)
 _CUT, _CUT_VIEWS = 0.03, 0.05
 """Rows are cut off if their end exceeds a share of the highest line integral in more than a share of the views."""
 _CUT_RANGES = 40
+_LEFT_OUT = 0.1
 _WIDEST_RAD = math.radians(85.0)
 
 
@@ -67,10 +68,18 @@ def cut_off(lines: Tensor, geometry: Any, weights: Floats) -> tuple[bool, bool]:
     order = torch.from_numpy(np.argsort(np.mod(geometry.angles, 2.0 * math.pi), kind="stable")).to(means.device)
     ends = (means[..., :width].mean(-1), means[..., -width:].mean(-1))
     found = [limit > 0 and _rises(end[..., order], limit) for end in ends]
-    if weights.shape[1] > 1 and is_offset(geometry):
+    if _leaves_out_short_side(weights, geometry):
         shown = weights.sum(0)
         found = [found[0] and shown[0] > shown[-1], found[1] and shown[-1] > shown[0]]
     return found[0], found[1]
+
+
+def _leaves_out_short_side(weights: Floats, geometry: Any) -> bool:
+    """Whether these are the weights of a full turn of an offset detector; a short scan needs both sides."""
+    if weights.shape[1] == 1 or not is_offset(geometry):
+        return False
+    ends = sorted((float(weights[:, 0].sum()), float(weights[:, -1].sum())))
+    return ends[0] < _LEFT_OUT * ends[1]
 
 
 def _rises(end: Tensor, limit: float) -> bool:
@@ -114,7 +123,7 @@ def mirrored(rows: Rows, grid: VolumeGrid, travel: float = 0.0) -> Rows:
     Filtered rows do not end with the readings: a voxel beyond the short side reads the filter's tail there.
     """
     g = rows.geometry
-    if rows.weights.shape[1] == 1 or not is_offset(g):
+    if not _leaves_out_short_side(rows.weights, g):
         return rows
     t = reach(g)
     half_cell = 0.5 * (t[-1] - t[0]) / (t.size - 1)

@@ -34,9 +34,9 @@ _LOG = logging.getLogger(__name__)
 G = TypeVar("G", bound=Geometry)
 
 
-def _check_weights(weights: Any, geometry: Geometry) -> NDArray[np.float64]:
+def _check_weights(weights: Any, geometry: Geometry, grid: VolumeGrid | None = None) -> NDArray[np.float64]:
     if weights is None:
-        return angular_weights(geometry)
+        return angular_weights(geometry, grid)
     w = np.asarray(weights, dtype=np.float64)
     if w.shape == (geometry.views,):
         w = w[:, None]
@@ -245,7 +245,7 @@ def fbp(
     for text in check_rows(geometry, grid, motion):
         _LOG.warning("%s", text)
     sinogram = _without_dead(sinogram, geometry)
-    rows = Rows(sinogram, geometry, _check_weights(weights, geometry), 0)
+    rows = Rows(sinogram, geometry, _check_weights(weights, geometry, grid), 0)
     known = sinogram.numel() > 0 and not _transformed()
     if (outside is None or number("outside", outside, low=0.0, unit="mm⁻¹") > 0) and known:
         sides = cut_off(sinogram, geometry, rows.weights)

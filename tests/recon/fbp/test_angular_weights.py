@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from recon.fbp.angular_weights import angular_weights, parker_share, view_steps
+from recon.fbp.coverage import view_notes
 from torchpcct.geometry import FanBeam, ParallelBeam, full_turn
 
 FAN = dict(sod=570.0, sdd=1040.0, columns=81, pitch=8.0)
@@ -135,10 +137,29 @@ def test_parallel_scans_repeat_after_half_a_turn():
     assert gap.sum() == pytest.approx(math.pi)
 
 
+@pytest.mark.parametrize(("turn", "views"), [(360.0, 457), (360.0, 361), (180.0, 181)])
+@pytest.mark.parametrize("digits", [3, 15])
+def test_both_ends_of_a_turn_share_one_step(turn, views, digits, caplog):
+    """Angles of a file, with few digits: no gap "where the usual step is 0.00°", and said as what it is."""
+    geometry = ParallelBeam(np.deg2rad(np.round(np.linspace(0.0, turn, views), digits)), 9, 1.0)
+    weights = angular_weights(geometry)[:, 0]
+    assert weights.sum() == pytest.approx(math.pi)
+    inner = weights[1:-1]
+    np.testing.assert_allclose(inner, inner.mean(), rtol=0.35 if turn == 360.0 else 0.01)
+    assert weights[0] + weights[-1] == pytest.approx(inner.mean(), rel=0.4)
+    assert not caplog.records
+    (note,) = view_notes(geometry)
+    assert f"from 0° to {turn:.0f}°, both ends included" in note
+    assert ("mirrored" in note) == (turn == 180.0)
+    assert view_notes(replace(geometry, angles=geometry.angles[:-1])) == []
+
+
 def test_too_few_views_are_refused():
     with pytest.raises(ValueError, match=r"cover 120\.0°, but parallel rays need 180°"):
         angular_weights(ParallelBeam(np.arange(120) * math.pi / 180, 9, 1.0))
-    with pytest.raises(ValueError, match=r"cover 200\.0°, but this fan needs 180° \+ 34\.\d°.*pass `weights`"):
+    with pytest.raises(
+        ValueError, match=r"cover 200\.0°, but this fan needs 180° \+ 34\.\d°.*or reconstruct by \"pwls\""
+    ):
         angular_weights(FanBeam(np.arange(200) * math.pi / 180, **FAN))
     with pytest.raises(TypeError, match="must be a ParallelBeam, FanBeam or ConeBeam"):
         angular_weights(3)  # type: ignore[arg-type]

@@ -93,6 +93,19 @@ def test_half_a_turn_of_an_offset_detector_is_refused():
         angular_weights(geometry)
 
 
+@pytest.mark.parametrize("lost", [(0, 14), (14, 0)])
+def test_a_short_scan_of_an_offset_detector_within_its_short_side(lost):
+    """An object that both sides see is measured whole in 240°, however far the long side reaches."""
+    turn = np.arange(480) * math.radians(240.0) / 479
+    geometry = cropped(replace(FULL["flat"], angles=turn), *lost)
+    assert is_offset(geometry)
+    radius = geometry.fov_radius
+    grid = VolumeGrid((96, 96), 2.0 * (radius - 1.0) / 96)
+    assert worst(fbp(scanned(geometry), geometry, grid), grid) < 0.015
+    with pytest.raises(ValueError, match=rf"reconstruct no more than {radius:.4g} mm about the axis"):
+        fbp(scanned(geometry), geometry, VolumeGrid((96, 96), 2.1 * radius / 96))
+
+
 @pytest.mark.parametrize("kind", FULL)
 def test_rows_that_end_inside_the_object_are_continued(kind):
     """60 % of the width: 1 % in the inner 80 % of the field of view; just ending the rows errs by more than 10 %."""
