@@ -57,6 +57,13 @@ _SC, _ALL = "tests/torchpcct/formats/test_scans.py::", "tests/train/test_data.py
 _VOX = "tests/torchpcct/acquisition/test_voxels.py::"
 _TISSUE = "recon/mbir/tissues.py"
 _M = "tests/recon/mbir/test_tissues.py::"
+_SHIPPED = "tests/recon/mbir/test_shipped_prior.py"
+_STEP = _SHIPPED + "::test_the_network_is_given_a_step_towards_the_data_and_where_it_is"
+_SHARE = _SHIPPED + "::test_the_error_is_that_share_of_the_rivals"
+_KEPT = _SHIPPED + "::test_fat_and_lumen_keep_their_values"
+_WORD = _SHIPPED + "::test_the_last_word_makes_the_network_s_volume_explain_the_data"
+_UN, _MB, _READ = "recon/mbir/unrolled.py", "recon/mbir/mbir.py", "recon/plaque/reading.py"
+_PQ = "tests/recon/plaque/test_quality.py::"
 _METAL = "tests/recon/test_metal.py::"
 _F = "tests/test_precision.py::"
 _WATER = _T + "test_a_bad_water_correction_is_refused"
@@ -284,6 +291,41 @@ FAULTS = (
           "[value[a] for a in value]", "tests/recon/test_cli.py::test_numbers_by_the_names_of_their_axes"),
     Fault("g/ml for mg/ml", "torchpcct/scene/materials.py", "most = 1000.0 * dissolved", "most = dissolved",
           "tests/torchpcct/scene/test_materials.py::test_a_concentration_of_iodine_by_its_name"),
+    Fault("a step away from the data", _UN, "towards = v + filtered(", "towards = v - filtered(", _SHARE),
+    Fault("steps away from the data, part by part", _UN, "problem.beta - problem.apply(v), 1.0 / (spectrum + _TOWARDS)",
+          "problem.apply(v) - problem.beta, 1.0 / (spectrum + _TOWARDS)", _STEP),
+    Fault("no step towards the data", _UN, "1.0 / (spectrum + _TOWARDS))", "0.0 * spectrum)", _SHARE),
+    Fault("the second step of another length", _UN, "1.0 / (spectrum + _TOWARDS))",
+          "(1.0 - 0.7 * k) / (spectrum + _TOWARDS))", _STEP),
+    Fault("the network does not know which step it is", _UN, "float(k))], 1)", "0.0)], 1)", _STEP),
+    Fault("the network hears another noise level", _UN, "level = torch.log(scale / REFERENCE_SCALE_HU)",
+          "level = torch.log(REFERENCE_SCALE_HU / scale)", _STEP),
+    Fault("the network is left out", _UN, "v = self.network(v, towards, condition)", "v = towards", _SHARE),
+    Fault("the network's inputs change places", _UN, "self.network(v, towards, condition)",
+          "self.network(towards, v, condition)", _SHARE),
+    Fault("weights of zero", _MB, "model.load_state_dict(tensors)",
+          "model.load_state_dict({k: v if 'seen' in k else 0 * v for k, v in tensors.items()})", _SHARE),
+    Fault("weights in another order", _MB, "model.load_state_dict(tensors)",
+          "model.load_state_dict({k: v if 'seen' in k else v.flip(0) for k, v in tensors.items()})", _SHARE),
+    Fault("the last word against the data", _UN, "return v + conjugate_gradient(", "return v - conjugate_gradient(",
+          _WORD),
+    Fault("no last word", _UN, "looks, solves[1]) if last_word else v", "looks, solves[1]) if False else v", _WORD),
+    Fault("the surround's zero is lost", _MB, "return to_hu(u * scale + problem.level, problem.mu_ref)",
+          "return to_hu(u * scale + 1.02 * problem.level, problem.mu_ref)", _KEPT),
+    Fault("the surround's zero is another", "recon/pwls/inset_problem.py",
+          "self.level = float(static_fbp(self._background, scan.geometry, grid).mean())",
+          "self.level = 1.02 * float(static_fbp(self._background, scan.geometry, grid).mean())",
+          "tests/recon/mbir/test_mbir.py::test_noise_free_values_in_hu"),
+    Fault("a second vessel passes", _READ, "return self.left.score <= STRIKING and", "return True and",
+          _PQ + "test_beside_a_second_vessel_that_is_not_known_nothing_of_a_plaque_is_claimed"),
+    Fault("a second vessel stays in the data", _READ, "_ROUNDS = 2", "_ROUNDS = 0",
+          _PQ + "test_a_second_vessel_apart_is_taken_off_the_data"),
+    Fault("lumens without contrast agent are read", "recon/plaque/start.py", "_LEAST_LUMEN_HU = 180.0",
+          "_LEAST_LUMEN_HU = 0.0", _PQ + "test_what_is_no_enhanced_vessel_is_refused_in_words"),
+    Fault("a second core is painted over", _READ, "if self.second_core >= CERTAIN:", "if False:",
+          _PQ + "test_a_second_core_is_said"),
+    Fault("noise of a residual by the wrong power", "recon/plaque/data.py", "(pairs * passed**2 * spectrum)",
+          "(pairs * passed * spectrum)", _PQ + "test_noise_alone_is_not_striking_anywhere_in_the_volume"),
 )  # fmt: skip
 
 
