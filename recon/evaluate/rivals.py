@@ -201,7 +201,7 @@ def bm4d(volume: Image, noise_hu: float, *, strength: float = 1.0, covariance: A
             None: white noise.
 
     Raises:
-        ImportError: the package is not installed.
+        ImportError: the package is not installed, or does not run with this NumPy (4.2.5 needs less than 2.4).
         ValueError, TypeError: a volume that is not 3-D, real and finite; a setting out of range; a covariance of
             another kind.
     """
@@ -216,7 +216,11 @@ def bm4d(volume: Image, noise_hu: float, *, strength: float = 1.0, covariance: A
         ) from None
     level = float(u.mean())
     told = noise if covariance is None else noise**2 * _spectrum(covariance, tuple(u.shape))
-    found = np.asarray(package.bm4d(_array(u - level).astype(np.float64), told))
+    try:
+        found = np.asarray(package.bm4d(_array(u - level).astype(np.float64), told))
+    except AttributeError as error:
+        # Release 4.2.5 calls a function that NumPy 2.4 has dropped.
+        raise ImportError(f"this release of bm4d does not run with NumPy {np.__version__} ({error})") from error
     return back(torch.from_numpy(found.reshape(u.shape)).to(u) + level)
 
 

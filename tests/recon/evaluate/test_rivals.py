@@ -152,6 +152,10 @@ def test_bm4d_without_its_package_says_how_to_get_it(monkeypatch, noise):
     monkeypatch.setitem(sys.modules, "bm4d", None)
     with pytest.raises(ImportError, match=r"torchpcct\[rivals\].*non-commercial"):
         rivals.bm4d(noise, NOISE)
+    # A release that calls what NumPy no longer has.
+    monkeypatch.setitem(sys.modules, "bm4d", types.SimpleNamespace(bm4d=lambda z, sigma: np.not_there))
+    with pytest.raises(ImportError, match=r"does not run with NumPy.*not_there"):
+        rivals.bm4d(noise, NOISE)
 
 
 @pytest.mark.parametrize("name", FILTERS)
