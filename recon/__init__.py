@@ -3,7 +3,8 @@
 Read :mod:`~recon.api` (one call for everything), then a method: :mod:`recon.fbp` (filtered backprojection),
 :mod:`recon.pwls` (penalised least squares; its engine is :mod:`recon.gram`, AᵀWA by FFT), :mod:`recon.mbir` (unrolled
 steps with a learned prior). Tools: :mod:`~recon.linear_operator`, :mod:`~recon.conjugate_gradient`. What any method can
-reach at best and at worst: :mod:`~recon.limits`, :mod:`~recon.sensitivity`. Comparisons: :mod:`recon.study`.
+reach at best and at worst: :mod:`~recon.limits`, :mod:`~recon.sensitivity`; what it has to beat:
+:mod:`recon.evaluate`. Comparisons: :mod:`recon.study`.
 """
 
 import importlib
