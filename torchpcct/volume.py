@@ -25,7 +25,7 @@ from torchpcct.formats.volume_files import (
 from torchpcct.geometry import VolumeGrid
 from torchpcct.validate import UNITS, choice
 
-__all__ = ["Volume", "check_volume_name", "from_hu", "to_hu"]
+__all__ = ["Volume", "check_volume_name", "from_hu", "in_words", "to_hu"]
 
 
 def to_hu(attenuation: Tensor, mu_water: float) -> Tensor:
@@ -36,6 +36,20 @@ def to_hu(attenuation: Tensor, mu_water: float) -> Tensor:
 def from_hu(numbers: Tensor, mu_water: float) -> Tensor:
     """Attenuation in mm⁻¹ from CT numbers, the inverse of :func:`to_hu`."""
     return mu_water * (1.0 + numbers / 1000.0)
+
+
+def in_words(hu: float, unit: str, mu_water: float, difference: bool = True) -> str:
+    """A value in HU, or a difference of such values, as a message says it of a scan in ``unit``.
+
+    Args:
+        hu: by the scan's ``mu_water``, which of a scan that is not in HU is a mere convention.
+        unit: of the scan.
+        mu_water: ``linearisation.mu_ref`` of the scan.
+        difference: False: a value, whose 0 is water.
+    """
+    if unit == "HU":
+        return f"{hu:.0f} HU" if abs(hu) >= 10.0 else f"{hu:.2g} HU"
+    return f"{mu_water * (hu / 1000.0 + (0.0 if difference else 1.0)):.3g} {unit}"
 
 
 @dataclass(frozen=True)

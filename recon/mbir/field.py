@@ -303,7 +303,7 @@ def _one(
     seen = seen[:: max(1, seen.numel() // 10**6)]
     low, high = (float(q) for q in torch.quantile(seen, seen.new_tensor([0.1, 0.9])))
     peak = float(to_hu(_stacked(problem, found)[gram.determined].max(), problem.mu_ref))
-    warnings = [text for scale in (low, high) for text in network.check(scale, peak)]
+    warnings = network.check((low, high), peak, problem.unit, problem.mu_ref)
     if problem.plane and len(slices) == 1:
         warnings.append("a single slice: the network was trained on volumes, which have neighbours along z")
     info = {

@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import logging
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -25,7 +26,7 @@ from recon.mbir.unrolled import DEFAULT_LOOK, Unrolled, look_frequency
 from recon.mbir.weights_io import digest, read_tensors
 from recon.pwls.inset_problem import InsetProblem
 from torchpcct.geometry import VolumeGrid
-from torchpcct.volume import from_hu, to_hu
+from torchpcct.volume import from_hu, in_words, to_hu
 
 __all__ = ["Mbir", "Solution", "average_onto", "working_grid"]
 
@@ -169,25 +170,30 @@ class Mbir:
         square = (volumes[:draws] - volumes[draws:]).square().mean(0)
         return torch.nn.functional.avg_pool3d(square[None, None], 3, 1, 1, count_include_pad=False)[0, 0].sqrt()
 
-    def check(self, scale: float, peak: float) -> list[str]:
+    def check(self, scales: Sequence[float], peak: float, unit: str = "HU", mu_water: float = 0.02) -> list[str]:
         """What speaks against trusting the network.
 
         Args:
-            scale: noise scale of the scan, HU.
+            scales: noise scales of the scan, HU.
             peak: largest value of the volume, HU.
+            unit, mu_water: of the scan; messages are in its unit.
         """
         found = []
         low, high = self.model.seen_scale_hu.tolist()
-        if not 0.98 * low <= scale <= 1.02 * high:
+        outside = [s for s in scales if not 0.98 * low <= s <= 1.02 * high]
+        if outside:
+            seen = " and ".join(dict.fromkeys(in_words(s, unit, mu_water) for s in outside))
             found.append(
-                f"the noise scale of the scan, {scale:.0f} HU, lies outside of the {low:.0f}…{high:.0f} HU of the "
-                "training: the contrast of small structures may be wrong"
-                + (', and edges of bone less sharp than by "fbp" or "pwls"' if scale < low else "")
+                f"the noise scale of the scan, {seen}, lies outside of the {in_words(low, unit, mu_water).split()[0]}…"
+                f"{in_words(high, unit, mu_water)} of the training: the contrast of small structures may be wrong"
+                + (', and edges of bone less sharp than by "fbp" or "pwls"' if min(outside) < low else "")
             )
         if peak > LARGEST_HU:
+            most, largest = (in_words(v, unit, mu_water, difference=False) for v in (peak, LARGEST_HU))
+            what = "metal shades the tissue beside it" if unit == "HU" else "what is so dense shades what is beside it"
             found.append(
-                f"the volume reaches {peak:.0f} HU, more than the {LARGEST_HU:.0f} HU of the training: metal shades "
-                "the tissue beside it, and the prior has not learned that"
+                f"the volume reaches {most}, more than the {largest} of the training: {what}, and the prior has not "
+                "learned that"
             )
         return found
 

@@ -112,9 +112,8 @@ def reconstruct_mbir(
                 "chi2": chi2, "seconds": round(seconds, 3), "weights_sha256": network.weights_sha256,
             }  # fmt: skip
             info |= solution.notes[k]
-            info["warnings"] = [
-                *info.get("warnings", []), *network.check(float(normal.scale_hu[k]), float(volume.max())),
-            ]  # fmt: skip
+            seen = network.check([float(normal.scale_hu[k])], float(volume.max()), part[k].unit, problem.mu_ref)
+            info["warnings"] = [*info.get("warnings", []), *seen]
             if not part[k].noise_free:
                 tested = problem.residual_test(part[k], volume, data[k])
                 info["residual_p"] = dict(tested.p_values)

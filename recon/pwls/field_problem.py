@@ -27,7 +27,7 @@ from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid
 from torchpcct.projector import Projector
 from torchpcct.scan import Scan
 from torchpcct.vector_geometry import VectorGeometry
-from torchpcct.volume import Volume, to_hu
+from torchpcct.volume import Volume, in_words, to_hu
 
 if TYPE_CHECKING:
     from torchpcct.metrics.residual_test import ResidualTest
@@ -102,6 +102,7 @@ class FieldProblem:
             raise ValueError(f"this scan needs a grid of the shape {wanted} (slices first), got {grid.shape}")
         self.warnings = check_rows(geometry, grid)
         self.grid, self.geometry, self.mu_ref = grid, geometry, scan.linearisation.mu_ref
+        self.unit = scan.unit
         self._asked = grid.slice if self.plane else grid
         self.work = self._asked
         self.projector = Projector(geometry, self.work)
@@ -254,13 +255,13 @@ def reconstruct_field(
         report["seconds"] = round(time.perf_counter() - began, 3)
         found = list(problem.warnings)
         if not report["converged"]:
-            found.append(unfinished(report))
+            found.append(unfinished(report, problem.unit, problem.mu_ref))
             warnings.warn(found[-1], RuntimeWarning, stacklevel=2)
         if report["undetermined_rmsd_hu"] > UNDETERMINED_HU:
             found.append(
                 f"{100 * report['undetermined']:.0f} % of the voxels are missed by some views (corners beyond the "
                 "field of view, outer slices): there the volume is "
-                f"{report['undetermined_rmsd_hu']:.0f} HU from the minimum"
+                f"{in_words(report['undetermined_rmsd_hu'], problem.unit, problem.mu_ref)} from the minimum"
             )
         found += sorted({text for test in tests for text in test.findings})
         if tests:
@@ -286,9 +287,10 @@ def joined(reports: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return worst
 
 
-def unfinished(report: dict[str, Any]) -> str:
+def unfinished(report: dict[str, Any], unit: str = "HU", mu_water: float = 0.02) -> str:
     """Says how far from the minimum a volume is that did not converge."""
+    left, asked = (in_words(v, unit, mu_water) for v in (report["rmsd_hu"][-1], report["tolerance_hu"]))
     return (
-        f"PWLS stopped {report['rmsd_hu'][-1]:.3g} HU from the minimum after {report['exact_pairs']} projection pairs "
-        f"(tolerance {report['tolerance_hu']:g} HU): raise max_exact, or strengthen the prior"
+        f"PWLS stopped {left} from the minimum after {report['exact_pairs']} projection pairs (tolerance {asked}): "
+        "raise max_exact, or strengthen the prior"
     )

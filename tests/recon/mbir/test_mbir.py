@@ -163,5 +163,11 @@ def test_shadow_of_dead_readings(clean, problem, network):
 
 def test_metal_is_outside_of_what_the_prior_knows(network):
     scale = float(network.model.seen_scale_hu.mean())
-    assert network.check(scale, 1800.0) == []
-    assert any("metal" in text for text in network.check(scale, 3000.0))
+    assert network.check([scale], 1800.0) == []
+    assert any("metal" in text for text in network.check([scale], 3000.0))
+    # A tooth in mm⁻¹ reaches 4 mm⁻¹: no metal, no HU, and both ends of its noise in one sentence.
+    said = network.check([1e4, 2e4], 2e5, "mm^-1", 0.02)
+    assert len(said) == 2
+    assert not any("HU" in text or "metal" in text for text in said)
+    assert "the noise scale of the scan, 0.2 mm^-1 and 0.4 mm^-1, lies outside" in said[0]
+    assert "the volume reaches 4.02 mm^-1" in said[1]

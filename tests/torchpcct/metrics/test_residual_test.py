@@ -61,6 +61,24 @@ def test_gains_are_found(change, match):
     assert any(match in text for text in findings)
 
 
+def test_a_hundredth_of_a_column_is_no_finding_however_sure():
+    """Noise of millions of readings: 0.012 columns once was "the rotation centre is wrong"."""
+    found = residual_test(noise(1) / 1000 + shifted(-0.012), 1e6 * W, LINES)
+    assert found.p_values["centre"] < 1e-6
+    assert abs(found.sizes["centre"]) == pytest.approx(0.012, rel=0.1)
+    assert not any("rotation centre" in text for text in found.findings)
+
+
+def test_what_dense_rays_show_alone_is_beam_hardening_first():
+    """Bone in some rows: said as a change of the gain once."""
+    bone = torch.tensor([0.0, 0, 1, 1, 0, 0])[:, None] * (LINES > 0.06)
+    (text,) = residual_test(noise(2) / 10 + 0.03 * bone, 100 * W, LINES).findings[-1:]
+    assert "readings of some rows" in text
+    assert text.index("beam hardening") < text.index("the gain changed")
+    rows = torch.tensor([0.0, 0, 0.01, 0, 0, 0])[:, None].expand(SHAPE)
+    assert "beam hardening" not in residual_test(noise(2) / 10 + rows, 100 * W, LINES).findings[-1]
+
+
 def test_a_wrong_noise_level_is_found():
     assert "stated noise variance" in residual_test(1.1 * noise(3), W, LINES).findings[0]
     assert "stated noise variance" in residual_test(0.9 * noise(3), W, LINES).findings[0]
