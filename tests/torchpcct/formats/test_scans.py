@@ -205,6 +205,27 @@ def test_the_axis_is_found_and_stripes_go(tmp_path):
     assert float((cleaned - lines)[0][:, others].abs().max()) < 0.03  # algotom's remove_all_stripe: 0.3
 
 
+def test_stripes_of_a_part_of_the_turn_go_and_the_rest_stays():
+    """Cells whose gain is off for 60 to 120 of 240 views, or that read nothing; the object hardly changes."""
+    g = ParallelBeam(np.arange(240) * math.pi / 240, 128, 1.0)
+    bodies = [Ellipsoid((3.0, -4.0), (45.0, 55.0), value=0.02), Ellipsoid((20.0, 15.0), (9.0, 6.0), value=0.03),
+              Ellipsoid((-18.0, -25.0), (7.0, 12.0), value=-0.015)]  # fmt: skip
+    p = line_integrals(g, bodies, sub=2)
+    n = np.random.default_rng(0).poisson(3e4 * np.exp(-p)).astype(float)
+    gain, zero = np.ones(n.shape), np.zeros(n.shape, bool)
+    gain[30:150, 40], gain[100:220, 71:73], gain[:60, 76] = 0.93, 1.08, 0.94
+    zero[50:90, 60] = zero[120:140, 84:86] = True
+    scans = [Scan.from_counts(v, g, air=3e4) for v in (n, np.where(zero, 0.0, np.rint(n * gain)))]
+    sound, striped = (cleaned(s).line_integrals().numpy() for s in scans)
+    noise = float((scans[0].line_integrals().numpy() - p).std())
+    assert float((sound - p).std()) < 1.02 * noise
+    for views, columns in ((slice(35, 145), 40), (slice(105, 215), slice(71, 73)), (slice(0, 55), 76)):
+        assert abs(float((striped - sound)[views, columns].mean())) < 0.035  # 0.06 to 0.08
+    assert np.abs((striped - sound)[zero]).max() < 0.5  # 9
+    assert float((striped - p).std()) < 1.1 * noise
+    assert cleaned(scans[1]).info["dead_readings"] == 80
+
+
 def test_cleaned_keeps_the_scan_and_its_weights(tmp_path):
     """A cell that changed its gain, a stray gamma; a cell without signal is dead though its mean is not quite 0."""
     path = data_exchange(tmp_path / "tooth.h5")
