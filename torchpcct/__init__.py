@@ -68,6 +68,10 @@ def _existing(path: str) -> str:
 _check_cache(os.path.dirname(__file__), os.path.expanduser("~/.cache/numba"))
 
 
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_LAZY})
+
+
 def __getattr__(name: str) -> Any:
     # Kernels compile and torch loads on first use: ``import torchpcct`` stays quick.
     if name in _LAZY:

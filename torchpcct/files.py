@@ -27,6 +27,7 @@ __all__ = [
     "VERSION",
     "WriteError",
     "clear_folder",
+    "fingerprint",
     "is_own_hdf5",
     "read_hdf5",
     "require_folder",
@@ -271,6 +272,18 @@ def is_sealed(path: str | os.PathLike[str]) -> bool:
     """Whether a file begins with the checksum of :func:`write_hdf5`, right or wrong."""
     with open(path, "rb") as file:
         return file.read(len(_MAGIC)) == _MAGIC
+
+
+def fingerprint(path: str | os.PathLike[str]) -> str:
+    """SHA-256 of a file, or of the names and contents of all files of a folder, in the order of their names."""
+    given = Path(path)
+    if not given.is_dir():
+        with given.open("rb") as content:
+            return hashlib.file_digest(content, "sha256").hexdigest()
+    total = hashlib.sha256()
+    for file in sorted(p for p in given.iterdir() if p.is_file()):
+        total.update(f"{file.name} {fingerprint(file)};".encode())
+    return total.hexdigest()
 
 
 def is_own_hdf5(path: str | os.PathLike[str], kind: str) -> bool:

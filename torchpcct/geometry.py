@@ -78,6 +78,14 @@ def _axis(count: int, pitch: float, offset: float) -> Floats:
     return (np.arange(count, dtype=np.float64) - (count - 1) / 2.0) * pitch + offset
 
 
+def _short(name: str, value: Any) -> str:
+    """A value in one line: of many angles the first and the last in degrees, of other arrays the shape."""
+    if name == "angles":
+        ends = f"{math.degrees(value[0]):.5g}°" + (f" … {math.degrees(value[-1]):.5g}°" if value.size > 1 else "")
+        return f"{value.size} views, {ends}" if value.size > 1 else ends
+    return f"array{value.shape}" if isinstance(value, np.ndarray) and value.size > 4 else repr(value)
+
+
 G = TypeVar("G", bound="Geometry")
 
 
@@ -110,6 +118,10 @@ class Geometry:
         values = (getattr(self, f.name) for f in fields(self))  # type: ignore[arg-type]
         return (type(self), *(v.tobytes() if isinstance(v, np.ndarray) else v for v in values))
 
+    def __repr__(self) -> str:
+        values = {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
+        return f"{type(self).__name__}({', '.join(f'{n}={_short(n, v)}' for n, v in values.items())})"
+
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Geometry) and self._key() == other._key()
 
@@ -117,7 +129,7 @@ class Geometry:
         return hash(self._key())
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ParallelBeam(Geometry):
     """Parallel rays in a plane.
 
@@ -205,7 +217,7 @@ class _Divergent(Geometry):
         return self.sod * math.sin(max(gamma, 0.0))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class FanBeam(_Divergent):
     """A fan of rays in the plane z = 0.
 
@@ -242,7 +254,7 @@ class FanBeam(_Divergent):
         return _axis(self.columns, self.pitch, self.offset)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ConeBeam(_Divergent):
     """A cone of rays on a circular orbit.
 

@@ -168,6 +168,14 @@ class Scan:
         fields["info"] |= dict(info or {})
         return cls(geometry=geometry, exposure_s=exposure_s, **fields)
 
+    def __repr__(self) -> str:
+        what = "line integrals" if self.logged else "counts" if self.counting else "readings"
+        size = " × ".join(map(str, self.counts.shape))
+        dead = 0 if self.dead is None else int(self.dead.sum())
+        noise = "noise free" if self.noise_free else f"{self.exposure_s:g} s, mean {float(self.counts.mean()):.4g}"
+        part = "" if self.window is None else ", a part of the detector"
+        return f"Scan({size} {what}, {noise}, {dead} dead{part}, volumes in {self.unit}\n     {self.geometry!r})"
+
     @property
     def noise_free(self) -> bool:
         """Whether the readings are expectations."""

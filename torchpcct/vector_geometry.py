@@ -24,7 +24,7 @@ __all__ = ["VectorGeometry", "check_motion", "helical_motion", "to_vectors"]
 Floats = NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class VectorGeometry(Geometry):
     """A scan that is given view by view.
 

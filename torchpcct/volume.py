@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -75,6 +76,11 @@ class Volume:
         if tuple(self.data.shape[-self.grid.ndim :]) != self.grid.shape:
             raise ValueError(f"data has shape {tuple(self.data.shape)}, its grid {self.grid.shape}")
         choice("unit", self.unit, UNITS)
+
+    def __repr__(self) -> str:
+        low, high = (float(v) for v in self.data.detach().aminmax()) if self.data.numel() else (math.nan, math.nan)
+        size, how = " × ".join(map(str, self.data.shape)), self.report.get("method", "no method")
+        return f"Volume({size}, {low:.4g} … {high:.4g} {self.unit}, {how}\n       {self.grid!r})"
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write ``.nii`` / ``.nii.gz`` (NIfTI-1), ``.mha`` (MetaImage), ``.h5`` (HDF5 with grid and report), or, if the

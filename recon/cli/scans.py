@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import math
+import shlex
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +22,7 @@ from recon.cli.parsing import (
     without_ending,
 )
 from torchpcct import VolumeGrid
-from torchpcct.files import is_own_hdf5
+from torchpcct.files import VERSION, fingerprint, is_own_hdf5
 from torchpcct.formats.volume_files import check_target, is_own_volume
 from torchpcct.validate import choice, number, numbers, whole
 
@@ -154,14 +156,17 @@ def _add_output(parser: argparse.ArgumentParser) -> None:
 
 def _show_config(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     from recon.cli.config import EXAMPLE
+    from torchpcct.formats.stack import EXAMPLE as STACK_EXAMPLE
 
-    print(EXAMPLE, end="")
+    print(STACK_EXAMPLE if arguments.stack else EXAMPLE, end="")
 
 
 def add_show_config(commands: Commands) -> None:
     parser = commands.add_parser(
-        "show-config", help="print a full example for simulate --config", description="Print a full YAML example."
-    )
+        "show-config", help="print a full example for simulate --config, or of a .yaml stack",
+        description="Print a full YAML example: for simulate --config, or, with --stack, of a stack of projections.",
+    )  # fmt: skip
+    parser.add_argument("--stack", action="store_true", help="the file beside TIFF or NumPy projections")
     parser.set_defaults(run=_show_config, device="cpu", no_progress=True, verbose=False)
 
 
@@ -293,7 +298,7 @@ def _require_voxels(shape: tuple[int, ...]) -> None:
         )
 
 
-_OPTIONS = {"kernel": "fbp", "look": "mbir", "tissues": "mbir", "point": "mbir"}
+_OPTIONS = {"kernel": "fbp", "look": "mbir", "tissues": "mbir", "point": "mbir", "weights": "mbir"}
 """Options that one method has."""
 
 
@@ -354,7 +359,7 @@ def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     config = {
         "scan": str(arguments.scan), "geometry": geometry_values(scan.geometry), "method": arguments.method,
         "grid": {"shape": list(grid.shape), "spacing": list(grid.spacing), "center": list(grid.center)},
-        "unit": scan.unit, "clean": arguments.clean, **options,
+        "unit": scan.unit, "clean": arguments.clean, **{k: v if k != "weights" else str(v) for k, v in options.items()},
     }  # fmt: skip
     if arguments.dry_run:
         bytes_ = 4 * (3 * scan.counts.numel() + 2 * grid.voxels)
@@ -369,11 +374,20 @@ def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
             f"about {bytes_ / 2**30:.2f} GiB; FBP about {seconds:.1f} s on one core, iterative methods many times that"
         )
         return
+    if "weights" in options:
+        from recon.mbir.mbir import Mbir
+
+        options["network"] = Mbir.load(options.pop("weights"))
     volume = reconstruct(
         scan, grid, arguments.method, progress=progress.of(arguments.method), device=arguments.device, **options
     )
     progress.close()
-    volume = volume.slices()
+    made = {
+        "torchpcct": VERSION, "command": shlex.join(["torchpcct", *arguments.command_line]),
+        "input": str(arguments.scan), "input_sha256": fingerprint(arguments.scan),
+    }  # fmt: skip
+    axis = {"axis": scan.info["axis"]} if arguments.find_axis else {}
+    volume = replace(volume, report={**volume.report, **axis, **made}).slices()
     volume.save(arguments.out)
     grid, mean = volume.grid, float(volume.data.mean())
     size = " × ".join(map(str, grid.shape))
@@ -401,6 +415,7 @@ def add_reconstruct(commands: Commands) -> None:
     parser.add_argument("--kernel", help="FBP kernel: soft, standard, detail, bone, ram-lak")
     parser.add_argument("--look", type=float, help="of MBIR: 0, for viewing … 1, for measuring (default 0.5)")
     parser.add_argument("--tissues", action="store_true", help="MBIR with the tissues of the vessel in the inset")
+    parser.add_argument("--weights", type=Path, metavar="FILE", help="of MBIR: your own (default: those that ship)")
     parser.add_argument("--point", type=float, nargs=3, metavar=axes, help="where a reader sees its plaque, mm")
     parser.add_argument("--voxel", type=float, metavar="MM", help="voxel size (default: the detector's; inset: 0.25)")
     own = "of a scan of slices Y X alone"

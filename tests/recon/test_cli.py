@@ -1,6 +1,12 @@
 """The command line: what it writes, what it refuses, what it says of itself."""
 
+import argparse
+import hashlib
 import json
+import logging
+import shlex
+import warnings
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -11,7 +17,10 @@ from analytic import Ellipsoid, line_integrals
 
 from recon.cli import main
 from recon.cli.config import read_config
-from torchpcct import ParallelBeam, Scan, Volume, VolumeGrid
+from recon.cli.parsing import as_options, saying
+from torchpcct import ParallelBeam, Scan, Volume, VolumeGrid, __version__
+from torchpcct.formats.geometry_yaml import geometry_of
+from torchpcct.formats.stack import _COUNTS, _LINES
 from torchpcct.scene.scene import Scene
 from torchpcct.scene.voxels import VoxelScene
 
@@ -332,3 +341,47 @@ def test_verify_finds_a_stale_readme_and_mends_it(tmp_path, capsys):
     readme.write_text("# T\n\n## The studies\n\nSo it is 1.3× now, of 7.\n", encoding="utf-8")
     assert main(["verify", "--root", str(tmp_path)]) == 2
     assert "no claim covers the figures of: So it is" in capsys.readouterr().out
+
+
+def test_a_report_says_what_it_was_made_of_and_how(tmp_path, capsys):
+    """Version, command line, hash of the input, found axis; weights by name, with their hash."""
+    geometry = ParallelBeam(np.arange(48) * np.pi / 24, 40, 1.0, -1.4)
+    lines = line_integrals(geometry, [Ellipsoid((2.0, -3.0), (9.0, 12.0), value=0.02)])
+    path, out = tmp_path / "scan.h5", tmp_path / "v.h5"
+    counts = np.random.default_rng(0).poisson(1e5 * np.exp(-lines))
+    Scan.from_counts(counts, replace(geometry, offset=0.0), air=1e5, mu_water=0.02).save(path)
+    command = ["reconstruct", str(path), "--find-axis", "--out", str(out)]
+    assert main(command) == 0
+    said = capsys.readouterr()
+    assert "axis at column 20.9" in said.out
+    report = Volume.load(out).report
+    assert report["axis"]["column"] == pytest.approx(20.9, abs=report["axis"]["error"])
+    assert report["command"] == shlex.join(["torchpcct", *command])
+    assert report["torchpcct"] == __version__
+    assert report["input_sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert all(said.err.count(text) <= 1 for text in report["warnings"])
+    assert json.loads((tmp_path / "v.h5.json").read_text(encoding="utf-8"))["command"] == report["command"]
+    assert main([*command, "--force", "--weights", str(path)]) == 2
+    assert "--weights is an option of --method mbir" in capsys.readouterr().err
+    assert main([*command, "--force", "--method", "mbir", "--weights", str(path)]) == 2
+    assert "holds no weights of this unrolled reconstruction" in capsys.readouterr().err
+
+
+def test_the_example_of_a_stack_is_complete(capsys):
+    assert main(["show-config", "--stack"]) == 0
+    text = capsys.readouterr().out.split("\n", 1)[1].replace("\n# ", "\n")  # what is optional, too
+    given = yaml.safe_load(text)
+    assert set(given) - {"readings", "kind", "geometry"} <= _COUNTS | _LINES
+    assert geometry_of(given["geometry"]).shape == (720, 64, 888)
+
+
+def test_a_warning_is_said_once_and_in_the_words_of_the_command(capsys):
+    actions = [argparse.ArgumentParser().add_argument("--pitch", metavar="MM")]
+    with saying(actions, verbose=False) as warn:
+        logging.getLogger("recon.api").warning("%s", "too few: give pitch=")
+        warnings.simplefilter("always")
+        warnings.warn("too few: give pitch=", UserWarning, stacklevel=1)
+        warn("too few: give pitch=")
+    assert capsys.readouterr().err == "warning: too few: give --pitch MM\n"
+    assert as_options("pitch=0.5 or pitch='x'; pitch must be 1", actions) == "--pitch 0.5 or --pitch x; pitch must be 1"
+    assert as_options("pitch must be 1", actions) == "--pitch must be 1"

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 import torch
 
+import torchpcct
 from recon import reconstruct
 from recon.fbp.inset import InsetFbp
-from torchpcct import FanBeam, Scan, VolumeGrid, acquire, full_turn
+from torchpcct import ConeBeam, FanBeam, Scan, VectorGeometry, Volume, VolumeGrid, acquire, full_turn
 from torchpcct.files import seal
 from torchpcct.scanner import presets
 from torchpcct.scene.plaque import plaque_scene
@@ -250,3 +251,17 @@ def test_a_lower_dose_keeps_dead_readings_dead():
     assert low.dead is not None
     assert low.dead[:, 3].all()
     assert int(low.dead.sum()) == 8
+
+
+def test_scans_geometries_and_volumes_print_in_a_few_lines():
+    """Hundreds of lines of angles once, of tensors besides."""
+    geometry = ConeBeam(full_turn(720), 600.0, 1000.0, 888, 2, 1.0)
+    scan = Scan.from_line_integrals(np.full(geometry.shape, 0.1), geometry, photons=1e4)
+    volume = Volume(torch.zeros(2, 3, 4), VolumeGrid((2, 3, 4), 1.0), {"method": "fbp"})
+    for printed in map(repr, (geometry, VectorGeometry.of(geometry), scan, volume)):
+        assert len(printed) < 400
+        assert printed.count("\n") <= 2
+    assert "angles=720 views, 0° … 359.5°" in repr(geometry)
+    assert "720 × 2 × 888 line integrals" in repr(scan)
+    assert "0 … 0 HU, fbp" in repr(volume)
+    assert set(torchpcct.__all__) <= set(dir(torchpcct))

@@ -1,13 +1,4 @@
-"""Projections as TIFF or NumPy files, described by a YAML file beside them.
-
-readings: proj/*.tif       # a pattern, in the order of the names; or one .npy, .tif with all views
-kind: counts               # or line_integrals
-air: flat.tif              # counts only: a file, a pattern or a number
-dark: dark.npy             # optional, as air
-dead: dead.npy             # optional mask
-gain: 1.0                  # optional: gain, electronic_noise, photons, mu_water, linearisation
-geometry: {…}              # see torchpcct.formats.geometry_yaml; or given to the reader
-"""
+"""Projections as TIFF or NumPy files, described by a YAML file beside them: :data:`EXAMPLE`."""
 
 from __future__ import annotations
 
@@ -25,7 +16,31 @@ from torchpcct.scan import Scan
 from torchpcct.validate import choice
 from torchpcct.vector_geometry import VectorGeometry
 
-__all__ = ["read_array", "read_stack"]
+__all__ = ["EXAMPLE", "read_array", "read_stack"]
+
+EXAMPLE = """\
+# A stack of projections: torchpcct reconstruct scan.yaml; files are looked for beside this one
+readings: proj/*.tif        # a pattern, in the order of the names; or one .npy, .tif with all views
+kind: counts                # or line_integrals: -ln of the transmission
+air: flat.tif               # of counts, without the object: a file, a pattern (several frames) or a number
+dark: dark.npy              # optional, of counts without beam; as air
+# dead: dead.npy            # optional: mask, 1 where a cell is dead
+# gain: 12.5                # optional, of counts: reading of one photon (default: from the noise of several air frames)
+# electronic_noise: 2.0     # optional, of counts: standard deviation in photons
+# photons: 20000            # optional, of line_integrals: of an unattenuated reading
+# mu_water: 0.02            # optional: attenuation of water in 1/mm, for HU
+# linearisation: [1.0, 0.02]  # optional: beam hardening, c1 p + c2 p^2 + …
+geometry:
+  kind: cone                # parallel, fan or cone; vectors and rtk: torchpcct/formats/geometry_yaml.py
+  angles_deg: {start: 0, step: 0.5, count: 720}   # or a list, or a text file with one angle a line
+  sod: 626                  # mm, source to rotation axis (not parallel)
+  sdd: 1098                 # mm, source to detector (not parallel)
+  columns: 888
+  rows: 64                  # cone only; the slices of parallel and fan beams are not named
+  pitch: [1.1, 1.0]         # mm, [row, column], or one number
+  offset: [0, 0.25]         # mm, of the detector's middle; optional
+  detector: flat            # or curved
+"""
 
 _COUNTS = {"air", "dark", "dead", "flux", "gain", "electronic_noise", "linearisation", "mu_water", "exposure_s"}
 _LINES = {"photons", "dead", "linearisation", "mu_water", "exposure_s"}
@@ -71,7 +86,7 @@ def _one(path: Path) -> Any:
 
 
 def read_stack(path: str | os.PathLike[str], geometry: Geometry | None = None) -> Scan:
-    """The scan that a YAML file describes; see the module's text.
+    """The scan that a YAML file describes; see :data:`EXAMPLE`.
 
     Args:
         path: YAML file.
