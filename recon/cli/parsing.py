@@ -83,7 +83,7 @@ def as_options(text: str, actions: Sequence[argparse.Action]) -> str:
         kind = action.metavar or (None if action.nargs == 0 else action.dest.upper())
         value = " ".join(kind) if isinstance(kind, tuple) else kind
         text = re.sub(rf"(?<![\w.-]){action.dest}=True\b", flag, text)
-        text = re.sub(rf"(?<![\w.-]){action.dest}=[\"']?([\w.-]+\w)[\"']?", rf"{flag} \1", text)
+        text = re.sub(rf"(?<![\w.-]){action.dest}=[\"']?([\w.-]*\w)[\"']?", rf"{flag} \1", text)
         text = re.sub(rf"(?<![\w.-]){action.dest}=", f"{flag} {value}" if value else flag, text)
         text = re.sub(rf"(^|: ){action.dest}(?=(\[\d\])? (must|needs)\b)", rf"\g<1>{flag}", text)
     return text
