@@ -25,7 +25,10 @@ TINY: dict[str, dict[str, Any]] = {
         "plaque_doses": (2.0,), "plaque_realizations": 4,
     },
     "hardcases": {
-        "views": 120, "cases": ("sound", "dead-column", "centre-2", "three-views", "metal"), "methods": ("fbp",),
+        "views": 120, "methods": ("fbp",),
+        "cases": (
+            "sound", "dead-column", "centre-2", "three-views", "metal", "body-sod", "body-reversed", "body-not-square",
+        ),
     },
     "motion": {
         "thinning": 24, "fractions": (0.2, 1.0), "eid_fractions": (0.2,), "errors": (0.2,), "voxel_mm": 0.4,

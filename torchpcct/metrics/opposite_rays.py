@@ -68,6 +68,8 @@ _FLAT_CELLS, _PLANE_CELLS = 2.0, 1.0
 """Rows count whose opposite rays part by less, along z: for shifts of the columns, and for turns of the views."""
 _INTERPOLATED = 0.5
 """What a cause explains at least, of what interpolation leaves: a sound scan of few readings 0.2, errors of 1 % 1.3."""
+_EXPLAINED = 0.1
+"""Share of the difference that a cause must explain to be named where opposite rays have little in common."""
 _LARGEST = 0.3
 """Relative errors and angles in rad beyond which nothing is linear: no cause is named for what is larger."""
 _FINE_STEP_RAD = math.radians(2.5)
@@ -194,7 +196,8 @@ def geometry_test(
             ranked.append((best.explained / of.here.numel(), _TEXTS[name](best.size, best.error)))
     mismatch, differ = (math.nan, 0) if plane is None else plane.mismatch(false_alarms / 3.0)
     mirrored = plane is not None and differ > 0 and plane.agrees_mirrored(min(_DIFFER, mismatch / 4.0))
-    if mirrored or differ == 2 or (differ and not ranked):
+    explained = max((share for share, _ in ranked), default=0.0)
+    if plane is not None and differ and (mirrored or explained < _EXPLAINED * plane.disagreement):
         ranked = [(math.inf, _mismatch_text(mismatch, differ == 2, mirrored))]
     return GeometryTest(sizes, errors, mismatch, tuple(text for _, text in sorted(ranked, reverse=True)[:1]))
 
@@ -441,6 +444,11 @@ class _Pairs:
         along = float(torch.where(self.known[..., 1:-1], bend * other, 0.0).double().sum())
         turned = 4.0 * float(_product(self._between_views(), self.known).sum())
         return max(along, 0.0) / 120.0 + max(turned, 0.0) / 120.0
+
+    @property
+    def disagreement(self) -> float:
+        """Mean square of the difference, noise taken off."""
+        return float(_product(self.difference, self.known).sum()) / self.here.numel()
 
     def mismatch(self, false_alarms: float) -> tuple[float, int]:
         """Share of the difference in what changes from view to view, and whether it is 1: too large, 2: nearly all."""

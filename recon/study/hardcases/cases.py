@@ -7,59 +7,23 @@ that makes the scan's description wrong (centre, gain) has none; it must be noti
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy import ndimage
 
-from torchpcct.geometry import VolumeGrid
+from recon.study.hardcases.body import BODY_CASES
+from recon.study.hardcases.case import Apply, Case, expected, views
 from torchpcct.scan import Scan
 from torchpcct.scene import Body, EllipticCylinder, Scene
 from torchpcct.scene.plaque import Plaque, plaque_scene
 from torchpcct.scene.plaque.variants import calcification_bodies, stent_bodies
 
-__all__ = ["CASES", "Case", "untouched"]
-
-
-@dataclass(frozen=True)
-class Case:
-    """One hard case.
-
-    Args:
-        title: what is wrong with the scan, a table's cell.
-        apply: the noise-free scan, its noisy realisation and a random generator, to the scan that is reconstructed.
-        noise: the best that any method can do, as noise over that of the sound scan: lost quanta are lost. What a
-            larger body takes comes on top of it.
-        scene: the scene around a plaque, if it is another one than the sound scan's; ``apply`` then gets scans of it.
-            What it adds to the plaque's own bodies, and the voxels beside that, are left out of the errors.
-    """
-
-    title: str
-    apply: Callable[[Scan, Scan, np.random.Generator], Scan]
-    noise: float = 1.0
-    scene: Callable[[Plaque], Scene] | None = None
-
-
-def untouched(scene: Scene, plaque: Plaque, grid: VolumeGrid) -> NDArray[np.bool_]:
-    """Voxels that no body which ``scene`` has beyond those of the plaque touches, nor a neighbour of theirs.
-
-    Args:
-        scene: of a case.
-        plaque: in it.
-        grid: ``(z, y, x)``.
-
-    Returns:
-        ``grid.shape``, True where the case shows what the sound scan does.
-    """
-    own = set(plaque_scene(plaque)[0].names)
-    added = [k for k, name in enumerate(scene.names) if name not in own]
-    if not added:
-        return np.ones(grid.shape, dtype=bool)
-    share = scene.volume_fractions(grid)[added].sum(0)
-    return ~np.asarray(ndimage.binary_dilation(share > 0, np.ones((3, 3, 3))))
+__all__ = ["CASES"]
 
 
 def _lost(share: float) -> Case:
@@ -86,17 +50,7 @@ def _cells(title: str, rows: slice, columns: int, factor: float) -> Case:
 
 
 def _views(title: str, keep: Callable[[int], np.ndarray]) -> Case:
-    """Only some of the views."""
-
-    def apply(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
-        assert scan.window is not None
-        kept = keep(scan.geometry.views)
-        return replace(
-            scan, counts=scan.counts[torch.from_numpy(kept)], geometry=scan.geometry.select(kept),
-            window=scan.window.select(kept),
-        )  # fmt: skip
-
-    return Case(title, apply, (720 / keep(720).size) ** 0.5)
+    return Case(title, views(keep), (720 / keep(720).size) ** 0.5)
 
 
 def _dark_views(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
@@ -105,13 +59,19 @@ def _dark_views(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
     return replace(scan, counts=counts)
 
 
-def _centre(columns: float) -> Case:
-    def apply(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
-        g = scan.geometry
-        offset = (g.offset[0], g.offset[1] + columns * g.pitch[1])
-        return replace(scan, geometry=replace(g, offset=offset))
+def _described(title: str, change: Callable[[Any], Any], unseen: str = "", tissues: bool = False) -> Case:
+    """The geometry is described wrongly."""
+    return Case(
+        title, lambda clean, scan, rng: replace(scan, geometry=change(scan.geometry)), unseen=unseen, tissues=tissues
+    )
 
-    return Case(f"centre wrong by {columns:g} columns", apply)
+
+def _centre(columns: float) -> Case:
+    return _described(
+        f"centre wrong by {columns:g} columns",
+        lambda g: replace(g, offset=(g.offset[0], g.offset[1] + columns * g.pitch[1])),
+        tissues=columns == 0.5,
+    )
 
 
 def _jitter(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
@@ -120,9 +80,34 @@ def _jitter(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
     return replace(scan, geometry=replace(g, angles=g.angles + 0.01 * step * rng.standard_normal(g.views)))
 
 
-def _drift(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
-    gain = 1 + 0.01 * torch.linspace(0, 1, scan.counts.shape[0])[:, None, None]
-    return replace(scan, counts=torch.round(scan.counts * gain))
+def _per_view(amplitude: float, drift: bool) -> Apply:
+    """A gain that drifts over the scan, or changes at random from view to view."""
+
+    def change(n: Any, air: Any, rng: np.random.Generator) -> Any:
+        views = len(n)
+        part = torch.linspace(0, 1, views) if drift else torch.from_numpy(rng.standard_normal(views)).float()
+        return n * (1 + amplitude * part)[:, None, None]
+
+    return expected(change)
+
+
+def _cell_gains(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
+    """Gains of the cells off by 1 %, which air does not show: rings."""
+    assert scan.exposure_s is not None
+    gains = 1 + 0.01 * torch.from_numpy(rng.standard_normal(tuple(clean.air.shape))).float()
+    return replace(clean, counts=clean.counts * clean._at_window(gains)).with_noise(scan.exposure_s, scan.seed or 0)
+
+
+def _rolled(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
+    """The detector turned by 2° about its normal: a row at the height h reads what lies h tan 2° beside it."""
+    assert scan.exposure_s is not None
+    assert clean.surround is not None
+    still, g = clean._at_window(clean.surround), clean.geometry
+    shifts = math.tan(math.radians(2.0)) * g.row_positions / g.pitch[1]
+    ratio = (clean.counts / still).numpy()
+    moved = [ndimage.shift(ratio[:, k], (0, s), order=1, mode="nearest") for k, s in enumerate(shifts)]
+    counts = torch.from_numpy(np.stack(moved, 1)).float() * still
+    return replace(clean, counts=counts).with_noise(scan.exposure_s, scan.seed or 0)
 
 
 def _million(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
@@ -178,12 +163,12 @@ def _without(gaps: tuple[tuple[float, float], ...]) -> Callable[[int], np.ndarra
     return keep
 
 
-def _scanned(title: str, scene: Callable[[Plaque], Scene]) -> Case:
-    return Case(title, lambda clean, scan, rng: scan, scene=scene)
+def _scanned(title: str, scene: Callable[[Plaque], Scene], other: bool = False, tissues: bool = True) -> Case:
+    return Case(title, lambda clean, scan, rng: scan, scene=scene, other=other, tissues=tissues)
 
 
 def _beside(material: str, diameter: float) -> Callable[[Plaque], Scene]:
-    """A rod of metal along the vessel, 1 mm of fat between the two."""
+    """A rod along the vessel, 1 mm of fat between the two."""
 
     def scene(plaque: Plaque) -> Scene:
         away = (-(plaque.vessel_diameter / 2 + 1.0 + diameter / 2), 0.0, 0.0)
@@ -202,13 +187,21 @@ def _calcified(plaque: Plaque) -> Scene:
     return plaque_scene(plaque, extra=calcification_bodies(plaque))[0]
 
 
+def _unenhanced(plaque: Plaque) -> Scene:
+    return plaque_scene(plaque, blood="blood")[0]
+
+
+def _coreless(plaque: Plaque) -> Scene:
+    return plaque_scene(plaque, core_contrast=0.0)[0]
+
+
 def _large(plaque: Plaque) -> Scene:
     return plaque_scene(plaque, patient_diameter=500.0)[0]
 
 
-CASES: dict[str, Case] = {
-    "sound": Case("nothing", lambda clean, scan, rng: scan),
-    "dose-100th": Case("1/100 of the dose", _hundredth, 10.0),
+_PLAQUE: dict[str, Case] = {
+    "sound": Case("nothing", lambda clean, scan, rng: scan, tissues=True),
+    "dose-100th": Case("1/100 of the dose", _hundredth, 10.0, tissues=True),
     "dose-million": Case("a million times the dose", _million, 2**0.5),
     "lost-0.1": _lost(0.001),
     "lost-1": _lost(0.01),
@@ -233,15 +226,34 @@ CASES: dict[str, Case] = {
     "centre-0.5": _centre(0.5),
     "centre-1": _centre(1.0),
     "centre-2": _centre(2.0),
-    "motion": Case("strong motion", _moving),
+    "motion": Case("strong motion", _moving, tissues=True),
     "spectrum": Case("spectrum off by 2 keV", _harder),
     "bowtie": Case("bowtie 1 mm beside its calibration", _bowtie),
     "truncated": Case("columns cut off inside of the inset's shadow", _narrow),
-    "gain-drift": Case("gain drifts by 1 %", _drift),
+    "gain-drift": Case("gain drifts by 1 %", _per_view(0.01, drift=True)),
     "calcification": _scanned("a calcification of 1500 HU beside the lumen", _calcified),
     "stent": _scanned("a stent in the lumen", _stented),
     "metal": _scanned("a titanium rod of 1.2 mm beside the vessel", _beside("titanium", 1.2)),
     "dynamic-range": _scanned("a tungsten rod of 1.2 mm: readings of 1e-6 of those in air", _beside("tungsten", 1.2)),
-    "large-body": _scanned("a body of 50 cm", _large),
-}
-"""Name → case. A new one needs nothing but its entry here."""
+    "large-body": _scanned("a body of 50 cm", _large, tissues=False),
+    "step": _described("steps between views 2 % too small", lambda g: replace(g, angles=0.98 * g.angles)),
+    "sdd-large": _described("sdd 3 % too large", lambda g: replace(g, sdd=1.03 * g.sdd), tissues=True),
+    "sdd-small": _described("sdd 3 % too small", lambda g: replace(g, sdd=0.97 * g.sdd)),
+    "pitch": _described("pitch 3 % too large", lambda g: replace(g, pitch=(g.pitch[0], 1.03 * g.pitch[1]))),
+    "rolled": Case("a detector rolled by 2°", _rolled),
+    "pile-up": Case("pile-up of 10 %", expected(lambda n, air, rng: n * torch.exp(0.1 - 0.1 * n / air))),
+    "scatter": Case("scatter: 5 % of the mean reading", expected(lambda n, air, rng: n + 0.05 * n.mean())),
+    "dark": Case("a dark signal of 0.1 % of air left in", expected(lambda n, air, rng: n + 0.001 * air)),
+    "saturation": Case(
+        "saturated at the mean reading", expected(lambda n, air, rng: n.clamp(max=float(n.mean()))),
+    ),
+    "lag": Case("5 % of a reading in the next view", expected(lambda n, air, rng: 0.95 * n + 0.05 * n.roll(1, 0))),
+    "flicker": Case("the tube flickers by 2 %", _per_view(0.02, drift=False)),
+    "rings": Case("gains of the cells off by 1 %", _cell_gains),
+    "second-vessel": _scanned("a second enhanced vessel of 3 mm, 1 mm beside", _beside("blood_iodine", 3.0)),
+    "unenhanced": _scanned("an unenhanced vessel", _unenhanced, other=True),
+    "no-core": _scanned("no core", _coreless, other=True),
+}  # fmt: skip
+
+CASES: dict[str, Case] = _PLAQUE | BODY_CASES
+"""Name → case. A new one needs nothing but its entry there."""

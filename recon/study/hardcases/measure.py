@@ -9,9 +9,9 @@ from __future__ import annotations
 import logging
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,17 +20,21 @@ import numpy as np
 import torch
 
 from recon import reconstruct
-from recon.study.hardcases.cases import CASES, untouched
+from recon.study.hardcases.body import GRID, body_scan, body_truth
+from recon.study.hardcases.case import untouched
+from recon.study.hardcases.cases import CASES
 from recon.study.hardcases.settings import Settings
 from recon.study.paper.rods import rod_values
 from recon.study.store import Pieces
 from recon.study.study import Clock, Progress, silent
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.geometry import VolumeGrid
-from torchpcct.scan import Scan
+from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
 from torchpcct.scanner import Scanner, presets
 from torchpcct.scene import Scene
-from torchpcct.scene.plaque import plaque_scene
+from torchpcct.scene.phantoms import thorax
+from torchpcct.scene.plaque import Plaque, plaque_scene
+from torchpcct.volume import Volume
 
 __all__ = ["RIGHT_NOISES", "WORSE", "Measured", "measure", "verdict"]
 
@@ -47,10 +51,11 @@ class Measured:
     """What the report needs.
 
     Attributes:
-        rows: one for each case and method: ``case``, ``title``, ``method``, ``error_hu`` (rms of the difference to the
-            sound scan's volume, None if refused), ``noise_hu`` (rms of the sound scan's noise), ``finite``, ``said``
-            (warnings, or the refusal), ``refused``, ``seconds``, ``verdict``, ``truth_hu`` (rms of the difference to
-            the truth), ``soft_hu`` (that of soft FBP from the same scan; either is None if refused).
+        rows: one for each case and method: ``case``, ``base``, ``title``, ``method``, ``error_hu`` (rms of the
+            difference to the sound scan's volume, of another scene what it adds to the error against the truth; None if
+            refused), ``noise_hu`` (rms of the sound scan's noise), ``finite``, ``said`` (warnings, or the refusal),
+            ``refused``, ``seconds``, ``verdict``, ``truth_hu`` (rms of the difference to the truth), ``soft_hu`` (that
+            of soft FBP from the same scan; either is None if refused).
         seconds: per step.
     """
 
@@ -66,8 +71,10 @@ def verdict(
     said: list[str],
     noise: float = 1.0,
     worse: float = 1.0,
+    unseen: str = "",
 ) -> str:
-    """``right``, ``said`` (wrong or refused, in words) or ``SILENT`` (wrong without a word).
+    """``right``, ``said`` (wrong or refused, in words), ``unseen`` (no data can show it) or ``SILENT`` (wrong without a
+    word).
 
     Args:
         error_hu: rms error in HU; None: refused.
@@ -76,16 +83,57 @@ def verdict(
         said: warnings and refusals beside those of the sound scan.
         noise: of :class:`recon.study.hardcases.cases.Case`: what it adds is no error.
         worse: error against the truth over that of soft FBP; more than :data:`WORSE` is not right.
+        unseen: why no data can show it, or empty.
     """
     allowed = (RIGHT_NOISES + 1.3 * max(noise**2 - 1.0, 0.0) ** 0.5) * noise_hu
     if error_hu is not None and finite and error_hu <= allowed and worse <= WORSE:
         return "right"
-    return "said" if said else "SILENT"
+    return "said" if said else "unseen" if unseen else "SILENT"
 
 
 def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
     """Reconstruct every case by every method; see :mod:`recon.study.study`."""
     clock, pieces = Clock(), Pieces(folder, settings)
+    used = {CASES[name].base for name in settings.cases}
+    bases = {name: make(settings, pieces.within(name), progress) for name, make in _BASES.items() if name in used}
+    clock.lap("simulate")
+    for base in bases.values():
+        for method in settings.methods:
+            if method != "tissues" or base.plaque is not None:
+                base.sound[method] = base.pieces(f"sound_{method}", partial(_sound, base, method))
+    clock.lap("sound scans")
+    rows = []
+    for k, name in enumerate(settings.cases):
+        rows += _case(name, bases[CASES[name].base], settings, pieces.within(f"case_{name}"), progress)
+        progress("cases", (k + 1) / len(settings.cases))
+    clock.lap("cases")
+    return Measured(settings, rows, clock.seconds)
+
+
+@dataclass(frozen=True)
+class _Base:
+    """A sound scan, and what is known of it.
+
+    Attributes:
+        scene, clean, noisy, grid, truth: of it.
+        simulate, truth_of: of another scene.
+        plaque: in it, or None.
+        sound: method → volume, warnings, rms noise, rms error against the truth.
+    """
+
+    scene: Scene
+    clean: Scan
+    noisy: Scan
+    grid: VolumeGrid
+    truth: torch.Tensor
+    simulate: Callable[[Scene], Scan]
+    truth_of: Callable[[Scene], torch.Tensor]
+    plaque: Plaque | None
+    pieces: Pieces
+    sound: dict[str, tuple[torch.Tensor, list[str], float, float]] = field(default_factory=dict)
+
+
+def _plaque_base(settings: Settings, pieces: Pieces, progress: Progress) -> _Base:
     scene, plaque = plaque_scene(vessel_length=_GRID_MM[0] - 0.2)
     scanner = presets.pcct(views=settings.views)
     scanner = scanner.replace(geometry=replace(scanner.geometry, rows=_ROWS))
@@ -94,51 +142,71 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     region = VolumeGrid((1, 1, 1), _GRID_MM, plaque.position[::-1])
     duty = settings.views / presets.PCCT_VIEWS
 
-    def simulate(scene: Scene, label: str = "simulate") -> Scan:
-        return acquire(scene, scanner, region=region, duty=min(duty, 1.0), progress=lambda f: progress(label, f))
+    def simulate(scene: Scene) -> Scan:
+        return acquire(scene, scanner, region=region, duty=min(duty, 1.0), progress=lambda f: progress("simulate", f))
 
+    truth_of = partial(_truth, scanner=scanner, grid=grid)
     clean = pieces("scan", partial(simulate, scene))
     noisy = clean.with_noise(settings.exposure_s, settings.seed)
-    clock.lap("simulate")
-    truth = pieces("truth", partial(_truth, scene, scanner, grid))
-    sound: dict[str, torch.Tensor] = {}
-    usual: dict[str, set[str]] = {}
-    noise: dict[str, float] = {}
-    for m in settings.methods:
+    truth = pieces("truth", partial(truth_of, scene))
+    return _Base(scene, clean, noisy, grid, truth, simulate, truth_of, plaque, pieces)
 
-        def both(m: str = m) -> tuple[torch.Tensor, list[str], float]:
-            volume = reconstruct(noisy, grid, m)
-            return (
-                volume.data,
-                list(volume.report.get("warnings", ())),
-                _rms(volume.data - reconstruct(clean, grid, m).data),
-            )
 
-        sound[m], texts, noise[m] = pieces(f"sound/{m}", both)
-        usual[m] = {_kind(text) for text in texts}
-    clock.lap("sound scan")
+def _body_base(settings: Settings, pieces: Pieces, progress: Progress) -> _Base:
+    scene = thorax()
+    clean = pieces("scan", partial(body_scan, scene))
+    noisy = clean.with_noise(NOISE_FREE_EXPOSURE_S, settings.seed)
+    return _Base(scene, clean, noisy, GRID, body_truth(scene), body_scan, body_truth, None, pieces)
+
+
+_BASES = {"plaque": _plaque_base, "body": _body_base}
+
+
+def _reconstruct(scan: Scan, grid: VolumeGrid, method: str) -> Volume:
+    options = {"tissues": True} if method == "tissues" else {}
+    return reconstruct(scan, grid, "mbir" if method == "tissues" else method, **options)
+
+
+def _sound(base: _Base, method: str) -> tuple[torch.Tensor, list[str], float, float]:
+    with _heard() as said:
+        volume = _reconstruct(base.noisy, base.grid, method)
+        noise = _rms(volume.data - _reconstruct(base.clean, base.grid, method).data)
+    texts = [*volume.report.get("warnings", ()), *said]
+    return volume.data, texts, noise, _rms(volume.data - base.truth)
+
+
+def _case(name: str, base: _Base, settings: Settings, pieces: Pieces, progress: Progress) -> list[dict[str, Any]]:
+    """A row for each method."""
+    case, clean, noisy, truth = CASES[name], base.clean, base.noisy, base.truth
+    seen, lost = torch.ones(base.grid.shape).bool(), case.noise
+    if case.scene is not None:
+        scene = case.scene(base.plaque or Plaque())
+        clean = pieces("scan", partial(base.simulate, scene))
+        noisy = clean.with_noise(noisy.exposure_s or NOISE_FREE_EXPOSURE_S, settings.seed)
+        truth = pieces("truth", partial(base.truth_of, scene))
+        grid = base.grid
+        if grid.ndim == 2:
+            grid = VolumeGrid((1, *grid.shape), (1.0, *grid.spacing), (0.0, *grid.center))
+        seen = torch.from_numpy(untouched(scene, base.scene, grid)).reshape(base.grid.shape)
+        if base.clean.surround is not None and clean.surround is not None:
+            lost *= float(base.clean._at_window(base.clean.surround / clean.surround).mean()) ** 0.5
+    try:
+        scan: Scan | Exception = case.apply(clean, noisy, np.random.default_rng(settings.seed))
+    except (ValueError, TypeError) as error:
+        scan = error
+    soft = pieces("soft", partial(_from_truth, scan, base.grid, truth, seen))
     rows = []
-    for k, name in enumerate(settings.cases):
-        case, within = CASES[name], pieces.within(f"case_{name}")
-        its_clean, its_noisy, its_truth, seen, lost = clean, noisy, truth, torch.ones(grid.shape).bool(), case.noise
-        if case.scene is not None:
-            its_scene = case.scene(plaque)
-            its_clean = within("scan", partial(simulate, its_scene, f"simulate {name}"))
-            its_noisy = its_clean.with_noise(settings.exposure_s, settings.seed)
-            its_truth = within("truth", partial(_truth, its_scene, scanner, grid))
-            seen = torch.from_numpy(untouched(its_scene, plaque, grid))
-            assert clean.surround is not None
-            assert its_clean.surround is not None
-            lost *= float(clean._at_window(clean.surround / its_clean.surround).mean()) ** 0.5
-        scan = case.apply(its_clean, its_noisy, np.random.default_rng(settings.seed))
-        soft = within("soft", partial(_from_truth, scan, grid, its_truth, seen))
-        for method in settings.methods:
-            against = _Against(sound[method], its_truth, seen, noise[method], usual[method], lost, soft)
-            row = within(method, partial(_row, scan, grid, method, against))
-            rows.append({"case": name, "title": case.title, "method": method, **row})
-        progress("cases", (k + 1) / len(settings.cases))
-    clock.lap("cases")
-    return Measured(settings, rows, clock.seconds)
+    for method in settings.methods:
+        if method == "tissues" and not case.tissues:
+            continue
+        volume, texts, noise, _ = base.sound[method]
+        usual = {_kind(text) for text in texts}
+        against = _Against(
+            volume, truth, base.truth if case.other else None, seen, noise, usual, lost, soft, case.unseen
+        )
+        row = pieces(method, partial(_row, scan, base.grid, method, against))
+        rows.append({"case": name, "base": case.base, "title": case.title, "method": method, **row})
+    return rows
 
 
 def _truth(scene: Scene, scanner: Scanner, grid: VolumeGrid) -> torch.Tensor:
@@ -154,22 +222,27 @@ class _Against:
     """What a row is judged by.
 
     Attributes:
-        sound, truth: volumes in HU. seen: the voxels that count.
+        sound, truth: volumes in HU. usual_truth: of the sound scan where its scene is another, else None. seen: the
+            voxels that count.
         noise: rms noise of the sound volume. usual: kinds of warnings of the sound scan.
-        lost: of :func:`verdict`. soft: error of soft FBP against the truth, None if refused.
+        lost, unseen: of :func:`verdict`. soft: error of soft FBP against the truth, None if refused.
     """
 
     sound: torch.Tensor
     truth: torch.Tensor
+    usual_truth: torch.Tensor | None
     seen: torch.Tensor
     noise: float
     usual: set[str]
     lost: float
     soft: float | None
+    unseen: str
 
 
-def _from_truth(scan: Scan, grid: VolumeGrid, truth: torch.Tensor, seen: torch.Tensor) -> float | None:
+def _from_truth(scan: Scan | Exception, grid: VolumeGrid, truth: torch.Tensor, seen: torch.Tensor) -> float | None:
     """Error of soft FBP against the truth, rms HU; None if it is refused."""
+    if isinstance(scan, Exception):
+        return None
     with _heard():
         try:
             volume = reconstruct(scan, grid, "fbp", kernel="soft")
@@ -178,11 +251,13 @@ def _from_truth(scan: Scan, grid: VolumeGrid, truth: torch.Tensor, seen: torch.T
     return _rms((volume.data - truth)[seen])
 
 
-def _row(scan: Scan, grid: VolumeGrid, method: str, by: _Against) -> dict[str, Any]:
+def _row(scan: Scan | Exception, grid: VolumeGrid, method: str, by: _Against) -> dict[str, Any]:
     start = time.perf_counter()
     with _heard() as said:
         try:
-            volume = reconstruct(scan, grid, method)
+            if isinstance(scan, Exception):
+                raise scan
+            volume = _reconstruct(scan, grid, method)
         except (ValueError, TypeError) as error:
             return {
                 "error_hu": None, "noise_hu": by.noise, "finite": True, "said": [str(error)], "refused": True,
@@ -192,13 +267,15 @@ def _row(scan: Scan, grid: VolumeGrid, method: str, by: _Against) -> dict[str, A
     seconds = time.perf_counter() - start
     finite = bool(torch.isfinite(volume.data).all())
     error_hu, truth_hu = (_rms((volume.data - other)[by.seen]) for other in (by.sound, by.truth))
+    if by.usual_truth is not None:
+        error_hu = max(truth_hu**2 - _rms((by.sound - by.usual_truth)[by.seen]) ** 2, 0.0) ** 0.5
     texts = list(dict.fromkeys([*volume.report.get("warnings", []), *said]))
     more = [t for t in texts if _kind(t) not in by.usual]
     # The standard kernel is sharper and noisier than the soft one by intent.
     worse = 1.0 if by.soft is None or method == "fbp" else truth_hu / by.soft
     return {
         "error_hu": error_hu, "noise_hu": by.noise, "finite": finite, "said": texts, "refused": False,
-        "seconds": seconds, "verdict": verdict(error_hu, by.noise, finite, more, by.lost, worse),
+        "seconds": seconds, "verdict": verdict(error_hu, by.noise, finite, more, by.lost, worse, by.unseen),
         "truth_hu": truth_hu, "soft_hu": by.soft,
     }  # fmt: skip
 

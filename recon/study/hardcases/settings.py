@@ -17,11 +17,11 @@ class Settings(StudySettings):
     """Settings of the hard cases; the quick ones have an eighth of the views, FBP alone, every case.
 
     Args:
-        views: of the scan that is made hard, at least 120.
+        views: of the plaque's scan that is made hard, at least 120.
         exposure_s: its exposure in s.
-        voxel_mm: voxel size of the inset.
+        voxel_mm: voxel size of its inset.
         seed: of the noise, and of what is broken at random.
-        methods: of :func:`recon.reconstruct`.
+        methods: of :func:`recon.reconstruct`; ``"tissues"``: MBIR with them, of some scans of the plaque.
         cases: names of :data:`recon.study.hardcases.cases.CASES`.
 
     Raises:
@@ -32,7 +32,7 @@ class Settings(StudySettings):
     exposure_s: float = 2.0
     voxel_mm: float = 0.4
     seed: int = 0
-    methods: tuple[str, ...] = ("fbp", "pwls", "mbir")
+    methods: tuple[str, ...] = ("fbp", "pwls", "mbir", "tissues")
     cases: tuple[str, ...] = tuple(CASES)
 
     QUICK: ClassVar = {"views": 120, "methods": ("fbp",)}

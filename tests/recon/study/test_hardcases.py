@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from tiny_studies import run_tiny
 
-from recon.study.hardcases.cases import CASES, untouched
+from recon.study.hardcases.case import untouched
+from recon.study.hardcases.cases import CASES
 from recon.study.hardcases.measure import verdict
 from recon.study.hardcases.settings import Settings
 from torchpcct.geometry import VolumeGrid
@@ -26,6 +27,7 @@ def test_verdicts():
     assert verdict(1.0, 10.0, False, []) == "SILENT"
     assert verdict(np.nan, 10.0, False, ["starved"]) == "said"
     assert verdict(None, 10.0, True, ["refused"]) == "said"
+    assert verdict(6.0, 10.0, True, [], unseen="turned") == "unseen"
     assert verdict(4.0, 10.0, True, [], worse=1.1) == "SILENT"
     assert verdict(4.0, 10.0, True, ["metal"], worse=1.1) == "said"
     assert verdict(4.0, 10.0, True, [], worse=1.04) == "right"
@@ -41,6 +43,16 @@ def test_a_mended_case_is_right_and_a_refused_one_said(tiny):
     assert any("opposite rays disagree" in text for text in rows["centre-2"]["said"])
 
 
+def test_a_whole_body(tiny):
+    rows = {r["case"]: r for r in tiny.measured.rows}
+    assert rows["body-sod"]["verdict"] == "unseen"
+    assert rows["body-sod"]["error_hu"] > rows["body-sod"]["noise_hu"] > 20
+    assert rows["body-reversed"]["verdict"] == "said"
+    assert "columns counted the other way" in rows["body-reversed"]["said"][0]
+    assert rows["body-not-square"]["refused"]
+    assert "unseen 1" in tiny.report.text
+
+
 def test_metal_is_named_and_its_own_voxels_do_not_count(tiny):
     rows = {r["case"]: r for r in tiny.measured.rows}
     assert any("metal" in text for text in rows["metal"]["said"])
@@ -53,20 +65,20 @@ def test_metal_is_named_and_its_own_voxels_do_not_count(tiny):
 def test_only_what_a_case_adds_is_left_out():
     scene, plaque = plaque_scene(vessel_length=6.2)
     grid = VolumeGrid((4, 23, 23), 0.4, plaque.position[::-1])
-    assert untouched(scene, plaque, grid).all()
+    assert untouched(scene, scene, grid).all()
     for name, volume in (("metal", math.pi * 0.6**2 * 1.6), ("dynamic-range", math.pi * 0.6**2 * 1.6)):
         with_rod = CASES[name].scene(plaque)
-        seen = untouched(with_rod, plaque, grid)
+        seen = untouched(with_rod, scene, grid)
         share = with_rod.volume_fractions(grid)[with_rod.index("implant")]
         assert share[seen].max() == 0
         assert share.sum() * 0.4**3 == pytest.approx(volume, rel=0.02)
         assert 0.8 < seen.mean() < 0.97
-    assert untouched(CASES["large-body"].scene(plaque), plaque, grid).all()
+    assert untouched(CASES["large-body"].scene(plaque), scene, grid).all()
 
 
 def test_the_report_counts_silent_errors(tiny):
     assert tiny.report.data["silent"] == 0 == sum(r["verdict"] == "SILENT" for r in tiny.measured.rows)
-    assert f"**Silent errors: {tiny.report.data['silent']}** of 5" in tiny.report.text
+    assert f"**Silent errors: {tiny.report.data['silent']}** of 8" in tiny.report.text
     assert "a dead column" in tiny.report.text
 
 
@@ -80,4 +92,4 @@ def test_settings_refuse_unknown_cases():
         Settings(cases=("x",))
     with pytest.raises(ValueError, match="methods must be one name or more"):
         Settings(methods="fbp")
-    assert len(CASES) >= 36
+    assert len(CASES) >= 100
