@@ -1,6 +1,6 @@
 """A whole body in a fan beam, and what happens to its scan: the kinds that need a whole field of view.
 
-A slice of the thorax, 360 views of 300 columns, exact path lengths at 70 keV, Poisson noise.
+A slice of the thorax, 360 views of 240 columns, exact path lengths at 70 keV, Poisson noise.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from torchpcct.scene.phantoms import thorax
 __all__ = ["BODY_CASES", "GRID", "body_scan", "body_truth"]
 
 KEV, PHOTONS, VIEWS = 70.0, 3e3, 360
-GRID = VolumeGrid((140, 190), 2.0, (-34.0, -14.0))
-GEOMETRY = FanBeam(full_turn(VIEWS), 541.0, 949.0, 300, 2.9)
+GRID = VolumeGrid((116, 158), 2.4, (-34.0, -14.0))
+GEOMETRY = FanBeam(full_turn(VIEWS), 541.0, 949.0, 240, 3.6)
 WATER = float(np.ravel(material("water").attenuation(KEV))[0])
 
 
@@ -94,10 +94,10 @@ def _columns(first: float, last: float) -> Apply:
 
 
 def _implants() -> Scene:
-    """Two screws of titanium of 12 mm in the vertebra's muscle."""
+    """Two screws of titanium of 12 mm in the muscle of the back."""
     rods = [
-        Body(f"implant_{k}", EllipticCylinder(6.0, position=(-14.0 + x, -34.0 - 70.0, 0.0)), "titanium", "muscle")
-        for k, x in enumerate((-60.0, 60.0))
+        Body(f"implant_{k}", EllipticCylinder(6.0, position=(-14.0 + x, -34.0 - 85.0, 0.0)), "titanium", "muscle")
+        for k, x in enumerate((-35.0, 35.0))
     ]
     base = thorax()
     return Scene([*base.bodies, *rods])
@@ -177,7 +177,7 @@ _CASES = {
     "reversed": _done("columns reversed", lambda clean, scan, rng: replace(scan, counts=scan.counts.flip(-1))),
     "swapped": _done(
         "views and columns swapped", lambda clean, scan, rng: _turned(
-            scan, full_turn(300), scan.counts[:300].T.contiguous()
+            scan, full_turn(240), scan.counts[:240].T.contiguous()
         ),
     ),
     "not-square": _given("views and columns swapped, not square", lambda n, s: _from_counts(n.T.copy(), s, PHOTONS)),
@@ -250,16 +250,16 @@ _CASES = {
     "drift": _read("gain drifts by 1 %", lambda n, air, rng: n * (1 + 0.01 * torch.linspace(0, 1, VIEWS)[:, None])),
     "drift-10": _read("gain drifts by 10 %", lambda n, air, rng: n * (1 + 0.1 * torch.linspace(0, 1, VIEWS)[:, None])),
     "flicker": _read("the tube flickers by 2 %", lambda n, air, rng: n * (1 + 0.02 * _random(rng, VIEWS, 1))),
-    "dead-column": _done("a dead column", _zeros(slice(None), slice(140, 141))),
-    "dead-part": _done("ten columns dead for a fifth of the turn", _zeros(slice(90, 162), slice(140, 150))),
+    "dead-column": _done("a dead column", _zeros(slice(None), slice(112, 113))),
+    "dead-part": _done("eight columns dead for a fifth of the turn", _zeros(slice(90, 162), slice(112, 120))),
     "dead-views": _done("three views without signal", _zeros(slice(40, 43), slice(None))),
     "hot-column": _read(
         "a column that reads 1.6 times too much",
-        lambda n, air, rng: n * torch.where(torch.arange(n.shape[1]) == 140, 1.6, 1.0),
+        lambda n, air, rng: n * torch.where(torch.arange(n.shape[1]) == 112, 1.6, 1.0),
     ),
     "moved": _done(
-        "moved by three columns after half a turn", lambda clean, scan, rng: replace(
-            scan, counts=torch.cat([scan.counts[:180], scan.counts[180:].roll(3, -1)])
+        "moved by two columns after half a turn", lambda clean, scan, rng: replace(
+            scan, counts=torch.cat([scan.counts[:180], scan.counts[180:].roll(2, -1)])
         ),
     ),
     "metal": _done(

@@ -39,6 +39,7 @@ def build_report(measured: Measured) -> Report:
         "study": "hardcases",
         "settings": asdict(s),
         "rows": measured.rows,
+        "cases": len(s.cases),
         "verdicts": dict(counts),
         "silent": counts["SILENT"],
         "seconds": measured.seconds,

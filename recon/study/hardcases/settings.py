@@ -28,7 +28,7 @@ class Settings(StudySettings):
         TypeError, ValueError: a value of the wrong kind or out of range; an unknown case.
     """
 
-    views: int = 984
+    views: int = 360
     exposure_s: float = 2.0
     voxel_mm: float = 0.4
     seed: int = 0
