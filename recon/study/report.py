@@ -14,12 +14,17 @@ import numpy as np
 
 from torchpcct.files import written_whole
 
-__all__ = ["Report", "markdown_table", "or_dash", "records_table"]
+__all__ = ["Report", "by_sign", "markdown_table", "or_dash", "records_table"]
 
 
 def or_dash(value: float, digits: int) -> str:
     """A table's cell: the value, or a dash for NaN."""
     return "–" if math.isnan(value) else f"{value:.{digits}f}"
+
+
+def by_sign(value: float, above: str, below: str, zero: float = 0.0) -> str:
+    """The word for a figure above ``zero`` (1 of a ratio), or for one that is not: directions are not fixed."""
+    return above if value > zero else below
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -2,9 +2,13 @@
 
 ``notebooks/claims.yaml`` lists the README's sentences that hold figures. Each entry is
 
-* ``text``: the sentence, every figure as ``{name:format}`` (:func:`format`'s language);
+* ``text``: the sentence, every figure as ``{name:format}`` (:func:`format`'s language; ``{name:|format}`` for its
+  size without the sign), and every word that hinges on a sign as a choice: ``{name?rises|falls}`` by whether the value
+  is above 0, ``{a>b?more|less}`` by which of two is larger (b may be a number). :data:`DIRECTIONS` stand nowhere else;
 * ``values``: name → ``file: path``, where file lies beside ``claims.yaml`` and path is a chain of keys separated by
   ``/``. Brackets pick the one row of a list that has these values: ``rows[method=mbir,exposure_s=2.0]/slope``.
+  ``worst of file: path`` is the largest size among the values of a mapping, ``worst name of file: path`` whose it is,
+  ``file: path ÷ file: path`` the ratio of two.
 
 :func:`verify` formats each sentence anew and looks for it in the README; :func:`rewrite` puts the new figures in.
 """
@@ -22,7 +26,18 @@ from typing import Any
 
 import yaml
 
-__all__ = ["Claim", "Verdict", "differences", "load_claims", "lookup", "rewrite", "uncovered", "verify"]
+__all__ = [
+    "DIRECTIONS",
+    "Claim",
+    "Verdict",
+    "differences",
+    "load_claims",
+    "lookup",
+    "rewrite",
+    "uncovered",
+    "unproven",
+    "verify",
+]
 
 RESULTS = ("The measured dose factor", "The studies")
 """Sections of the README whose figures are results: a claim must cover each."""
@@ -39,7 +54,16 @@ PASSING = (
 )
 """Keys of results that tell of the run and not of what was found: they differ from run to run."""
 
-_FIELD = re.compile(r"\{(\w+)(?::([^}]*))?\}")
+DIRECTIONS = re.compile(
+    r"\b(loses|gains|falls?|falling|rises?|raises|lowers|saves|grows|shrinks|reach|(less|larger|smaller|worse|"
+    r"noisier|quieter|higher|lower) than|too (large|small|high|low|thick|thin))\b"
+)
+"""Words that are wrong where a figure has the other sign: a claim with figures chooses them by it."""
+
+_FIELD = re.compile(r"\{(\w+)(?:>([\w.]+))?(?:\?([^|}]*)\|([^|}]*)|:([^}]*))?\}")
+"""A figure, or a choice of words: name, what it is compared with, the words if it is larger and if not, format."""
+
+_WORST, _WORST_NAME = "worst of ", "worst name of "
 _FIGURE = r"([-+−]?\d+(?:[.,]\d+)*%?|[A-Za-z]\w*)"
 _ROW = re.compile(r"^([^[]*)\[(.+)\]$")
 
@@ -49,7 +73,7 @@ class Claim:
     """A sentence of the README with the keys of its figures.
 
     Args:
-        text: with ``{name:format}`` for every figure.
+        text: with a field for every figure, and for every word that hinges on a sign.
         values: name → ``"file: path"``.
     """
 
@@ -63,16 +87,32 @@ class Claim:
             ValueError: a file, key or figure is missing, or the format does not fit.
         """
 
-        def figure(match: re.Match[str]) -> str:
-            name, how = match[1], match[2] or ""
+        def read(place: str) -> Any:
+            file, _, path = place.removeprefix(_WORST).removeprefix(_WORST_NAME).partition(":")
+            value = lookup(_read(folder / file.strip()), path.strip())
+            if not place.startswith((_WORST, _WORST_NAME)):
+                return value
+            name = max(value, key=lambda k: abs(value[k]))
+            return abs(value[name]) if place.startswith(_WORST) else name
+
+        def value_of(name: str) -> Any:
             if name not in self.values:
                 raise ValueError(f"claim {self.text!r} gives no value for {{{name}}}")
-            file, _, path = self.values[name].partition(":")
-            value = lookup(_read(folder / file.strip()), path.strip())
+            first, _, divisor = self.values[name].partition(" ÷ ")
+            value = read(first)
+            return value / read(divisor) if divisor else value
+
+        def figure(match: re.Match[str]) -> str:
+            name, other, larger, smaller, how = match.groups()
+            value = value_of(name)
             try:
-                return format(value, how)
+                if larger is not None:
+                    least = value_of(other) if other in self.values else float(other or 0)
+                    return str(larger if value > least else smaller)
+                how = how or ""
+                return format(abs(value), how[1:]) if how.startswith("|") else format(value, how)
             except (TypeError, ValueError):
-                raise ValueError(f"{self.values[name]} is {value!r}, which {{{name}:{how}}} cannot show") from None
+                raise ValueError(f"{self.values[name]} is {value!r}, which {match[0]} cannot show") from None
 
         return _FIELD.sub(figure, self.text)
 
@@ -81,7 +121,11 @@ class Claim:
         parts = []
         last = 0
         for match in _FIELD.finditer(self.text):
-            parts += [_loose(self.text[last : match.start()]), _FIGURE]
+            words = match[3] is not None
+            parts += [
+                _loose(self.text[last : match.start()]),
+                f"({_loose(match[3])}|{_loose(match[4])})" if words else _FIGURE,
+            ]
             last = match.end()
         return re.compile("".join([*parts, _loose(self.text[last:])]))
 
@@ -193,6 +237,13 @@ def uncovered(readme: str, claims: list[Claim], sections: tuple[str, ...]) -> It
             if re.search(r"\d", plain):
                 yield line.rstrip()
         place += len(line)
+
+
+def unproven(claims: list[Claim]) -> Iterator[str]:
+    """Claims with figures that say a direction as a fixed word, which the figures' signs do not choose."""
+    for claim in claims:
+        if claim.values and (found := DIRECTIONS.search(_FIELD.sub(" ", claim.text))):
+            yield f"{found[0]!r} is no choice in {claim.text!r}: write {{name?{found[0]}|…}}"
 
 
 def differences(committed: Any, again: Any, tolerance: float = 1e-3, place: str = "") -> Iterator[str]:

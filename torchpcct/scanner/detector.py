@@ -167,6 +167,15 @@ class SiliconDetector:
             energies_kev: ``(E,)`` photon energies in keV.
             thresholds_kev: ``(T,)`` any thresholds in keV (−inf: all interactions).
         """
+        return self._above(energies_kev, thresholds_kev, 0.0)
+
+    def photons_above(self, energies_kev: ArrayLike, thresholds_kev: ArrayLike) -> Floats:
+        """Photons that count at least once, per incident photon, arguments as of :meth:`above`: without charge sharing
+        the same; with it a photon may count in two cells, or in none."""
+        return self._above(energies_kev, thresholds_kev, 1.0)
+
+    def _above(self, energies_kev: ArrayLike, thresholds_kev: ArrayLike, both: float) -> Floats:
+        """Of a split deposit the chances of both parts to count, less ``both`` times that of both at once."""
         energies = np.atleast_1d(np.asarray(energies_kev, dtype=np.float64))
         thresholds = np.atleast_1d(np.asarray(thresholds_kev, dtype=np.float64))
         photo, compton = self.interaction(energies)
@@ -180,9 +189,9 @@ class SiliconDetector:
         for i, t in enumerate(thresholds):
             whole = ndtr((deposit - t) / self.sigma_kev)
             if self.charge_sharing:
-                shared = sum(
-                    2 * w * ndtr((u * deposit - t) / self.sigma_kev) for u, w in zip(parts, weights, strict=True)
-                )
+                # The nodes are symmetric: reversed, they are those of the other part.
+                one = [ndtr((u * deposit - t) / self.sigma_kev) for u in parts]
+                shared = sum(w * (2.0 * a - both * a * b) for a, b, w in zip(one, one[::-1], weights, strict=True))
                 whole = (1 - self.charge_sharing) * whole + self.charge_sharing * shared
             out[i] = (chance * whole).sum(axis=1)
         return out

@@ -8,7 +8,7 @@ from typing import Any
 from recon.study.bowtie.absolute_noise import FIT, REGIONS
 from recon.study.bowtie.muscle_dose import READINGS
 from recon.study.paper import facts as paper
-from recon.study.report import markdown_table
+from recon.study.report import by_sign, markdown_table
 
 __all__ = ["muscle_section", "noise_section"]
 
@@ -46,7 +46,8 @@ def noise_section(causes: dict[str, Any]) -> str:
             f"{min(share):.2f} to {max(share):.2f} here, whatever is changed but the thorax."
         )
     if not math.isnan(scale):
-        text += f" A thorax {100 * (scale - 1):.0f} % larger than ours would need the same factor as the CTDI phantom."
+        size = f"{100 * abs(scale - 1):.0f} % {by_sign(scale, 'larger', 'smaller', 1.0)}"
+        text += f" A thorax {size} than ours would need the same factor as the CTDI phantom."
     if both:
         text += f" Two changes that do: {'; '.join(both)}. Which it was the paper does not let one tell."
     return text

@@ -62,22 +62,27 @@ def _mean_energy(thresholds: Any, binned: Any) -> float:
 
 
 def charge_sharing(share: float, photons: int, rng: np.random.Generator) -> dict[str, Any]:
-    """Counts, energies, CT numbers and efficiency if a share of the pulses splits between two strips."""
+    """Counts (both parts may count), photons (or none), energies, CT numbers and efficiency if pulses split between two
+    strips."""
     energies, beam = beam_behind(presets.pcct())
     pure, split = SiliconDetector("spectral"), SiliconDetector("spectral", charge_sharing=share)
     before, after = pure.response(energies) @ beam, split.response(energies) @ beam
+    lowest = pure.thresholds_kev[:1]
+    seen = [float(d.photons_above(energies, lowest)[0] @ beam) for d in (pure, split)]
     deposits = follow(SiliconDetector(), energies, beam, photons, rng)
     thresholds, sigma = pure.thresholds_kev, pure.sigma_kev
     dqe = [efficiency(deposits.counts(thresholds[0], sigma, rng, charge_sharing=c))[0] for c in (0.0, share)]
     return {
         "share": share,
         "counts_percent": 100 * float(after.sum() / before.sum() - 1),
+        "photons_percent": 100 * (seen[1] / seen[0] - 1),
         "bins": (after / after.sum()).tolist(),
         "bins_without": (before / before.sum()).tolist(),
         "energy_shift_kev": _mean_energy(thresholds, after) - _mean_energy(thresholds, before),
         "hu_shift": hu_shift(energies, pure.response(energies).sum(0) * beam, split.response(energies).sum(0) * beam),
         "dqe_without": dqe[0],
         "dqe": dqe[1],
+        "dqe_percent": 100 * float(dqe[1] / dqe[0] - 1),
     }
 
 

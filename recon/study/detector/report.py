@@ -11,7 +11,7 @@ from recon.study.detector.figures import draw
 from recon.study.detector.measure import Measured
 from recon.study.detector.rate import EXPOSURE_S
 from recon.study.paper.facts import FULL_VIEWS
-from recon.study.report import Report, markdown_table, records_table
+from recon.study.report import Report, by_sign, markdown_table, records_table
 from recon.study.study import environment, time_line
 from torchpcct.acquisition.plan import Effect
 
@@ -106,6 +106,7 @@ def _charge_sharing(rows: list[dict[str, Any]]) -> str:
     columns = {
         "charge sharing": "{split:.0f} % of pulses split",
         "counts": "{counts_percent:+.1f} %",
+        "photons that count": "{photons_percent:+.2f} %",
         "mean bin energy": "{energy_shift_kev:+.1f} keV",
         "fibrous tissue / blood": "{hu_shift[fibrous_tissue]:+.2f} / {hu_shift[blood_iodine]:+.2f} HU",
         "DQE": "{dqe_without:.3f} → {dqe:.3f}",
@@ -113,9 +114,21 @@ def _charge_sharing(rows: list[dict[str, Any]]) -> str:
     }
     percent = [{"split": 100 * r["share"], "noise": 100 * ((r["dqe_without"] / r["dqe"]) ** 0.5 - 1)} for r in rows]
     table = records_table([{**r, **p} for r, p in zip(rows, percent, strict=True)], columns)
+    told = "; ".join(_shared(r) for r in rows)
     return (
         "## Charge sharing\n\nOff by default (`SiliconDetector(charge_sharing=…)`); the shares are assumed. Behind "
-        f"24 cm of fat, counting mode with its water correction; the shifts are those of CT numbers.\n\n{table}"
+        f"24 cm of fat, counting mode with its water correction; the shifts are those of CT numbers.\n\n{table}\n\n"
+        f"Of split pulses both parts may count, or none: {told}."
+    )
+
+
+def _shared(row: dict[str, Any]) -> str:
+    """What charge sharing does to counts, photons and efficiency, in words of their signs."""
+    counts, photons, dqe = (row[f"{k}_percent"] for k in ("counts", "photons", "dqe"))
+    return (
+        f"{100 * row['share']:.0f} % {by_sign(counts, 'raise', 'lower')} the counts by {abs(counts):.1f} %, "
+        f"{abs(photons):.2f} % {by_sign(photons, 'more', 'fewer')} photons count, and the DQE "
+        f"{by_sign(dqe, 'rises', 'falls')} by {abs(dqe):.1f} %"
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from recon.study.checks import Check, around, checks_section, effects_section
 from recon.study.paper import facts as paper
-from recon.study.report import Report, markdown_table, or_dash
+from recon.study.report import Report, by_sign, markdown_table, or_dash
 from recon.study.resolution.blur import FWHM_PER_SIGMA, limits
 from recon.study.resolution.figures import curves_figure, images_figure
 from recon.study.resolution.measure import Measured, RoiFigures
@@ -39,6 +39,7 @@ def build_report(m: Measured) -> Report:
         "limits_px": found,
         "margin_fwhm_mm": margin,
         "final_fwhm_mm": final,
+        "cap_excess": pcct.blurred[0].cap_line / m.plaque.cap_thickness - 1.0,
         "variants": [
             {
                 "bulge_mm": bulge,
@@ -103,7 +104,7 @@ def _checks(m: Measured, found: dict[str, Any], final: float) -> list[Check]:
     )
     own, roi_hu = e.rois.own_contrast_hu / p.rois.own_contrast_hu, p.rois.roi_hu
     coarse = (
-        f"the contrast falls to {100 * own:.0f} %, the noise of the ROI means "
+        f"the contrast {by_sign(own, 'rises', 'falls', 1.0)} to {100 * own:.0f} %, the noise of the ROI means "
         f"to {100 * e.rois.sd_hu / p.rois.sd_hu:.0f} %: the coarse cells pass little of the noise either. The PCCT "
         f"blurred to the EID-CT's resolution: contrast of the core {m.smoothed.own_contrast_hu:.1f} HU, CNR "
         f"{m.smoothed.own_cnr:.2f}"
@@ -148,8 +149,19 @@ def _intro(m: Measured, found: dict[str, Any], margin: float, final: float) -> s
         f"{100 * s.tolerance:.0f} % at a blur of {_PX_FWHM * found['cap']:.2f} mm, the lumen's area "
         + ("by less at every blur" if found["lumen"] >= s.sigmas_px[-1] else f"at {_PX_FWHM * found['lumen']:.2f} mm")
         + f": a margin of {margin:.2f} mm, so the image as a whole should be better than {final:.2f} mm "
-        f"(paper: {paper.RESOLUTION['final_fwhm_mm']} mm).** In the EID-CT's image, "
+        f"(paper: {paper.RESOLUTION['final_fwhm_mm']} mm).** "
+        f"{_cap_read(p.blurred[0].cap_line, m.plaque.cap_thickness)} In the EID-CT's image, "
         f"{m.scanners['EID-CT'].width.area:.2f} mm wide, no core is segmented."
+    )
+
+
+def _cap_read(read_mm: float, true_mm: float) -> str:
+    """What the criterion of the cap starts from."""
+    excess = read_mm / true_mm - 1.0
+    return (
+        f"The cap's criterion is one of change: it starts from an image in which a cap of {true_mm:.2f} mm already "
+        f"reads {read_mm:.2f} mm, {100 * abs(excess):.0f} % too {by_sign(excess, 'thick', 'thin')}, and says nothing "
+        "of how well a cap is measured."
     )
 
 

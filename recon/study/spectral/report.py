@@ -9,7 +9,7 @@ import numpy as np
 
 from recon.study.checks import Check, around, checks_section, effects_section
 from recon.study.paper import facts as paper
-from recon.study.report import Report, markdown_table, records_table
+from recon.study.report import Report, by_sign, markdown_table, records_table
 from recon.study.spectral.calibration_text import calibration_section, contrast_cost
 from recon.study.spectral.figures import curves_figure, tissue_figure
 from recon.study.spectral.measure import Measured
@@ -250,10 +250,11 @@ def _noise_for_contrast(values: list[dict[str, Any]]) -> str:
     noise = noisy["joint MBIR"]["fat_sd_hu"] / noisy["FBP"]["fat_sd_hu"]
     kept = contrast(clean["joint MBIR"]) / contrast(clean["FBP"])
     return (
-        f"At {100 * noisy['noise']:.0f} % noise joint MBIR has {100 * noise:.0f} % of FBP's noise in fat. It pays with "
-        f"contrast: without noise fibrous tissue and core differ by {contrast(clean['joint MBIR']):.1f} HU, by FBP "
-        f"by {contrast(clean['FBP']):.1f}: {100 * (1 - kept):.0f} % less. For equal contrast the noise is "
-        f"{100 * noise / kept:.0f} % of FBP's. Contrasts in noise are those of one realisation."
+        f"At {100 * noisy['noise']:.0f} % noise joint MBIR has {100 * noise:.0f} % of FBP's noise in fat. It "
+        f"{by_sign(kept, 'gains', 'pays with', 1.0)} contrast: without noise fibrous tissue and core differ by "
+        f"{contrast(clean['joint MBIR']):.1f} HU, by FBP by {contrast(clean['FBP']):.1f}: {100 * abs(1 - kept):.0f} % "
+        f"{by_sign(kept, 'more', 'less', 1.0)}. For equal contrast the noise is {100 * noise / kept:.0f} % of FBP's. "
+        "Contrasts in noise are those of one realisation."
     )
 
 

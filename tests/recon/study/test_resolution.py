@@ -140,6 +140,10 @@ def test_report(tiny, tmp_path):
     assert all(c["note"] for c in data["checks"] if not c["ok"] and ("rim" in c["name"] or "CNR" in c["name"]))
     width = data["scanners"]["PCCT"]["fwhm_mm"]["area"]
     assert data["final_fwhm_mm"] == pytest.approx(math.hypot(width, data["margin_fwhm_mm"]))
+    # The report says what the criterion starts from, in a word of the figure's sign.
+    excess = data["scanners"]["PCCT"]["blurred"][0]["cap_line_mm"] / data["truth"]["cap_mm"] - 1.0
+    assert data["cap_excess"] == pytest.approx(excess)
+    assert f"{100 * abs(excess):.0f} % too {'thick' if excess > 0 else 'thin'}" in study.report.text
     assert data["scanners"]["EID-CT"]["smoothed"] is None
 
 

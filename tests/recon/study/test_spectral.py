@@ -11,7 +11,7 @@ from tiny_studies import assert_report_is_whole
 
 from recon.study.spectral import calibration
 from recon.study.spectral.calibration import SHOWN_KEV, CalibrationError, calibration_costs, cases, decomposed
-from recon.study.spectral.report import checks_of
+from recon.study.spectral.report import _noise_for_contrast, checks_of
 from recon.study.spectral.settings import Settings
 from recon.study.spectral.tissues import BODIES, truth_labels
 from torchpcct.geometry import VolumeGrid
@@ -157,3 +157,12 @@ def test_vmi_of_the_corners_is_the_tissue():
 def test_bad_settings(change, match):
     with pytest.raises(ValueError, match=match):
         Settings(**change)
+
+
+def test_what_joint_mbir_does_to_the_contrast_is_said_by_its_sign():
+    def value(fibrous: float) -> dict[str, float]:
+        return {"core_hu": 40.0, "fibrous_hu": fibrous, "fat_sd_hu": 20.0}
+
+    for joint, words in ((90.0, ("pays with contrast", "17 % less")), (112.0, ("gains contrast", "20 % more"))):
+        text = _noise_for_contrast([{"noise": 1.0, "FBP": value(100.0), "joint MBIR": value(joint)}])
+        assert all(word in text for word in words)

@@ -5,7 +5,7 @@ import math
 
 import pytest
 
-from recon.study.verify import Claim, differences, load_claims, lookup, rewrite, uncovered, verify
+from recon.study.verify import Claim, _parsed, differences, load_claims, lookup, rewrite, uncovered, unproven, verify
 
 DATA = {"rows": [{"m": "a", "s": 2.0, "v": 1.234}, {"m": "b", "s": 2.0, "v": [5.0, 6.6]}], "n": {"k": 200}}
 
@@ -42,6 +42,33 @@ def test_a_true_and_a_stale_sentence(folder):
 def test_rewrite_puts_the_committed_figures_in_and_keeps_the_lines(folder):
     old = README.replace("1.2×", "9.99×").replace("200", "12")
     assert rewrite(old, [CLAIM], folder) == README
+
+
+def test_words_are_chosen_by_the_sign_of_their_figure(folder):
+    """A figure may be right in a sentence that says the contrary."""
+    values = {"a": "r.json: shift", "b": "r.json: n/k", "w": "worst of r.json: organs"}
+    values["o"] = "worst name of r.json: organs"
+    values["q"] = "r.json: n/k ÷ r.json: rows[m=a]/s"
+    text = "it {a?gains|loses} {a:|.1f} %, {b>a?more|less} than {b}, {b>1?above|below} 1; "
+    text += "at most {w:.0f} ({o}), half {q:.0f}"
+    claim = Claim(text, values)
+    for shift, sentence in ((4.6, "it gains 4.6 %, more than 200"), (-4.6, "it loses 4.6 %, more than 200")):
+        data = DATA | {"shift": shift, "organs": {"heart": 2.0, "spine": -8.1}}
+        (folder / "r.json").write_text(json.dumps(data), encoding="utf-8")
+        _parsed.cache_clear()
+        said = claim.said(folder)
+        assert said == f"{sentence}, above 1; at most 8 (spine), half 100"
+        other = said.replace("gains", "loses") if shift > 0 else said.replace("loses", "gains")
+        assert verify(said, [claim], folder)[0].ok
+        assert not verify(other, [claim], folder)[0].ok
+        assert rewrite(other, [claim], folder) == said
+
+
+def test_directions_that_no_figure_chooses_are_named():
+    values = {"a": "r.json: n/k"}
+    assert list(unproven([Claim("it {a?gains|loses} {a:|.1f} %", values), Claim("more than this", {})])) == []
+    for text in ("it loses {a:.1f} %", "is {a:.1f} HU too large", "does not reach the {a:.1f}", "{a:.1f} less than"):
+        assert len(list(unproven([Claim(text, values)]))) == 1
 
 
 def test_figures_without_a_claim_are_found():
