@@ -160,7 +160,11 @@ def deformation_limit(
     """Smallest standard deviation in HU of the difference of two tissues whose outlines are known up to a smooth error.
 
     Each outline is displaced along its normal by a Gaussian random field; its effect on the volume is taken to first
-    order, so the displacement should be smaller than the tissues are thick.
+    order. That is right for displacements well below the thickness of the tissues between the outlines: as large as the
+    paper's cap (0.17 mm) or wall (0.19 mm) they are extrapolated, for a layer cannot vanish or turn over here.
+
+    The figure hinges on the voxels, which must be small beside the layers: on large ones outlines that lie close
+    together change the same voxels and cannot be told apart (``tests/bench/shape_limit.py``: the paper's plaque).
 
     Args:
         gram: AᵀWA of the inset at the exposure in question (``apply``), in mm⁻¹.

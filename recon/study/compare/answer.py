@@ -89,7 +89,7 @@ def answer(data: dict[str, Any]) -> str:
             f", {_interval(e['factor'], 2)} times by the variance of the contrast {label} (slope "
             f"{e['slope']['value']:.2f}, bias {e['bias_hu']['value']:+.0f} HU)"
         )
-    text += f" and {_interval(best['fat_factor'], 2)} times by the noise of a voxel in plain fat"
+    text += f" and {_interval(best['fat_factor'], 2)} times by the noise of a voxel in plain fat, the tissue it is told"
     text = text[0].upper() + text[1:]
     s = data["settings"]
     reduced = s["views"] < 1968 or not s["control"]
@@ -127,8 +127,8 @@ def dose_section(data: dict[str, Any]) -> str:
         "“without the core”: the contrast read in that twin, where there is none. ROI contrast: between the paper's "
         "two ROIs; lesion contrast: between all core and all fibrous tissue of the core's slices. The factor of a "
         "contrast is that of its variance at slope 1: never read it without slope and bias. Noise in fat is that of "
-        f"single voxels (FBP 0.25 mm, MBIR {data['mbir_voxel_mm']:.2f} mm): it says how smooth the image is, not what "
-        "can be seen.",
+        f"single voxels (FBP 0.25 mm, MBIR {data['mbir_voxel_mm']:.2f} mm), in the tissue that "
+        "MBIR is told as the surround: it says how smooth the image is there, not what can be seen.",
     ]
     for e in data["dose_factors"]:
         fbp = _at(data["reference"], e["exposure_s"])

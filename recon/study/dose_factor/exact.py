@@ -17,14 +17,9 @@ from recon.study.dose_factor.settings import FBP_BASE, LINEAR_METHODS, MAIN_SCEN
 from recon.study.dose_factor.variant import Variant
 from torchpcct.metrics import LinearReference, NoiseCovariance, ceiling, paper_cnr_ceiling, task_transfer
 
-__all__ = ["Exact", "contrast_sd"]
+__all__ = ["Exact"]
 
 Floats = NDArray[np.float64]
-
-
-def contrast_sd(covariance: Floats, dose: float = 1.0) -> float:
-    """Standard deviation of the contrast between two ROI means, from their covariance at 1 s."""
-    return math.sqrt((covariance[0, 0] + covariance[1, 1] - 2 * covariance[0, 1]) / dose)
 
 
 class Exact:
@@ -123,11 +118,13 @@ class Exact:
         return drawn_figures(self.m, name, dose, self.truth)
 
     def _sharper(self, dose: float) -> dict[str, LinearReference]:
-        """FBP variants to match resolution with."""
+        """FBP variants to match resolution with, and their noise at the core's edge."""
         found = {}
         for label, f in self.m.fbp.items():
             plane, z = (task_transfer(f[d], self.m.distances["fbp", d], REACH_MM, BIN_MM) for d in ("plane", "z"))
-            found[label] = LinearReference(plane, z, NoiseCovariance.exact(f["row"] / dose, FBP_BASE[1]))
+            # The correlation of neighbours is that of fat, the variance that of the core's edge.
+            row = f["row"] * (f["variance"][2] / f["variance"][0] / dose)
+            found[label] = LinearReference(plane, z, NoiseCovariance.exact(row, FBP_BASE[1]))
         return found
 
     def entries(self, dose: float) -> list[dict[str, Any]]:

@@ -4,8 +4,8 @@ Both give the same arrays, at one exposure:
 
 * ``readings`` ``(scenes, rows)`` of noise-free scans, ``covariance`` ``(rows, rows)`` HU²: of
   :attr:`recon.study.dose_factor.readings.Readings.weights`;
-* ``variance`` ``(2,)`` HU² of a voxel in fat and in the vessel; ``square`` ``(2,)`` mean squared error of the
-  noise-free volume in vessel and fat;
+* ``variance`` ``(3,)`` HU² of a voxel in fat, in the vessel and at the core's edge, each averaged over its slices;
+  ``square`` ``(2,)`` mean squared error of the noise-free volume in vessel and fat;
 * ``row`` ``(z, y, x)`` covariance in HU² of the middle voxel with those around it, scaled to the variance in fat
   (linear noise knows no tissue);
 * ``plane`` and ``z``: edge profile of the core, present minus absent.
@@ -47,15 +47,16 @@ def _of_scenes(readings: Readings, volumes: Tensor) -> dict[str, Any]:
 
 
 def _noise(readings: Readings, covariance: Floats, spread: Tensor) -> dict[str, Any]:
-    count, fat, vessel = len(readings.weights), len(readings.voxels[0]), len(readings.voxels[1])
-    variances = np.diag(covariance)[count:]
-    level = float(variances[:fat].mean())
+    count, ends = len(readings.weights), np.cumsum([len(places) for places, _ in readings.samples])
+    single = np.split(np.diag(covariance)[count:], ends)
+    variances = [shares @ v for (_, shares), v in zip(readings.samples, single, strict=False)]
+    level = float(variances[0])
     grid, middle = readings.grid, readings.middle
     reach = [min(round(_LAGS_MM / s), k, n - 1 - k) for s, k, n in zip(grid.spacing, middle, grid.shape, strict=True)]
     row = spread.double().numpy()[tuple(slice(k - r, k + r + 1) for k, r in zip(middle, reach, strict=True))]
     return {
         "covariance": covariance[:count, :count],
-        "variance": np.array([level, variances[fat : fat + vessel].mean()]),
+        "variance": np.array(variances),
         "row": row * (level / float(spread[middle])),
     }
 

@@ -75,13 +75,14 @@ def exact_figures(
         realizations=None,
         noise=_exact_noise(found["row"] / dose, spacing, m.fat_shape[kind]),
         log_variance=math.log(found["variance"][0] / dose),
+        log_edge=math.log(found["variance"][2] / dose),
         means={name: list(map(float, row[rois])) for name, row in zip(MAIN_SCENES, readings, strict=True)},
         slopes={
             name: float((values[k] - values[1]) / (true[k] - true[1])) for k, name in enumerate(MAIN_SCENES) if k != 1
         },
         log_core=core, log_fibrous=fibrous, log_contrast=contrast, log_detectability=seen,
         log_error=[
-            math.log(b + v / dose) for b, v in zip(found["square"], found["variance"][::-1], strict=True)
+            math.log(b + v / dose) for b, v in zip(found["square"], found["variance"][1::-1], strict=True)
         ],
         f50={d: _f50(found[d], m.distances[kind, d]) for d in DIRECTIONS},
     )  # fmt: skip
@@ -132,6 +133,7 @@ def drawn_figures(m: Measured, method: str, dose: float, truth: dict[str, Floats
             change = (v - values[absent][: len(v)]) / (true[name] - true[absent])
             slopes[name] = controlled_mean(change, None, None)
     noise = RegionNoise.of(samples["paper"]["fat"], m.settings.voxel_mm, _SHELL_LP_MM)
+    edge = samples["paper"]["edge"].astype(np.float64)
     f50: dict[str, Any] = {}
     for d in DIRECTIONS:
         try:
@@ -141,6 +143,7 @@ def drawn_figures(m: Measured, method: str, dose: float, truth: dict[str, Floats
             f50[d] = None
     return Figures(
         realizations=len(readings), noise=noise, log_variance=noise.log_variance, means=means, slopes=dict(slopes),
+        log_edge=log_of_sum(np.square(edge - edge.mean(0)).mean(1), lost=1),
         log_core=list(logs["core"]), log_fibrous=list(logs["fibrous"]), log_contrast=list(logs["contrast"]),
         log_detectability={
             o: control.detectability(readings[:, _rows(o)], samples[absent]["readings"][:, _rows(o)], o)

@@ -75,7 +75,7 @@ class Measured:
         responses: (method, dose) → the same of the method's own linear response
             (:mod:`recon.study.dose_factor.response`), a better control; of methods with all realisations.
         samples: (method, scene, dose) → ``readings (n, rows)``, with and without the core ``plane`` and ``z``
-            ``(n, bins)``; of the paper's scene also ``fat``, ``square`` and ``shape``.
+            ``(n, bins)``; of the paper's scene also ``fat``, ``edge``, ``square`` and ``shape``.
         extra, vessels: (method, scene or vessel, dose) → :meth:`recon.study.dose_factor.places.Places.found`.
         volumes: (method or "fbp", scene, dose) → first realisation, HU.
         gains: dose → method or FBP variant → worst-case response, HU mm^1.5.
@@ -209,14 +209,14 @@ class _Study:
             self.report("exact: FBP, linear methods", done / steps)
             done += 1
             m.fbp[fbp_label(kernel, FBP_BASE[1])] = self.store.piece(
-                f"exact/fbp_{kernel}", self.noise.key,
+                f"exact/fbp_{kernel}", f"{self.noise.key} 3",
                 partial(fbp_figures, scenes, self._readings("fbp"), kernel),
             )  # fmt: skip
         for method in load_methods(names):
             for dose in s.doses:
                 self.report("exact: FBP, linear methods", done / steps)
                 done += 1
-                place, key = f"exact/{method.name}_{dose:g}s", f"{self.noise.key} {fingerprint(method)}"
+                place, key = f"exact/{method.name}_{dose:g}s", f"{self.noise.key} {fingerprint(method)} 3"
                 kept = in_parts(method, self.store, place, key)
                 found = self.store.piece(
                     place, key,
@@ -333,11 +333,12 @@ class _Study:
                     result["first"] = volume[0].numpy().astype(np.float16)
             if name == "paper":
                 result |= {"fat": readings.fat(volume), "square": readings.squares(volume)}
+                result["edge"] = readings.edge(volume)
                 result["shape"] = np.array([segmentation(scene, scene.grid, v) for v in volume])
             return result
 
         place = f"methods/{method.name}/{name}_{dose:g}s_{block.start}-{block.stop}"
-        key = f"{self.noise.key} {fingerprint(method)} 3"
+        key = f"{self.noise.key} {fingerprint(method)} 4"
         found = self.store.piece(place, key, compute)
         self.store.drop(place)
         return found

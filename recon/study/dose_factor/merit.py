@@ -32,7 +32,7 @@ Figure = float | Jackknifed
 
 FACTOR_NAMES = {
     "noise": "pixel noise",
-    "noise_matched": "noise, matched",
+    "noise_matched": "edge, matched",
     "d_prime_axial": "d′ axial",
     "d_prime_volume": "d′ volume",
     "contrast_paper": "σ² paper",
@@ -49,7 +49,7 @@ FACTOR_NAMES = {
 class Figures:
     """Attributes:
     realizations: None: exact.
-    noise: in fat; ``log_variance``: ln of a voxel's variance there, HU².
+    noise: in fat; ``log_variance``: ln of a voxel's variance there, HU²; ``log_edge``: at the core's edge.
     means: scene (with and without the core) → expectations of core and fibrous tissue of every ROI, HU.
     slopes: scene → contrast slope between it and the absent core in the paper's ROI.
     log_core, log_fibrous, log_contrast: ln of the variance in every ROI, HU².
@@ -61,6 +61,7 @@ class Figures:
     realizations: int | None
     noise: RegionNoise
     log_variance: Figure
+    log_edge: Figure
     means: Mapping[str, Sequence[Figure]]
     slopes: Mapping[str, Figure]
     log_core: Sequence[Figure]
@@ -176,6 +177,7 @@ def entry_of(figures: Figures, reference: Figures, truth: dict[str, Floats]) -> 
     return {
         "realizations": figures.realizations,
         "fat_sd_hu": json_of(figures.log_variance, 0.5),
+        "edge_sd_hu": json_of(figures.log_edge, 0.5),
         "fat_nps": {
             "frequency_lp_mm": figures.noise.frequencies.tolist(), "hu2_mm2": figures.noise.radial.tolist(),
         },
@@ -244,11 +246,12 @@ def _error_factor(log_error: Figure, bias2: float, variance: float) -> Any:
 
 
 def _matched(figures: Figures, sharper: dict[str, LinearReference]) -> Any:
-    """Factor by the variance in fat against FBP filtered to the same f50, in plane and along z."""
+    """Factor by the variance at the core's edge against FBP filtered to the same f50 there, in plane and along z: of
+    one place, for a method that adapts to the image is sharp at an edge, quiet in plain fat, and nowhere both."""
     plane, along_z = (figures.f50[d] for d in DIRECTIONS)
     if plane is None or along_z is None:
         return none("the edge's transfer function cannot be told")
-    log_variance = figures.log_variance
+    log_variance = figures.log_edge
     if not isinstance(log_variance, Jackknifed):
         log_variance = Jackknifed(log_variance, np.full(3, log_variance))
     why = "no FBP"
@@ -259,7 +262,7 @@ def _matched(figures: Figures, sharper: dict[str, LinearReference]) -> Any:
             why = str(error)
             continue
         low, high = m.ratio.high**-2, m.ratio.low**-2
-        found = {"value": m.ratio.value**-2, "against": label, "sigma_mm": m.sigma_mm, "sigma_z_mm": m.sigma_z_mm,
-                 "fbp_sd_hu": m.reference_sd_hu}  # fmt: skip
+        found = {"value": m.ratio.value**-2, "against": label, "kernel": label.split()[0],
+                 "sigma_mm": m.sigma_mm, "sigma_z_mm": m.sigma_z_mm, "fbp_sd_hu": m.reference_sd_hu}  # fmt: skip
         return found if figures.realizations is None else {**found, "low": low, "high": high}
     return none(why)

@@ -34,8 +34,8 @@ _CLEAR_MM = 0.6
 """Fat whose error counts keeps this far from the vessel and from the rim of the inset."""
 _FINE = 5
 """Points along the edge of a voxel for its true value."""
-_SAMPLED = 3
-"""Voxels of the vessel whose exact variance stands for all."""
+_EDGE_MM = 0.2
+"""The core's edge: voxels whose middle is no further from its surface."""
 
 
 class Readings:
@@ -49,7 +49,10 @@ class Readings:
     Attributes:
         weights: ``(2 · rois + channels, z, y, x)`` float64: core and fibrous mean of every ROI of
             :data:`recon.study.dose_factor.settings.ROIS`, then the channels of every observer.
-        voxels: ``[fat, vessel]``, places whose exact variance stands for the region's.
+        samples: of fat, vessel and the core's edge the voxels whose exact variance stands for the region's, and their
+            shares in it. One in every slice (of the vessel those of the fat, of the fat in both its parts): FDK smooths
+            along z where it interpolates between detector rows and not where a slice meets a row, so the variance of a
+            single slice may be a third above the mean.
         distances: direction → ``(bins,)`` mm from the core's surface, of :meth:`read`'s ``profile``.
     """
 
@@ -72,17 +75,21 @@ class Readings:
         inner = np.zeros(grid.shape, dtype=bool)
         inner[tuple(slice(k, n - k) for k, n in zip(rim, grid.shape, strict=True))] = True
         self._masks = [torch.from_numpy(vessel), torch.from_numpy(away & inner)]
-        inside = np.argwhere(vessel)
-        picked = inside[np.linspace(0, len(inside) - 1, _SAMPLED + 2).astype(int)[1:-1]]
-        _, y, x = self._boxes[0]
-        fat: list[tuple[int, ...]] = [(grid.shape[0] // 2, (y.start + y.stop) // 2, (x.start + x.stop) // 2)]
-        self.voxels: list[list[tuple[int, ...]]] = [fat, [tuple(int(k) for k in p) for p in picked]]
-        self.distances: dict[str, Floats] = {}
-        self._profiles = self._edges(variant, crop)
-
-    def _edges(self, variant: Variant, crop: VolumeGrid) -> list[Tensor]:
-        """Matrices ``(bins, voxels of the crop)`` that average over voxels of equal distance from the core."""
+        fat: list[tuple[int, ...]] = [
+            (z, (y.start + y.stop) // 2, (x.start + x.stop) // 2) for slices, y, x in self._boxes for z in slices
+        ]
+        slices = self._boxes[0][0]
         distance = ellipsoid_distance(crop, variant.core_center, tuple(variant.plaque.core.semi_axes[::-1]))
+        self._edge = np.flatnonzero(np.abs(distance) <= _EDGE_MM)
+        corner = np.array([part.start for part in self._crop])
+        rim = np.argwhere(np.abs(distance) <= _EDGE_MM) + corner
+        self.samples = [(fat, np.full(len(fat), 1.0 / len(fat))), _by_slice(np.argwhere(vessel), slices),
+                        _by_slice(rim, np.unique(rim[:, 0]).tolist())]  # fmt: skip
+        self.distances: dict[str, Floats] = {}
+        self._profiles = self._edges(distance, crop)
+
+    def _edges(self, distance: Floats, crop: VolumeGrid) -> list[Tensor]:
+        """Matrices ``(bins, voxels of the crop)`` that average over voxels of equal distance from the core."""
         count = round(sum(REACH_MM) / BIN_MM)
         matrices = []
         for direction in DIRECTIONS:
@@ -99,9 +106,9 @@ class Readings:
         return matrices
 
     def functionals(self) -> list[Functional]:
-        """The rows of :attr:`weights`, then single voxels: of the fat, of the vessel, and the middle one."""
+        """The rows of :attr:`weights`, then single voxels: of :attr:`samples`, and the middle one."""
         singles = []
-        for place in (*self.voxels[0], *self.voxels[1], self.middle):
+        for place in (*(place for places, _ in self.samples for place in places), self.middle):
             weights = torch.zeros(self.grid.shape, dtype=torch.float64)
             weights[place] = 1.0
             singles.append(weights)
@@ -132,6 +139,11 @@ class Readings:
         """``(n, slices, y, x)`` of uniform fat."""
         return torch.cat([volumes[(slice(None), *box)] for box in self._boxes], 1).float().numpy()
 
+    def edge(self, volumes: Tensor) -> NDArray[np.float32]:
+        """``(n, voxels)`` of the core's edge."""
+        crop = volumes[(slice(None), *self._crop)].flatten(1)
+        return crop[:, torch.from_numpy(self._edge)].float().numpy()
+
     @property
     def fat_shape(self) -> tuple[int, int]:
         """``(y, x)`` voxels of a slice of :meth:`fat`."""
@@ -143,6 +155,13 @@ class Readings:
         error = (volumes.double() - self._truth).square()
         found: Floats = torch.stack([error[:, m].mean(1) for m in self._masks], 1).numpy()
         return found
+
+
+def _by_slice(places: NDArray[np.int64], slices: list[int]) -> tuple[list[tuple[int, ...]], Floats]:
+    """Of the places in each of the slices the one in the middle, and how many there are over those of all."""
+    of = [places[places[:, 0] == z] for z in slices]
+    counts = np.array([len(p) for p in of], dtype=np.float64)
+    return [tuple(map(int, p[len(p) // 2])) for p in of], counts / counts.sum()
 
 
 def _fat_boxes(grid: VolumeGrid, patient: NDArray[np.float64]) -> list[tuple[Any, slice, slice]]:

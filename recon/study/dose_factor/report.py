@@ -57,7 +57,9 @@ def _headline(data: dict[str, Any]) -> str:
         asked = (("contrast_paper", "contrast in the paper's ROI"), ("contrast_tissue", "contrast in the whole lesion"),
                  ("d_prime_volume", "d′ of the volume"))  # fmt: skip
         found = ", ".join(f"{text(f[k])} by {label} (limit {c[k]:.1f})" for k, label in asked)
-        parts.append(f"at {dose:g} s {found}, {text(f['noise'])} by the noise in fat")
+        parts.append(
+            f"at {dose:g} s {found}, {text(f['noise'])} by the noise in plain fat, the tissue that MBIR is told"
+        )
     return (
         f"The paper assumes {ASSUMED_FACTOR}×; measured for {METHOD_NAMES[method]} against FBP {fbp_label(*FBP_BASE)}: "
         + "; ".join(parts)
@@ -77,6 +79,7 @@ def _intro(data: dict[str, Any]) -> str:
     controls = f"{own}linear filters"
     tissues = ", ".join(f"{k} {v:.1f}" for k, v in t["tissues_hu"].items())
     rois = ", ".join(f"{k} {r['foreground_mm2']:.2f} / {r['background_mm2']:.2f}" for k, r in data["rois"].items())
+    notes = "".join(f"\n\n{note}" for note in data.get("notes", ()))
     return (
         f"Seeds from {s['seed']}, the same for every method and scene. {s['views']} views; methods on "
         f"{s['voxel_mm']:g} mm voxels. {drawn}\n\n"
@@ -90,7 +93,7 @@ def _intro(data: dict[str, Any]) -> str:
         "difference-of-Gaussians channels, the same channels and estimate for all; with and without core the draws are "
         "the same, which counts as n draws. RMSE against the true volume. The limit is the best unbiased estimate with "
         "all shapes known; for d′ the ideal observer, which knows all but whether the core is there. A figure above "
-        "the limit is bias, not skill."
+        f"the limit is bias, not skill.{notes}"
     )
 
 

@@ -88,7 +88,7 @@ PURPOSES = {
     "mbir": "quiet images with sharp outlines, ROI means a little shrunk",
     "mbir_tissues": "plaques in an enhanced vessel: sharp outlines, a core that is certain at full contrast",
     "mbir_viewing": "the quietest images",
-    "mbir_measuring": "ROI means at nearly full contrast",
+    "mbir_measuring": "more of the contrast, at more noise",
     "mbir_no_cnn": "what the network adds (ablation)",
     "mbir_one_step": "what the second step adds (ablation)",
     "mbir_free": "what data consistency adds (ablation)",

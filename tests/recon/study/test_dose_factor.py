@@ -12,6 +12,7 @@ from tiny_studies import TINY as SMALLEST
 from tiny_studies import assert_report_is_whole
 
 from recon.cli import main
+from recon.fbp.inset import InsetFbp
 from recon.pwls.qggmrf import quadratic
 from recon.study import registry
 from recon.study.dose_factor import measure as study
@@ -120,6 +121,25 @@ def test_exact_fbp_is_that_of_its_realisations(scene, measured):
     assert ((ratio > 0.4) & (ratio < 1.9)).all()
 
 
+def test_exact_noise_of_fbp_in_fat_is_that_of_all_slices_that_methods_are_read_in(scene, measured):
+    """A slice that meets a detector row is noisier than its neighbours: one voxel of it is not the region."""
+    grid = scene.grid_of(0.25)
+    readings, fbp = Readings(scene, grid, scene.facts.tissue_hu), InsetFbp(scene.clean, [grid], ["soft"])
+    noisy = torch.stack([fbp(scene.clean.with_noise(2.0, seed))[0][0] for seed in range(16)])
+    drawn = readings.fat(noisy).astype(float).var(0, ddof=1).mean()
+    assert drawn == pytest.approx(measured.fbp["soft 0.25 mm"]["variance"][0] / 2.0, rel=0.07)
+
+
+def test_noise_at_matched_resolution_is_told_where_the_resolution_is(analysed):
+    """Both at the core's edge: not the resolution of an edge with the noise of plain fat."""
+    for e in analysed["methods"]:
+        matched = e["factors"]["noise_matched"]
+        if matched["value"] is not None:
+            assert matched["value"] == pytest.approx((matched["fbp_sd_hu"] / e["edge_sd_hu"]["value"]) ** 2)
+    soft = entry(analysed, "FBP soft 0.25 mm")
+    assert soft["factors"]["noise_matched"]["fbp_sd_hu"] == pytest.approx(soft["edge_sd_hu"]["value"], rel=1e-3)
+
+
 def test_exact_linear_is_that_of_its_realisations(scene, measured):
     noise = Realisations(TINY, scene.store, lambda name: scene)
     b = noise.statistic("paper", 2.0, range(7))
@@ -132,7 +152,7 @@ def test_exact_linear_is_that_of_its_realisations(scene, measured):
     fat = readings.fat(volumes).astype(float)
     assert fat.var(0, ddof=1).mean() == pytest.approx(found["variance"][0], rel=0.25)
     square = readings.squares(volumes).mean(0)
-    assert square == pytest.approx(found["square"] + found["variance"][::-1], rel=0.25)
+    assert square == pytest.approx(found["square"] + found["variance"][1::-1], rel=0.25)
 
 
 def test_exact_noise_spectrum_is_that_of_realisations(scene, measured):
