@@ -29,7 +29,7 @@ from recon.mbir.problem import NormalisedProblem
 from recon.mbir.unrolled import DEFAULT_LOOK, start
 from train.config import ObjectiveConfig
 from train.data import Batch, Data, seed_of
-from train.scenes.held_out import ValidationScenes, validation_scenes
+from train.scenes.held_out import CHECKPOINT_SEED, ValidationScenes, validation_scenes
 
 __all__ = ["Loss", "Objective", "Validation"]
 
@@ -127,7 +127,9 @@ class Objective:
         return self.config.data * (tame * (data + self.config.white * white)).sum()
 
     @torch.no_grad()
-    def validate(self, model: nn.Module, data: Data, seed: int = 0, look: float = DEFAULT_LOOK) -> Validation:
+    def validate(
+        self, model: nn.Module, data: Data, seed: int = CHECKPOINT_SEED, look: float = DEFAULT_LOOK
+    ) -> Validation:
         """Figures on held-out plaques; small contrasts and lesions count, and that no contrast is invented.
 
         Args:

@@ -413,7 +413,7 @@ def add_reconstruct(commands: Commands) -> None:
     axes = ("Z", "Y", "X")
     parser.add_argument("--method", default="fbp", help="fbp, pwls or mbir (default fbp)")
     parser.add_argument("--kernel", help="FBP kernel: soft, standard, detail, bone, ram-lak")
-    parser.add_argument("--look", type=float, help="of MBIR: 0, for viewing … 1, for measuring (default 0.5)")
+    parser.add_argument("--look", type=float, help="of MBIR: 0, quiet … 1, more contrast and noise (default 0.5)")
     parser.add_argument("--tissues", action="store_true", help="MBIR with the tissues of the vessel in the inset")
     parser.add_argument("--weights", type=Path, metavar="FILE", help="of MBIR: your own (default: those that ship)")
     parser.add_argument("--point", type=float, nargs=3, metavar=axes, help="where a reader sees its plaque, mm")

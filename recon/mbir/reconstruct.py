@@ -48,7 +48,7 @@ def reconstruct_mbir(
         network: with its weights; None: those of the package.
         problem: kept from an earlier call with the same scan and (working) grid; None: made here.
         batch: volumes at a time.
-        look: 0, quiet images for viewing, … 1, for measuring: ROI means at nearly full contrast
+        look: 0, quiet images for viewing, … 1, for measuring: more of the contrast, at more noise
             (:mod:`recon.mbir.unrolled`); None: that of ``network``, which is 0.5 unless it was loaded with another.
         noise_map: add an estimate of each voxel's standard deviation, ``report["noise_sd_hu"]``.
         tissues: fit the tissues of a contrast-enhanced vessel first, and let the network reconstruct what they leave

@@ -1,6 +1,6 @@
 """How much of a fitted core MBIR with tissues should draw: the trade-off between its contrast and its noise.
 
-    python tests/bench/tissue_shares.py [--draws 48] [--plaques 24] [--doses 0.35 2.0] [--out notebooks/plaque]
+    python tests/bench/tissue_shares.py [--draws 48] [--plaques 16] [--doses 0.35 2.0] [--out notebooks/plaque]
 
 One reading a draw, blind; then the image with the core enters the tissues' image T (`recon.mbir.tissues`) with a share
 that is never its own, half of the core's probability P, P (what the package does), P², all of it from P = 0.95 on, or
@@ -165,7 +165,7 @@ def main() -> None:
     """Both kinds of draws at every dose; the files are written after each."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--draws", type=int, default=48, help="of the paper's plaque")
-    parser.add_argument("--plaques", type=int, default=24, help="held-out plaques")
+    parser.add_argument("--plaques", type=int, default=16, help="held-out plaques")
     parser.add_argument("--doses", type=float, nargs="+", default=[0.35, 2.0], metavar="S")
     parser.add_argument("--out", type=Path, default=Path("notebooks/plaque"), help="folder for the report")
     options = parser.parse_args()

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from train.scenes.drawing import draw_scene
-from train.scenes.held_out import validation_scenes
+from train.scenes.held_out import unseen_plaque, validation_scenes
 from train.scenes.rasterise import random_scene, rasterise
 from train.scenes.scene import SceneConfig, Solid, Texture, TrainingScene, Vessel, is_paper_family
 
@@ -148,16 +148,28 @@ def test_paper_family_is_recognised() -> None:
     assert is_paper_family(TrainingScene(-90.0, (vessel(solids=(PAPER_CORE,)),)))
     turned = replace(PAPER_CORE, semi_axes=(1.1, 0.5, 0.9), contrast=-36.0)
     assert is_paper_family(TrainingScene(-90.0, (vessel(diameter=2.6), vessel(diameter=3.6, solids=(turned,)))))
-    others = (
+    relatives = (
         vessel(diameter=2.9, solids=(PAPER_CORE,)),
         vessel(solids=(PAPER_CORE, PAPER_CORE)),
         vessel(solids=(replace(PAPER_CORE, contrast=-80.0),)),
-        vessel(solids=(replace(PAPER_CORE, contrast=52.0),)),
-        vessel(solids=(replace(PAPER_CORE, semi_axes=(0.6, 0.7, 0.985)),)),
         vessel(solids=(replace(PAPER_CORE, shape="superquadric", exponent=4.0),)),
+    )
+    assert all(is_paper_family(TrainingScene(-90.0, (v,))) for v in relatives)
+    others = (
+        vessel(diameter=2.6, solids=(PAPER_CORE,)),
+        vessel(solids=(replace(PAPER_CORE, contrast=-95.0),)),
+        vessel(solids=(replace(PAPER_CORE, contrast=52.0),)),
+        vessel(solids=(replace(PAPER_CORE, semi_axes=(0.6, 0.65, 0.985)),)),
         vessel(),
     )
     assert not any(is_paper_family(TrainingScene(-90.0, (v,))) for v in others)
+
+
+def test_the_rule_takes_something_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One draw in a hundred: a rule that rejects nothing excludes nothing."""
+    monkeypatch.setattr("train.scenes.drawing.is_paper_family", lambda scene: False)
+    rejected = sum(is_paper_family(draw_scene(seed, EXTENT)) for seed in range(600))
+    assert 3 <= rejected <= 18
 
 
 def test_paper_family_is_never_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -183,6 +195,15 @@ def test_texture_has_its_sd_and_length() -> None:
     points = np.stack([Texture(8.0, 0.6, seed).field((10, 10, 10), (0.06, 0.06, 0.6)) for seed in range(80)])
     correlation = np.mean(points[..., 1:] * points[..., :-1]) / np.mean(points**2)
     assert correlation == pytest.approx(math.exp(-0.5), abs=0.12)
+
+
+def test_plaques_that_weights_are_tested_on_chose_no_checkpoint() -> None:
+    shape, spacing = (24, 24, 29), (0.375, 0.375, 0.375)
+    chose = validation_scenes(shape, spacing, contrasts=(-60.0,)).scenes
+    tested = [unseen_plaque(k, shape, spacing, contrasts=(-60.0,)) for k in (0, 7, 8)]
+    assert [i for _, i in tested] == [0, 7, 0]
+    assert not any(held.scenes[i] in chose for held, i in tested)
+    assert tested[0][0].scenes[0] != tested[2][0].scenes[0]
 
 
 def test_validation_scenes() -> None:

@@ -262,14 +262,15 @@ class TrainingScene:
 def is_paper_family(scene: TrainingScene) -> bool:
     """Whether a scene is close to the paper's plaque in everything that describes it.
 
-    True if some vessel has an outer diameter within 10 % of 3.36 mm and holds exactly one core, an ellipsoid whose
-    semi-axes are, in order of size, all within 20 % of 0.6, 0.985, 0.985 mm, with a contrast of −70…−35 HU.
+    True if some vessel has an outer diameter within 20 % of 3.36 mm and holds, maybe among others, a core of any shape
+    whose semi-axes are, in order of size, all within 30 % of 0.6, 0.985, 0.985 mm, with a contrast of −90…−30 HU. That
+    is one in a hundred of the scenes that are drawn. (The weights that ship were trained with half of these widths and
+    single ellipsoids only, which is so rare a scene that the rule took nothing away.)
     """
-    for vessel in scene.vessels:
-        cores = vessel.cores
-        if len(cores) != 1 or cores[0].shape != "ellipsoid" or not -70.0 <= cores[0].contrast <= -35.0:
-            continue
-        ratios = [a / b for a, b in zip(sorted(cores[0].semi_axes), (0.6, 0.985, 0.985), strict=True)]
-        if abs(vessel.diameter / 3.36 - 1.0) <= 0.1 and all(abs(ratio - 1.0) <= 0.2 for ratio in ratios):
-            return True
-    return False
+    return any(
+        -90.0 <= core.contrast <= -30.0
+        and all(abs(a / b - 1.0) <= 0.3 for a, b in zip(sorted(core.semi_axes), (0.6, 0.985, 0.985), strict=True))
+        for vessel in scene.vessels
+        if abs(vessel.diameter / 3.36 - 1.0) <= 0.2
+        for core in vessel.cores
+    )
