@@ -162,16 +162,15 @@ def _resolution_table(data: dict[str, Any]) -> str:
     rows = []
     for e in data["methods"]:
         f, m = e["f50_lp_mm"], e["factors"]["noise_matched"]
-        sigmas = [f"{m[k]:.2f}" if k in m else "–" for k in ("sigma_mm", "sigma_z_mm")]
-        cells = [str(m.get("realizations") or _count(e)), text(f["plane"]), text(f["z"]), text(e.get("edge_sd_hu"), 1)]
-        cells += [m.get("against", "–"), *sigmas, text(m)]
+        sigmas = f"{m['sigma_mm']:.2f} / {m['sigma_z_mm']:.2f}" if "sigma_mm" in m else "–"
+        cells = [text(f["plane"]), text(f["z"]), text(e.get("edge_sd_hu"), 1), m.get("against", "–"), sigmas, text(m)]
         rows.append([f"{_name(e)}, {e['exposure_s']:g} s", *cells])
     return (
         "## Noise at matched resolution\n\nBoth at the core's edge: f50 (present minus absent), line pairs per mm, in "
         "plane and along z, and the SD of its voxels, HU. FBP of the softest kernel that is sharp enough, filtered by "
-        "Gaussians of σ to the same f50; its variance at the edge over the method's. (In plain fat a method that "
-        "adapts to the image is quiet without being sharp: its noise there belongs to no resolution.)\n\n"
-        + markdown_table(["", "n", "f50 plane", "f50 z", "edge SD", "FBP", "σ, mm", "σ z, mm", "factor"], rows)
+        "Gaussians of σ in plane and along z to the same f50; its variance at the edge over the method's. (In plain fat "
+        "a method that adapts to the image is quiet without being sharp: its noise there belongs to no resolution.)\n\n"
+        + markdown_table(["", "f50 plane", "f50 z", "edge SD", "FBP", "σ / σ z, mm", "factor"], rows)
     )
 
 
