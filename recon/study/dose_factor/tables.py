@@ -168,8 +168,8 @@ def _resolution_table(data: dict[str, Any]) -> str:
     return (
         "## Noise at matched resolution\n\nBoth at the core's edge: f50 (present minus absent), line pairs per mm, in "
         "plane and along z, and the SD of its voxels, HU. FBP of the softest kernel that is sharp enough, filtered by "
-        "Gaussians of σ in plane and along z to the same f50; its variance at the edge over the method's. (A method that "
-        "adapts to the image is quiet in plain fat without being sharp: that noise belongs to no resolution.)\n\n"
+        "Gaussians of σ in plane and along z to the same f50; its variance at the edge over the method's. (A method "
+        "that adapts to the image is quiet in plain fat without being sharp: that noise belongs to no resolution.)\n\n"
         + markdown_table(["", "f50 plane", "f50 z", "edge SD", "FBP", "σ / σ z, mm", "factor"], rows)
     )
 
