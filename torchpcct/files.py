@@ -137,17 +137,13 @@ def clear_folder(folder: str | os.PathLike[str]) -> None:
 
 
 @contextmanager
-def written_whole(path: str | os.PathLike[str], *failures: type[Exception]) -> Iterator[Path]:
+def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary name beside ``path``, for a file or a folder; flush what is there to the disk, rename it.
 
     Whoever reads ``path`` at any moment, also after a crash, finds the old content or the new one, whole; so do any
     number of processes and threads that write it at once. On any failure what is temporary is removed; what a killed
     process left is removed by the next write of the same name, a minute later. A folder takes the place of none, or of
     an empty one.
-
-    Args:
-        path: to write.
-        failures: what the writer raises where it cannot write, beside ``OSError``.
 
     Raises:
         FileNotFoundError: the folder of ``path`` does not exist.
@@ -168,9 +164,7 @@ def written_whole(path: str | os.PathLike[str], *failures: type[Exception]) -> I
         raise
     except FileNotFoundError as error:
         raise FileNotFoundError(f"cannot write {target}: its folder has been removed") from error
-    except Exception as error:
-        if not isinstance(error, (OSError, *failures)):
-            raise
+    except OSError as error:
         raise _write_error(target, error) from error
     finally:
         _remove(part)

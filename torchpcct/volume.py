@@ -86,7 +86,7 @@ class Volume:
         """Write ``.nii`` / ``.nii.gz`` (NIfTI-1), ``.mha`` (MetaImage), ``.h5`` (HDF5 with grid and report), or, if the
         name has no ending, a folder with a DICOM series in HU.
 
-        x, y, z of the scanner become right, anterior, superior. MetaImage and DICOM need the extra ``io``. A 2-D image
+        x, y, z of the scanner become right, anterior, superior. DICOM needs the extra ``io``. A 2-D image
         is written as :meth:`slices` makes it, but to HDF5, which keeps it as it is.
 
         Raises:

@@ -45,15 +45,14 @@ def write_tensors(path: Path, kind: str, tensors: Mapping[str, Tensor], metadata
         tensors: any names and types; copied to the CPU.
         metadata: JSON values, floats exact; no NaN or infinity.
     """
-    from safetensors import SafetensorError  # loads with its first use
-    from safetensors.torch import save_file
+    from safetensors.torch import save  # loads with its first use
 
     # Copies, as safetensors refuses tensors that share memory.
     plain = {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}
     text = json.dumps(dict(metadata), ensure_ascii=False, allow_nan=False)
     header = {"format": kind, "sha256": digest(plain), "metadata": text, "sha256_of_metadata": _sha256(text)}
-    with written_whole(path, SafetensorError) as part:
-        save_file(plain, part, header)
+    with written_whole(path) as part:
+        part.write_bytes(save(plain, header))  # save_file writes a temporary file of its own, and leaves it if killed
 
 
 def read_tensors(path: Path, kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:

@@ -83,7 +83,7 @@ class Store:
                 with written_whole(self.path(name + ".npz")) as part:  # its folder again, which others may clear
                     np.savez(part, **sealed)
                 break
-            except FileNotFoundError as error:
+            except (FileNotFoundError, FileExistsError) as error:  # of its folder
                 log.info("cleared while it was written: %s", error)
         return arrays
 

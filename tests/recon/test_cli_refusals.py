@@ -289,9 +289,7 @@ def test_a_full_disk_is_one_sentence_and_status_1(tmp_path, lines, capsys):
     try:
         for name in ("v.h5", "v.nii.gz", "v.mha", "series"):
             assert main(["reconstruct", str(lines / "two.h5"), "--out", str(tmp_path / name)]) == 1
-            said = capsys.readouterr().err
-            assert f"torchpcct reconstruct: cannot write {tmp_path / name}: " in said
-            assert len(said.splitlines()) == 1
+            assert capsys.readouterr().err == f"torchpcct reconstruct: cannot write {tmp_path / name}: File too large\n"
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert list(tmp_path.iterdir()) == []

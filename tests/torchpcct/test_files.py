@@ -25,7 +25,7 @@ from torchpcct.files import write_hdf5
 folder, rng = Path(sys.argv[1]), np.random.default_rng(0)
 cone = ConeBeam(full_turn(40), 300.0, 500.0, 64, 16, 1.0)
 scan = Scan.from_counts(rng.poisson(5e4, cone.shape), cone, air=5e4)
-small = Volume(torch.randn(4, 9, 9), VolumeGrid((4, 9, 9), 1.0))  # of one buffer of ITK
+small = Volume(torch.randn(4, 9, 9), VolumeGrid((4, 9, 9), 1.0))  # a last buffer may be lost
 volume = Volume(torch.round(300 * torch.randn(12, 64, 64)), VolumeGrid((12, 64, 64), 1.0))
 def objects(path):  # more structure than HDF5 keeps in memory
     with write_hdf5(path, "test") as file:
@@ -58,11 +58,8 @@ def test_what_cannot_be_written_is_an_error_in_one_sentence_and_leaves_nothing(t
     assert run.returncode == 0, run.stderr[-3000:]
     said = run.stdout.splitlines()
     assert len(said) == 3 * 10 - 3
-    assert [
-        s
-        for s in said
-        if not (s.startswith("cannot write ") and s.endswith(("File too large", "No space left on device")))
-    ] == []
+    assert [s for s in said if not (s.startswith("cannot write ") and s.endswith("File too large"))] == []
+    assert run.stderr == ""
     assert list(tmp_path.iterdir()) == []
 
 
