@@ -221,7 +221,10 @@ def read_plaque(
             cleared, find_vessel(cleared.pilot(), data.grid, None if where is None else np.array(where)), vessel_prior
         )
         fit = vessel.fit(vessel.first_guess(), expected=True)
-    fit = _calcified(vessel, fit, particles, rng)
+    stands = leftover(vessel, fit)
+    if stands.score <= STRIKING or not stands.beside:
+        # Bodies in the vessel do not explain what lies beside it; they would only stand in for it.
+        fit = _calcified(vessel, fit, particles, rng)
     core = CorePrior(point=place, point_sd=point_sd)
     return _read(vessel, fit, core, particles, prior, rng, seed)
 
