@@ -72,9 +72,11 @@ def answer(data: dict[str, Any]) -> str:
         verdict, reaches = {
             "yes": ("Yes", "reaches"), "no": ("No", "does not reach"), "open": ("Open", "may or may not reach"),
         }[cnr["met"]]  # fmt: skip
+        controlled = "controlled " if data["settings"]["control"] else ""
         against = "and not" if cnr["met"] == "no" else "against"
         text = (
-            f"{verdict}: at {tested['mbir_s']:.2f} s MBIR's CNR of {_interval(cnr['mbir'], 2)} {reaches} the "
+            f"{verdict}: at {tested['mbir_s']:.2f} s MBIR's {controlled}CNR of {_interval(cnr['mbir'], 2)} {reaches} "
+            "the "
             f"{cnr['fbp']:.2f} of FBP (soft kernel, 0.25 mm) at {tested['fbp_s']:.2f} s, as it is worth "
             f"{_interval(cnr['factor'], 2)} times the dose {against} the {ASSUMED_FACTOR:g} times that the paper "
             "assumes; "

@@ -40,6 +40,11 @@ def noise_free_table(data: dict[str, Any]) -> str:
     )
 
 
+def _controlled(data: dict[str, Any]) -> list[dict[str, Any]]:
+    """MBIR's dose factors, if a control takes most of their noise off."""
+    return list(data.get("dose_factors", [])) if data["settings"].get("control") else []
+
+
 def tables(data: dict[str, Any], dose: str, exposure: float) -> str:
     """Exact, measured and published moments of both ROIs and the CNR at an exposure."""
     s = data["settings"]
@@ -56,7 +61,10 @@ def tables(data: dict[str, Any], dose: str, exposure: float) -> str:
             lambda means, variances: f"{means[roi]:.1f} ({np.sqrt(variances[roi]):.1f})",
         )
 
-    def table(title: str, entries: Any, form: str, runs: Callable[[Any], str], known: Callable[[Any, Any], str]) -> str:
+    def table(
+        title: str, entries: Any, form: str, runs: Callable[[Any], str], known: Callable[[Any, Any], str],
+        controlled: str = "",
+    ) -> str:  # fmt: skip
         def of_exact(method: str, kernel: str, voxel: float) -> str:
             e = exact.get((kernel, voxel)) if method == "fbp" else None
             if e is None:
@@ -77,6 +85,8 @@ def tables(data: dict[str, Any], dose: str, exposure: float) -> str:
                 cells = [cell(m, k, voxel) for m, k in methods]
                 if any(cells):
                     rows.append([f"{voxel:.2f} mm, {source}", *cells])
+            if controlled and voxel == data.get("mbir_voxel_mm"):
+                rows.append([f"{voxel:.2f} mm, controlled", *[controlled if m == MBIR else "" for m in methods]])
         header = [kernel if method == "fbp" else method.upper() for method, kernel in methods]
         return f"{title}\n\n" + markdown_table(["", *header], rows)
 
@@ -91,6 +101,7 @@ def tables(data: dict[str, Any], dose: str, exposure: float) -> str:
                 "{:.2f}",
                 lambda e: f"{e['cnr']:.2f}",
                 lambda means, variances: f"{(means[1] - means[0]) / np.sqrt(variances.sum()):.2f}",
+                next((f"{e['paper_cnr']['value']:.2f}" for e in _controlled(data) if e["exposure_s"] == exposure), ""),
             ),
         ]
     )

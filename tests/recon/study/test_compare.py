@@ -1,6 +1,8 @@
 """The comparison at small scale, and the ROIs that it measures in."""
 
+import json
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -267,3 +269,21 @@ def test_settings_refuse_too_few_realisations_for_mbir():
     assert Settings(realizations=5, control=False).exposures((2.0, 0.35)) == (0.35, 2.0)
     with pytest.raises(ValueError, match="at least 3"):
         Settings(realizations=2, mbir=False)
+
+
+def test_the_table_says_which_estimate_the_headline_is():
+    """A controlled CNR of 0.88 once stood over a table of ten raw draws that said 0.08, without a word."""
+    folder = Path(__file__).parents[3] / "notebooks" / "compare"
+    data = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+    text = (folder / "report.md").read_text(encoding="utf-8")
+    said = answer(data)
+    assert said == data["answer"]
+    assert said in text
+    assert "MBIR's controlled CNR of" in said
+    name, exposure = next(iter(data["settings"]["doses"].items()))
+    section = tables(data, name, exposure)
+    assert section in text
+    row = next(line for line in section.splitlines() if "controlled" in line)
+    (factors,) = (f for f in data["dose_factors"] if f["exposure_s"] == exposure)
+    assert row.split("|")[-2].strip() == f"{factors['paper_cnr']['value']:.2f}"
+    assert "controlled" not in tables({**data, "settings": {**data["settings"], "control": False}}, name, exposure)
