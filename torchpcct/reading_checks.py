@@ -67,7 +67,7 @@ def reading_warnings(scan: Scan) -> list[str]:
     # Of transmissions the noise says nothing of the photons in each cell.
     unknown = str(scan.info.get("signal_of_one_photon_from")).startswith("noise")
     offset = [] if unknown else _offset(counts, quantum)
-    return dim + (_clipped(counts) or offset or _brighter_than_air(lines))
+    return dim + (_clipped(counts, quantum) or offset or _brighter_than_air(lines))
 
 
 def _without_light(scan: Scan) -> list[str]:
@@ -136,14 +136,15 @@ def _mean(values: NDArray[np.float64], axes: tuple[int, ...]) -> NDArray[np.floa
     return np.where(number > 0, total / np.maximum(number, 1), np.nan)
 
 
-def _clipped(counts: NDArray[np.float64]) -> list[str]:
+def _clipped(counts: NDArray[np.float64], quantum: float) -> list[str]:
     """Readings that stop at the detector's full well: the highest of a cell comes again and again."""
     columns = counts.shape[-1]
     views = counts.shape[0]
     highest = np.nanmax(np.where(np.isnan(counts), -np.inf, counts), axis=0)
     at_top = counts >= highest
-    often = at_top.sum(0) >= max(5, 0.05 * views)
-    share = float((at_top & often & (highest > 0)).sum()) / counts.size
+    # A handful of photons comes again and again, too.
+    often = (at_top.sum(0) >= max(5, 0.05 * views)) & (highest > DIM * quantum)
+    share = float((at_top & often).sum()) / counts.size
     if share < CLIPPED_SHARE:
         return []
     # Below, there must be noise: white, of more than one step of the digits, and more than the highest readings have.
@@ -166,7 +167,7 @@ def _clipped(counts: NDArray[np.float64]) -> list[str]:
         return []
     return [
         f"{100 * share:.2g} % of the readings stop at the highest value of their cell: the detector is saturated, and "
-        "the thin parts of the object read too low; lower the exposure (or give readings= with those masked by dead=)"
+        "the thin parts of the object read too low; lower the exposure, or mask those readings by dead="
     ]
 
 
