@@ -89,11 +89,12 @@ def perona_malik(
     return back(u)
 
 
-def bilateral(volume: Image, noise_hu: float, *, sigma: float = 0.7, edge: float = 2.0, reach: float = 1.5) -> Image:
+def bilateral(volume: Image, noise_hu: float, *, sigma: float = 1.4, edge: float = 2.0, reach: float = 2.5) -> Image:
     """Joint bilateral filter in 3-D: a mean over the neighbourhood of what looks alike in the smoothed volume.
 
     Weights are exp(−d² / (2 reach²) − ((Gu_q − Gu) / (edge · noise_hu))² / 2) at the distance d (Tomasi, Manduchi 1998,
     ICCV; guided by the volume's own smooth version, as Petschnigg et al. 2004, ACM Trans. Graph. 23:664, by another).
+    The defaults have the least error in vessels of any direction on 0.2 mm voxels of FBP with the detail kernel.
 
     Args:
         volume: ``(z, y, x)`` HU.
@@ -229,7 +230,7 @@ FILTERS: dict[str, Callable[..., Any]] = {
 }  # fmt: skip
 """By name."""
 
-_LOOKS_AT_SMOOTHED: Mapping[str, float] = {"perona_malik": 0.7, "bilateral": 0.7}
+_LOOKS_AT_SMOOTHED: Mapping[str, float] = {"perona_malik": 0.7, "bilateral": 1.4}
 """Filters whose ``noise_hu`` is that of the volume smoothed by ``sigma``, with the default of that."""
 
 
