@@ -66,7 +66,7 @@ def test_what_every_filter_leaves_alone(name, noise):
 GROWING = {
     "gaussian": ("sigma", (0.0, 0.5, 1.0)),
     "perona_malik": ("steps", (0, 5, 15)),
-    "bilateral": ("edge", (0.02, 0.3, 2.0)),
+    "bilateral": ("edge", (0.005, 0.1, 2.0)),
     "nlm": ("strength", (0.05, 0.5, 2.0)),
     "tv": ("strength", (0.01, 0.3, 1.0)),
 }
