@@ -68,6 +68,8 @@ class PlaqueReading:
         layer: ``grid.shape`` float32, share of each voxel in that vessel's fibrous layer, calcifications left out.
         chi2: mean square of the residual on the vessel's voxels, but for those at its ends inside of the volume, over
             its expectation; chi2_sd: its standard deviation under the model.
+        taken_off_hu: largest value beside the vessel that was taken off the data, 0 where nothing was. Otherwise no
+            figure of a plaque body is given: what is left of a neighbour at the vessel's wall is too much like one.
         left: what stands out most of what the tissues leave of the data.
         texture_hu: standard deviation of a texture of 0.3 mm that the residual shows; texture_high_hu: its 95 % limit.
         info: settings, and how the fit went.
@@ -90,6 +92,7 @@ class PlaqueReading:
     texture_hu: float
     texture_high_hu: float
     info: Mapping[str, Any] = field(default_factory=dict)
+    taken_off_hu: float = 0.0
 
     @property
     def explained(self) -> bool:
@@ -99,7 +102,7 @@ class PlaqueReading:
     @property
     def certain(self) -> bool:
         """Whether the data prove a core."""
-        return self.explained and self.presence >= CERTAIN
+        return self.explained and not self.taken_off_hu and self.presence >= CERTAIN
 
     @property
     def mean_contrast(self) -> float:
@@ -212,10 +215,12 @@ def read_plaque(
     start = find_vessel(data.pilot(), data.grid, None if where is None else np.array(where))
     vessel = Vessel(data, start, vessel_prior)
     fit = vessel.fit(vessel.first_guess(), expected=True)
+    taken = 0.0
     for _ in range(_ROUNDS):
         foreign = beside(data, vessel, fit)
         if foreign is None:
             break
+        taken = float(foreign.abs().max())
         cleared = replace(data, b=data.b - data.apply(foreign))
         vessel = Vessel(
             cleared, find_vessel(cleared.pilot(), data.grid, None if where is None else np.array(where)), vessel_prior
@@ -226,7 +231,16 @@ def read_plaque(
         # Bodies in the vessel do not explain what lies beside it; they would only stand in for it.
         fit = _calcified(vessel, fit, particles, rng)
     core = CorePrior(point=place, point_sd=point_sd)
-    return _read(vessel, fit, core, particles, prior, rng, seed)
+    reading = _read(vessel, fit, core, particles, prior, rng, seed)
+    if not taken:
+        return reading
+    why = f"something of {taken:.0f} HU stands beside the vessel: what is left of it is too much like a plaque body"
+    return replace(
+        reading,
+        taken_off_hu=taken,
+        figures={name: e for name, e in reading.figures.items() if name not in reading.given_core},
+        refused=dict.fromkeys(reading.given_core, why) if reading.explained else reading.refused,
+    )
 
 
 def _calcified(vessel: Vessel, fit: Fit, particles: int, rng: np.random.Generator) -> Fit:

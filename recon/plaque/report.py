@@ -39,8 +39,13 @@ def table(reading: PlaqueReading, others: Mapping[str, Any] | None = None, devia
         f"Plaque body: P = {reading.presence:.3f}"
         + (f" (less than {CERTAIN}: its figures are refused)" if reading.presence < CERTAIN else "")
         + (f"; calcifications: {reading.calcifications}" if reading.calcifications else "")
-        if reading.explained
-        else "Plaque body: none can be told: the tissues do not explain the data, see the warning",
+        if reading.explained and not reading.taken_off_hu
+        else "Plaque body: none can be told: "
+        + (
+            f"beside the vessel, {reading.taken_off_hu:.0f} HU were taken off the data"
+            if reading.explained
+            else "the tissues do not explain the data, see the warning"
+        ),
         "",
         " | ".join(["| figure", "tissues as unknowns [95 %]", *(f"{name}, same regions" for name in read)]) + " |",
         "|---" * (2 + len(read)) + "|",
@@ -56,7 +61,7 @@ def table(reading: PlaqueReading, others: Mapping[str, Any] | None = None, devia
         lines.append(" | ".join([f"| {name}", *cells]) + " |")
     for name, why in reading.refused.items():
         lines.append(" | ".join([f"| {name}", f"refused: {why}", *("–" for _ in read)]) + " |")
-    if reading.explained:
+    if reading.explained and not reading.taken_off_hu:
         lines += [
             "",
             f"Contrast over a core that is there and one that is not: {reading.mean_contrast:.0f} HU. A contrast is "
@@ -129,6 +134,7 @@ def save(
         "chi2": reading.chi2,
         "chi2_sd": reading.chi2_sd,
         "left": asdict(reading.left),
+        "taken_off_hu": reading.taken_off_hu,
         "texture_hu": reading.texture_hu,
         "texture_high_hu": reading.texture_high_hu,
         "warnings": reading.warnings,

@@ -91,7 +91,11 @@ def test_a_second_vessel_apart_is_taken_off_the_data(both):
     assert both.explained
     assert both.warnings == []
     assert both.calcifications == 0
-    assert "contrast" not in both.figures
+    assert both.taken_off_hu > 300.0
+    assert not both.certain
+    assert set(both.figures).isdisjoint(both.given_core)
+    assert "stands beside the vessel" in both.refused["contrast"]
+    assert "were taken off the data" in table(both)
     assert both.figures["lumen"].value == pytest.approx(drawn_vessel.VALUES["lumen"], abs=10)
 
 
