@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 # What loads torch or numba is imported by the command: help and refusals come at once.
 from recon.cli.parsing import Commands, check_results, command
 from torchpcct import VolumeGrid
-from torchpcct.files import require_writable
 from torchpcct.validate import number, numbers, whole
 
 if TYPE_CHECKING:
@@ -48,8 +47,6 @@ def _plaque(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     grid = VolumeGrid(shape, voxel, tuple(arguments.center or PAPER_POSITION[::-1]))
     if arguments.point is not None:
         require_within(arguments.point, grid)
-    folder = arguments.out or Path("out") / "plaque"
-    require_writable(folder)
     scan = Scan.load(arguments.scan)
     start = time.perf_counter()
     problem = InsetProblem(scan, grid)
