@@ -11,8 +11,10 @@ import numpy as np
 from recon.fbp.angular_weights import SAME_VIEW, angular_weights, is_offset
 from recon.fbp.any_orbit import straighten
 from recon.fbp.detector_edges import cut_off
+from torchpcct.defects import GAIN_ERROR
 from torchpcct.detector_window import shadow
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid, view_step
+from torchpcct.robust import MEDIAN_TO_SD
 from torchpcct.scan import Scan
 from torchpcct.vector_geometry import VectorGeometry
 
@@ -25,6 +27,7 @@ _CENTRE_MARGIN = 8
 """Columns beside a grid's shadow that the test of the rotation centre looks at."""
 
 
+_FEWEST_COLUMNS, _SIGMAS, _ALIKE = 16, 8.0, 0.25
 _EVEN = 0.1
 """Relative change over the views of what a row ends at, from which it is no air that is described too bright."""
 _STEADY, _TRAVEL = 0.98, 0.25
@@ -176,12 +179,37 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
         weights = angular_weights(geometry)
     except ValueError:  # FBP refuses these views, other methods need not
         weights = np.ones((geometry.views, 1))
+    found += _gain_texts(lines)
     sides = cut_off(lines, geometry, weights)
     if any(sides):
         found.append(_cut_text(lines, sides))
     elif not found and not is_offset(geometry):
         found += moment_test(lines, geometry).findings
     return found
+
+
+def _gain_texts(lines: Any) -> list[str]:
+    """A column that reads too much or too little in all views, beside good ones: rows tell each other's gains
+    (:mod:`torchpcct.defects`), a single row has only its neighbours."""
+    rows = lines.reshape(lines.shape[0], -1, lines.shape[-1])
+    if rows.shape[1] > 1 or rows.shape[-1] < _FEWEST_COLUMNS:
+        return []
+    mean = rows.double().mean((0, 1)).numpy()
+    bend = mean[1:-1] - (mean[:-2] + mean[2:]) / 2
+    usual = MEDIAN_TO_SD * float(np.median(np.abs(bend)))
+    size = np.abs(bend[1:-1])
+    # The neighbours of a wrong gain bend by half as much, the other way; an edge or a wire on the axis does not.
+    beside = np.maximum(np.abs(bend[:-2] + bend[1:-1] / 2), np.abs(bend[2:] + bend[1:-1] / 2))
+    wrong = np.flatnonzero((size > max(GAIN_ERROR, _SIGMAS * usual)) & (beside < _ALIKE * size))
+    if not wrong.size:
+        return []
+    most = int(wrong[np.argmax(size[wrong])])
+    gain = math.exp(-bend[most + 1])
+    more = f" (and {wrong.size - 1} more)" if wrong.size > 1 else ""
+    return [
+        f"column {most + 2}{more} reads {gain:.2g} times what its neighbours do, in all views: a wrong gain, which "
+        "draws a ring; mask it (dead=)"
+    ]
 
 
 def _cut_text(lines: Any, sides: tuple[bool, bool]) -> str:
