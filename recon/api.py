@@ -19,7 +19,7 @@ from torchpcct.defects import dead_readings, mended
 from torchpcct.geometry import VolumeGrid
 from torchpcct.reading_checks import reading_warnings
 from torchpcct.scan import Scan
-from torchpcct.validate import choice
+from torchpcct.validate import checked, choice
 from torchpcct.volume import Volume, from_hu
 
 __all__ = ["METHODS", "reconstruct"]
@@ -40,12 +40,13 @@ def reconstruct(scan: Scan, grid: VolumeGrid, method: str = ..., **options: Any)
 def reconstruct(scan: Sequence[Scan], grid: VolumeGrid, method: str = ..., **options: Any) -> list[Volume]: ...
 
 
+@checked
 def reconstruct(
     scan: Scan | Sequence[Scan],
     grid: VolumeGrid,
     method: str = "fbp",
     *,
-    progress: Progress | None = None,
+    progress: Callable[[float], None] | None = None,
     device: str | torch.device = "cpu",
     **options: Any,
 ) -> Volume | list[Volume]:
@@ -83,7 +84,7 @@ def reconstruct(
         ValueError: an unknown method, kernel or option value, a grid outside the field of view, a starved scan.
         TypeError: ``scan`` is no :class:`torchpcct.Scan`, or an option does not exist.
     """
-    scans = [scan] if isinstance(scan, Scan) else list(scan)
+    scans = [scan] if isinstance(scan, Scan) else list(scan) if isinstance(scan, Sequence) else []
     if not scans or not all(isinstance(s, Scan) for s in scans):
         raise TypeError(f"scan must be a Scan or a non-empty sequence of scans, got {type(scan).__name__}")
     if not isinstance(grid, VolumeGrid) or (grid.ndim != 3 and scans[0].geometry.has_rows):

@@ -30,7 +30,7 @@ from torch import Tensor
 
 from recon.conjugate_gradient import conjugate_gradient
 from recon.linear_operator import gaussian_kernel, separable_filter
-from torchpcct.validate import number, whole
+from torchpcct.validate import checked, number, whole
 
 __all__ = ["contrast_limit", "deformation_limit", "known_inside", "outline_maps"]
 
@@ -43,6 +43,7 @@ _CROFTON = {
 """Each direction to a neighbouring voxel, one of two opposite ones, and its share of the sphere."""
 
 
+@checked
 def known_inside(fractions: NDArray[np.float64], rings: int = 0) -> NDArray[np.bool_]:
     """Voxels that belong to one tissue for sure.
 
@@ -60,6 +61,7 @@ def known_inside(fractions: NDArray[np.float64], rings: int = 0) -> NDArray[np.b
     return np.asarray(pure, dtype=bool)
 
 
+@checked
 def contrast_limit(
     gram: Any,
     inside: NDArray[np.bool_],
@@ -97,6 +99,7 @@ def contrast_limit(
     )
 
 
+@checked
 def outline_maps(
     labels: NDArray[np.integer[Any]], values: Sequence[float], factor: int, fine_mm: float
 ) -> NDArray[np.float32]:
@@ -144,6 +147,7 @@ def outline_maps(
     return np.asarray(maps, dtype=np.float32).reshape(-1, *shape)
 
 
+@checked
 def deformation_limit(
     gram: Any,
     fractions: NDArray[np.float64],

@@ -5,6 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from torchpcct.robust import MEDIAN_TO_SD
+from torchpcct.validate import checked
 
 __all__ = ["DENSEST_HU", "metal_warnings"]
 
@@ -13,6 +14,7 @@ DENSEST_HU = 3000.0
 _SIGMAS = 6.0
 
 
+@checked
 def metal_warnings(volume: Tensor) -> list[str]:
     """Whether a volume in HU reads more than tissue can, and more than its noise explains.
 

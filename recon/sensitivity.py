@@ -14,11 +14,12 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torchpcct.validate import whole
+from torchpcct.validate import checked, whole
 
 __all__ = ["worst_case_gain"]
 
 
+@checked
 def worst_case_gain(
     reconstruct: Callable[[Tensor], Tensor],
     data: Tensor,

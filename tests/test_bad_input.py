@@ -1,22 +1,40 @@
 """A table of bad inputs: each is refused by a TypeError or ValueError that names the argument, never anything else."""
 
+import inspect
 import math
+import sys
 
 import numpy as np
 import pytest
 import torch
 
+import recon
+import torchpcct.scanner
 from recon import fbp, pwls
 from recon.fbp.fbp import filter_sinogram, interleave
 from recon.pwls.qggmrf import QGGMRF
 from recon.study import registry
-from torchpcct import ConeBeam, FanBeam, ParallelBeam, Projector, Volume, VolumeGrid, full_turn
+from torchpcct import (
+    ConeBeam,
+    FanBeam,
+    ParallelBeam,
+    Projector,
+    Scan,
+    Volume,
+    VolumeGrid,
+    VoxelScene,
+    dose,
+    full_turn,
+    metrics,
+    spectral,
+)
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.metrics import cnr, mean_interval, sd_interval
 from torchpcct.metrics.residual_test import residual_test
-from torchpcct.scanner import Source
+from torchpcct.scanner import SiliconDetector, Source, TransportedSilicon, presets
 from torchpcct.scanner.linearisation import WaterLinearisation
-from torchpcct.scene import Body, Ellipsoid, EllipticCylinder, Scene
+from torchpcct.scene import Body, Ellipsoid, EllipticCylinder, Scene, chord_lengths
+from torchpcct.scene.materials import MATERIALS, Material
 
 NAN, INF = math.nan, math.inf
 NO_NUMBER = ("a", None, 1j, [1.0], {}, object())
@@ -148,9 +166,69 @@ CALLS = {
 }
 
 
+CALLS |= {
+    "cnr_from_moments: shapes": (
+        lambda: metrics.cnr_from_moments([1.0, 2.0], 1.0, [1.0, 2.0, 3.0], 1.0),
+        "fg_mean (2,)",
+    ),
+    "controlled_mean: no axis": (lambda: metrics.controlled_mean([1.0, 2.0], 0.0, 0.0), "controls"),
+    "inverse: two entries": (lambda: spectral.inverse(torch.ones(2, 3)), "packed"),
+    "label: complex": (lambda: spectral.label(torch.ones(2, 3, dtype=torch.complex64)), "fractions"),
+    "spectral model: text": (lambda: spectral.SpectralModel("a", np.ones((2, 2, 2))), "energies"),
+    "spectral model: complex": (lambda: spectral.SpectralModel([50.0, 60.0], np.ones((2, 2, 2)) * 1j), "spectra"),
+    "voxels: text": (lambda: VoxelScene("a", GRID), "hu"),
+    "material: list of shares": (lambda: Material("a", 1.0, [1.0]), "mass_fractions of 'a'"),
+    "material: text for a share": (lambda: Material("a", 1.0, {"H": "x"}), "mass fraction of H"),
+    "material: two densities": (lambda: Material("a", [1.0, 2.0], {"H": 1.0}), "density"),
+    "material: two weights": (lambda: MATERIALS["water"].hu([50.0, 60.0, 70.0], [1.0, 2.0]), "weights"),
+    "material: no energy": (lambda: MATERIALS["water"].attenuation([]), "energies_kev"),
+    "preset: number for a bowtie": (lambda: presets.pcct(bowtie=3.0), "bowtie"),
+    "detector: array for a mode": (lambda: SiliconDetector(np.zeros(3)), "mode"),
+    "detector: no stack": (lambda: TransportedSilicon(stack=None), "stack"),
+    "tube: table of one": (lambda: Source(table="a"), "table"),
+    "chords: nothing": (lambda: chord_lengths(None, np.zeros(3), np.ones(3)), "scene"),
+    "scene: nothing": (lambda: Scene(None), "bodies"),
+    "body: text for a rotation": (lambda: Ellipsoid(1.0, rotation=["a"]), "rotation"),
+    "fbp: text for weights": (lambda: fbp(Y, CONE_2, GRID, weights="a"), "weights"),
+    "scan: text for a seed": (lambda: Scan.from_counts(Y + 5, CONE_2, air=9.0).at_dose(0.5, "a"), "seed"),
+}
+
+
 @pytest.mark.parametrize("name", CALLS)
 def test_a_bad_call_is_refused(name):
     call, word = CALLS[name]
     with pytest.raises((ValueError, TypeError)) as caught:
         call()
     assert word in str(caught.value)
+
+
+PACKAGES = (torchpcct, torchpcct.scanner, torchpcct.scene, metrics, spectral, dose, recon)
+FUNCTIONS = {f"{f.__module__}.{f.__name__}": f for package in PACKAGES for name in package.__all__
+             if inspect.isfunction(f := getattr(package, name)) and inspect.signature(f).parameters}  # fmt: skip
+
+
+def _fits(kind, names):
+    """Something that an annotation takes; of a class an empty instance, for no function sees it."""
+    head, _, inner = kind.split(" | ")[0].partition("[")
+    if head == "tuple":
+        return (1.0,) * (inner.count(",") + 1)
+    known = {"float": 1.0, "int": 1, "str": "a", "bool": True, "ArrayLike": [1.0], "Floats": [1.0], "Callable": len,
+             "Tensor": torch.zeros(2), "Sequence": [], "Mapping": {}}  # fmt: skip
+    made = names.get(head)
+    return known[head] if head in known else object.__new__(made) if isinstance(made, type) else None
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_every_argument_of_every_public_function_is_refused_by_its_name(name):
+    """Of a wrong kind, before anything is done with it: no AttributeError, no words of numpy or torch."""
+    function = FUNCTIONS[name]
+    assert hasattr(function, "__wrapped__"), "decorate it with torchpcct.validate.checked"
+    parameters = inspect.signature(function).parameters
+    kinds = {n: str(p.annotation) for n, p in parameters.items() if p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)}
+    names = {**vars(sys.modules[function.__module__]), "Any": None}
+    fitting = {n: _fits(kind, names) for n, kind in kinds.items() if parameters[n].default is inspect.Parameter.empty}
+    for argument, kind in kinds.items():
+        if {"Any", "torch.device"} & set(kind.split(" | ")):
+            continue  # the function's own business
+        with pytest.raises(TypeError, match=rf"^{argument} must be .*, got <object object at"):
+            function(**{**fitting, argument: object()})

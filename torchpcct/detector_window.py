@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
-from torchpcct.validate import whole
+from torchpcct.validate import checked, whole
 from torchpcct.vector_geometry import VectorGeometry
 
 __all__ = ["DetectorWindow", "shadow"]
@@ -152,6 +152,7 @@ class DetectorWindow:
         return math.prod(self.shape) / math.prod(geometry.shape)
 
 
+@checked
 def shadow(geometry: Geometry, grid: VolumeGrid, margin: int = 0, motion: Any = None) -> DetectorWindow:
     """The smallest window that sees every voxel corner of ``grid`` in every view.
 

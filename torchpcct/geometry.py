@@ -24,7 +24,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from torchpcct.validate import choice, number, per_axis, whole
+from torchpcct.validate import checked, choice, number, per_axis, whole
 
 __all__ = ["ConeBeam", "FanBeam", "Geometry", "ParallelBeam", "VolumeGrid", "full_turn", "view_step"]
 
@@ -35,6 +35,7 @@ _DEGREES_SPAN_RAD, _DEGREES_STEP_RAD = 20.0, 0.04
 rad. Helical scans of as many turns have far smaller steps."""
 
 
+@checked
 def full_turn(views: int, start: float = 0.0) -> Floats:
     """``views`` equally spaced source angles over 2π, ``(views,)`` rad float64, the first at ``start``."""
     return np.arange(whole("views", views), dtype=np.float64) * (2.0 * math.pi / views) + start

@@ -21,7 +21,7 @@ from torchpcct.readings import MANY, counted, inverse_variance, log_bias, logged
 from torchpcct.scan_checks import check_exposure, check_scan
 from torchpcct.scan_file import scan_fields, write_scan
 from torchpcct.scanner.linearisation import WaterLinearisation
-from torchpcct.validate import number
+from torchpcct.validate import checked, number
 
 __all__ = ["NOISE_FREE_EXPOSURE_S", "Scan"]
 
@@ -90,6 +90,7 @@ class Scan:
         check_scan(self)
 
     @classmethod
+    @checked
     def from_counts(
         cls,
         readings: Any,
@@ -139,6 +140,7 @@ class Scan:
         return cls(geometry=geometry, exposure_s=exposure_s, **fields)
 
     @classmethod
+    @checked
     def from_line_integrals(
         cls,
         lines: Any,
@@ -186,6 +188,7 @@ class Scan:
         """Share of readings that registered nothing (energy integrating: 0 or less)."""
         return float((self.counts <= 0).float().mean())
 
+    @checked
     def with_noise(self, exposure_s: float, seed: int) -> Scan:
         """A noisy realisation of a noise-free scan.
 
@@ -217,6 +220,7 @@ class Scan:
             seed=int(seed),
         )
 
+    @checked
     def at_dose(self, fraction: float, seed: int = 0) -> Scan:
         """The same scan as if it had been taken with a fraction of its dose: a measured scan, its noise included.
 

@@ -12,17 +12,19 @@ from torch import Tensor
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, Geometry
 from torchpcct.scanner.linearisation import WaterLinearisation
-from torchpcct.validate import UNITS, choice, number, whole
+from torchpcct.validate import UNITS, checked, choice, number, whole
 
 __all__ = ["check_exposure", "check_scan"]
 
 
+@checked
 def check_exposure(exposure_s: float | None) -> None:
     """Raise ``ValueError`` unless the exposure is a finite time > 0 s, or None (noise free)."""
     if exposure_s is not None:
         number("exposure_s", exposure_s, positive=True, unit="s")
 
 
+@checked
 def check_scan(scan: Any) -> None:
     """Refuse a scan whose members do not fit together; see :class:`torchpcct.scan.Scan`.
 

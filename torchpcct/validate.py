@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 import math
-from collections.abc import Collection, Sequence
-from typing import Any
+import re
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
-__all__ = ["UNITS", "choice", "coverage", "number", "numbers", "per_axis", "whole"]
+__all__ = ["UNITS", "broadcast", "checked", "choice", "coverage", "number", "numbers", "per_axis", "reals", "whole"]
 
 UNITS = ("HU", "mm^-1", "pixel^-1")
 """Of scans and volumes; of ``pixel^-1`` all lengths are in pixels."""
@@ -127,6 +130,149 @@ def choice(name: str, value: Any, options: Collection[str]) -> str:
     Raises:
         ValueError: it is not; the message lists them.
     """
-    if value not in options:
+    if not isinstance(value, str) or value not in options:
         raise ValueError(f"unknown {name} {value!r}: use one of {', '.join(options)}")
     return str(value)
+
+
+def reals(name: str, value: Any) -> Any:
+    """``value`` as an array of real numbers, float64, of any shape.
+
+    Raises:
+        TypeError: anything that holds no real numbers.
+    """
+    if not _is_real(value):
+        raise TypeError(f"{name} must hold real numbers, got {_short(value)}")
+    return np.asarray(value.detach() if hasattr(value, "detach") else value, dtype=np.float64)
+
+
+def broadcast(**arrays: Any) -> list[Any]:
+    """Arrays by their names, broadcast to one shape.
+
+    Raises:
+        ValueError: shapes that do not fit; the message has them all.
+    """
+    try:
+        return list(np.broadcast_arrays(*arrays.values()))
+    except ValueError:
+        listed = ", ".join(f"{name} {np.shape(value)}" for name, value in arrays.items())
+        raise ValueError(f"shapes must be equal or broadcast to one, got {listed}") from None
+
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+_SAID = {
+    "int": "a whole number", "float": "a number", "str": "a text", "bool": "True or False", "None": "None",
+    "ArrayLike": "real numbers", "Floats": "real numbers",
+    "Tensor": "a torch.Tensor",
+    "Callable": "a function", "Sequence": "a sequence",
+    "Geometry": "a ParallelBeam, FanBeam or ConeBeam (or a VectorGeometry)",
+    "Mapping": "a mapping", "tuple": "a sequence",
+}  # fmt: skip
+
+
+def checked(function: F) -> F:
+    """A function that refuses arguments which its annotations exclude, by name, before it does anything.
+
+    Checked are ``int``, ``float``, ``str``, ``bool``, ``Tensor``, ``ArrayLike`` (real numbers of any shape),
+    ``Callable``, ``Sequence``, ``Mapping``, ``tuple[float, ...]`` (of a fixed length, too), classes, and what ``|``
+    joins; every other annotation lets everything pass. Values are handed on as they are: shapes and ranges are the
+    function's own business.
+
+    Raises:
+        TypeError: of the function that is made, for such an argument.
+    """
+    signature = inspect.signature(function)
+    said = {name: str(p.annotation) for name, p in signature.parameters.items()
+            if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)}  # fmt: skip
+
+    @functools.wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        try:
+            given = signature.bind(*args, **kwargs).arguments
+        except TypeError:
+            return function(*args, **kwargs)  # Python's own words name the function, too
+        for name, value in given.items():
+            if name not in said or value is signature.parameters[name].default:
+                continue
+            kinds = _alternatives(said[name])
+            if not any(_is(value, kind, function.__globals__) for kind in kinds):
+                remedy = ": torch.from_numpy makes one" if "Tensor" in kinds and isinstance(value, np.ndarray) else ""
+                wanted = " or ".join(dict.fromkeys(_in_words(kind) for kind in kinds))
+                raise TypeError(f"{name} must be {wanted}, got {_short(value)}{remedy}")
+        return function(*args, **kwargs)
+
+    return cast(F, call)
+
+
+def _short(value: Any) -> str:
+    """A value for a message: its kind and, where that is short, itself."""
+    kind = type(value).__name__
+    return kind if hasattr(value, "shape") or len(repr(value)) > 60 else f"{value!r} ({kind})"
+
+
+@functools.cache
+def _alternatives(annotation: str) -> tuple[str, ...]:
+    """The parts that ``|`` joins outside of brackets."""
+    return tuple(part.strip() for part in re.split(r"\|(?![^\[]*\])", annotation))
+
+
+def _in_words(kind: str) -> str:
+    head, _, inner = kind.partition("[")
+    if head == "tuple" and "..." not in inner:
+        return f"{inner.count(',') + 1} numbers"
+    return _SAID.get(head, f"a {head.rpartition('.')[2]}")
+
+
+def _is(value: Any, kind: str, names: Mapping[str, Any]) -> bool:
+    head, _, inner = kind.partition("[")
+    if head == "Any":
+        return True
+    if head == "None":
+        return value is None
+    if head in ("int", "float"):
+        exact = isinstance(value, int | np.integer) or (
+            head == "float" and (isinstance(value, float | np.floating) or _is_scalar(value))
+        )
+        return exact and not isinstance(value, bool | np.bool_)
+    if head == "bool":
+        return isinstance(value, bool | np.bool_)
+    if head == "str":
+        return isinstance(value, str)
+    if head in ("ArrayLike", "Floats"):
+        return _is_real(value)
+    if head == "Callable":
+        return callable(value)
+    if head == "Mapping":
+        return isinstance(value, Mapping)
+    if head == "Sequence":
+        return isinstance(value, Iterable) and not isinstance(value, str | bytes | Mapping)
+    if head == "tuple":
+        if not isinstance(value, Sequence | np.ndarray) or isinstance(value, str | bytes):
+            return False
+        if "[" in inner:
+            return True
+        parts = inner.rstrip("]").split(", ")
+        if "..." not in parts and len(parts) != len(value):
+            return False
+        return set(parts) - {"..."} not in ({"float"}, {"int"}) or all(_is(v, parts[0], names) for v in value)
+    known = names.get(head)
+    if isinstance(known, type):
+        return isinstance(value, known)
+    # A class that only the type checker imports is known by its name.
+    by_name = known is None and head.isidentifier() and head[:1].isupper()
+    return not by_name or any(base.__name__ == head for base in type(value).__mro__)
+
+
+def _is_scalar(value: Any) -> bool:
+    """An array or a tensor without axes, of a real number."""
+    return getattr(value, "shape", None) == () and _is_real(value)
+
+
+def _is_real(value: Any) -> bool:
+    if value is None or isinstance(value, str | bytes | Mapping):
+        return False
+    try:
+        return np.asarray(value.detach() if hasattr(value, "detach") else value).dtype.kind in "fiub"
+    except (TypeError, ValueError, RuntimeError):
+        return False

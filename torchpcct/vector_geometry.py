@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam
-from torchpcct.validate import number, whole
+from torchpcct.validate import checked, number, whole
 
 __all__ = ["VectorGeometry", "check_motion", "helical_motion", "to_vectors"]
 
@@ -216,6 +216,7 @@ class VectorGeometry(Geometry):
         return replace(self, vectors=flat)
 
 
+@checked
 def to_vectors(geometry: Geometry, motion: Any = None) -> Floats:
     """ASTRA's vectors of a scan with a flat detector, ``(views, 6)`` or, for a cone beam, ``(views, 12)`` float64.
 
@@ -257,6 +258,7 @@ def to_vectors(geometry: Geometry, motion: Any = None) -> Floats:
     )  # fmt: skip
 
 
+@checked
 def check_motion(motion: Any, views: int, axes: int) -> Floats:
     """Displacements of the grid per view as ``(views, axes)`` float64.
 
@@ -271,6 +273,7 @@ def check_motion(motion: Any, views: int, axes: int) -> Floats:
     return shift
 
 
+@checked
 def helical_motion(geometry: ConeBeam, feed: float, start: float = 0.0) -> Floats:
     """The table's travel as a displacement of the grid, ``(views, 3)`` z, y, x mm, for ``Projector(…, motion=…)``.
 

@@ -24,16 +24,18 @@ from torchpcct.formats.volume_files import (
     write_nifti,
 )
 from torchpcct.geometry import VolumeGrid
-from torchpcct.validate import UNITS, choice
+from torchpcct.validate import UNITS, checked, choice
 
 __all__ = ["Volume", "check_volume_name", "from_hu", "in_words", "to_hu"]
 
 
+@checked
 def to_hu(attenuation: Tensor, mu_water: float) -> Tensor:
     """CT numbers from attenuation in mm⁻¹: 1000 (μ / μ_water − 1), so that water reads 0 and air −1000."""
     return 1000.0 * (attenuation / mu_water - 1.0)
 
 
+@checked
 def from_hu(numbers: Tensor, mu_water: float) -> Tensor:
     """Attenuation in mm⁻¹ from CT numbers, the inverse of :func:`to_hu`."""
     return mu_water * (1.0 + numbers / 1000.0)

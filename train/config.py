@@ -18,7 +18,7 @@ import yaml
 
 from recon.mbir.network import NetworkConfig
 from torchpcct.formats.damage import yaml_values
-from torchpcct.validate import number, numbers, whole
+from torchpcct.validate import checked, number, numbers, whole
 from train.scenes.scene import SceneConfig
 
 __all__ = ["DataConfig", "ObjectiveConfig", "Situation", "TrainConfig", "differences", "load_config", "packaged_config"]
@@ -275,6 +275,7 @@ class TrainConfig:
         return text
 
 
+@checked
 def load_config(path: str | Path) -> TrainConfig:
     """Configuration of a YAML file.
 
@@ -288,12 +289,14 @@ def load_config(path: str | Path) -> TrainConfig:
         raise ValueError(f"{path}: {error}") from error
 
 
+@checked
 def packaged_config(name: str) -> TrainConfig:
     """A configuration of ``train/configs``, such as ``default`` or ``quick``."""
     text = resources.files("train").joinpath("configs", f"{name}.yaml").read_text(encoding="utf-8")
     return TrainConfig.from_yaml(text)
 
 
+@checked
 def differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:
     """Names in which two configurations, as plain values, differ, with a dot after the name of a section."""
     a, b = _flat(first), _flat(second)

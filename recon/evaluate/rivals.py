@@ -24,11 +24,11 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
-from torchpcct.validate import choice, number, whole
+from torchpcct.validate import checked, choice, number, whole
 
 __all__ = ["FILTERS", "bilateral", "bm4d", "denoised", "flat_noise", "gaussian", "nlm", "perona_malik", "tv"]
 
@@ -38,6 +38,7 @@ _REACH = 4.0
 """Standard deviations to which a Gaussian is summed."""
 
 
+@checked
 def gaussian(volume: Image, noise_hu: float = 0.0, *, sigma: float = 1.0) -> Image:
     """The volume smoothed by a Gaussian, which keeps no edges: what the others must do better than.
 
@@ -53,6 +54,7 @@ def gaussian(volume: Image, noise_hu: float = 0.0, *, sigma: float = 1.0) -> Ima
     return back(_smoothed(u, number("sigma", sigma, low=0.0, unit="voxels")))
 
 
+@checked
 def perona_malik(
     volume: Image, noise_hu: float, *, sigma: float = 0.7, edge: float = 1.3, steps: int = 15, rate: float = 1 / 7
 ) -> Image:
@@ -89,6 +91,7 @@ def perona_malik(
     return back(u)
 
 
+@checked
 def bilateral(volume: Image, noise_hu: float, *, sigma: float = 1.4, edge: float = 2.0, reach: float = 2.5) -> Image:
     """Joint bilateral filter in 3-D: a mean over the neighbourhood of what looks alike in the smoothed volume.
 
@@ -126,6 +129,7 @@ def bilateral(volume: Image, noise_hu: float, *, sigma: float = 1.4, edge: float
     return back(u + sums / total)
 
 
+@checked
 def nlm(
     volume: Image, noise_hu: float, *, strength: float = 0.6, patch: int = 1, search: int = 4, told: float = 1.0
 ) -> Image:
@@ -164,6 +168,7 @@ def nlm(
     return back(u + sums / total)
 
 
+@checked
 def tv(volume: Image, noise_hu: float, *, strength: float = 1.0, steps: int = 100) -> Image:
     """Total variation in 3-D (Rudin, Osher, Fatemi 1992, Physica D 60:259), solved by scikit-image (Chambolle 2004).
 
@@ -186,7 +191,8 @@ def tv(volume: Image, noise_hu: float, *, strength: float = 1.0, steps: int = 10
     return back(torch.from_numpy(np.ascontiguousarray(found)).to(u) + level)
 
 
-def bm4d(volume: Image, noise_hu: float, *, strength: float = 1.0, covariance: Any = None) -> Image:
+@checked
+def bm4d(volume: Image, noise_hu: float, *, strength: float = 1.0, covariance: ArrayLike | None = None) -> Image:
     """BM4D: collaborative filtering of groups of like blocks, for correlated noise (Mäkinen, Azzari, Foi 2020, IEEE
     Trans. Image Process. 29:8339; Maggioni et al. 2013).
 
@@ -234,6 +240,7 @@ _LOOKS_AT_SMOOTHED: Mapping[str, float] = {"perona_malik": 0.7, "bilateral": 1.4
 """Filters whose ``noise_hu`` is that of the volume smoothed by ``sigma``, with the default of that."""
 
 
+@checked
 def denoised(name: str, volume: Image, flat: Any, **settings: Any) -> Image:
     """A volume filtered, with the noise measured in a region of it.
 
@@ -252,6 +259,7 @@ def denoised(name: str, volume: Image, flat: Any, **settings: Any) -> Image:
     return run(volume, flat_noise(volume, flat, sigma=sigma), **settings)
 
 
+@checked
 def flat_noise(volume: Image, flat: Any, *, sigma: float = 0.0) -> float:
     """Standard deviation in HU of a region that is flat in truth, of the volume smoothed by ``sigma`` voxels.
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
+from torchpcct.validate import checked
 
 __all__ = ["angular_weights", "check_gaps", "is_offset", "offset_share", "parker_share", "view_steps"]
 
@@ -36,6 +37,7 @@ INNER_GAP_RAD = math.radians(5.0)
 WIDEST_STEP_RAD = math.radians(75.0)
 
 
+@checked
 def view_steps(
     angles: Floats, period: float = 2.0 * math.pi, smallest_opening: float = 0.0
 ) -> tuple[Floats, float, float]:
@@ -81,6 +83,7 @@ def view_steps(
     return out, start, span
 
 
+@checked
 def check_gaps(angles: Floats, period: float = 2.0 * math.pi) -> None:
     """Refuse views that are too few, or that lack inside of the arc they cover; log a warning where a few lack.
 
@@ -115,6 +118,7 @@ def check_gaps(angles: Floats, period: float = 2.0 * math.pi) -> None:
         _LOG.warning("%s: the views beside it stand for those that lack", lacking)
 
 
+@checked
 def parker_share(beta: Floats, gamma: Floats, half_fan: float) -> Floats:
     """Parker's smooth share of a reading in a scan of ``π + 2 · half_fan``.
 
@@ -141,6 +145,7 @@ def parker_share(beta: Floats, gamma: Floats, half_fan: float) -> Floats:
     return np.where((beta < 0.0) | (beta > end), 0.0, share)
 
 
+@checked
 def is_offset(geometry: Any) -> bool:
     """Whether the detector reaches farther to one side by more than :data:`OFFSET_SHARE` of its width and two columns.
 
@@ -151,6 +156,7 @@ def is_offset(geometry: Any) -> bool:
     return bool(abs(u[0] + u[-1]) > max(OFFSET_SHARE * width, 2.0 * width / max(u.size - 1, 1)) * (1.0 + 1e-9))
 
 
+@checked
 def offset_share(position: Floats) -> Floats:
     """Share of a reading in a full turn of an offset detector (Wang, Med. Phys. 29, 1634, 2002).
 
@@ -179,6 +185,7 @@ def _reach(grid: VolumeGrid) -> float:
     return far + (math.hypot(y, x) if far > 1e-6 * max(y, x) else max(y, x)) / 2
 
 
+@checked
 def angular_weights(geometry: Geometry, grid: VolumeGrid | None = None) -> Floats:
     """Weights of all readings: the angle of each view times the share of each column.
 

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from recon.fbp.backproject import check_data
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
-from torchpcct.validate import whole
+from torchpcct.validate import checked, whole
 from torchpcct.vector_geometry import VectorGeometry
 
 __all__ = ["IdealCircle", "Straightened", "at_slices", "ideal_circle", "straighten"]
@@ -63,6 +63,7 @@ class Straightened(NamedTuple):
     slices: Floats | None = None
 
 
+@checked
 def ideal_circle(geometry: VectorGeometry) -> IdealCircle:
     """The ideal circle about z that a scan of any flat detectors can be resampled onto.
 
@@ -76,6 +77,7 @@ def ideal_circle(geometry: VectorGeometry) -> IdealCircle:
     return found._replace(motion=None) if still else found
 
 
+@checked
 def straighten(sinogram: Tensor, geometry: VectorGeometry) -> Straightened:
     """Resample a scan of any flat detectors onto an ideal circle about z.
 
@@ -98,6 +100,7 @@ def straighten(sinogram: Tensor, geometry: VectorGeometry) -> Straightened:
     return Straightened(out, circle.geometry, circle.motion, circle.slices)
 
 
+@checked
 def at_slices(s: Straightened, grid: VolumeGrid) -> Tensor:
     """Sinograms ``(..., z, views, columns)`` of a grid's slices, interpolated between the rows of parallel rays.
 

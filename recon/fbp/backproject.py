@@ -15,6 +15,7 @@ from recon.linear_operator import apply_linear
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
 from torchpcct.threads import run
+from torchpcct.validate import checked
 from torchpcct.vector_geometry import check_motion
 
 __all__ = ["BackprojectionPlan", "backproject", "check_data", "data_shape"]
@@ -41,6 +42,7 @@ def _atan_polynomial(reach: float, columns_per_rad: float, dtype: torch.dtype) -
     return tuple(float(c) for c in fit.convert(kind=Polynomial).coef[::-1])
 
 
+@checked
 def check_data(name: str, data: Any, shape: tuple[int, ...]) -> None:
     if not isinstance(data, Tensor):
         raise TypeError(f"{name} must be a torch.Tensor, got {type(data).__name__}: use torch.as_tensor")
@@ -51,6 +53,7 @@ def check_data(name: str, data: Any, shape: tuple[int, ...]) -> None:
         raise ValueError(f"{name} must have the shape ({expected}), got {tuple(data.shape)}")
 
 
+@checked
 def data_shape(geometry: Geometry, window: DetectorWindow) -> tuple[int, ...]:
     if isinstance(geometry, ConeBeam):
         return (window.views, window.rows, window.columns)
@@ -234,6 +237,7 @@ def _shifts(motion: Any, cosines: Any, sines: Any, axes: int) -> NDArray[np.floa
     return out
 
 
+@checked
 def backproject(
     filtered: Tensor,
     geometry: Geometry,

@@ -16,6 +16,7 @@ from torchpcct.detector_window import shadow
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid, view_step
 from torchpcct.robust import MEDIAN_TO_SD
 from torchpcct.scan import Scan
+from torchpcct.validate import checked
 from torchpcct.vector_geometry import VectorGeometry
 
 __all__ = ["check_rows", "consistency_warnings", "refuse_helix", "sampling_warnings", "view_notes"]
@@ -35,6 +36,7 @@ _STEADY, _TRAVEL = 0.98, 0.25
 that the rows cover at the axis, is a table's travel."""
 
 
+@checked
 def refuse_helix(geometry: Geometry, motion: Any) -> None:
     """Raise ``ValueError`` for a motion that makes a cone beam's circle a helix, which FDK cannot reconstruct.
 
@@ -55,6 +57,7 @@ def refuse_helix(geometry: Geometry, motion: Any) -> None:
         )
 
 
+@checked
 def check_rows(geometry: Geometry, grid: VolumeGrid, motion: Any = None) -> list[str]:
     """Refuse a grid that no view of a cone beam sees; say which slices are not seen by all views, or by none.
 
@@ -97,6 +100,7 @@ def check_rows(geometry: Geometry, grid: VolumeGrid, motion: Any = None) -> list
     return found
 
 
+@checked
 def view_notes(geometry: Geometry) -> list[str]:
     """What is unusual about the views and right nevertheless: both ends of a turn, or half a turn, among them.
 
@@ -115,6 +119,7 @@ def view_notes(geometry: Geometry) -> list[str]:
     ]
 
 
+@checked
 def sampling_warnings(geometry: Geometry) -> list[str]:
     """Whether the views are too few for the field of view.
 
@@ -140,6 +145,7 @@ def sampling_warnings(geometry: Geometry) -> list[str]:
     ]
 
 
+@checked
 def consistency_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
     """Whether a scan contradicts itself or its description, whatever reconstructs it.
 

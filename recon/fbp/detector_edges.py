@@ -19,6 +19,7 @@ from torch import Tensor
 from recon.fbp.angular_weights import is_offset
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid
 from torchpcct.robust import MEDIAN_TO_SD
+from torchpcct.validate import checked
 
 __all__ = ["Rows", "continued", "cut_off", "mirrored", "reach"]
 
@@ -48,6 +49,7 @@ class Rows(NamedTuple):
     added: int
 
 
+@checked
 def reach(geometry: Any) -> Floats:
     """Distance from the axis of the ray to every column centre, signed, ``(columns,)`` mm."""
     if isinstance(geometry, ParallelBeam):
@@ -55,6 +57,7 @@ def reach(geometry: Any) -> Floats:
     return np.asarray(geometry.sod * np.sin(geometry.fan_angles))
 
 
+@checked
 def cut_off(lines: Tensor, geometry: Any, weights: Floats) -> tuple[bool, bool]:
     """Whether the rows end inside the object, at the first and at the last column.
 
@@ -117,6 +120,7 @@ def _room(geometry: Any) -> tuple[int, int]:
     return tuple(int(min(n, max(0.0, (far - abs(end)) / pitch - 1))) for end in (u[0], u[-1]))  # type: ignore[return-value]
 
 
+@checked
 def mirrored(rows: Rows, grid: VolumeGrid, travel: float = 0.0) -> Rows:
     """The rows of an offset detector with zeros on the short side, where the grid needs them.
 
@@ -137,6 +141,7 @@ def mirrored(rows: Rows, grid: VolumeGrid, travel: float = 0.0) -> Rows:
     return Rows(lines, _wider(g, before, behind), weights, rows.added + before)
 
 
+@checked
 def continued(rows: Rows, sides: tuple[bool, bool], outside: float) -> Rows:
     """The rows continued on the sides where they are cut off.
 

@@ -27,6 +27,7 @@ from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.roi import RoiMean
 from torchpcct.scan import Scan
+from torchpcct.validate import checked
 
 __all__ = [
     "RoiAdjoints",
@@ -42,6 +43,7 @@ FILTER_MARGIN_COLUMNS = 32
 1 / n⁴: what lies beyond adds less than 1e-4 to the variance of an ROI mean."""
 
 
+@checked
 def line_integral_variance(clean: Scan, exposure_s: float) -> Tensor:
     """Variance of the water-linearised line integrals of a noise-free scan at an exposure, shape of ``clean.counts``.
 
@@ -99,6 +101,7 @@ class RoiAdjoints:
         return total
 
 
+@checked
 def roi_adjoints(clean: Scan, fbp: InsetFbp, rois: Sequence[Sequence[RoiMean]]) -> RoiAdjoints:
     """The adjoint vectors of ROI means.
 
@@ -122,6 +125,7 @@ def roi_adjoints(clean: Scan, fbp: InsetFbp, rois: Sequence[Sequence[RoiMean]]) 
     return RoiAdjoints(window, vectors)
 
 
+@checked
 def roi_covariance(
     clean: Scan, fbp: InsetFbp, rois: Sequence[Sequence[RoiMean]], exposure_s: float
 ) -> list[NDArray[np.float64]]:
@@ -150,6 +154,7 @@ def roi_covariance(
     return results
 
 
+@checked
 def functional_covariance(fbp: InsetFbp, functionals: Tensor, ray_covariance: Tensor) -> NDArray[np.float64]:
     """Exact covariance of linear functionals of two channels: one adjoint pass per functional, no Monte Carlo.
 
@@ -183,6 +188,7 @@ def functional_covariance(fbp: InsetFbp, functionals: Tensor, ray_covariance: Te
     return np.stack([_gram(h, c) for c in w.crop(ray_covariance, seen)], axis=-1)
 
 
+@checked
 def voxel_covariance(clean: Scan, fbp: InsetFbp, exposure_s: float, voxel: Sequence[int]) -> Tensor:
     """Exact covariance in HU² of one voxel with all voxels: one adjoint pass and one reconstruction.
 

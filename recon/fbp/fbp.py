@@ -24,7 +24,7 @@ from recon.linear_operator import apply_linear
 from torchpcct.dead_cells import bridge
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid, view_step
-from torchpcct.validate import number
+from torchpcct.validate import checked, number, reals
 from torchpcct.vector_geometry import VectorGeometry
 
 __all__ = ["backproject", "fbp", "filter_sinogram", "filter_windowed", "interleave", "straightened_fbp"]
@@ -37,7 +37,7 @@ G = TypeVar("G", bound=Geometry)
 def _check_weights(weights: Any, geometry: Geometry, grid: VolumeGrid | None = None) -> NDArray[np.float64]:
     if weights is None:
         return angular_weights(geometry, grid)
-    w = np.asarray(weights, dtype=np.float64)
+    w = reals("weights", weights)
     if w.shape == (geometry.views,):
         w = w[:, None]
     if w.shape not in ((geometry.views, 1), (geometry.views, geometry.columns)):
@@ -59,6 +59,7 @@ def _filter(
     return out.movedim(kernel_axis, 0) if several else out.squeeze(kernel_axis)
 
 
+@checked
 def filter_sinogram(
     sinogram: Tensor,
     geometry: Geometry,
@@ -94,6 +95,7 @@ def filter_sinogram(
     return _filter(sinogram, geometry, kernel, weights, whole, whole if window is None else window)
 
 
+@checked
 def filter_windowed(
     difference: Tensor,
     geometry: Geometry,
@@ -126,6 +128,7 @@ def filter_windowed(
     return _filter(difference, geometry, kernel, weights, window_in, window_out)
 
 
+@checked
 def interleave(sinogram: Tensor, geometry: G) -> tuple[Tensor, G]:
     """Spread the columns over a detector of half the pitch, for scans with a quarter-column offset.
 
@@ -192,6 +195,7 @@ def _check_opposites(geometry: Any) -> None:
         )  # fmt: skip
 
 
+@checked
 def fbp(
     sinogram: Tensor,
     geometry: Geometry,
@@ -269,6 +273,7 @@ def fbp(
     return apply_linear(filtered, plan.forward, plan.transpose)
 
 
+@checked
 def straightened_fbp(
     straight: Straightened, grid: VolumeGrid, kernel: str | Sequence[str], *, weights: Any = None, outside: float | None
 ) -> Tensor:

@@ -25,7 +25,7 @@ from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import ConeBeam, Geometry, VolumeGrid
 from torchpcct.scan import Scan
 from torchpcct.scene.motion import SinusoidalMotion
-from torchpcct.validate import number
+from torchpcct.validate import checked, number
 from torchpcct.vector_geometry import VectorGeometry
 from torchpcct.volume import to_hu
 
@@ -37,6 +37,7 @@ SAME_SURROUND = 1e-4
 behind 24 cm of fat it is worth 0.02 HU."""
 
 
+@checked
 def view_motion(motion: SinusoidalMotion, geometry: Geometry, rotation_s: float) -> NDArray[np.float64]:
     """Displacement of a moving body in every view, as projectors and backprojectors take it.
 
@@ -56,6 +57,7 @@ def view_motion(motion: SinusoidalMotion, geometry: Geometry, rotation_s: float)
     return np.ascontiguousarray(motion.displacement(times)[:, ::-1])
 
 
+@checked
 def static_fbp(lines: Tensor, geometry: ConeBeam, grid: VolumeGrid, kernel: str = "standard") -> Tensor:
     """FBP of readings that are the same in every view (rotationally symmetric objects).
 
@@ -85,6 +87,7 @@ def _static(lines: Tensor, geometry: ConeBeam, kernel: str | Sequence[str], part
     return part.take(filter_sinogram(lines.unsqueeze(-3), one, kernel, weights=weights[:1, :1]).squeeze(-3))
 
 
+@checked
 def require_inside(inner: DetectorWindow, window: DetectorWindow) -> None:
     """Refuse a grid whose shadow ``inner`` the scan's window does not hold (ValueError)."""
     if not window.holds(inner):
@@ -136,6 +139,7 @@ class InsetFbp:
             surround is not known).
     """
 
+    @checked
     def __init__(
         self,
         scan: Scan,

@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.fft import next_fast_len
 
+from torchpcct.validate import checked
+
 __all__ = ["KERNELS", "apodization", "fast_length", "ramp_kernel"]
 
 Floats = NDArray[np.float64]
@@ -55,6 +57,7 @@ def _pieces(kernel: str) -> tuple[Floats, Floats]:
     return breaks, coefficients
 
 
+@checked
 def apodization(kernel: str, fraction: ArrayLike) -> Floats:
     """Value of a kernel's apodisation window.
 
@@ -100,6 +103,7 @@ def _unit_kernel(n: int, kernel: str) -> Floats:
     return out
 
 
+@checked
 def ramp_kernel(n: int, pitch: float, kernel: str = "ram-lak", *, equiangular: bool = False) -> Floats:
     """Spatial samples of the band-limited, apodised ramp (Kak and Slaney, chapter 3, equations 61 and 103).
 
@@ -129,6 +133,7 @@ def ramp_kernel(n: int, pitch: float, kernel: str = "ram-lak", *, equiangular: b
     return h
 
 
+@checked
 def fast_length(n: int) -> int:
     """The smallest length ≥ ``n`` whose only prime factors are 2, 3 and 5 and that is even (fast real FFTs)."""
     return 2 * int(next_fast_len((n + 1) // 2, real=True))

@@ -21,7 +21,7 @@ from recon.plaque.start import find_vessel
 from recon.plaque.vessel import FAT, FIBROUS, Fit, Vessel
 from recon.plaque.vessel_prior import VesselPrior
 from torchpcct.geometry import VolumeGrid
-from torchpcct.validate import number, numbers, whole
+from torchpcct.validate import checked, number, numbers, whole
 
 __all__ = ["CERTAIN", "PlaqueReading", "core_regions", "read_plaque", "read_regions"]
 
@@ -145,6 +145,7 @@ class PlaqueReading:
         return read_regions(self.regions, volume)
 
 
+@checked
 def core_regions(regions: Mapping[str, Any]) -> dict[str, NDArray[np.bool_]]:
     """Voxels wholly inside of each region, from the shares of its voxels; regions without such voxels are left out."""
     found = {}
@@ -157,6 +158,7 @@ def core_regions(regions: Mapping[str, Any]) -> dict[str, NDArray[np.bool_]]:
     return found
 
 
+@checked
 def read_regions(regions: Mapping[str, Any], volume: Any) -> dict[str, float]:
     """See :meth:`PlaqueReading.read`.
 

@@ -32,7 +32,7 @@ from recon.pwls.memory import gram_bytes, require_memory
 from recon.pwls.model_solver import ModelSolver, line_search
 from recon.pwls.qggmrf import QGGMRF, BoundPrior
 from torchpcct.detector_window import shadow
-from torchpcct.validate import number, whole
+from torchpcct.validate import checked, number, whole
 
 __all__ = ["PwlsResult", "data_model", "pwls", "solve_normal", "weighted_data"]
 
@@ -79,6 +79,7 @@ class PwlsResult:
     report: Mapping[str, Any] = field(default_factory=dict)
 
 
+@checked
 def pwls(
     A: Any,
     y: Tensor,
@@ -150,6 +151,7 @@ def pwls(
     return PwlsResult(result.x, {**result.report, "misfit": misfit.tolist(), "seconds": time.perf_counter() - started})
 
 
+@checked
 def data_model(A: Any, weights: Tensor, nodes: int = 9) -> Gram | FieldModel:
     """The model of AᵀWA that suits the grid: FFT with position-dependent kernels for an inset, else the field's.
 
@@ -179,6 +181,7 @@ def check_data(y: Any, shape: tuple[int, ...]) -> None:
         raise ValueError(f"y must have shape (..., {', '.join(map(str, shape))}), got {tuple(y.shape)}")
 
 
+@checked
 def weighted_data(y: Any, shape: tuple[int, ...], known: Tensor, weigh: Callable[[Tensor], Tensor]) -> Tensor:
     """W y of data ``(..., *shape)``, where readings that are not ``known`` count as 0 and may hold anything.
 
@@ -193,6 +196,7 @@ def weighted_data(y: Any, shape: tuple[int, ...], known: Tensor, weigh: Callable
     return weighted
 
 
+@checked
 def solve_normal(
     b: Tensor,
     exact: Callable[[Tensor], Tensor],

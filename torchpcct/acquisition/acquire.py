@@ -25,7 +25,7 @@ from torchpcct.scan_checks import check_exposure
 from torchpcct.scanner.scanner import Scanner
 from torchpcct.scene.scene import Scene
 from torchpcct.scene.voxels import VoxelScene
-from torchpcct.validate import whole
+from torchpcct.validate import checked, whole
 
 __all__ = ["acquire", "plan"]
 
@@ -49,6 +49,7 @@ def plan(
     return make_plan(Bodies.of(scene, scanner.geometry, rotation_s, duty), scanner, region, tolerance_hu, sub_rays)
 
 
+@checked
 def acquire(
     scene: Scene | VoxelScene,
     scanner: Scanner,

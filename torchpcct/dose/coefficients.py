@@ -21,7 +21,7 @@ from torchpcct.scanner import Scanner
 from torchpcct.scanner.compton import mean_recoil_fraction
 from torchpcct.scanner.filters import behind_filters
 from torchpcct.scene.materials import Material
-from torchpcct.validate import number
+from torchpcct.validate import checked, number
 
 __all__ = ["MGY_PER_KEV_PER_G", "air_fluence", "fan_half_angle", "mass_energy_absorption", "mass_interaction"]
 
@@ -31,6 +31,7 @@ MGY_PER_KEV_PER_G = 1.602176634e-10
 """1 keV / g in mGy."""
 
 
+@checked
 def mass_energy_absorption(material: Material, energies_kev: ArrayLike) -> Floats:
     """Mass energy-absorption coefficient μ_en / ρ in mm²/g (100 times the value in cm²/g).
 
@@ -61,6 +62,7 @@ def fan_half_angle(scanner: Scanner) -> float:
     return edge / g.sdd if g.detector == "curved" else math.atan(edge / g.sdd)
 
 
+@checked
 def air_fluence(scanner: Scanner, fan_angles_rad: ArrayLike, *, group_kev: float = 0.0) -> tuple[Floats, Floats]:
     """Photons behind tube, flat filters and bowties, without an object, at 1 m from the focal spot.
 

@@ -21,6 +21,7 @@ from torchpcct.geometry import VolumeGrid
 from torchpcct.scanner import Scanner
 from torchpcct.scene import Scene
 from torchpcct.scene.phantoms.quality import CTDI_HOLES, ctdi
+from torchpcct.validate import checked
 
 __all__ = ["CtdiDose", "ctdi_dose", "disc_samples"]
 
@@ -75,6 +76,7 @@ def disc_samples(center: Any, radius: float, count: int = _SAMPLES) -> Floats:
     return np.asarray(center, dtype=np.float64) + np.stack([r * np.cos(phi), r * np.sin(phi)], axis=-1)
 
 
+@checked
 def ctdi_dose(
     scanner: Scanner,
     exposure_s: float,

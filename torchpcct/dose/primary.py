@@ -32,7 +32,7 @@ from torchpcct.scene import Scene
 from torchpcct.scene.chords import interval
 from torchpcct.scene.materials import material
 from torchpcct.threads import run
-from torchpcct.validate import choice, number, whole
+from torchpcct.validate import checked, choice, number, whole
 
 __all__ = ["QUANTITIES", "plane_points", "primary_dose"]
 
@@ -113,6 +113,7 @@ def check_static(scene: Scene) -> None:
         raise ValueError("the scene moves: a dose map is that of one place, give scene.with_motion(None)")
 
 
+@checked
 def primary_dose(
     scene: Scene,
     scanner: Scanner,

@@ -29,7 +29,7 @@ from torchpcct.scanner import Scanner
 from torchpcct.scene import Scene
 from torchpcct.scene.materials import Material
 from torchpcct.threads import run
-from torchpcct.validate import number, whole
+from torchpcct.validate import checked, number, whole
 
 __all__ = ["MonteCarloDose", "monte_carlo_dose"]
 
@@ -108,6 +108,7 @@ def _tables(materials: list[Material], highest_kev: float) -> tuple[Any, ...]:
     return total, kinds["photo"], kinds["incoh"], absorption, total.max(0), squares, form
 
 
+@checked
 def monte_carlo_dose(
     scene: Scene,
     scanner: Scanner,

@@ -14,10 +14,12 @@ from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam
 from torchpcct.metrics.rotation_axis import RotationAxis, at_axis, rotation_axis
 from torchpcct.robust import MEDIAN_TO_SD
 from torchpcct.scan import Scan
+from torchpcct.validate import checked
 
 __all__ = ["centred", "cleaned", "find_axis", "without_outliers", "without_stripes"]
 
 
+@checked
 def find_axis(scan: Scan) -> RotationAxis:
     """The column of the rotation axis with its error: of a full turn of any beam, or half a turn of parallel rays.
 
@@ -36,6 +38,7 @@ def find_axis(scan: Scan) -> RotationAxis:
     return rotation_axis(lines, g)
 
 
+@checked
 def centred(scan: Scan, axis: float | RotationAxis | None = None) -> Scan:
     """The same scan with its rotation axis at a column; None: :func:`find_axis`, noted in ``info``."""
     found = find_axis(scan) if axis is None else axis
@@ -45,6 +48,7 @@ def centred(scan: Scan, axis: float | RotationAxis | None = None) -> Scan:
     return replace(scan, geometry=at_axis(scan.geometry, found.column), info={**scan.info, "axis": said})
 
 
+@checked
 def cleaned(scan: Scan, *, snr: float = 3.0, threshold: float = 0.08) -> Scan:
     """The same parallel or fan-beam scan without outliers and stripes (:func:`without_outliers`,
     :func:`without_stripes`).
@@ -70,6 +74,7 @@ _LASTING, _LEAST_VIEWS, _BLOCKS = (0.4, 0.2, 0.1), 30, 360
 averaged to."""
 
 
+@checked
 def without_stripes(lines: Tensor, *, snr: float = 3.0) -> Tensor:
     """Line integrals ``(..., views, columns)`` without the stripes of cells whose gain is off: rings in the image.
 
@@ -115,6 +120,7 @@ def without_stripes(lines: Tensor, *, snr: float = 3.0) -> Tensor:
     return torch.from_numpy(clean).to(lines.dtype).reshape(lines.shape)
 
 
+@checked
 def without_outliers(lines: Tensor, *, threshold: float = 0.08) -> Tensor:
     """Line integrals ``(..., views, columns)`` without single outliers (cosmic rays, "zingers").
 

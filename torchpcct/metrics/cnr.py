@@ -10,11 +10,11 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
 from torchpcct.metrics.bootstrap import generator
-from torchpcct.validate import coverage, number, whole
+from torchpcct.validate import broadcast, checked, coverage, number, whole
 
 __all__ = ["Interval", "cnr", "cnr_from_moments", "cnr_interval", "cnr_range", "mean_interval", "sd_interval"]
 
@@ -37,7 +37,8 @@ def _means(name: str, values: Any) -> Floats:
     return means
 
 
-def cnr(foreground_means: Any, background_means: Any) -> Any:
+@checked
+def cnr(foreground_means: ArrayLike, background_means: ArrayLike) -> Any:
     """CNR from the ROI means of every realisation.
 
     Args:
@@ -56,23 +57,26 @@ def cnr(foreground_means: Any, background_means: Any) -> Any:
     return cnr_from_moments(fg.mean(-1), fg.std(-1, ddof=1), bg.mean(-1), bg.std(-1, ddof=1))
 
 
-def cnr_from_moments(fg_mean: Any, fg_sd: Any, bg_mean: Any, bg_sd: Any) -> Any:
+@checked
+def cnr_from_moments(fg_mean: ArrayLike, fg_sd: ArrayLike, bg_mean: ArrayLike, bg_sd: ArrayLike) -> Any:
     """CNR from published means and standard deviations across realisations (any broadcastable shapes).
 
     Raises:
-        ValueError: a negative standard deviation, or both zero (noise-free data have no CNR).
+        ValueError: a negative standard deviation, or both zero (noise-free data have no CNR); shapes that do not fit.
     """
-    fg_sd, bg_sd = np.asarray(fg_sd, dtype=np.float64), np.asarray(bg_sd, dtype=np.float64)
-    if (fg_sd < 0).any() or (bg_sd < 0).any():
+    given = {"fg_mean": fg_mean, "fg_sd": fg_sd, "bg_mean": bg_mean, "bg_sd": bg_sd}
+    fg, fg_noise, bg, bg_noise = broadcast(**{k: np.asarray(v, dtype=np.float64) for k, v in given.items()})
+    if (fg_noise < 0).any() or (bg_noise < 0).any():
         raise ValueError("standard deviations must not be negative")
-    noise = np.hypot(fg_sd, bg_sd)
+    noise = np.hypot(fg_noise, bg_noise)
     if (noise == 0).any():
         raise ValueError("the ROI means do not vary: CNR needs noisy realisations (exposure_s is not None)")
-    value = (np.asarray(bg_mean, dtype=np.float64) - np.asarray(fg_mean, dtype=np.float64)) / noise
+    value = (bg - fg) / noise
     return float(value) if value.ndim == 0 else value
 
 
-def mean_interval(means: Any, level: float = 0.95) -> Interval:
+@checked
+def mean_interval(means: ArrayLike, level: float = 0.95) -> Interval:
     """Student's interval for the mean over realisations, ``means`` ``(realisations,)``.
 
     Raises:
@@ -86,6 +90,7 @@ def mean_interval(means: Any, level: float = 0.95) -> Interval:
     return Interval(float(m.mean() - half), float(m.mean() + half))
 
 
+@checked
 def sd_interval(sd: float, realizations: int, level: float = 0.95) -> Interval:
     """χ² interval for a standard deviation estimated from ``realizations`` normal draws: ×[0.69, 1.83] at n = 10.
 
@@ -101,9 +106,10 @@ def sd_interval(sd: float, realizations: int, level: float = 0.95) -> Interval:
     return Interval(float(sd * np.sqrt(dof / low)), float(sd * np.sqrt(dof / high)))
 
 
+@checked
 def cnr_interval(
-    foreground_means: Any,
-    background_means: Any,
+    foreground_means: ArrayLike,
+    background_means: ArrayLike,
     level: float = 0.95,
     draws: int = 20_000,
     seed: int = 0,
@@ -142,8 +148,9 @@ def cnr_interval(
     return Interval(float(low), float(high))
 
 
+@checked
 def cnr_range(
-    means: Any, covariance: Any, realizations: int, level: float = 0.95, draws: int = 20_000, seed: int = 0
+    means: ArrayLike, covariance: ArrayLike, realizations: int, level: float = 0.95, draws: int = 20_000, seed: int = 0
 ) -> Interval:
     """Range of the CNR that an experiment of a few realisations measures when mean and covariance are known exactly.
 

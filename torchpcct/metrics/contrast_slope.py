@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from torchpcct.metrics.bootstrap import Estimate, bca_interval, evaluate, leave_one_out, resampling
 from torchpcct.metrics.cnr import mean_interval
+from torchpcct.validate import checked
 
 __all__ = ["ContrastSlope", "contrast_slope", "paired_interval", "roi_bias"]
 
@@ -38,8 +39,9 @@ class ContrastSlope:
     seed: int
 
 
+@checked
 def contrast_slope(
-    true_contrasts: Any, measured: Any, level: float = 0.95, draws: int = 2000, seed: int = 0
+    true_contrasts: ArrayLike, measured: ArrayLike, level: float = 0.95, draws: int = 2000, seed: int = 0
 ) -> ContrastSlope:
     """Weighted least-squares slope over scenes whose core differs; 1 is unbiased, below 1 shrinks contrast.
 
@@ -111,7 +113,8 @@ def paired_interval(
     return Estimate(exact, *bca_interval(exact, statistic(resampling(n, draws, seed), drawn), jackknife, level))
 
 
-def roi_bias(means: Any, truth: Any, level: float = 0.95) -> list[Estimate]:
+@checked
+def roi_bias(means: ArrayLike, truth: ArrayLike, level: float = 0.95) -> list[Estimate]:
     """Mean minus truth of each ROI with Student's interval.
 
     Args:

@@ -27,12 +27,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
 from torchpcct.metrics.bootstrap import Estimate
 from torchpcct.metrics.jackknife import Jackknifed, combined
-from torchpcct.validate import coverage
+from torchpcct.validate import checked, coverage
 
 __all__ = [
     "controlled_cnr",
@@ -113,10 +113,13 @@ def _known_covariance(value: Any, count: int) -> Floats:
 
 
 def _count(controls: Any) -> int:
+    if controls is not None and np.ndim(controls) == 0:
+        raise ValueError(f"controls must have the shape (realisations,) or (realisations, controls), got {controls!r}")
     return 0 if controls is None else 1 if np.ndim(controls) == 1 else np.shape(controls)[-1]
 
 
-def controlled_mean(values: Any, controls: Any, control_mean: Any) -> Jackknifed:
+@checked
+def controlled_mean(values: ArrayLike, controls: ArrayLike | None, control_mean: ArrayLike | None) -> Jackknifed:
     """Expectation of a method's figure, by regression on controls of known expectation.
 
     Args:
@@ -132,7 +135,10 @@ def controlled_mean(values: Any, controls: Any, control_mean: Any) -> Jackknifed
     return Jackknifed(float(fit.coefficients[0]), fit.left_out[:, 0])
 
 
-def controlled_log_variance(values: Any, controls: Any, control_covariance: Any = None) -> Jackknifed:
+@checked
+def controlled_log_variance(
+    values: ArrayLike, controls: ArrayLike | None, control_covariance: ArrayLike | None = None
+) -> Jackknifed:
     """Logarithm of a method's variance, ln(βᵀΣβ + σ_e²), by regression on controls of known covariance Σ.
 
     ``.exponential()`` gives the variance, ``.exponential(scale=0.5)`` the SD, with interval.
@@ -152,7 +158,10 @@ def controlled_log_variance(values: Any, controls: Any, control_covariance: Any 
     return Jackknifed(math.log(value), np.log(left_out))
 
 
-def controlled_slope(true_contrasts: Any, measured: Any, controls: Any, control_mean: Any) -> Jackknifed:
+@checked
+def controlled_slope(
+    true_contrasts: ArrayLike, measured: ArrayLike, controls: ArrayLike | None, control_mean: ArrayLike | None
+) -> Jackknifed:
     """Slope of the measured against the true contrast over scenes, as :func:`contrast_slope`, but with controls.
 
     Args:
@@ -176,8 +185,13 @@ def controlled_slope(true_contrasts: Any, measured: Any, controls: Any, control_
     return controlled_mean((weight * centered / spread) @ y, controls, control_mean)
 
 
+@checked
 def controlled_cnr(
-    foreground: Any, background: Any, controls: Any, control_mean: Any, control_covariance: Any
+    foreground: ArrayLike,
+    background: ArrayLike,
+    controls: ArrayLike | None,
+    control_mean: ArrayLike | None,
+    control_covariance: ArrayLike | None,
 ) -> Jackknifed:
     """The paper's CNR, (μ_bg − μ_fg) / √(σ²_bg + σ²_fg), with means and variances controlled.
 
@@ -194,6 +208,7 @@ def controlled_cnr(
     return combined(lambda f, b, vf, vb: (b - f) / np.sqrt(np.exp(vf) + np.exp(vb)), *means, *logs)
 
 
+@checked
 def variance_factor(
     log_variance: Jackknifed,
     reference: Jackknifed | float,
@@ -225,6 +240,7 @@ def variance_factor(
     return ratio.exponential(level)
 
 
+@checked
 def expected_half_width(realizations: int, correlation: float, level: float = 0.95) -> float:
     """Half-width (as a factor) of a variance factor's interval for normal values: exp(z √(2 (1 − R⁴) / n)).
 

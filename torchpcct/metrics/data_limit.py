@@ -18,10 +18,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
 
 from torchpcct.metrics.roi import as_array
-from torchpcct.validate import number
+from torchpcct.validate import checked, number
 
 __all__ = ["Ceiling", "ceiling", "information_matrix", "paper_cnr_ceiling"]
 
@@ -32,7 +33,8 @@ _WORST_CONDITION = 1e12
 """Of the information scaled to a unit diagonal. Beyond it the inverse has no digits left in float64."""
 
 
-def information_matrix(maps: Sequence[Any] | Any, inverse_variance: Any, *, scale: float = 1.0) -> Floats:
+@checked
+def information_matrix(maps: Sequence[Any] | Tensor, inverse_variance: ArrayLike, *, scale: float = 1.0) -> Floats:
     """Fisher information of the tissue amplitudes, ``F_ij = scale² Σ a_i w a_j``.
 
     Args:
@@ -111,7 +113,8 @@ class Ceiling:
         return float(self.functional_sd[0])
 
 
-def ceiling(information: Any, functionals: Any, dose: float = 1.0) -> Ceiling:
+@checked
+def ceiling(information: ArrayLike, functionals: ArrayLike, dose: float = 1.0) -> Ceiling:
     """Limit for linear functionals of the tissue amplitudes.
 
     Args:
@@ -150,7 +153,10 @@ def ceiling(information: Any, functionals: Any, dose: float = 1.0) -> Ceiling:
     return Ceiling(covariance, h, spread @ spread.T)
 
 
-def paper_cnr_ceiling(information: Any, amplitudes: Any, foreground: Any, background: Any, dose: float = 1.0) -> float:
+@checked
+def paper_cnr_ceiling(
+    information: ArrayLike, amplitudes: ArrayLike, foreground: ArrayLike, background: ArrayLike, dose: float = 1.0
+) -> float:
     """The paper's CNR of the best unbiased ROI means, ``(μ_bg − μ_fg) / sqrt(σ²_bg + σ²_fg)``.
 
     Generalised least squares minimises both variances at once, so no unbiased method exceeds this.

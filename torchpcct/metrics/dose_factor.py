@@ -14,12 +14,12 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from torchpcct.metrics.bootstrap import Estimate, evaluate
 from torchpcct.metrics.contrast_slope import ContrastSlope, paired_interval
 from torchpcct.metrics.dose_curve import FIGURES, DoseCurve, MeasuredDoseCurve, finite_pairs, invert_rising
-from torchpcct.validate import choice, number
+from torchpcct.validate import checked, choice, number
 
 __all__ = ["DoseFactor", "dose_factor", "efficiency"]
 
@@ -45,8 +45,9 @@ class DoseFactor(NamedTuple):
         return f"{self.label(self.value)} [{self.label(self.low)}, {self.label(self.high)}]"
 
 
+@checked
 def dose_factor(
-    samples: Any,
+    samples: ArrayLike,
     curve: DoseCurve | MeasuredDoseCurve,
     figure: str = "paper_cnr",
     *,
@@ -101,9 +102,10 @@ def dose_factor(
     return DoseFactor(*found, float(curve.doses[0]), float(curve.doses[-1]))
 
 
+@checked
 def efficiency(
     ideal_sd: float,
-    contrasts: Any,
+    contrasts: ArrayLike,
     slope: float | ContrastSlope = 1.0,
     level: float = 0.95,
     draws: int = 2000,

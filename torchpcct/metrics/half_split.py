@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchpcct.metrics.resolution import first_below
 from torchpcct.scan import Scan
-from torchpcct.validate import choice, whole
+from torchpcct.validate import checked, choice, whole
 from torchpcct.vector_geometry import VectorGeometry
 
 __all__ = ["HalfSplit", "half_split", "halves"]
@@ -152,6 +152,7 @@ def _rings(values: Tensor) -> Tensor:
     return total.index_add_(0, ring, values.sum(0).flatten())[1 : min(ny, nx) // 2 + 1]
 
 
+@checked
 def halves(scan: Scan, how: str = "views", seed: int = 0) -> tuple[Scan, Scan]:
     """Two scans of one.
 
@@ -200,6 +201,7 @@ def _selected(scan: Scan, views: Any) -> Scan:
     )
 
 
+@checked
 def half_split(scan: Scan, reconstruct: Callable[[Scan], Tensor], how: str = "views", seed: int = 0) -> HalfSplit:
     """Reconstruct both halves of a scan by one method.
 

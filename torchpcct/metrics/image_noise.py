@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from torchpcct.metrics.bootstrap import Estimate
 from torchpcct.metrics.jackknife import Jackknifed, combined, log_of_sum
 from torchpcct.metrics.noise_power import NoisePower
-from torchpcct.validate import per_axis
+from torchpcct.validate import checked, per_axis
 
 __all__ = ["RegionNoise", "central_frequency_ratio", "noise_magnitude_ratio"]
 
@@ -127,6 +127,7 @@ def _limit(method: RegionNoise, reference: RegionNoise) -> float:
     return float(min(method.frequencies[-1], reference.frequencies[-1]))
 
 
+@checked
 def noise_magnitude_ratio(method: RegionNoise, reference: RegionNoise, level: float = 0.95) -> Estimate:
     """NMR = √(∫ NPS_method df / ∫ NPS_reference df), up to the lower of both highest frequencies.
 
@@ -141,6 +142,7 @@ def noise_magnitude_ratio(method: RegionNoise, reference: RegionNoise, level: fl
     return combined(np.subtract, method.moment(0, limit), reference.moment(0, limit)).exponential(level, 0.5)
 
 
+@checked
 def central_frequency_ratio(method: RegionNoise, reference: RegionNoise, level: float = 0.95) -> Estimate:
     """CFR = f̄_method / f̄_reference of the mean frequencies f̄ = ∫ f NPS df / ∫ NPS df; arguments and errors as
     :func:`noise_magnitude_ratio`."""

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from torchpcct.metrics.bootstrap import Estimate
-from torchpcct.validate import coverage
+from torchpcct.validate import checked, coverage
 
 __all__ = ["Jackknifed", "combined", "log_of_sum"]
 
@@ -73,6 +73,7 @@ class Jackknifed:
         return Jackknifed(self.value, left_out)
 
 
+@checked
 def combined(function: Callable[..., Any], *figures: Jackknifed | float) -> Jackknifed:
     """A smooth function of figures of the same realisations; numbers are taken as exact.
 

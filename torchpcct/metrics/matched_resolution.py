@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from torchpcct.metrics.bootstrap import Estimate
 from torchpcct.metrics.jackknife import Jackknifed
 from torchpcct.metrics.noise_covariance import NoiseCovariance
 from torchpcct.metrics.resolution import TransferFunction, task_transfer
-from torchpcct.validate import choice, number, per_axis
+from torchpcct.validate import checked, choice, number, per_axis
 
 __all__ = [
     "LinearReference",
@@ -35,7 +35,8 @@ __all__ = [
 Floats = NDArray[np.float64]
 
 
-def edge_mask(distance: Any, spacing: Any, along: str, within_deg: float = 30.0) -> NDArray[np.bool_]:
+@checked
+def edge_mask(distance: ArrayLike, spacing: ArrayLike, along: str, within_deg: float = 30.0) -> NDArray[np.bool_]:
     """Voxels whose nearest surface faces in plane, or along z, for :func:`task_transfer`.
 
     Args:
@@ -60,8 +61,9 @@ def edge_mask(distance: Any, spacing: Any, along: str, within_deg: float = 30.0)
     return mask
 
 
+@checked
 def jackknifed_f50(
-    images: Any, distance: Any, reach: tuple[float, float], bin_mm: float, mask: Any = None
+    images: ArrayLike, distance: ArrayLike, reach: tuple[float, float], bin_mm: float, mask: Any = None
 ) -> Jackknifed:
     """f50 of an edge in the mean image, cycles per mm, with each realisation left out once.
 
@@ -86,6 +88,7 @@ def jackknifed_f50(
     return Jackknifed(f50(total / len(x)), np.array([f50((total - image) / (len(x) - 1)) for image in x]))
 
 
+@checked
 def gaussian_to_reach(transfer: TransferFunction, f50: float) -> float:
     """σ in mm of the Gaussian filter after which a transfer function falls to ½ at ``f50`` (cycles per mm).
 
@@ -135,6 +138,7 @@ class MatchedNoise:
     reference_z_correlation: float
 
 
+@checked
 def matched_noise_ratio(
     log_variance: Jackknifed,
     f50: Jackknifed | float,

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from torchpcct.metrics.resolution import first_below
 from torchpcct.metrics.roi import as_array
-from torchpcct.validate import number, per_axis
+from torchpcct.validate import checked, number, per_axis
 
 __all__ = ["NoisePower", "noise_power_spectrum"]
 
@@ -94,6 +94,7 @@ def _shells(radius: Floats, values: Floats, width: float) -> tuple[Floats, Float
     return mean_radius, np.bincount(shell, values)[used] / count[used]
 
 
+@checked
 def noise_power_spectrum(realizations: Any, spacing: float | tuple[float, ...]) -> NoisePower:
     """Noise power spectrum of an ensemble.
 

@@ -15,13 +15,13 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import expit, logit, ndtr, ndtri
 
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.bootstrap import Estimate, bca_interval, evaluate, leave_one_out, resampling
 from torchpcct.metrics.roi import as_array
-from torchpcct.validate import coverage
+from torchpcct.validate import checked, coverage
 
 __all__ = [
     "ObserverResult",
@@ -40,6 +40,7 @@ __all__ = [
 Floats = NDArray[np.float64]
 
 
+@checked
 def dog_channels(
     grid: VolumeGrid,
     center: tuple[float, ...],
@@ -81,7 +82,8 @@ def dog_channels(
     return channels / np.sqrt(np.square(channels).sum(tuple(range(1, channels.ndim)), keepdims=True))
 
 
-def template_channel(expected_difference: Any) -> Floats:
+@checked
+def template_channel(expected_difference: ArrayLike) -> Floats:
     """The known signal itself as a channel, ``(1, ...)`` of unit norm: to be stacked with the others.
 
     Args:
@@ -97,7 +99,8 @@ def template_channel(expected_difference: Any) -> Floats:
     return (t / norm)[None]
 
 
-def channel_responses(images: Any, channels: Any) -> Floats:
+@checked
+def channel_responses(images: ArrayLike, channels: ArrayLike) -> Floats:
     """Inner products of images ``(n, ...)`` with channels ``(c, ...)``, ``(n, c)`` float64.
 
     Raises:
@@ -113,8 +116,9 @@ def channel_responses(images: Any, channels: Any) -> Floats:
     return responses
 
 
+@checked
 def hotelling_scores(
-    present: Any, absent: Any, *, known_means: tuple[Any, Any] | None = None, train: int | None = None
+    present: ArrayLike, absent: ArrayLike, *, known_means: tuple[Any, Any] | None = None, train: int | None = None
 ) -> tuple[Floats, Floats]:
     """Decision variables of the Hotelling observer on pairs that it was not trained on.
 
@@ -183,7 +187,8 @@ def _pair(present: Any, absent: Any) -> tuple[Floats, Floats]:
     return a, b
 
 
-def auc(present: Any, absent: Any, *, paired: bool = True, level: float = 0.95) -> Estimate:
+@checked
+def auc(present: ArrayLike, absent: ArrayLike, *, paired: bool = True, level: float = 0.95) -> Estimate:
     """Area under the ROC curve (Wilcoxon) with an interval on the logit scale.
 
     The variance is DeLong's; with ``paired`` each pair of one noise seed is one sampling unit (Obuchowski 1997), which
@@ -220,7 +225,8 @@ def auc(present: Any, absent: Any, *, paired: bool = True, level: float = 0.95) 
     return Estimate(area, float(expit(logit(area) - half)), float(expit(logit(area) + half)))
 
 
-def d_prime(present: Any, absent: Any, level: float = 0.95, draws: int = 2000, seed: int = 0) -> Estimate:
+@checked
+def d_prime(present: ArrayLike, absent: ArrayLike, level: float = 0.95, draws: int = 2000, seed: int = 0) -> Estimate:
     """Detectability ``(s̄₁ − s̄₀) / sqrt((σ₁² + σ₀²) / 2)`` with a bootstrap interval over pairs.
 
     Args:
@@ -246,7 +252,8 @@ def d_prime(present: Any, absent: Any, level: float = 0.95, draws: int = 2000, s
     return Estimate(value, *bca_interval(value, resampled, statistic(leave_one_out(a.size)), level))
 
 
-def auc_from_d_prime(value: Any) -> Any:
+@checked
+def auc_from_d_prime(value: ArrayLike) -> Any:
     """Area of normal scores of equal variance, ``Φ(d′ / √2)``."""
     area = ndtr(np.asarray(value, dtype=np.float64) / math.sqrt(2.0))
     return float(area) if np.ndim(area) == 0 else area
@@ -261,10 +268,11 @@ class ObserverResult(NamedTuple):
     absent: Floats
 
 
+@checked
 def observe(
-    present: Any,
-    absent: Any,
-    channels: Any,
+    present: ArrayLike,
+    absent: ArrayLike,
+    channels: ArrayLike,
     *,
     known_means: tuple[Any, Any] | None = None,
     train: int | None = None,
@@ -287,7 +295,8 @@ def observe(
     return ObserverResult(auc(s1, s0, level=level), d_prime(s1, s0, level=level, seed=seed), s1, s0)
 
 
-def false_positive_rate(present: Any, absent: Any, sensitivity: float = 0.9) -> float:
+@checked
+def false_positive_rate(present: ArrayLike, absent: ArrayLike, sensitivity: float = 0.9) -> float:
     """Share of absent scores at or above the highest threshold that still finds ``sensitivity`` of the present ones.
 
     Raises:
@@ -306,6 +315,7 @@ def _false_positives(a: Floats, b: Floats, sensitivity: float) -> Floats:
     return (b >= threshold[..., None]).mean(-1)
 
 
+@checked
 def false_positive_difference(
     method: tuple[Any, Any],
     reference: tuple[Any, Any],

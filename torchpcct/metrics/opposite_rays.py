@@ -44,7 +44,7 @@ from torch.nn import functional as F
 
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, view_step
-from torchpcct.validate import coverage
+from torchpcct.validate import checked, coverage
 
 __all__ = ["CENTRE_TOLERANCE", "CentreTest", "GeometryTest", "OppositeRays", "centre_test", "geometry_test"]
 
@@ -120,6 +120,7 @@ class GeometryTest:
     findings: tuple[str, ...]
 
 
+@checked
 def centre_test(
     lines: Tensor,
     geometry: Geometry,
@@ -148,6 +149,7 @@ def centre_test(
     return _UNKNOWN if pairs is None else _centre(pairs, false_alarms)[0]
 
 
+@checked
 def geometry_test(
     lines: Tensor,
     geometry: Geometry,

@@ -17,6 +17,7 @@ from scipy import ndimage
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.roi import RoiMean
 from torchpcct.scene import Scene
+from torchpcct.validate import checked
 
 __all__ = ["RoiPair", "RoiRule", "place_rois", "whole_rois"]
 
@@ -64,6 +65,7 @@ class RoiPair:
         }
 
 
+@checked
 def place_rois(
     scene: Scene,
     image: VolumeGrid,
@@ -100,6 +102,7 @@ def place_rois(
     return RoiPair(foreground, background, image, rule)
 
 
+@checked
 def whole_rois(
     scene: Scene,
     image: VolumeGrid,

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import binary_dilation, map_coordinates
 from scipy.spatial import cKDTree
 from skimage.measure import find_contours, label
@@ -31,6 +31,7 @@ from skimage.morphology import reconstruction
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.resolution import first_below
 from torchpcct.metrics.roi import as_array
+from torchpcct.validate import checked
 
 __all__ = [
     "CORE_HU",
@@ -58,7 +59,8 @@ Floats = NDArray[np.float64]
 _CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], dtype=bool)
 
 
-def threshold_contour(image: Any, grid: VolumeGrid, threshold: float, seed: tuple[float, float]) -> Floats | None:
+@checked
+def threshold_contour(image: ArrayLike, grid: VolumeGrid, threshold: float, seed: tuple[float, float]) -> Floats | None:
     """Closed contour at a threshold around a point, by marching squares with linear interpolation.
 
     Args:
@@ -86,7 +88,8 @@ def threshold_contour(image: Any, grid: VolumeGrid, threshold: float, seed: tupl
     return best
 
 
-def lumen_area(image: Any, grid: VolumeGrid, seed: tuple[float, float], threshold: float = LUMEN_HU) -> float:
+@checked
+def lumen_area(image: ArrayLike, grid: VolumeGrid, seed: tuple[float, float], threshold: float = LUMEN_HU) -> float:
     """Area in mm² inside the threshold contour around ``seed`` (sub-voxel); NaN where there is no closed contour.
 
     Args:
@@ -96,8 +99,9 @@ def lumen_area(image: Any, grid: VolumeGrid, seed: tuple[float, float], threshol
     return math.nan if contour is None else _area(contour)
 
 
+@checked
 def cap_thickness(
-    image: Any,
+    image: ArrayLike,
     grid: VolumeGrid,
     lumen_seed: tuple[float, float],
     core_seed: tuple[float, float],
@@ -184,8 +188,9 @@ class PlaqueSegmentation:
         return found
 
 
+@checked
 def segment_plaque(
-    image: Any, grid: VolumeGrid, *, lumen_hu: float = LUMEN_HU, core_hu: tuple[float, float] = CORE_HU
+    image: ArrayLike, grid: VolumeGrid, *, lumen_hu: float = LUMEN_HU, core_hu: tuple[float, float] = CORE_HU
 ) -> PlaqueSegmentation:
     """Segment lumen and core.
 
@@ -211,8 +216,9 @@ def segment_plaque(
     return PlaqueSegmentation(x, plane, lumen, band, core, float(lumen_hu), (low, high))
 
 
+@checked
 def cap_on_line(
-    image: Any,
+    image: ArrayLike,
     grid: VolumeGrid,
     start: tuple[float, float],
     end: tuple[float, float],
@@ -262,7 +268,8 @@ def cap_on_line(
     return edges[1] - edges[0] if profile[0] >= lumen_hu else math.nan
 
 
-def basin_depth(image: Any, grid: VolumeGrid, within: Any) -> float:
+@checked
+def basin_depth(image: ArrayLike, grid: VolumeGrid, within: ArrayLike) -> float:
     """Depth in HU of the deepest basin in a region: from its bottom to the lowest pass that leads to the border.
 
     What remains of a dark core's boundary, whatever its absolute CT numbers: 0 where the image falls from the core all
@@ -284,7 +291,8 @@ def basin_depth(image: Any, grid: VolumeGrid, within: Any) -> float:
     return float((reconstruction(lake, x, method="erosion", footprint=_CROSS) - x)[region].max())
 
 
-def dice(a: Any, b: Any) -> float:
+@checked
+def dice(a: ArrayLike, b: ArrayLike) -> float:
     """Dice overlap ``2 |a ∩ b| / (|a| + |b|)`` of two masks, 0…1; NaN where both are empty.
 
     Raises:

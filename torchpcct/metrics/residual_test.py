@@ -21,7 +21,7 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from torchpcct.validate import coverage, number
+from torchpcct.validate import checked, coverage, number
 
 __all__ = ["FALSE_ALARMS", "ResidualTest", "residual_test"]
 
@@ -57,6 +57,7 @@ class ResidualTest:
     findings: tuple[str, ...]
 
 
+@checked
 def residual_test(
     residual: Tensor, weights: Tensor, fitted: Tensor, *, unknowns: int = 0, false_alarms: float = FALSE_ALARMS
 ) -> ResidualTest:

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.roi import as_array
-from torchpcct.validate import number
+from torchpcct.validate import checked, number
 
 __all__ = [
     "TransferFunction",
@@ -34,6 +34,7 @@ __all__ = [
 Floats = NDArray[np.float64]
 
 
+@checked
 def ellipsoid_distance(
     grid: VolumeGrid, center: tuple[float, ...], semi_axes: tuple[float, ...], rotation: ArrayLike | None = None
 ) -> Floats:
@@ -79,8 +80,9 @@ def ellipsoid_distance(
     return np.where(inside, -distance, distance).reshape(grid.shape)
 
 
+@checked
 def edge_profile(
-    image: Any, distance: Any, reach: tuple[float, float], bin_mm: float, mask: Any = None
+    image: ArrayLike, distance: ArrayLike, reach: tuple[float, float], bin_mm: float, mask: Any = None
 ) -> tuple[Floats, Floats]:
     """Edge-spread function on equidistant positions.
 
@@ -134,7 +136,10 @@ def first_below(x: Floats, values: Floats, level: float, never: float) -> float:
     return float(x[k - 1] + (values[k - 1] - level) / (values[k - 1] - values[k]) * (x[k] - x[k - 1]))
 
 
-def edge_width(positions: Any, profile: Any, low: float = 0.1, high: float = 0.9, plateau: int = 3) -> float:
+@checked
+def edge_width(
+    positions: ArrayLike, profile: ArrayLike, low: float = 0.1, high: float = 0.9, plateau: int = 3
+) -> float:
     """Distance in mm over which an edge goes from ``low`` to ``high`` of its step.
 
     Args:
@@ -207,8 +212,9 @@ class TransferFunction:
         return edge_width(self.positions, self.profile)
 
 
+@checked
 def task_transfer(
-    image: Any, distance: Any, reach: tuple[float, float], bin_mm: float, mask: Any = None
+    image: ArrayLike, distance: ArrayLike, reach: tuple[float, float], bin_mm: float, mask: Any = None
 ) -> TransferFunction:
     """Task transfer function from the ensemble mean of an edge.
 
@@ -233,6 +239,7 @@ def task_transfer(
     return TransferFunction(frequencies, values / np.sinc(frequencies * bin_mm) ** 2, positions, profile)
 
 
+@checked
 def match_edge_width(
     target_mm: float, width_of: Callable[[float], float], low: float, high: float, tolerance: float = 1e-3
 ) -> float:

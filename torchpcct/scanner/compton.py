@@ -7,6 +7,8 @@ import functools
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from torchpcct.validate import checked
+
 __all__ = ["ELECTRON_REST_KEV", "mean_recoil_fraction", "recoil"]
 
 Floats = NDArray[np.float64]
@@ -22,6 +24,7 @@ def _gauss_legendre(count: int) -> tuple[Floats, Floats]:
     return nodes, weights
 
 
+@checked
 def recoil(energies_kev: ArrayLike, nodes: int = _NODES) -> tuple[Floats, Floats]:
     """Recoil-electron energies and their probabilities (Klein and Nishina 1929; binding is neglected).
 
@@ -42,6 +45,7 @@ def recoil(energies_kev: ArrayLike, nodes: int = _NODES) -> tuple[Floats, Floats
     return energies * (1.0 - ratio), density / density.sum(axis=1, keepdims=True)
 
 
+@checked
 def mean_recoil_fraction(energies_kev: ArrayLike) -> Floats:
     """Mean share of the photon's energy that a Compton interaction gives to the electron, ``(E,)``."""
     energies = np.atleast_1d(np.asarray(energies_kev, dtype=np.float64))

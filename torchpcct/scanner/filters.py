@@ -13,7 +13,7 @@ from scipy.interpolate import PchipInterpolator
 
 from torchpcct.scanner.source import Slabs
 from torchpcct.scene.materials import MATERIALS, Material
-from torchpcct.validate import number, numbers
+from torchpcct.validate import checked, number, numbers
 
 __all__ = ["Bowtie", "behind_filters", "large_bowtie", "roi_bowtie"]
 
@@ -83,11 +83,13 @@ class Bowtie:
         return np.exp(-np.multiply.outer(self.thickness(fan_angles_rad), self.material.attenuation(energies_kev)))
 
 
+@checked
 def large_bowtie() -> Bowtie:
     """Aluminium body bowtie for a large field of view: 2.5 mm at the centre, 37 mm at 0.48 rad."""
     return Bowtie(MATERIALS["aluminium"], _LARGE_RAD, tuple(10.0 * t for t in _LARGE_CM), "large")
 
 
+@checked
 def roi_bowtie(
     sod: float,
     diameter_mm: float = ROI_DIAMETER_MM,
@@ -128,6 +130,7 @@ def roi_bowtie(
     return Bowtie(metal, angles, (0.0, 0.0, thickness_mm, thickness_mm), "roi")
 
 
+@checked
 def behind_filters(
     photons: Floats, fan_angles_rad: Floats, energies_kev: Floats, flat: Slabs, bowties: tuple[Bowtie, ...]
 ) -> Floats:

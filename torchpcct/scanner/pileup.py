@@ -24,6 +24,7 @@ from torch import Tensor
 
 from torchpcct.scanner.detector import SiliconDetector
 from torchpcct.scene.materials import MATERIALS
+from torchpcct.validate import checked
 
 __all__ = ["PileUpMap", "pulse_heights", "recorded_rates"]
 
@@ -37,6 +38,7 @@ _SAMPLES = 2048
 """Samples of the map along the line integral."""
 
 
+@checked
 def pulse_heights(detector: SiliconDetector, energies_kev: ArrayLike, size: int, step_kev: float = _STEP_KEV) -> Floats:
     """Pulses per incident photon by recorded height, ``(E, size)``.
 
@@ -48,6 +50,7 @@ def pulse_heights(detector: SiliconDetector, energies_kev: ArrayLike, size: int,
     return np.asarray(np.maximum(cumulative - np.append(cumulative[1:], 0 * cumulative[:1], axis=0), 0.0).T)
 
 
+@checked
 def recorded_rates(detector: SiliconDetector, energies_kev: ArrayLike, quanta_per_s: ArrayLike) -> Floats:
     """Recorded counts per second and bin.
 

@@ -6,6 +6,7 @@ named constant here.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from torchpcct.geometry import ConeBeam, full_turn
@@ -14,7 +15,7 @@ from torchpcct.scanner.filters import Bowtie, large_bowtie, roi_bowtie
 from torchpcct.scanner.scanner import Scanner
 from torchpcct.scanner.source import Source
 from torchpcct.scene.materials import MATERIALS
-from torchpcct.validate import choice
+from torchpcct.validate import checked, choice
 
 __all__ = [
     "EID_OFFSET_COLUMNS",
@@ -52,12 +53,17 @@ def _bowties(name: Any, sod: float) -> tuple[Bowtie, ...]:
     if isinstance(name, Bowtie):
         return (name,)
     if not isinstance(name, str):
+        if name is not None and not isinstance(name, Sequence):
+            raise TypeError(
+                f"bowtie must be one of {', '.join(_BOWTIES)}, a Bowtie or a sequence of them, got {name!r}"
+            )
         return tuple(name or ())
     choice("bowtie", name, _BOWTIES)
     large = (large_bowtie(),) if "large" in name else ()
     return (*large, roi_bowtie(sod)) if "roi" in name else large
 
 
+@checked
 def pcct(
     views: int = PCCT_VIEWS,
     mode: str = "counting",
@@ -101,6 +107,7 @@ def pcct(
     )
 
 
+@checked
 def eid(
     views: int = EID_VIEWS,
     *,

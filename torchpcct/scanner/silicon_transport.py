@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from torchpcct.scanner.compton import ELECTRON_REST_KEV
 from torchpcct.scanner.detector import SiliconDetector
 from torchpcct.scene.materials import MATERIALS
-from torchpcct.validate import choice, number, whole
+from torchpcct.validate import checked, choice, number, whole
 
 __all__ = ["Deposits", "Stack", "efficiency", "follow"]
 
@@ -111,6 +111,7 @@ class Deposits:
         return np.bincount(owner[counted], minlength=self.photons)
 
 
+@checked
 def follow(
     detector: SiliconDetector,
     energies_kev: ArrayLike,
@@ -174,6 +175,7 @@ def follow(
     return Deposits(incident, photon, sheet, strip, segment, left, orders)
 
 
+@checked
 def efficiency(counts: ArrayLike, task: ArrayLike | None = None) -> tuple[float, float]:
     """Zero-frequency DQE of counts against an ideal energy-resolving detector, and its standard error.
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpcct.scene.materials import MATERIALS, Material
-from torchpcct.validate import number, numbers
+from torchpcct.validate import number, numbers, reals
 
 __all__ = ["ANODE_ANGLE_DEG", "INHERENT_ALUMINIUM_MM", "TUBE_OUTPUT", "Slabs", "Source", "Spectrum", "slabs"]
 
@@ -153,7 +153,9 @@ class Source:
 
 
 def _table(value: Any) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    energies, fluence = (np.asarray(v, dtype=np.float64) for v in value)
+    if not isinstance(value, tuple | list | np.ndarray) or len(value) != 2:
+        raise TypeError(f"table must be a pair, energies in keV and fluences, got {value!r:.60}")
+    energies, fluence = (reals("table", v) for v in value)
     if energies.ndim != 1 or energies.shape != fluence.shape or energies.size == 0:
         raise ValueError(f"table must hold as many fluences as energies, got {energies.shape} and {fluence.shape}")
     if not (np.isfinite(energies).all() and energies[0] > 0 and (np.diff(energies) > 0).all()):

@@ -56,6 +56,8 @@ class TransportedSilicon(SiliconDetector):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if not isinstance(self.stack, Stack):
+            raise TypeError(f"stack must be a Stack, got {type(self.stack).__name__}")
         whole("photons", self.photons, 1000)
         whole("transport_seed", self.transport_seed, 0)
         share = 1.0 - self.stack.foil_mm / self.stack.sheet_pitch_mm

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from torchpcct.validate import number, numbers
+from torchpcct.validate import checked, number, numbers, reals
 
 __all__ = ["Box", "Ellipsoid", "EllipticCylinder", "Shape", "rotation_matrix"]
 
@@ -27,6 +27,7 @@ FAR = 2000.0
 _ORTHOGONAL = 1e-9
 
 
+@checked
 def rotation_matrix(axis: ArrayLike, angle: float) -> Floats:
     """Right-handed rotation by ``angle`` rad about ``axis`` (3 numbers, any length > 0), ``(3, 3)`` float64.
 
@@ -47,7 +48,7 @@ def _rotation(value: Any) -> Matrix:
         angle = number("rotation", value)
         m = rotation_matrix((0.0, 0.0, 1.0), angle)
     else:
-        m = np.asarray(value, dtype=np.float64)
+        m = reals("rotation", value)
         if m.shape != (3, 3):
             raise ValueError(f"rotation must be an angle about z in rad or a 3 × 3 matrix, got shape {m.shape}")
         proper = np.abs(m @ m.T - np.eye(3)).max() < _ORTHOGONAL and np.linalg.det(m) > 0

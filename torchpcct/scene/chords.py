@@ -26,6 +26,7 @@ from torchpcct.scene.bodies import Box, Ellipsoid, EllipticCylinder, Shape
 from torchpcct.scene.chord_kernels import BOX, BULGED, CYLINDER, ELLIPSOID, NARROWED, chords, interval
 from torchpcct.scene.tubes import BulgedTube, NarrowedTube
 from torchpcct.threads import run
+from torchpcct.validate import checked
 
 __all__ = ["PARAMETERS", "chord_lengths", "interval", "pack"]
 
@@ -88,6 +89,7 @@ def _bounding_radius(shape: Shape) -> float:
     return math.hypot(*((high - low)[:2] / 2.0))
 
 
+@checked
 def pack(shapes: Sequence[Shape]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Shapes as the arrays that the kernels read.
 
@@ -133,6 +135,7 @@ def pack(shapes: Sequence[Shape]) -> tuple[NDArray[np.int64], NDArray[np.float64
     return kinds, params
 
 
+@checked
 def chord_lengths(scene: Any, origins: ArrayLike, directions: ArrayLike) -> NDArray[np.float64]:
     """Length that straight lines run inside each shape.
 
@@ -148,7 +151,10 @@ def chord_lengths(scene: Any, origins: ArrayLike, directions: ArrayLike) -> NDAr
         ValueError: a wrong shape, a value that is not finite, a direction of length 0.
         TypeError: an element that is not a shape.
     """
-    kinds, params = pack(scene.shapes if hasattr(scene, "shapes") else list(scene))
+    shapes = getattr(scene, "shapes", scene)
+    if not isinstance(shapes, Sequence):
+        raise TypeError(f"scene must be a Scene or a sequence of shapes, got {type(scene).__name__}")
+    kinds, params = pack(shapes)
     o = np.atleast_2d(np.asarray(origins, dtype=np.float64))
     d = np.atleast_2d(np.asarray(directions, dtype=np.float64))
     for name, value in (("origins", o), ("directions", d)):

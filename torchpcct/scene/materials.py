@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpcct.scene.materials_tables import FORMULAS, TABLES
-from torchpcct.validate import number
+from torchpcct.validate import checked, number, reals
 
 __all__ = [
     "FRACTION_TOLERANCE",
@@ -78,7 +78,9 @@ def _atomic_mass(element: str) -> float:
 
 
 def _energies(energies_kev: Any) -> Floats:
-    energies = np.array(energies_kev, dtype=np.float64, order="C")
+    energies = np.array(reals("energies_kev", energies_kev), order="C")
+    if not energies.size:
+        raise ValueError("energies_kev is empty: give one energy or more")
     low, high = ENERGY_RANGE_KEV
     bad = ~((energies >= low) & (energies <= high))
     if bad.any():
@@ -109,10 +111,13 @@ class Material:
     mass_fractions: Mapping[str, float]
 
     def __post_init__(self) -> None:
-        density = float(self.density_g_cm3)
+        given = reals("density_g_cm3", self.density_g_cm3)
+        density = float(given) if given.ndim == 0 else math.nan
         if not (math.isfinite(density) and density > 0):
             raise ValueError(f"density of {self.name!r} must be greater than 0 g/cm³, got {self.density_g_cm3!r}")
-        fractions = {str(k): float(v) for k, v in dict(self.mass_fractions).items()}
+        if not isinstance(self.mass_fractions, Mapping):
+            raise TypeError(f"mass_fractions of {self.name!r} must map elements to shares, got {self.mass_fractions!r}")
+        fractions = {str(k): number(f"mass fraction of {k}", v) for k, v in self.mass_fractions.items()}
         if not fractions:
             raise ValueError(f"material {self.name!r} needs at least one element")
         for element, fraction in fractions.items():
@@ -170,8 +175,12 @@ class Material:
             energies_kev: energies ``(E,)`` keV, or one energy.
             weights: relative detected signal per energy, broadcast to ``energies_kev``.
         """
-        energies = np.atleast_1d(np.asarray(energies_kev, dtype=np.float64))
-        w = np.broadcast_to(np.asarray(weights, dtype=np.float64), energies.shape)
+        energies = np.atleast_1d(reals("energies_kev", energies_kev))
+        if np.shape(weights) not in ((), energies.shape):
+            raise ValueError(
+                f"weights must be one for each of the {energies.shape} energies_kev, got {np.shape(weights)}"
+            )
+        w = np.broadcast_to(reals("weights", weights), energies.shape)
         if not (np.isfinite(w).all() and (w >= 0).all() and w.sum() > 0):
             raise ValueError("weights must be finite, ≥ 0 and not all zero")
         return float(
@@ -184,6 +193,7 @@ class Material:
         return Material(self.name if name is None else name, density_g_cm3, self.mass_fractions)
 
 
+@checked
 def formula_mass_fractions(formula: Mapping[str, float]) -> dict[str, float]:
     """Mass fractions of a molecular formula, element → number of atoms (which may be fractional)."""
     masses = {element: count * _atomic_mass(element) for element, count in formula.items()}
@@ -193,11 +203,13 @@ def formula_mass_fractions(formula: Mapping[str, float]) -> dict[str, float]:
     return {element: mass / total for element, mass in masses.items()}
 
 
+@checked
 def compound(name: str, density_g_cm3: float, formula: Mapping[str, float]) -> Material:
     """A material from its molecular formula, e.g. ``compound("water", 1.0, {"H": 2, "O": 1})``."""
     return Material(name, density_g_cm3, formula_mass_fractions(formula))
 
 
+@checked
 def mixture(name: str, density_g_cm3: float, parts: Mapping[Material, float]) -> Material:
     """A mixture by *mass* at a given density; the shares must sum to 1 within :data:`FRACTION_TOLERANCE`."""
     fractions: dict[str, float] = {}
@@ -209,6 +221,7 @@ def mixture(name: str, density_g_cm3: float, parts: Mapping[Material, float]) ->
     return Material(name, density_g_cm3, fractions)
 
 
+@checked
 def blend(name: str, parts: Mapping[Material, float]) -> Material:
     """A mixture by *volume*: density and attenuation are the volume-weighted means of the parts (ideal mixing)."""
     shares = {part: float(share) for part, share in parts.items()}
@@ -219,6 +232,7 @@ def blend(name: str, parts: Mapping[Material, float]) -> Material:
     return mixture(name, density, {p: s * p.density_g_cm3 / (total * density) for p, s in shares.items()})
 
 
+@checked
 def solution(solute: Material | str, mg_per_ml: float, solvent: Material | str = "water") -> Material:
     """So many mg of one material in every ml of the whole, in another: contrast agents, calibration rods.
 
@@ -234,6 +248,7 @@ def solution(solute: Material | str, mg_per_ml: float, solvent: Material | str =
     return blend(name, {matrix: 1.0 - share, dissolved: share})
 
 
+@checked
 def calcification(
     hu: float = 1500.0,
     energies_kev: Any = 64.0,

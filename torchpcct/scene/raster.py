@@ -14,7 +14,7 @@ from torchpcct.kernel_cache import forget_outdated
 from torchpcct.scene.bodies import Shape
 from torchpcct.scene.chords import interval, pack
 from torchpcct.threads import run
-from torchpcct.validate import whole
+from torchpcct.validate import checked, whole
 
 __all__ = ["volume_fractions"]
 
@@ -46,6 +46,7 @@ def _fill(
                     out[b, k, j, last] += (t1 - last) * share
 
 
+@checked
 def volume_fractions(shapes: Sequence[Shape], parents: Sequence[int], grid: VolumeGrid, oversample: int = 4) -> Floats:
     """Share of each voxel that each of ``B`` nested bodies fills itself, without the bodies inside it.
 

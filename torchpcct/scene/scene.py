@@ -23,6 +23,7 @@ from torchpcct.scene.bodies import Shape
 from torchpcct.scene.materials import Material
 from torchpcct.scene.materials import material as material_of
 from torchpcct.scene.motion import SinusoidalMotion
+from torchpcct.validate import checked
 
 __all__ = ["Body", "Scene", "voxel_centres"]
 
@@ -71,6 +72,7 @@ class Scene:
         TypeError: an element that is not a :class:`Body` or a motion.
     """
 
+    @checked
     def __init__(
         self,
         bodies: Sequence[Body],
@@ -338,6 +340,7 @@ class Scene:
         return self.render(grid, dict(zip(self.names, mu, strict=True)), oversample=oversample)
 
 
+@checked
 def voxel_centres(grid: VolumeGrid) -> Floats:
     """``(*grid.shape, 3)`` as x, y, z in mm; a 2-D grid lies in the plane z = 0."""
     axes = grid.axes if grid.ndim == 3 else (np.zeros(1), *grid.axes)

@@ -18,11 +18,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scene.materials import MATERIALS, Material, material
-from torchpcct.validate import choice
+from torchpcct.validate import checked, choice
 
 __all__ = ["BODY_TISSUES", "DENSE", "VoxelScene"]
 
@@ -90,18 +90,17 @@ class VoxelScene:
         In 10 mm the blur of cells and kernel takes part (cells of 1 mm, soft kernel).
     """
 
+    @checked
     def __init__(
         self,
-        hu: Any,
+        hu: ArrayLike,
         grid: VolumeGrid,
         *,
-        energies_kev: Any = None,
-        weights: Any = 1.0,
+        energies_kev: ArrayLike | None = None,
+        weights: ArrayLike = 1.0,
         dense: Any = "bone",
         tissues: Sequence[Material | str] | None = None,
     ) -> None:
-        if not isinstance(grid, VolumeGrid):
-            raise TypeError(f"grid must be a VolumeGrid, got {type(grid).__name__}")
         values = np.asarray(hu, dtype=np.float32)
         if grid.ndim != 3 or values.shape != grid.shape:
             raise ValueError(f"hu needs the shape (z, y, x) of its grid, {grid.shape}, got {values.shape}")

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from torchpcct.scene.materials import Material, material
+from torchpcct.validate import checked
 
 __all__ = ["FIT_ENERGIES_KEV", "Basis", "pe_pvc"]
 
@@ -118,6 +119,7 @@ class Basis:
         return np.asarray(1000.0 * error / material("water").attenuation(energies_kev))
 
 
+@checked
 def pe_pvc() -> Basis:
     """Polyethylene (0.93 g/cm³) and rigid PVC (1.37 g/cm³), the basis of Li et al. (densities assumed)."""
     return Basis(material("polyethylene"), material("pvc"))

@@ -19,6 +19,7 @@ from torchpcct.scan import Scan
 from torchpcct.spectral.decompose_kernels import sensitivity, solve
 from torchpcct.spectral.model import SpectralModel, evaluate
 from torchpcct.threads import run
+from torchpcct.validate import checked
 
 __all__ = ["Decomposition", "cramer_rao", "decompose", "decompose_scan", "decompose_surround", "inverse"]
 
@@ -36,8 +37,11 @@ STEP_LIMIT = 160
 """Most rays take three steps; a few in a million, with a handful of counts, need their steps damped."""
 
 
+@checked
 def inverse(packed: Tensor) -> Tensor:
     """Inverse of symmetric 2 × 2 matrices packed as ``(3, ...)``: entries 11, 12, 22; information ↔ covariance."""
+    if packed.shape[:1] != (3,):
+        raise ValueError(f"packed must have the shape (3, ...), got {tuple(packed.shape)}")
     a, b, c = packed
     return torch.stack([c, -b, a]) / (a * c - b * b)
 
@@ -65,6 +69,7 @@ class Decomposition:
         return inverse(self.information)
 
 
+@checked
 def decompose(
     counts: Tensor,
     model: SpectralModel,
@@ -163,6 +168,7 @@ class _Decompose(torch.autograd.Function):
         return g.reshape(counts.shape).to(counts.dtype), *(None,) * 6
 
 
+@checked
 def cramer_rao(
     line_integrals: Tensor, model: SpectralModel, *, columns: Any = None, scale: Any = None, order: int = 1
 ) -> Tensor:
@@ -203,6 +209,7 @@ def cramer_rao(
     return inverse(packed).reshape(3, *shape).to(line_integrals.dtype)
 
 
+@checked
 def decompose_scan(scan: Scan, model: SpectralModel, **options: Any) -> Decomposition:
     """:func:`decompose` of all readings of a spectral scan, ``(2, views, rows, columns)``.
 
@@ -217,6 +224,7 @@ def decompose_scan(scan: Scan, model: SpectralModel, **options: Any) -> Decompos
     return decompose(scan.counts, model, columns=columns, scale=scale, **{**exact, **options})
 
 
+@checked
 def decompose_surround(scan: Scan, model: SpectralModel) -> Tensor:
     """Line integrals ``(2, rows, columns)`` in mm of a windowed scan's surround, which is noise free.
 

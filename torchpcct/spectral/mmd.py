@@ -21,11 +21,13 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from torchpcct.metrics import plaque_measures
 from torchpcct.scene.materials import Material
 from torchpcct.spectral.basis import FIT_ENERGIES_KEV, Basis
+from torchpcct.validate import checked
 
 __all__ = ["MMD_TISSUES", "clean", "dice", "label", "mmd", "nearest"]
 
@@ -35,11 +37,12 @@ MMD_TISSUES = ("blood_iodine", "necrotic_core", "fibrous_tissue", "pericoronary_
 _SLACK = 1e-9  # round-off: a voxel on an edge is inside
 
 
+@checked
 def mmd(
     basis_images: Tensor,
     basis: Basis,
     tissues: Sequence[Material | str] | Any = MMD_TISSUES,
-    covariance: Any = None,
+    covariance: ArrayLike | None = None,
 ) -> Tensor:
     """Volume fractions.
 
@@ -133,13 +136,20 @@ def _nearest(x: Tensor, corners: Tensor) -> tuple[Tensor, Tensor]:
     return alpha, distance
 
 
+@checked
 def label(fractions: Tensor) -> Tensor:
     """Index of the largest fraction, ``(K, ...)`` → ``(...)`` int64."""
+    if not fractions.is_floating_point() or not fractions.ndim:
+        raise TypeError(f"fractions must be a floating point tensor (K, ...), got {fractions.dtype}")
     return fractions.argmax(0)
 
 
+@checked
 def nearest(
-    fractions: Tensor, basis: Basis, tissues: Sequence[Material | str] | Any = MMD_TISSUES, covariance: Any = None
+    fractions: Tensor,
+    basis: Basis,
+    tissues: Sequence[Material | str] | Any = MMD_TISSUES,
+    covariance: ArrayLike | None = None,
 ) -> Tensor:
     """The pure tissue nearest to each mixture: k-means whose centres stay at the tissues, which are known.
 
@@ -170,6 +180,7 @@ def nearest(
     return distance.argmin(0).reshape(fractions.shape[1:]).to(fractions.device)
 
 
+@checked
 def clean(fractions: Tensor, window: int = 3, iterations: int = 50) -> Tensor:
     """Labels from noisy fractions by k-means.
 
@@ -210,7 +221,8 @@ def clean(fractions: Tensor, window: int = 3, iterations: int = 50) -> Tensor:
     return labels.reshape(fractions.shape[1:])
 
 
-def dice(labels: Any, truth: Any, names: Sequence[str] = MMD_TISSUES) -> Mapping[str, float]:
+@checked
+def dice(labels: ArrayLike, truth: ArrayLike, names: Sequence[str] = MMD_TISSUES) -> Mapping[str, float]:
     """Dice coefficient 2 |A ∩ B| / (|A| + |B|) of each tissue.
 
     Args:

@@ -24,6 +24,7 @@ from torchpcct.scene.materials import material
 from torchpcct.spectral.basis import Basis, pe_pvc
 from torchpcct.spectral.decompose_kernels import expected
 from torchpcct.threads import run
+from torchpcct.validate import reals
 
 __all__ = ["SpectralModel"]
 
@@ -66,8 +67,8 @@ class SpectralModel:
     basis: Basis = field(default_factory=pe_pvc)
 
     def __post_init__(self) -> None:
-        energies = np.ascontiguousarray(self.energies, np.float64)
-        spectra = np.asarray(self.spectra, np.float64)
+        energies = np.ascontiguousarray(reals("energies", self.energies))
+        spectra = reals("spectra", self.spectra)
         if spectra.ndim != 3 or energies.shape != spectra.shape[-1:]:
             raise ValueError(
                 f"spectra must have the shape (columns, bins, {energies.size} energies), got {spectra.shape}"

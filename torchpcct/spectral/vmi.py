@@ -19,6 +19,7 @@ from torch import Tensor
 
 from torchpcct.scene.materials import material
 from torchpcct.spectral.basis import Basis
+from torchpcct.validate import checked
 
 __all__ = ["VMI_ENERGIES_KEV", "VmiCurve", "sample_covariance", "vmi", "vmi_curve", "vmi_noise", "vmi_weights"]
 
@@ -30,6 +31,7 @@ _SINGULAR = 1e-5
 VMI_ENERGIES_KEV = tuple(float(e) for e in range(40, 141))
 
 
+@checked
 def vmi_weights(
     basis: Basis, energies_kev: ArrayLike = VMI_ENERGIES_KEV, water: ArrayLike | None = None
 ) -> tuple[Floats, Floats]:
@@ -64,6 +66,7 @@ def _pair(name: str, value: Any, entries: int) -> Tensor:
     return t if t.is_floating_point() else t.to(torch.float64)
 
 
+@checked
 def vmi(
     basis_images: Tensor, basis: Basis, energies_kev: ArrayLike = VMI_ENERGIES_KEV, water: ArrayLike | None = None
 ) -> Tensor:
@@ -84,8 +87,9 @@ def vmi(
     return torch.tensordot(g, images, dims=1) + offset.reshape(-1, *(1,) * (images.ndim - 1))
 
 
+@checked
 def vmi_noise(
-    covariance: Any, basis: Basis, energies_kev: ArrayLike = VMI_ENERGIES_KEV, water: ArrayLike | None = None
+    covariance: ArrayLike, basis: Basis, energies_kev: ArrayLike = VMI_ENERGIES_KEV, water: ArrayLike | None = None
 ) -> Tensor:
     """Standard deviation of virtual monochromatic images.
 
@@ -110,7 +114,8 @@ def vmi_noise(
     return torch.tensordot(terms, c, dims=1).clamp_min(0).sqrt()
 
 
-def sample_covariance(basis_images: Any, mask: Any = None) -> Floats:
+@checked
+def sample_covariance(basis_images: ArrayLike, mask: Any = None) -> Floats:
     """Covariance ``(3,)`` of basis values over a region or over realisations, with n − 1 in the denominator.
 
     Args:
@@ -157,6 +162,7 @@ class VmiCurve:
         return float(self.energies[k])
 
 
+@checked
 def vmi_curve(
     first: ArrayLike,
     second: ArrayLike,

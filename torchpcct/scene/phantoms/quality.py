@@ -7,7 +7,7 @@ from typing import Any
 
 from torchpcct.scene.bodies import EllipticCylinder
 from torchpcct.scene.scene import Body, Scene
-from torchpcct.validate import number
+from torchpcct.validate import checked, number
 
 __all__ = ["CTDI_HOLES", "ctdi", "water_cylinder"]
 
@@ -15,6 +15,7 @@ __all__ = ["CTDI_HOLES", "ctdi", "water_cylinder"]
 CTDI_HOLES = ("centre", "peripheral_0", "peripheral_90", "peripheral_180", "peripheral_270")
 
 
+@checked
 def water_cylinder(
     diameter: float = 200.0, length: float = math.inf, material: Any = "water", position: Any = (0.0, 0.0, 0.0)
 ) -> Scene:
@@ -30,6 +31,7 @@ def water_cylinder(
     return Scene([Body("cylinder", EllipticCylinder(radius, half, position=position), material)])
 
 
+@checked
 def ctdi(
     diameter: float = 320.0,
     insert: Any = "water",

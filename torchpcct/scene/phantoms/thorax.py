@@ -17,7 +17,7 @@ from typing import Any
 from torchpcct.scene.bodies import EllipticCylinder
 from torchpcct.scene.plaque.plaque import Plaque
 from torchpcct.scene.scene import Body, Scene
-from torchpcct.validate import number, numbers
+from torchpcct.validate import checked, number, numbers
 
 __all__ = ["HEART_CENTER_MM", "RIB_ANGLES_DEG", "thorax"]
 
@@ -62,6 +62,7 @@ def _cylinder(axes: tuple[float, float], center: tuple[float, float], turn: floa
     return EllipticCylinder(axes, position=(*center, 0.0), rotation=turn)
 
 
+@checked
 def thorax(
     center: Any = (-HEART_CENTER_MM[0], -HEART_CENTER_MM[1]),
     *,

@@ -26,7 +26,7 @@ from torchpcct.scene.materials import Material, material
 from torchpcct.scene.motion import SinusoidalMotion
 from torchpcct.scene.scene import Body, Scene
 from torchpcct.scene.tubes import BulgedTube, NarrowedTube
-from torchpcct.validate import number, numbers
+from torchpcct.validate import checked, number, numbers
 
 __all__ = ["Plaque", "interpolate_material", "plaque_scene"]
 
@@ -207,6 +207,7 @@ def _gap(lumen: NarrowedTube, center: tuple[float, ...], axes: tuple[float, ...]
     return float(minimize(gap, start, method="Nelder-Mead", options=options).fun)
 
 
+@checked
 def interpolate_material(name: str, start: Any, end: Any, weight: float) -> Material:
     """A material whose attenuation lies at ``weight`` of the way between two others, at every energy.
 
@@ -239,6 +240,7 @@ def interpolate_material(name: str, start: Any, end: Any, weight: float) -> Mate
     return Material(name, density, {element: value / density for element, value in partial.items()})
 
 
+@checked
 def plaque_scene(
     plaque: Plaque | None = None,
     *,

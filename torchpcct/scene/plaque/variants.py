@@ -16,11 +16,12 @@ from torchpcct.scene.bodies import Ellipsoid, EllipticCylinder
 from torchpcct.scene.materials import calcification
 from torchpcct.scene.plaque.plaque import PAPER_POSITION, Plaque, interpolate_material, plaque_scene
 from torchpcct.scene.scene import Body, Scene
-from torchpcct.validate import number, whole
+from torchpcct.validate import checked, number, whole
 
 __all__ = ["VARIANTS", "calcification_bodies", "plaque_variant", "stent_bodies", "textured"]
 
 
+@checked
 def calcification_bodies(
     plaque: Plaque,
     *,
@@ -43,6 +44,7 @@ def calcification_bodies(
     return (Body("calcification", shape, material, "fibrous"),)
 
 
+@checked
 def stent_bodies(
     plaque: Plaque,
     *,
@@ -90,6 +92,7 @@ def stent_bodies(
     return tuple(bodies)
 
 
+@checked
 def textured(
     scene: Scene,
     body: str,
@@ -200,6 +203,7 @@ VARIANTS: dict[str, Callable[..., tuple[Scene, Plaque]]] = {
 """Each variant's name and the function that builds it; see :func:`plaque_variant`."""
 
 
+@checked
 def plaque_variant(name: str, **options: Any) -> tuple[Scene, Plaque]:
     """One of the variants of the paper's scene.
 
