@@ -22,7 +22,7 @@ TINY: dict[str, dict[str, Any]] = {
     "detector": {"photons": 4000, "dead_times_ns": (50.0,), "charge_sharing": (0.1,)},
     "bowtie": {
         "views": 96, "realizations": 2, "map_mm": 12.0, "cause_views": 24, "histories": 20_000, "plaque_views": 40,
-        "plaque_doses": (2.0,), "plaque_realizations": 4,
+        "plaque_doses": (2.0,), "plaque_realizations": 8,
     },
     "hardcases": {
         "views": 120, "methods": ("fbp",),

@@ -29,7 +29,7 @@ class Settings(StudySettings):
         histories: photons of each Monte Carlo run; 0: no scatter.
         plaque_views: of the plaque's scans; fewer than the paper's keep the tube load.
         plaque_doses: exposures of the plaque's scans in s.
-        plaque_realizations: paired realisations for MBIR.
+        plaque_realizations: paired realisations for MBIR; controlling them needs at least 8.
         seed: of the first realisation and of the Monte Carlo.
 
     Raises:
@@ -51,12 +51,12 @@ class Settings(StudySettings):
 
     QUICK: ClassVar = {
         "views": 492, "realizations": 2, "map_mm": 6.0, "cause_views": 0, "histories": 100_000,
-        "plaque_views": 123, "plaque_doses": (2.0,), "plaque_realizations": 4,
+        "plaque_views": 123, "plaque_doses": (2.0,), "plaque_realizations": 8,
     }  # fmt: skip
 
     def __post_init__(self) -> None:
         self.check_whole(cause_views=0)
-        self.check_whole(views=8, realizations=2, histories=0, plaque_views=8, plaque_realizations=4, seed=0)
+        self.check_whole(views=8, realizations=2, histories=0, plaque_views=8, plaque_realizations=8, seed=0)
         if 0 < self.histories < 10_000:
             raise ValueError(f"histories must be 0 (no scatter) or at least 10000, got {self.histories}")
         if 0 < self.cause_views < 8:

@@ -193,7 +193,7 @@ def test_arms_stand_beside_the_chest():
         ({"exposure_s": 0.0}, "exposure_s"),
         ({"map_mm": math.nan}, "map_mm"),
         ({"plaque_doses": ()}, "plaque_doses"),
-        ({"plaque_realizations": 3}, "plaque_realizations"),
+        ({"plaque_realizations": 7}, "plaque_realizations"),
         ({"detector": "film"}, "detector"),
         ({"cause_views": 3}, "cause_views"),
     ],
