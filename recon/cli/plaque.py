@@ -20,6 +20,8 @@ __all__ = ["add_plaque"]
 
 
 def _plaque(arguments: argparse.Namespace, progress: ProgressBars) -> None:
+    if not arguments.scan.exists():
+        raise FileNotFoundError(f"{arguments.scan} does not exist (torchpcct simulate makes scans)")
     folder = arguments.out or Path("out") / "plaque"
     names = ("report.md", "report.json", "tissues.nii.gz", "image.nii.gz", "plaque.png")
     check_results(arguments, folder, lambda report: "presence" in report, *names)

@@ -171,7 +171,9 @@ def _sliced(scan: Scan, slices: slice) -> Scan:
     kept = np.arange(scan.counts.shape[0])[slices]
     if not kept.size:
         raise ValueError(f"slices= must lie within the {scan.counts.shape[0]} slices of the scan, got {_text(slices)}")
-    changed = {n: None if getattr(scan, n) is None else getattr(scan, n)[kept] for n in ("quantum", "dead")}
+    changed: dict[str, Any] = {
+        n: None if getattr(scan, n) is None else getattr(scan, n)[kept] for n in ("quantum", "dead")
+    }
     return replace(scan, counts=scan.counts[kept], air=scan.air[kept], **changed)
 
 
