@@ -386,8 +386,8 @@ def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         "torchpcct": VERSION, "command": shlex.join(["torchpcct", *arguments.command_line]),
         "input": str(arguments.scan), "input_sha256": fingerprint(arguments.scan),
     }  # fmt: skip
-    axis = {"axis": scan.info["axis"]} if arguments.find_axis else {}
-    volume = replace(volume, report={**volume.report, **axis, **made}).slices()
+    placed = {"axis": scan.info["axis"]} if arguments.find_axis else {}
+    volume = replace(volume, report={**volume.report, **placed, **made}).slices()
     volume.save(arguments.out)
     grid, mean = volume.grid, float(volume.data.mean())
     size = " × ".join(map(str, grid.shape))
