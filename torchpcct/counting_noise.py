@@ -127,7 +127,7 @@ def _thinned_rows(begin: int, end: int, counts: Any, first: Any, fraction: float
         for j in range(counts.shape[1]):
             given = np.float64(counts[i, j])
             state = stream(key, first[i] + j)
-            n = math.floor(given)
+            n = np.floor(given)
             if n < given:
                 # A gain has made them no whole numbers: up or down, so that the mean stays.
                 state, u = draw(state)
