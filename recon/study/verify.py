@@ -64,7 +64,7 @@ _FIELD = re.compile(r"\{(\w+)(?:>([\w.]+))?(?:\?([^|}]*)\|([^|}]*)|:([^}]*))?\}"
 """A figure, or a choice of words: name, what it is compared with, the words if it is larger and if not, format."""
 
 _WORST, _WORST_NAME = "worst of ", "worst name of "
-_FIGURE = r"([-+−]?\d+(?:[.,]\d+)*%?|[A-Za-z]\w*)"
+_FIGURE = r"([-+−]?\d+(?:[.,]\d+)*%?|[A-Za-z]\w*(?:\s\w+)?)"
 _ROW = re.compile(r"^([^[]*)\[(.+)\]$")
 
 
@@ -93,7 +93,7 @@ class Claim:
             if not place.startswith((_WORST, _WORST_NAME)):
                 return value
             name = max(value, key=lambda k: abs(value[k]))
-            return abs(value[name]) if place.startswith(_WORST) else name
+            return abs(value[name]) if place.startswith(_WORST) else name.replace("_", " ")
 
         def value_of(name: str) -> Any:
             if name not in self.values:
