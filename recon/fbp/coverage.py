@@ -11,7 +11,7 @@ import numpy as np
 from recon.fbp.angular_weights import SAME_VIEW, angular_weights, is_offset
 from recon.fbp.any_orbit import straighten
 from recon.fbp.detector_edges import cut_off
-from torchpcct.defects import GAIN_ERROR
+from torchpcct.defects import BRIGHT, GAIN_ERROR
 from torchpcct.detector_window import shadow
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid, view_step
 from torchpcct.robust import MEDIAN_TO_SD
@@ -29,8 +29,15 @@ _CENTRE_MARGIN = 8
 
 
 _FEWEST_COLUMNS, _SIGMAS, _ALIKE = 16, 8.0, 0.25
+_FEWEST_VIEWS, _FEWEST_CELLS = 24, 500
+_BLOCKS, _BLOCK_SIGMAS = 12, 2.0
 _EVEN = 0.1
 """Relative change over the views of what a row ends at, from which it is no air that is described too bright."""
+_SURROUND_TOLERANCE, _GAIN_TOLERANCE = 0.01, 0.004
+"""Relative deviation of the readings at a window's borders from its surround, and standard deviation of the gains of
+single cells, that are no finding."""
+_BORDER = 2
+"""Columns at either border of a window that are compared with the surround."""
 _STEADY, _TRAVEL = 0.98, 0.25
 """A motion along z that a straight line explains to this share of its variance, by more than this share of the height
 that the rows cover at the axis, is a table's travel."""
@@ -150,7 +157,8 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
     """Whether a scan contradicts itself or its description, whatever reconstructs it.
 
     Opposite rays (:mod:`torchpcct.metrics.opposite_rays`); where they agree, the moments of the views
-    (:mod:`torchpcct.metrics.moments`) of a whole field; and rows that end inside the object.
+    (:mod:`torchpcct.metrics.moments`) of a whole field; rows that end inside the object; and of a window whether its
+    borders see the surround, and its cells have one gain.
 
     Args:
         scan: counting or energy integrating, without energy bins; of several slices the middle one is looked at.
@@ -162,7 +170,7 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
     from torchpcct.metrics.moments import moment_test
     from torchpcct.metrics.opposite_rays import geometry_test  # loads scipy.stats
 
-    window, about = scan.window, (0.0, 0.0)
+    whole, window, about = scan, scan.window, (0.0, 0.0)
     if window is not None:
         window, about = shadow(scan.geometry, grid, margin=_CENTRE_MARGIN).within(window), tuple(grid.center[-2:])
         scan = scan.crop(window)
@@ -179,7 +187,7 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
         lines = lines[lines.shape[0] // 2]
     if window is not None:
         lines = lines - window.take(scan.surround_line_integrals())
-        return list(geometry_test(lines, geometry, window, about).findings)
+        return [*_surround_texts(whole), *geometry_test(lines, geometry, window, about).findings]
     found = list(geometry_test(lines, geometry).findings)
     try:
         weights = angular_weights(geometry)
@@ -192,6 +200,81 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
     elif not found and not is_offset(geometry):
         found += moment_test(lines, geometry).findings
     return found
+
+
+def _surround_texts(scan: Scan) -> list[str]:
+    """Whether a window's borders, which see next to nothing of the inset, read what the known surround says; and
+    whether cells deviate from those in the rows beside them in the views of even and of odd number alike, as gains do
+    and noise does not."""
+    window = scan.window
+    assert window is not None
+    lines = (scan.line_integrals() - window.take(scan.surround_line_integrals())).double()
+    if lines.ndim != 3 or lines.shape[-1] < 4 * _BORDER or lines.shape[0] < _FEWEST_VIEWS:
+        return []
+    found = []
+    # What stands at the rim of the inset is at one border at a time, not at both over a third of the turn.
+    off = [_border_deviation(scan, part) for part in (slice(_BORDER), slice(-_BORDER, None))]
+    for sign, side in ((1.0, "above"), (-1.0, "below")):
+        least = min(float(np.quantile(sign * ratio - _BLOCK_SIGMAS * error, 0.7)) for ratio, error in off)
+        if least > _SURROUND_TOLERANCE:
+            size = 100.0 * np.mean([np.quantile(sign * ratio, 0.7) for ratio, _ in off])
+            found.append(
+                f"beside the inset the readings of a third of the views or more lie {size:.2g} % {side} those of the "
+                "known surround: they hold something else than the transmission (a dark signal, scatter, pile-up, "
+                "saturation), or exposure or surround are not those of the scan; values are off by a smooth background"
+            )
+    gain = _gain_spread(lines, window.column_indices)
+    if gain > _GAIN_TOLERANCE:
+        found.append(
+            f"the cells of the detector differ from their neighbours in the next rows by {100 * gain:.2g} % in all "
+            "their views (standard deviation): gains that the calibration in air did not see, which draw rings"
+        )
+    return found
+
+
+def _border_deviation(scan: Scan, part: slice) -> tuple[Any, Any]:
+    """Relative deviation of the columns ``part`` of a window from the surround in blocks of views, and its standard
+    error from the scatter of the views: ratios of sums, which have no bias of a logarithm."""
+    assert scan.window is not None
+    assert scan.surround is not None
+    expected = scan.window.take(scan.surround)[..., part].double()
+    if scan.flux is not None:
+        expected = expected * scan.flux.double()[:, None, None]
+    read = scan.counts[..., part].double()
+    # Lost readings at a border have neighbours on one side only, and are not found.
+    sound = (read > 0) | (expected < BRIGHT)
+    views = [(values * sound).sum((1, 2)).numpy() for values in (read, expected)]
+    blocks = np.array_split(np.arange(len(read)), _BLOCKS)
+    ratios = [views[0][k].sum() / max(views[1][k].sum(), 1e-9) - 1.0 for k in blocks]
+    errors = [np.std(views[0][k] / np.maximum(views[1][k], 1e-9)) / math.sqrt(max(k.size - 1, 1)) for k in blocks]
+    return np.array(ratios), np.array(errors)
+
+
+def _gain_spread(lines: Any, columns: Any) -> float:
+    """Standard deviation of the cells' gains, less 4 standard errors; 0 where there are too few rows.
+
+    Args:
+        lines: ``(views, rows, columns)`` of a window.
+        columns: ``(views, columns)`` detector column of each.
+    """
+    if lines.shape[1] < 3:
+        return 0.0
+    bend = (lines[:, 1:-1] - (lines[:, :-2] + lines[:, 2:]) / 2).movedim(1, 0).numpy()
+    low, width = int(columns.min()), int(np.ptp(columns)) + 1
+    means, counts = [], []
+    for part in (slice(0, None, 2), slice(1, None, 2)):
+        at = (columns[part] - low).ravel()
+        counts.append(np.bincount(at, minlength=width))
+        means.append(np.stack([np.bincount(at, row[part].ravel(), width) for row in bend]) / np.maximum(counts[-1], 1))
+    often = (counts[0] > 0) & (counts[1] > 0)
+    # Independent noise, the same gains: the mean product is the variance of the gains, times 1 + 2 / 4 for the bend.
+    product = (means[0] * means[1])[:, often]
+    if product.size < _FEWEST_CELLS:
+        return 0.0
+    weight = np.broadcast_to(np.minimum(counts[0], counts[1])[often], product.shape)
+    mean = float((weight * product).sum() / weight.sum())
+    error = float(np.sqrt((weight**2 * (product - mean) ** 2).sum()) / weight.sum())
+    return math.sqrt(max(mean - 4.0 * error, 0.0) / 1.5)
 
 
 def _gain_texts(lines: Any) -> list[str]:

@@ -214,3 +214,32 @@ def test_fbp_of_a_wrong_rotation_centre_is_named(clean):
     wrong = replace(noisy, geometry=replace(g, offset=(g.offset[0], g.offset[1] + g.pitch[1] / 2)))
     found = reconstruct(wrong, GRID, "fbp").report["warnings"]
     assert any("opposite rays disagree" in text and "too high" in text for text in found)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda n, air, gain: n * torch.exp(0.1 - 0.1 * n / air), "above those of the known surround"),
+        (lambda n, air, gain: n + 0.001 * air, "above those of the known surround"),
+        (lambda n, air, gain: n.clamp(max=float(n.mean())), "below those of the known surround"),
+        (lambda n, air, gain: n * gain, "gains that the calibration in air did not see"),
+        (lambda n, air, gain: n, ""),
+    ],
+    ids=["pile-up", "dark signal", "saturation", "gains", "sound"],
+)
+def test_a_window_that_does_not_read_its_surround_is_named(clean, change, said):
+    """FBP of an inset took them for the inset's own, 30 to 120 HU off; PWLS and MBIR see them in their residual."""
+    air = clean._at_window(clean.air)
+    gain = clean.window.take(1 + 0.01 * torch.randn(clean.air.shape, generator=torch.Generator().manual_seed(0)))
+    changed = replace(clean, counts=change(clean.counts, air, gain))
+    for seed in range(3):
+        found = [
+            t for t in consistency_warnings(changed.with_noise(4.0, seed), GRID) if "surround" in t or "gains" in t
+        ]
+        assert len(found) == bool(said)
+        assert not said or said in found[0]
+    # Noise of few counts, and readings that were lost, are no such thing.
+    few = clean.with_noise(0.02, 0)
+    lost = torch.rand(few.counts.shape, generator=torch.Generator().manual_seed(1)) < 0.1
+    for scan in (few, replace(clean.with_noise(4.0, 0), counts=clean.with_noise(4.0, 0).counts.masked_fill(lost, 0.0))):
+        assert not [t for t in consistency_warnings(scan, GRID) if "surround" in t]
