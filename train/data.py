@@ -172,6 +172,8 @@ def _random_contrast(
         inside = around
     flat = float(torch.rand((), generator=generator)) < config.flat_roi
     first = _ball(inside, config.core_roi, config.voxel_mm, generator, inside)
+    # Where there is no core, both lie in the same tissue: voxels of both would cancel.
+    around = around & ~first
     # The tissue next to the core is what the study's background ROI lies in, and hardest: half of all draws.
     margin = 0.7 + 0.5 * float(torch.rand((), generator=generator))
     near = around & _within(first, margin, config.voxel_mm)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import functools
 import hashlib
@@ -23,7 +24,7 @@ __all__ = ["Pieces", "Store", "packed", "unpacked"]
 log = logging.getLogger(__name__)
 
 
-_TRIES = 10
+_TRIES = 100
 """To write a piece, where others clear its folder; it is only kept for later, and a study goes on without."""
 _MARK = "\nSHA-256 "
 """Parts the key from the checksum of the arrays. Pieces of earlier versions have none, and are taken as they are."""
@@ -52,6 +53,11 @@ class Store:
     def path(self, name: str) -> Path:
         """A file's path; its folder is made if need be."""
         path = self.folder / name
+        for _ in range(_TRIES):
+            # Another study that clears the folder may take it away, or one above it, in the middle of this.
+            with contextlib.suppress(FileExistsError, FileNotFoundError):
+                path.parent.mkdir(parents=True, exist_ok=True)
+                return path
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
 

@@ -100,6 +100,8 @@ def test_a_study_outlives_another_one_that_clears_the_same_folder(tmp_path, monk
 def test_an_interruption_while_hdf5_writes_waits_for_it(tmp_path):
     """Ctrl-C in what HDF5 asks of the file would be a write that is lost, and a file that is sealed without it."""
     path = tmp_path / "f.h5"
+    # A shell that starts commands in the background has them ignore Ctrl-C.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def write():
         with write_hdf5(path, "test") as file:
@@ -110,7 +112,7 @@ def test_an_interruption_while_hdf5_writes_waits_for_it(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         write()
     assert list(tmp_path.iterdir()) == []
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.signal(signal.SIGINT, before) is signal.default_int_handler
     with write_hdf5(path, "test") as file:
         file["a"] = np.arange(9)
     with h5py.File(path) as file:

@@ -226,5 +226,5 @@ def test_refusals():
         Projector(wobbling(CONE), VolumeGrid((4, 70, 70), 2.0))
     with pytest.raises(ValueError, match="window belongs to a circular scan"):
         Projector(wobbling(CONE), GRID, DetectorWindow.full(CONE))
-    with pytest.raises(TypeError, match="a helix needs a ConeBeam"):
+    with pytest.raises(TypeError, match="geometry must be a ConeBeam"):
         helical_motion(FAN, 3.0)  # type: ignore[arg-type]
