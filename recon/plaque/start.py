@@ -16,8 +16,8 @@ __all__ = ["find_vessel", "require_within"]
 
 Floats = NDArray[np.float64]
 
-_BALL_MM = 1.8
-"""Larger than any lumen's radius."""
+_BALLS_MM = (1.8, 0.9)
+"""Larger than any lumen's radius; and for a narrow one, whose noise along it holds the walk of a large ball back."""
 _LEAST_STEP_HU = 120.0
 _LEAST_LUMEN_HU = 180.0
 """Where the lumen reads less, its outline is that of the noise: fibrous tissue has up to 150 HU."""
@@ -71,7 +71,10 @@ def find_vessel(pilot: Floats, grid: VolumeGrid, point: Floats | None) -> Start:
             f"a lumen is determined only with contrast agent (at least {_LEAST_LUMEN_HU:.0f} HU)"
         )
     half = 0.5 * (blood + 100.0)
-    line, ends = follow(pilot, grid, half, middle, _BALL_MM)
+    try:
+        line, ends = follow(pilot, grid, half, middle, _BALLS_MM[0])
+    except ValueError:
+        line, ends = follow(pilot, grid, half, middle, _BALLS_MM[1])
     low, high = max(ends[0], -0.5), min(ends[1], line.length + 0.5)
     region, _ = ndimage.label(pilot > half)
     at = tuple(np.clip(np.rint((middle - origin) / step).astype(int), 0, np.array(grid.shape) - 1))

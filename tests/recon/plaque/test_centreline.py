@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from recon.plaque.centreline import Centreline, follow
+from recon.plaque.start import find_vessel
 from torchpcct import VolumeGrid
 
 
@@ -58,3 +59,15 @@ def test_follows_a_tube_in_any_direction(direction):
 def test_nothing_to_follow():
     with pytest.raises(ValueError, match="no vessel brighter than 200 HU"):
         follow(np.zeros(GRID.shape), GRID, 200.0, np.array(GRID.center), 1.8)
+
+
+def test_a_narrow_lumen_is_followed_though_it_is_brighter_in_its_middle():
+    """A ball much wider than the lumen stayed at its brightest part: "no direction, or shorter than 5 mm"."""
+    z, y, x = np.meshgrid(*(a - c for a, c in zip(GRID.axes, GRID.center, strict=True)), indexing="ij", sparse=True)
+    rho = np.hypot(y, x)
+    lumen = np.exp(-((rho / 0.6) ** 2)) * (200.0 + 100.0 * np.exp(-((z / 1.2) ** 2)))
+    pilot = -90.0 + 150.0 / (1.0 + np.exp((rho - 1.3) / 0.15)) + lumen
+    start = find_vessel(pilot, GRID, None)
+    assert start.lumen.length > 6.0
+    assert not np.isfinite(start.ends).any()
+    assert np.abs(start.lumen.points[:, 1:] - np.array(GRID.center)[1:]).max() < 0.1
