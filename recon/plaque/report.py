@@ -80,6 +80,12 @@ def table(reading: PlaqueReading, others: Mapping[str, Any] | None = None, devia
     return "\n".join(lines) + "\n"
 
 
+def _hidden(reading: PlaqueReading) -> set[str]:
+    """Plaque bodies that a reading must not show: fibrous tissue in their place."""
+    told = reading.explained and not reading.taken_off_hu
+    return (set() if told else {"calcification"}) | (set() if reading.certain else {"core"})
+
+
 def picture(reading: PlaqueReading, others: Mapping[str, Any] | None = None) -> Any:
     """Sections across and along z through the core's centre: other volumes with the outlines, and the fitted tissues.
 
@@ -91,7 +97,8 @@ def picture(reading: PlaqueReading, others: Mapping[str, Any] | None = None) -> 
     index = [int(np.clip(round((c - a[0]) / s), 0, n - 1))
              for c, a, s, n in zip(centre, grid.axes, grid.spacing, grid.shape, strict=True)]  # fmt: skip
     (z0, z1), (y0, y1), (x0, x1) = ((a[0] - s / 2, a[-1] + s / 2) for a, s in zip(grid.axes, grid.spacing, strict=True))
-    shown = {k: v for k, v in _COLOURS.items() if k in reading.regions and (k != "core" or reading.certain)}
+    hidden = _hidden(reading)
+    shown = {k: v for k, v in _COLOURS.items() if k in reading.regions and k not in hidden}
     rows = []
     for cut, extent in (((index[0],), (x0, x1, y0, y1)), ((slice(None), index[1]), (x0, x1, z0, z1))):
         outlines = tuple((reading.regions[k][cut] > 0.5, colour) for k, colour in shown.items())
@@ -108,7 +115,8 @@ def save(
 ) -> list[Path]:
     """Write ``report.md``, ``report.json``, ``tissues.nii.gz`` (labels), ``image.nii.gz`` and ``plaque.png``.
 
-    Labels: 0 fat, 1 wall, 2 fibrous, 3 lumen, 4 core, 5 calcification; the core only where it is certain.
+    Labels: 0 fat, 1 wall, 2 fibrous, 3 lumen, 4 core, 5 calcification; the core only where it is certain, and no
+    plaque body where none can be told.
 
     Args:
         reading: to write.
@@ -118,8 +126,8 @@ def save(
     folder.mkdir(parents=True, exist_ok=True)
     names = ["fat", "wall", "fibrous", "lumen", "core", "calcification"]
     shares = [reading.regions.get(n, np.zeros(reading.grid.shape, np.float32)) for n in names]
-    if not reading.certain:
-        shares[2], shares[4] = shares[2] + shares[4], 0 * shares[4]
+    for k in (names.index(name) for name in _hidden(reading)):
+        shares[2], shares[k] = shares[2] + shares[k], 0 * shares[k]
     labels = np.argmax(np.stack(shares), 0).astype(np.float32)
     data = {
         "presence": reading.presence,

@@ -10,9 +10,10 @@ from scipy import ndimage
 
 from recon.plaque import read_plaque, reading
 from recon.plaque.quality import LENGTH_MM, STRIKING, Leftover, misfit, texture
-from recon.plaque.report import table
+from recon.plaque.report import save, table
 from recon.plaque.start import find_vessel
 from recon.plaque.vessel import Vessel
+from torchpcct.volume import Volume
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +45,7 @@ def test_texture_is_told_from_none(gram):
     assert textured.sd_of("contrast") >= 0
 
 
-def test_a_calcification_becomes_a_body_and_not_a_core(gram):
+def test_a_calcification_becomes_a_body_and_not_a_core(gram, tmp_path):
     found = read_plaque(drawn_vessel.data(gram, drawn_vessel.image(gram.grid, 0.0, 3, 1200.0), 5), particles=150)
     assert found.calcifications >= 1  # a coarse grid may make two bodies of it
     assert abs(found.chi2 - 1) < 4 * found.chi2_sd
@@ -55,6 +56,11 @@ def test_a_calcification_becomes_a_body_and_not_a_core(gram):
     # The vessel tilts: 1 mm along it moves its axis by about the tilt in y.
     y = drawn_vessel.TILT - drawn_vessel.HARD_AT[1]
     assert np.linalg.norm(place - (1.0, y, drawn_vessel.HARD_AT[0])) < 0.5
+    save(found, tmp_path / "sound")
+    save(replace(found, taken_off_hu=300.0), tmp_path / "beside")
+    labels = [Volume.load(tmp_path / name / "tissues.nii.gz").data for name in ("sound", "beside")]
+    assert (labels[0] == 5).any()
+    assert not (labels[1] > 3).any()  # what stands in for a neighbour is drawn as no plaque body
 
 
 def test_what_the_model_does_not_have_is_warned_of(gram):
