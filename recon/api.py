@@ -111,8 +111,8 @@ def reconstruct(
         [] if method == "mbir" or s.unit != "HU" else metal_warnings(v.data)
         for s, v in zip(scans, volumes, strict=True)
     ]
-    checked = [consistency_warnings(s, grid) for s in scans]
-    for text in dict.fromkeys(text for texts in (*checked, *metal) for text in texts):
+    contradictions = [consistency_warnings(s, grid) for s in scans]
+    for text in dict.fromkeys(text for texts in (*contradictions, *metal) for text in texts):
         _LOG.warning("%s", text)
     if scans[0].unit != "HU":
         mu = scans[0].linearisation.mu_ref
@@ -127,7 +127,7 @@ def reconstruct(
                 "warnings": [*before, *wrong, *v.report.get("warnings", []), *found],
             },
         )
-        for v, (s, before), wrong, found in zip(volumes, whole, checked, metal, strict=True)
+        for v, (s, before), wrong, found in zip(volumes, whole, contradictions, metal, strict=True)
     ]
     return volumes[0] if isinstance(scan, Scan) else volumes
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import copy
 import functools
 import hashlib
@@ -53,11 +52,6 @@ class Store:
     def path(self, name: str) -> Path:
         """A file's path; its folder is made if need be."""
         path = self.folder / name
-        for _ in range(_TRIES):
-            # Another study that clears the folder may take it away, or one above it, in the middle of this.
-            with contextlib.suppress(FileExistsError, FileNotFoundError):
-                path.parent.mkdir(parents=True, exist_ok=True)
-                return path
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
 
@@ -69,7 +63,7 @@ class Store:
             key: everything that the piece depends on.
             compute: gives the arrays.
         """
-        path = self.path(name + ".npz")
+        path = self.folder / (name + ".npz")
         if path.exists():
             try:
                 with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
