@@ -33,7 +33,7 @@ from pathlib import Path
 from tiny_studies import TINY
 from recon.cli import main
 from recon.study import registry
-from recon.study.store import Store
+from recon.evaluate.store import Store
 out, name = sys.argv[1:]
 kind = registry.part(name, "settings").Settings
 fewer = {"scenes": (), "vessels": ()} if name == "dose-factor" else {}

@@ -39,7 +39,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--resume", action="store_true", help="continue the run in --out")
     parser.add_argument("--steps", type=int, metavar="N", help="optimisation steps, instead of the configuration's")
     parser.add_argument("--seed", type=int, metavar="N", help="seed, instead of the configuration's")
-    parser.add_argument("--weights", type=Path, metavar="FILE", help="start from the weights of another run")
+    parser.add_argument("--weights", type=Path, metavar="FILE", help="start from the weights of another run, of a network as wide or less")
     parser.add_argument("--threads", type=int, metavar="N", help="threads per process (default: torch's choice)")
     parser.add_argument("--no-progress", action="store_true", help="no progress line")
     parser.add_argument("--no-tensorboard", action="store_true", help="no TensorBoard events")
@@ -57,7 +57,7 @@ def build(config: TrainConfig) -> tuple[Unrolled, Data, Objective]:
 
     torch.manual_seed(config.seed)
     model = Unrolled(NetworkConfig(**config.network), steps=config.unroll)
-    model.network.half_precision = config.bfloat16
+    model.network.half_precision = config.bfloat16 and torch.ops.mkldnn._is_mkldnn_bf16_supported()
     return model, Data(config.data), Objective(config.objective, config.single)
 
 
@@ -81,7 +81,7 @@ def _run(arguments: argparse.Namespace, command: str) -> int:
 
     from recon.mbir.mbir import WEIGHTS_FORMAT
     from recon.mbir.weights_io import read_tensors
-    from train.checkpoint import Store
+    from train.checkpoint import Store, start_from
     from train.config import TrainConfig, load_config, packaged_config
     from train.loop import train
     from train.run import DivergedError
@@ -101,7 +101,7 @@ def _run(arguments: argparse.Namespace, command: str) -> int:
         with _processes():
             model, data, objective = build(config)
             if arguments.weights is not None:
-                model.load_state_dict(read_tensors(arguments.weights, WEIGHTS_FORMAT)[0])
+                start_from(model, read_tensors(arguments.weights, WEIGHTS_FORMAT)[0])
             state, number = train(
                 config,
                 model,

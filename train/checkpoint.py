@@ -7,12 +7,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from torch import Tensor
+import torch
+from torch import Tensor, nn
 
 from recon.mbir.weights_io import TensorFileError, read_tensors, write_tensors
 from torchpcct.files import LEFTOVER
 
-__all__ = ["CHECKPOINT_FORMAT", "Store"]
+__all__ = ["CHECKPOINT_FORMAT", "Store", "start_from"]
 
 CHECKPOINT_FORMAT = "torchpcct training checkpoint 2"
 UNFINISHED = "checkpoint.next."
@@ -60,3 +61,27 @@ class Store:
         for path in self.current.parent.iterdir():
             if LEFTOVER.match(path.name) or path.name.startswith(UNFINISHED):
                 path.unlink(missing_ok=True)
+
+
+@torch.no_grad()
+def start_from(model: nn.Module, tensors: Mapping[str, Tensor]) -> None:
+    """Put the weights of another run into a model, whose network may have more channels.
+
+    A wider network computes at first what the narrower one did (Chen, Goodfellow, Shlens 2016, ICLR: Net2Net): its
+    additional channels keep their random inputs, and what they give counts nothing in the channels that were there.
+
+    Raises:
+        ValueError: the weights are of another kind of network, or of a wider one.
+    """
+    state = model.state_dict()
+    for name, value in state.items():
+        old = tensors.get(name)
+        if old is None or old.dim() != value.dim() or any(a > b for a, b in zip(old.shape, value.shape, strict=True)):
+            shape = "none" if old is None else tuple(old.shape)
+            raise ValueError(
+                f"the weights to start from do not fit into this network: {name} has the shape {shape} there, "
+                f"{tuple(value.shape)} here; name a configuration whose network is the same or wider"
+            )
+        if value.dim() > 1:
+            value[: old.shape[0], old.shape[1] :] = 0.0
+        value[tuple(slice(n) for n in old.shape)] = old

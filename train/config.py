@@ -142,10 +142,10 @@ class ObjectiveConfig:
 
     Args:
         data: of eᵀH e.
-        white: of ‖e‖², against ``data``; edge: by how much more inside and next to bodies.
+        white: of ‖e‖², against ``data``; edge: by how much more within two voxels of an edge.
         noise_free: of ``data`` and ``white`` of the same scene without noise, against those with noise: what is left
             there is blur and overshoot.
-        contrast: of the ROI contrasts' errors.
+        contrast: of the ROI contrasts' errors at look 1; viewing: share of it that is left at look 0, linear between.
         bias: κ at look 0 and at look 1, linear between.
         contrast_sd: an ROI contrast error, in noise units, that counts as 1.
         looks: range of the look, uniform.
@@ -161,6 +161,7 @@ class ObjectiveConfig:
     edge: float = 2.0
     noise_free: float = 0.0
     contrast: float = 0.2
+    viewing: float = 1.0
     bias: tuple[float, float] = (1.0, 1.0)
     contrast_sd: float = 0.15
     looks: tuple[float, float] = (0.0, 1.0)
@@ -170,6 +171,7 @@ class ObjectiveConfig:
     def __post_init__(self) -> None:
         for name in ("data", "white", "edge", "noise_free", "contrast"):
             _set(self, **{name: number(name, getattr(self, name), low=0.0)})
+        _set(self, viewing=number("viewing", self.viewing, low=0.0, high=1.0))
         _set(self, contrast_sd=number("contrast_sd", self.contrast_sd, positive=True))
         first, last = numbers("bias", self.bias, 2)
         if not (first >= 0 and last >= 0):
@@ -205,7 +207,8 @@ class TrainConfig:
         network: arguments of :class:`recon.mbir.network.NetworkConfig`.
         unroll: steps K of :class:`recon.mbir.unrolled.Unrolled`.
         single: share of the training with one step of the K: the network is the same in all, and one is cheaper.
-        bfloat16: convolve in that precision; half the time on processors that have it.
+        bfloat16: convolve in that precision where the processor has it, in half the time (others would imitate it, at
+            twenty times the time, and convolve in float32).
         data, objective: :class:`DataConfig` and :class:`ObjectiveConfig`, or mappings of their fields.
 
     Raises:

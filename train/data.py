@@ -45,7 +45,7 @@ class Batch:
 
     Args:
         problem: of ``2 · size`` volumes, the first draws of all scenes, then the second ones.
-        noise_free: the same of ``size`` volumes without noise.
+        with_noise_free: the same with ``size`` volumes without noise after them.
         truth: ``(size, z, y, x)`` HU above the background.
         contrast: ``(size, rois, z, y, x)`` weights of ROI contrasts: mean over a core (or of plain tissue) less mean
             over the tissue around it, random small parts of both, last all of both; 0 where the scene offers none.
@@ -53,7 +53,7 @@ class Batch:
     """
 
     problem: NormalisedProblem
-    noise_free: NormalisedProblem
+    with_noise_free: NormalisedProblem
     truth: Tensor
     contrast: Tensor
     voxels: Tensor
@@ -96,12 +96,12 @@ class Data:
         truth, exposure, contrast, voxels, first, second = (torch.stack(list(v)) for v in zip(*drawn, strict=True))
         scaled = (hu * exposure).reshape(-1, 1, 1, 1)
         signal = gram.apply(truth) * scaled
-        b = torch.cat([signal + first, signal + second])
-        noisy, clean = (
-            NormalisedProblem.from_statistic(gram, part, exposure.repeat(len(part) // len(exposure)), hu, c.voxel_mm)
-            for part in (b, signal)
+        b = torch.cat([signal + first, signal + second, signal])
+        noisy, all_three = (
+            NormalisedProblem.from_statistic(gram, b[: k * len(signal)], exposure.repeat(k), hu, c.voxel_mm)
+            for k in (2, 3)
         )
-        return Batch(noisy, clean, truth, contrast, voxels)
+        return Batch(noisy, all_three, truth, contrast, voxels)
 
     def _drawn(self, seed: int, step: int, index: int, gram: Gram) -> tuple[Tensor, ...]:
         c = self.config

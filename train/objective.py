@@ -4,14 +4,14 @@ A plain squared error teaches a network to shrink what it is unsure of: the erro
 terms, all from two independent noise draws of each scene with errors e₁, e₂ in noise units:
 
 * ``data``: eᵀH e per voxel, the error as the scanner would see it, which is the noise-whitened squared error;
-* ``white``: ‖e‖² per voxel, for the frequencies that the scanner does not see; more at and inside bodies, where edges
-  are;
+* ``white``: ‖e‖² per voxel, for the frequencies that the scanner does not see; more on both sides of edges, where blur
+  and undershoot are;
 * ``noise_free``: both of the same scene without noise, where all that is left is blur and overshoot beside edges;
 * ``contrast``: the errors d of ROI contrasts, small ones and that of a whole core, (d₁² + d₂²) / 2 + κ d₁ d₂. The
   product of two draws is an unbiased estimate of the squared bias, so κ trades variance against bias.
 
-Every scene has a random look, so that one network serves all of them; κ grows with it, since who measures minds bias
-more than noise.
+Every scene has a random look, so that one network serves all of them: from the least error, which shrinks what it is
+unsure of, at look 0, to the least bias at look 1. The contrast's weight and κ grow with it.
 """
 
 from __future__ import annotations
@@ -34,9 +34,11 @@ from train.scenes.held_out import CHECKPOINT_SEED, ValidationScenes, validation_
 __all__ = ["Loss", "Objective", "Validation"]
 
 _BODY_HU = 15.0
-"""What differs by more from the background is a body, for the weight of edges."""
+"""What differs by more from the background is a body; where values differ by more there is an edge."""
 _TAME_ERROR, _TAME_CONTRAST = 0.02, 2.0
 """A few scenes (calcifications at high dose) would drown all others: losses beyond count less than their size."""
+_NOISE_FREE_SHARE = 0.5
+"""Share of the steps that see their scenes without noise too; there that counts so many times more."""
 _SMALL_VOXELS = 6
 """Of the small ROIs of the validation: a quarter of a square millimetre, as the paper's."""
 _FALSE_HU = {0.35: 6.0, 2.0: 3.0}
@@ -96,35 +98,35 @@ class Objective:
         low, high = c.looks
         look = low + (high - low) * torch.rand(n)
         steps = 1 if progress < self.single else None
-        error, image = self._image(model, batch.problem, batch.truth.repeat(2, 1, 1, 1), look.repeat(2), steps)
-        data, white = image
+        free = bool(c.noise_free) and float(torch.rand(())) < _NOISE_FREE_SHARE
+        copies = 3 if free else 2
+        problem = batch.with_noise_free if free else batch.problem
+        truth = batch.truth.repeat(copies, 1, 1, 1)
+        error = model(problem, look.repeat(copies), steps=steps) - truth / problem.scale_hu.reshape(-1, 1, 1, 1)
+        data = (error * problem.apply(error)).mean(dim=(1, 2, 3))
+        weight = 1.0 + c.edge * _edges(batch.truth).repeat(copies, 1, 1, 1)
+        white = (error.square() * weight).mean(dim=(1, 2, 3))
+        image = c.data * (data + c.white * white) / (1.0 + data.detach() / _TAME_ERROR)
+        noisy, error = image[: 2 * n], error[: 2 * n]
         # The noise of an ROI mean falls with its size, but less than as 1/√voxels: neighbours are correlated.
         size = (20.0 / batch.voxels.clamp_min(4.0)).pow(0.25) * c.contrast_sd
         d = torch.einsum("dnzyx,nrzyx->dnr", error.unflatten(0, (2, n)), batch.contrast) / size
         variance, product = d.square().mean(0), d[0] * d[1]
-        total = 0.5 * self._tamed(data, white)
+        total = 0.5 * noisy.sum()
         tame = 1.0 / (1.0 + variance.detach() / _TAME_CONTRAST)
         kappa = (c.bias[0] + (c.bias[1] - c.bias[0]) * look)[:, None]
-        total = total + c.contrast * (tame * (variance + kappa * product)).sum()
-        parts = {"data": data.sum() / 2, "white": white.sum() / 2, "contrast": variance.sum(), "bias": product.sum()}
+        weight = c.contrast * (c.viewing + (1.0 - c.viewing) * look)[:, None]
+        total = total + (weight * tame * (variance + kappa * product)).sum()
+        parts = {
+            "data": data[: 2 * n].sum() / 2, "white": white[: 2 * n].sum() / 2,
+            "contrast": variance.sum(), "bias": product.sum(),
+        }  # fmt: skip
         if c.noise_free:
-            _, (data, white) = self._image(model, batch.noise_free, batch.truth, look, steps)
-            total = total + c.noise_free * self._tamed(data, white)
-            parts["noise_free"] = (data + c.white * white).sum()
+            parts["noise_free"] = torch.tensor(math.nan)
+        if free:
+            total = total + c.noise_free / _NOISE_FREE_SHARE * image[2 * n :].sum()
+            parts["noise_free"] = image[2 * n :].sum() / c.data
         return Loss(total, {k: float(v.detach()) for k, v in parts.items()})
-
-    def _image(
-        self, model: nn.Module, problem: NormalisedProblem, truth: Tensor, look: Tensor, steps: int | None
-    ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-        """Errors in noise units, and of each volume their mean squares as the scanner sees them, and as they are."""
-        error = model(problem, look, steps=steps) - truth / problem.scale_hu.reshape(-1, 1, 1, 1)
-        data = (error * problem.apply(error)).mean(dim=(1, 2, 3))
-        white = (error.square() * (1.0 + self.config.edge * _bodies(truth))).mean(dim=(1, 2, 3))
-        return error, (data, white)
-
-    def _tamed(self, data: Tensor, white: Tensor) -> Tensor:
-        tame = 1.0 / (1.0 + data.detach() / _TAME_ERROR)
-        return self.config.data * (tame * (data + self.config.white * white)).sum()
 
     @torch.no_grad()
     def validate(
@@ -209,6 +211,14 @@ class Objective:
 def _bodies(truth: Tensor) -> Tensor:
     """1 in bodies and one voxel about them, else 0; ``(n, z, y, x)``."""
     return F.max_pool3d((truth.abs() > _BODY_HU).float()[:, None], 3, 1, 1)[:, 0]
+
+
+def _edges(truth: Tensor) -> Tensor:
+    """1 where values of the cube of five voxels about a voxel differ by more than that of a body, else 0."""
+    both = torch.stack([truth, -truth], 1)
+    for size in ((1, 1, 5), (1, 5, 1), (5, 1, 1)):
+        both = F.max_pool3d(both, size, 1, [n // 2 for n in size])
+    return (both.sum(1) > _BODY_HU).float()
 
 
 def _mean(mask: Tensor) -> Tensor:

@@ -1,8 +1,8 @@
 """Command line: ``torchpcct compare | dose-factor | study | simulate | reconstruct | lower-dose | info | …``.
 
 Here stand the studies and :func:`main`; :mod:`~recon.cli.scans` has the commands that make scans and volumes,
-:mod:`~recon.cli.looking` those that show files, :mod:`~recon.cli.plaque` reads tissues, :mod:`~recon.cli.config` reads
-what ``simulate`` is told, :mod:`~recon.cli.parsing` is what all share.
+:mod:`~recon.cli.looking` those that show files, :mod:`~recon.cli.plaque` reads tissues,
+:mod:`~torchpcct.acquisition.config` reads what ``simulate`` is told, :mod:`~recon.cli.parsing` is what all share.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from recon.cli.evaluating import add_evaluate, add_show_task
 from recon.cli.looking import add_info, add_view
 from recon.cli.parsing import Commands, as_options, check_results, command, saying
 
@@ -50,7 +51,7 @@ def _run_study(name: str, settings: Any, arguments: argparse.Namespace, progress
         listed = ", ".join(f"{part} {value:.1f}" for part, value in minutes.items())
         total = f"about {sum(minutes.values()):.0f} min on two idle cores if nothing is finished yet"
         print(f"{total} ({listed})", file=sys.stderr)
-    from recon.study.store import Pieces  # loads torch
+    from recon.evaluate.store import Pieces  # loads torch
 
     start = time.perf_counter()
     report = registry.run(name, settings, progress, folder)
@@ -59,7 +60,7 @@ def _run_study(name: str, settings: Any, arguments: argparse.Namespace, progress
         report.made_by(shlex.join(["torchpcct", *arguments.command_line]))
     files = report.save(folder)
     Pieces.clear(folder)
-    print(report.text)
+    print(report.screen or report.text)
     print(f"\n{time.perf_counter() - start:.0f} s in all. Written: {', '.join(map(str, files))}")
 
 
@@ -203,7 +204,8 @@ def _parser() -> tuple[argparse.ArgumentParser, Commands]:
     parser.add_argument("--version", action="version", version=f"torchpcct {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     scans = (add_simulate, add_show_config, add_reconstruct, add_lower_dose, add_info, add_view)
-    for add in (_add_compare, _add_dose_factor, _add_hardcases, _add_study, *scans, add_plaque, _add_verify):
+    studies = (_add_compare, _add_dose_factor, _add_hardcases, _add_study)
+    for add in (add_evaluate, add_show_task, *studies, *scans, add_plaque, _add_verify):
         add(commands)
     return parser, commands
 

@@ -27,12 +27,12 @@ from torchpcct.formats.volume_files import check_target, is_own_volume
 from torchpcct.validate import choice, number, numbers, whole
 
 if TYPE_CHECKING:
-    from recon.cli.config import SimulationConfig
     from recon.study.study import ProgressBars
+    from torchpcct.acquisition.config import SimulationConfig
     from torchpcct.scan import Scan
     from torchpcct.scene.voxels import VoxelScene
 
-__all__ = ["add_lower_dose", "add_reconstruct", "add_show_config", "add_simulate"]
+__all__ = ["add_lower_dose", "add_reconstruct", "add_show_config", "add_simulate", "grid_of_scan"]
 
 _PAPER_VIEWS = 1968
 MOST_VOXELS = 2**31
@@ -47,8 +47,8 @@ _FBP_RATE = 1e8
 
 def _paper(arguments: argparse.Namespace) -> SimulationConfig:
     """The paper's plaque scan, from the options alone."""
-    from recon.cli.config import SimulationConfig
     from recon.study.paper.plaque_scan import inset_grid
+    from torchpcct.acquisition.config import SimulationConfig
     from torchpcct.scanner import presets
     from torchpcct.scene.plaque import plaque_scene
 
@@ -80,8 +80,8 @@ def _simulate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         number("--exposure (exposure_s)", arguments.exposure, positive=True, unit="s")
     if arguments.config is not None and not arguments.config.exists():
         raise FileNotFoundError(f"{arguments.config} does not exist: torchpcct show-config prints an example")
-    from recon.cli.config import read_config
     from torchpcct.acquisition.acquire import acquire, plan
+    from torchpcct.acquisition.config import read_config
     from torchpcct.scene.voxels import VoxelScene
 
     if arguments.config is None:
@@ -155,7 +155,7 @@ def _add_output(parser: argparse.ArgumentParser) -> None:
 
 
 def _show_config(arguments: argparse.Namespace, progress: ProgressBars) -> None:
-    from recon.cli.config import EXAMPLE
+    from torchpcct.acquisition.config import EXAMPLE
     from torchpcct.formats.stack import EXAMPLE as STACK_EXAMPLE
 
     print(STACK_EXAMPLE if arguments.stack else EXAMPLE, end="")
@@ -215,7 +215,7 @@ def _reader_options(arguments: argparse.Namespace) -> dict[str, Any]:
     return options
 
 
-def _grid(scan: Scan, arguments: argparse.Namespace) -> VolumeGrid:
+def grid_of_scan(scan: Scan, arguments: argparse.Namespace) -> VolumeGrid:
     """The grid that was asked for; else the plaque's inset for a windowed scan, the field of view for any other."""
     import numpy as np
 
@@ -353,7 +353,7 @@ def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         from torchpcct.formats.preprocess import cleaned
 
         scan = cleaned(scan)
-    grid = _grid(scan, arguments)
+    grid = grid_of_scan(scan, arguments)
     _require_voxels(grid.shape)
     check_target(arguments.out, grid.voxels, scan.unit)
     config = {

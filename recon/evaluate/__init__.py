@@ -1,1 +1,59 @@
-"""What a reconstruction is judged against: :mod:`~recon.evaluate.rivals`, the strongest simple filters of a volume."""
+"""Measure any reconstruction at any task: how much dose does it save, and what does it do to the image?
+
+:func:`evaluate` runs tasks (:mod:`~recon.evaluate.task`, ready ones in :mod:`~recon.evaluate.tasks`) × methods
+(:mod:`~recon.evaluate.methods`) on the same noise realisations (:mod:`~recon.evaluate.draws`), reads the volumes
+(:mod:`~recon.evaluate.measure`) and gives figures with intervals (:mod:`~recon.evaluate.estimates`), of which
+:func:`save` makes a report. What every method has to beat is in :mod:`~recon.evaluate.rivals`: the strongest simple
+filters of a volume. Where nobody knows the truth: :func:`evaluate_scans`.
+
+Your denoiser on a lung nodule:
+
+    from recon.evaluate import denoiser, evaluate, save
+
+    found = evaluate("nodule", ["mbir", denoiser(mine, "fbp:detail")], exposures_s=1.0, n=20, folder="out/mine/pieces")
+    save(found, "out/mine")
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from recon.evaluate.experiment import Evaluation, evaluate, export_scans
+    from recon.evaluate.methods import Method, deepinv_denoiser, denoiser, method_of
+    from recon.evaluate.report import save
+    from recon.evaluate.task import Task
+    from recon.evaluate.tasks import TASKS, read_task
+    from recon.evaluate.without_truth import evaluate_scans, evaluate_volumes
+
+__all__ = [
+    "TASKS",
+    "Evaluation",
+    "Method",
+    "Task",
+    "deepinv_denoiser",
+    "denoiser",
+    "evaluate",
+    "evaluate_scans",
+    "evaluate_volumes",
+    "export_scans",
+    "method_of",
+    "read_task",
+    "save",
+]
+
+_SOURCES = {
+    "experiment": ("Evaluation", "evaluate", "export_scans"),
+    "methods": ("Method", "deepinv_denoiser", "denoiser", "method_of"),
+    "report": ("save",),
+    "task": ("Task",),
+    "tasks": ("TASKS", "read_task"),
+    "without_truth": ("evaluate_scans", "evaluate_volumes"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    """A name of another module, which loads (torch, numba) when the name is first used."""
+    for module, names in _SOURCES.items():
+        if name in names:
+            return getattr(importlib.import_module(f"recon.evaluate.{module}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -34,7 +34,7 @@ from torch import Tensor
 from recon.mbir.mbir import Mbir, average_onto
 from recon.mbir.network import Network
 from recon.mbir.problem import NormalisedProblem, filtered
-from recon.mbir.unrolled import REFERENCE_SCALE_HU, consistent, low_residual, start
+from recon.mbir.unrolled import REFERENCE_SCALE_HU, consistent, guide_noise, low_residual, start
 from recon.pwls.field_model import FieldModel
 from recon.pwls.field_problem import FieldProblem, field_prior
 from recon.pwls.memory import require_memory
@@ -151,7 +151,7 @@ def trained_grid(grid: VolumeGrid, geometry: Any) -> VolumeGrid:
 
 def blockwise(
     network: Network, estimate: Tensor, towards: Tensor, condition: Callable[[tuple[slice, ...]], Tensor],
-    block: int = BLOCK, halo: int = HALO,
+    block: int = BLOCK, halo: int = HALO, guide_noise: Tensor | None = None,
 ) -> Tensor:  # fmt: skip
     """The network on volumes ``(1, z, y, x)`` of any size, block by block; neighbours fade into each other.
 
@@ -162,14 +162,15 @@ def blockwise(
         block: voxels along each axis that a block gives; with those it shares with its neighbours ``2 · halo`` more. A
             multiple of 8, as ``halo``: blocks of voxels must be those of the whole.
         halo: voxels on each side that help only, or fade.
+        guide_noise: ``(1,)``, see :meth:`recon.mbir.network.Network.forward`.
     """
     shape = estimate.shape[-3:]
     if max(shape) <= block + 2 * halo:
-        return network(estimate, towards, condition((slice(None),) * 3))
+        return network(estimate, towards, condition((slice(None),) * 3), guide_noise)
     total, weight = torch.zeros_like(estimate), torch.zeros(shape, dtype=estimate.dtype, device=estimate.device)
     for part in _parts(shape, block, halo):
         here: Any = (..., *part)
-        out = network(estimate[here], towards[here], condition(part))
+        out = network(estimate[here], towards[here], condition(part), guide_noise)
         fade = torch.ones((), dtype=estimate.dtype, device=estimate.device)
         for axis, (s, n) in enumerate(zip(part, shape, strict=True)):
             fade = fade * _fade(s, n, halo).to(estimate).reshape(-1, *[1] * (2 - axis))
@@ -282,6 +283,7 @@ def _one(
     scales = normal.scale_hu * gram.ratio
     spectrum = normal.spectrum()
     v = start(normal, spectrum, SOLVES[0])
+    noise = guide_noise(spectrum, v.shape[-3:], network.voxel_mm)
     steps = network.parts.get("steps")
     for k in range(model.steps if steps is None else steps):
         towards = v + filtered(normal.beta - normal.apply(v), 1.0 / (spectrum + _TOWARDS))
@@ -290,7 +292,7 @@ def _one(
             here = torch.log(scales[part] / REFERENCE_SCALE_HU).mean().clamp(-3.0, 3.0)
             return torch.tensor([[float(here), network.look - 0.5, float(k)]])
 
-        v = blockwise(model.network, v, towards, condition)
+        v = blockwise(model.network, v, towards, condition, guide_noise=noise)
     looks = torch.full((1,), float(network.look))
     u = consistent(normal, spectrum, v, looks, SOLVES[1]) if network.parts.get("last_word", True) else v
     left = normal.beta - normal.apply(u)
@@ -304,8 +306,15 @@ def _one(
     low, high = (float(q) for q in torch.quantile(seen, seen.new_tensor([0.1, 0.9])))
     peak = float(to_hu(_stacked(problem, found)[gram.determined].max(), problem.mu_ref))
     warnings = network.check((low, high), peak, problem.unit, problem.mu_ref)
+    strange = []
     if problem.plane and len(slices) == 1:
-        warnings.append("a single slice: the network was trained on volumes, which have neighbours along z")
+        strange.append("a single slice, without neighbours along z")
+    if problem.unit != "HU":
+        strange.append(f"values in {problem.unit}, not a patient in HU")
+    if network.noisier_or_quieter((low, high)):
+        strange.append("another noise than that of its scans")
+    if strange:
+        warnings.insert(0, f'the network was not trained for this ({"; ".join(strange)}): use method="pwls"')
     info = {
         "method": "mbir", "iterations": model.steps, "look": network.look,
         "residual": float(low_residual(replace(normal, beta=whole), left, network.look)),

@@ -170,6 +170,11 @@ class Mbir:
         square = (volumes[:draws] - volumes[draws:]).square().mean(0)
         return torch.nn.functional.avg_pool3d(square[None, None], 3, 1, 1, count_include_pad=False)[0, 0].sqrt()
 
+    def noisier_or_quieter(self, scales: Sequence[float]) -> list[float]:
+        """Those of the noise scales in HU that the training has not seen."""
+        low, high = self.model.seen_scale_hu.tolist()
+        return [s for s in scales if not 0.98 * low <= s <= 1.02 * high]
+
     def check(self, scales: Sequence[float], peak: float, unit: str = "HU", mu_water: float = 0.02) -> list[str]:
         """What speaks against trusting the network.
 
@@ -180,7 +185,7 @@ class Mbir:
         """
         found = []
         low, high = self.model.seen_scale_hu.tolist()
-        outside = [s for s in scales if not 0.98 * low <= s <= 1.02 * high]
+        outside = self.noisier_or_quieter(scales)
         if outside:
             seen = " and ".join(dict.fromkeys(in_words(s, unit, mu_water) for s in outside))
             found.append(

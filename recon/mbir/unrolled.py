@@ -21,17 +21,17 @@ surprise it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor, nn
 
 from recon.conjugate_gradient import conjugate_gradient
-from recon.mbir.network import Network, NetworkConfig
+from recon.mbir.network import GUIDE_VOXELS, Network, NetworkConfig
 from recon.mbir.problem import NormalisedProblem, filtered, squared_frequencies
 from torchpcct.validate import number, whole
 
-__all__ = ["DEFAULT_LOOK", "REFERENCE_SCALE_HU", "Unrolled", "look_frequency", "low_residual", "start"]
+__all__ = ["DEFAULT_LOOK", "REFERENCE_SCALE_HU", "Unrolled", "guide_noise", "look_frequency", "low_residual", "start"]
 
 REFERENCE_SCALE_HU = 200.0
 """Noise scale at which its conditioning variable is 0: about 1 s of the paper's scan."""
@@ -108,10 +108,11 @@ class Unrolled(nn.Module):
         v = start(problem, spectrum, solves[0])
         if callback is not None:
             callback(0, v)
+        noise = guide_noise(spectrum, problem.beta.shape[-3:], problem.voxel_mm)
         for k in range(self.steps if steps is None else steps):
             towards = v + filtered(problem.beta - problem.apply(v), 1.0 / (spectrum + _TOWARDS))
             condition = torch.stack([level, looks - 0.5, torch.full_like(level, float(k))], 1)
-            v = self.network(v, towards, condition)
+            v = self.network(v, towards, condition, noise)
             if callback is not None:
                 callback(k + 1, v)
         return consistent(problem, spectrum, v, looks, solves[1]) if last_word else v
@@ -125,6 +126,28 @@ def start(problem: NormalisedProblem, spectrum: Tensor, iterations: int = _SOLVE
         lambda w: problem.apply(w) + filtered(w, prior), problem.beta, lambda w: filtered(w, inverse),
         iterations=iterations,
     )  # fmt: skip
+
+
+def guide_noise(spectrum: Tensor, shape: Sequence[int], voxel_mm: float) -> Tensor:
+    """Standard deviation of the first step towards the data smoothed by a Gaussian, in noise units, ``(batch,)``.
+
+    That step is linear in β, whose noise has the spectrum of H.
+
+    Args:
+        spectrum: of H, ``(batch, z, y, x//2 + 1)``.
+        shape: of the volume; voxel_mm: its voxels.
+    """
+    f2 = squared_frequencies(tuple(shape), voxel_mm).to(spectrum)
+    prior = _START[0] + _START[1] * f2
+    passed = (1.0 + prior / (spectrum + _TOWARDS)) / (spectrum + prior)
+    blur = torch.exp(-2.0 * (math.pi * GUIDE_VOXELS * voxel_mm) ** 2 * f2)
+    power = (passed * blur).square() * spectrum
+    # Frequencies of a real volume come in pairs, but for the first along x and, of an even number, the last.
+    pairs = torch.full((spectrum.shape[-1],), 2.0, dtype=spectrum.dtype, device=spectrum.device)
+    pairs[0] = 1.0
+    if shape[-1] % 2 == 0:
+        pairs[-1] = 1.0
+    return ((power * pairs).sum((-3, -2, -1)) / math.prod(shape)).sqrt()
 
 
 def _low_pass(problem: NormalisedProblem, looks: Tensor) -> Tensor:

@@ -64,12 +64,14 @@ class Report:
         data: JSON values (NumPy arrays and scalars are converted).
         text: Markdown.
         figures: file name → matplotlib figure.
+        screen: what a terminal shows of it; empty: the text.
     """
 
     name: str
     data: dict[str, Any]
     text: str
     figures: dict[str, Any] = field(default_factory=dict)
+    screen: str = ""
 
     def made_by(self, command: str) -> None:
         """Add the command that repeats the study to values and text."""

@@ -4,7 +4,7 @@ A study is a folder of this package with four modules, listed in :mod:`recon.stu
 
 * ``settings.py``: ``Settings(StudySettings)``, a frozen dataclass that validates itself;
 * ``measure.py``: ``measure(settings, progress=silent, folder=None) -> Measured``, which simulates, reconstructs and
-  measures. It prints nothing and writes nothing, but finished pieces into ``folder`` (:mod:`recon.study.store`), so
+  measures. It prints nothing and writes nothing, but finished pieces into ``folder`` (:mod:`recon.evaluate.store`), so
   that an interrupted study goes on;
 * ``report.py``: ``build_report(measured) -> Report``: JSON values, Markdown and the figures; it measures nothing;
 * ``figures.py``: the pictures of the report.

@@ -24,8 +24,8 @@ import torch
 from plaque import TISSUES_HU, Draws
 from torch import Tensor
 
+from recon.evaluate.vessels import vessel
 from recon.plaque import TissueData, read_plaque
-from recon.study.dose_factor.vessel_shapes import vessel
 from recon.study.dose_factor.vessels import fine_grid, projected
 from torchpcct.files import written_whole
 from torchpcct.geometry import VolumeGrid

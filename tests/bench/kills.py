@@ -29,8 +29,8 @@ import numpy as np
 import torch
 from results import write_results
 
+from recon.evaluate.store import Store
 from recon.mbir.weights_io import read_tensors, write_tensors
-from recon.study.store import Store
 from torchpcct import ConeBeam, Scan, Volume, VolumeGrid, full_turn
 from torchpcct.files import LEFTOVER, WriteError, written_whole
 

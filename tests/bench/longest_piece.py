@@ -49,7 +49,7 @@ COMMANDS: dict[str, list[str]] = {
 STUDY = """
 import sys, time
 out, log, *command = sys.argv[1:]
-from recon.study.store import Store
+from recon.evaluate.store import Store
 inner, running = Store.piece, []
 def noted(self, name, key, compute):
     spent = []

@@ -42,7 +42,7 @@ _D = "tests/torchpcct/test_defects.py::"
 _Q = "tests/torchpcct/metrics/test_residual_test.py::"
 _O = "tests/torchpcct/metrics/test_opposite_rays.py::"
 _OPP = "torchpcct/metrics/opposite_rays.py"
-_P = "tests/recon/study/test_store.py::"
+_P = "tests/recon/evaluate/test_store.py::"
 _SAME = _P + "test_finished_pieces_are_used_again_by_the_same_settings_and_source_only"
 _W = "tests/recon/fbp/test_angular_weights.py"
 _N = "tests/torchpcct/metrics/test_cnr.py::"
@@ -164,7 +164,7 @@ FAULTS = (
           "tests/torchpcct/test_dead_cells.py::test_lost_columns_rows_and_views_of_linear_data_come_back"),
     Fault("window ignored", "torchpcct/defects.py", "parts = [np.s_[:, c : c + columns] for c in first]",
           "parts = [np.s_[:, 0:columns] for c in first]", _D + "test_cells_are_followed_through_a_window"),
-    Fault("damaged pieces pass", "recon/study/store.py", "if mark and digest !=", "if False and digest !=",
+    Fault("damaged pieces pass", "recon/evaluate/store.py", "if mark and digest !=", "if False and digest !=",
           _C + "test_damaged_pieces_are_computed_again"),
     Fault("threads left behind by a fork", "torchpcct/threads.py", "after_in_child=_renew", "after_in_parent=_renew",
           "tests/torchpcct/projector/test_manners.py::test_a_forked_process_computes_on_threads_of_its_own"),
@@ -188,9 +188,10 @@ FAULTS = (
           _O + "test_an_error_within_the_tolerance_is_measured_but_no_finding"),
     Fault("centre untested", "recon/api.py", "[consistency_warnings(s, grid) for s in scans]", "[[] for _ in scans]",
           _R + "test_fbp_of_a_wrong_rotation_centre_is_named"),
-    Fault("pieces of other settings", "recon/study/store.py", "if found == key:", "if True:", _SAME),
-    Fault("pieces of another version", "recon/study/store.py", 'f"{settings!r} {_source()}"', 'f"{settings!r}"', _SAME),
-    Fault("pieces written in place", "recon/study/store.py",
+    Fault("pieces of other settings", "recon/evaluate/store.py", "if found == key:", "if True:", _SAME),
+    Fault("pieces of another version", "recon/evaluate/store.py",
+          'f"{settings!r} {source_digest()}"', 'f"{settings!r}"', _SAME),
+    Fault("pieces written in place", "recon/evaluate/store.py",
           'with written_whole(self.path(name + ".npz")) as part:', "for part in [path]:",
           _P + "test_kills_at_random_moments_lose_one_piece_at_most"),
     Fault("a threshold that ignores the noise", "recon/pwls/qggmrf.py", "threshold=16.0, relative=True)",
@@ -199,7 +200,7 @@ FAULTS = (
           _C + "test_refusals_name_value_and_remedy_and_leave_nothing"),
     Fault("kept views are computed again", "torchpcct/acquisition/acquire.py", "values = keep(", "values = _computed(",
           "tests/torchpcct/acquisition/test_acquire.py::test_an_interrupted_scan_goes_on_with_what_was_kept"),
-    Fault("parts of a piece stay for ever", "recon/study/store.py",
+    Fault("parts of a piece stay for ever", "recon/evaluate/store.py",
           "clear_folder(self.folder / name)", "pass",
           "tests/recon/study/test_dose_factor.py::test_parts_of_a_long_method_are_kept_until_their_block_is"),
     Fault("long methods keep nothing", "recon/study/dose_factor/reconstructed.py",
@@ -287,8 +288,9 @@ FAULTS = (
           '"iodine": BODY_TISSUES[4:]', _VOX + "test_what_is_above_muscle_is_the_users_choice"),
     Fault("numbers at 70 keV whatever the scanner", "torchpcct/scene/voxels.py", "if not self.scanners_own:",
           "if True:", _VOX + "test_numbers_come_back_from_a_polychromatic_scan"),
-    Fault("axes by name in the wrong order", "recon/cli/config.py", "[value[a] for a in order if a in value]",
-          "[value[a] for a in value]", "tests/recon/test_cli.py::test_numbers_by_the_names_of_their_axes"),
+    Fault("axes by name in the wrong order", "torchpcct/acquisition/config.py",
+          "[value[a] for a in order if a in value]", "[value[a] for a in value]",
+          "tests/recon/test_cli.py::test_numbers_by_the_names_of_their_axes"),
     Fault("g/ml for mg/ml", "torchpcct/scene/materials.py", "most = 1000.0 * dissolved", "most = dissolved",
           "tests/torchpcct/scene/test_materials.py::test_a_concentration_of_iodine_by_its_name"),
     Fault("a step away from the data", _UN, "towards = v + filtered(", "towards = v - filtered(", _SHARE),
@@ -300,9 +302,9 @@ FAULTS = (
     Fault("the network does not know which step it is", _UN, "float(k))], 1)", "0.0)], 1)", _STEP),
     Fault("the network hears another noise level", _UN, "level = torch.log(scale / REFERENCE_SCALE_HU)",
           "level = torch.log(REFERENCE_SCALE_HU / scale)", _STEP),
-    Fault("the network is left out", _UN, "v = self.network(v, towards, condition)", "v = towards", _SHARE),
-    Fault("the network's inputs change places", _UN, "self.network(v, towards, condition)",
-          "self.network(towards, v, condition)", _SHARE),
+    Fault("the network is left out", _UN, "v = self.network(v, towards, condition, noise)", "v = towards", _SHARE),
+    Fault("the network's inputs change places", _UN, "self.network(v, towards, condition, noise)",
+          "self.network(towards, v, condition, noise)", _SHARE),
     Fault("weights of zero", _MB, "model.load_state_dict(tensors)",
           "model.load_state_dict({k: v if 'seen' in k else 0 * v for k, v in tensors.items()})", _SHARE),
     Fault("weights in another order", _MB, "model.load_state_dict(tensors)",

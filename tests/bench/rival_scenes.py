@@ -19,14 +19,14 @@ from rod_values import ROD_HU
 from scipy import ndimage
 from torch import Tensor
 
+from recon.evaluate.store import Store
+from recon.evaluate.vessels import SHAPES, Centreline, Vessel
 from recon.fbp.inset import InsetFbp
 from recon.pwls.inset_problem import InsetProblem
 from recon.study.dose_factor.settings import Settings
 from recon.study.dose_factor.variant import Variant
-from recon.study.dose_factor.vessel_shapes import SHAPES, Centreline, Vessel
 from recon.study.dose_factor.vessels import fine_grid
 from recon.study.paper.plaque_scan import inset_grid
-from recon.study.store import Store
 from torchpcct import Projector, VolumeGrid
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.scan import Scan

@@ -34,6 +34,7 @@ from rival_scenes import DIRECTIONS, KERNELS, PLACES, Bench, Place
 from rod_values import ROD_HU
 from torch import Tensor
 
+import recon.evaluate
 from recon.evaluate.rivals import FILTERS, flat_noise
 from recon.fbp.exact_noise import voxel_covariance
 from recon.fbp.inset import InsetFbp
@@ -42,6 +43,8 @@ from recon.pwls.qggmrf import DEFAULT_PRIOR
 from recon.study.dose_factor.methods import Penalised
 
 HERE = Path(__file__).parent
+TUNED = Path(str(recon.evaluate.__path__[0])) / "rivals_tuning.json"
+"""Where the instrument finds them."""
 DOSES, BASES = (0.35, 0.7, 2.0), (*KERNELS, "pwls")
 SEARCH: dict[str, dict[str, list[Any]]] = {
     "gaussian": {"sigma": [0.4, 0.6, 0.8, 1.0, 1.3]},
@@ -131,7 +134,7 @@ def error(volume: Tensor, place: Place, twin: int = 0) -> float:
 
 def tune(bench: Bench, folder: Path, doses: list[float], names: list[str], bases: list[str]) -> None:
     """Settings of every filter on every base."""
-    methods, path = Methods(bench, {}), folder / "rivals_tuning.json"
+    methods, path = Methods(bench, {}), TUNED
     for dose, name, base in itertools.product(doses, names, bases):
         method, key = f"{base} + {name}", f"{dose:g} s"
         if method in read(path).get(key, {}) or (name == "bm4d" and base == "pwls"):
@@ -142,7 +145,8 @@ def tune(bench: Bench, folder: Path, doses: list[float], names: list[str], bases
         print(key, method, found, flush=True)
         kept = read(path)
         kept.setdefault(key, {})[method] = found
-        write_results(folder, "rivals_tuning", kept, tuning_text(kept))
+        TUNED.write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
+        (folder / "rivals_tuning.md").write_text(tuning_text(kept), encoding="utf-8")
 
 
 def searched(methods: Methods, name: str, base: str, dose: float) -> dict[str, Any]:
@@ -303,7 +307,7 @@ def main() -> None:
     if options.task == "tune":
         tune(bench, options.out, options.doses or list(DOSES), names, options.bases)
         return
-    tuned = read(options.out / "rivals_tuning.json")
+    tuned = read(TUNED)
     options.doses = options.doses or [0.35, 2.0]
     if not options.methods:
         filtered = [f"{best_of(tuned, n)} + {n}" for n in names]

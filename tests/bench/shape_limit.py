@@ -17,11 +17,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from recon.evaluate.store import Store
 from recon.pwls.inset_problem import InsetProblem
 from recon.study.dose_factor.scene import StudyScene
 from recon.study.dose_factor.settings import FBP_BASE, Settings, fbp_label
 from recon.study.dose_factor.shape_limit import DISPLACEMENTS_MM, contrast_sd
-from recon.study.store import Store
 from recon.study.study import environment
 from recon.study.verify import lookup
 from torchpcct.files import written_whole

@@ -2,7 +2,7 @@
 
     python tests/bench/tissue_vessels.py [--draws 12] [--doses 0.35 2.0] [--vessels NAME ...] [--out notebooks/plaque]
 
-Vessels are those of the dose-factor study (`recon.study.dose_factor.vessel_shapes`), painted on 0.1 mm voxels, with
+Vessels are those of the dose-factor study (`recon.evaluate.vessels`), painted on 0.1 mm voxels, with
 their core and with fibrous tissue in its place; all carry the same noise, of the paper scan's Gram operator. A reading
 is blind. Contrast is that of all of core and fibrous tissue (± standard error), RMSE that of the voxels of vessel wall
 and lumen against the painted truth.
@@ -21,11 +21,11 @@ from results import write_results
 from rod_values import ROD_HU
 from tissues import reconstructed
 
+from recon.evaluate.vessels import vessel
 from recon.mbir.mbir import Mbir
 from recon.mbir.tissues import TissueMbir
 from recon.pwls.inset_problem import InsetProblem
 from recon.study.dose_factor.settings import VESSEL_ROIS, VESSELS
-from recon.study.dose_factor.vessel_shapes import vessel
 from recon.study.dose_factor.vessels import fine_grid, projected
 from recon.study.paper.plaque_scan import inset_grid
 from torchpcct.acquisition.acquire import acquire

@@ -16,9 +16,9 @@ import yaml
 from analytic import Ellipsoid, line_integrals
 
 from recon.cli import main
-from recon.cli.config import read_config
 from recon.cli.parsing import as_options, saying
 from torchpcct import ParallelBeam, Scan, Volume, VolumeGrid, __version__
+from torchpcct.acquisition.config import read_config
 from torchpcct.formats.geometry_yaml import geometry_of
 from torchpcct.formats.stack import _COUNTS, _LINES
 from torchpcct.scene.scene import Scene
@@ -315,7 +315,7 @@ def test_a_lower_dose_of_a_scan_file(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    "command", ["compare", "dose-factor", "study", "simulate", "reconstruct", "lower-dose", "plaque"]
+    "command", ["evaluate", "compare", "dose-factor", "study", "simulate", "reconstruct", "lower-dose", "plaque"]
 )
 def test_help(command, capsys):
     with pytest.raises(SystemExit) as stop:

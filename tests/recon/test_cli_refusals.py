@@ -18,7 +18,7 @@ import pytest
 import torch
 
 from recon.cli import main
-from recon.study.store import Store
+from recon.evaluate.store import Store
 from torchpcct import ParallelBeam, Scan, Volume, VolumeGrid
 from torchpcct.files import _part, require_writable, written_whole
 

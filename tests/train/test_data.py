@@ -36,7 +36,7 @@ def test_scenes_of_a_batch_differ(data):
         batch = data.batch(2, step, range(4))
         sorted_values = batch.truth.flatten(1).sort(1).values
         exposures = batch.problem.scale_hu[:4]
-        noise = (batch.problem.beta[:4] - batch.noise_free.beta).flatten(1)
+        noise = (batch.problem.beta[:4] - batch.with_noise_free.beta[8:]).flatten(1)
         assert torch.pdist(sorted_values).min() > 1.0
         assert torch.pdist(exposures.reshape(4, 1)).min() > 0.0
         assert torch.corrcoef(noise).fill_diagonal_(0.0).abs().max() < 0.5

@@ -103,6 +103,24 @@ def test_ellipsoid_has_its_volume_at_any_offset(axes: tuple, spacing: tuple) -> 
         assert centroid == pytest.approx(centre[::-1], abs=0.005)
 
 
+def test_second_tissue_lies_behind_all_and_leaves_both() -> None:
+    """Fat beside muscle: one border through the inset, and the vessel where it was."""
+    config = SceneConfig(second_tissue=1.0, texture_probability=0.0, free_probability=0.0, second_vessel=0.0)
+    shares = []
+    for seed in range(30):
+        scene = draw_scene(seed, EXTENT, config)
+        image, core, around = rasterise(scene, (20, 20, 20), (0.2, 0.2, 0.2))
+        plain = rasterise(replace(scene, tissues=()), (20, 20, 20), (0.2, 0.2, 0.2))[0]
+        (second,) = scene.tissues
+        filled = core + around > 0.999
+        np.testing.assert_allclose(image[filled], plain[filled], atol=0.1)
+        assert image.min() >= min(plain.min(), second.hu) - 1e-3
+        shares.append(float((np.abs(image - second.hu) < 1e-3).mean()))
+        assert (second.hu > -20.0) == (scene.background < -20.0)
+    assert min(shares) < 0.2
+    assert max(shares) > 0.5
+
+
 def test_voxels_are_averages_of_finer_ones() -> None:
     for seed in (5, 7, 11):
         scene = replace(draw_scene(seed, EXTENT), textures=(Texture(10.0, 0.8, seed),) * 2)

@@ -66,7 +66,11 @@ def draw_scene(seed: int, extent_mm: Triple, config: SceneConfig | None = None) 
 
 
 def _draw(draw: Draw, extent: Triple, config: SceneConfig) -> TrainingScene:
-    background = draw(config.muscle if draw.chance(config.muscle_probability) else config.fat)
+    in_muscle = draw.chance(config.muscle_probability)
+    background = draw(config.muscle if in_muscle else config.fat)
+    tissues: tuple[Solid, ...] = ()
+    if draw.chance(config.second_tissue):
+        tissues = (_draw_tissue(draw, extent, config, background, draw(config.fat if in_muscle else config.muscle)),)
     vessels: tuple[Vessel, ...] = ()
     free: tuple[Solid, ...] = ()
     if draw.chance(config.free_probability):
@@ -87,7 +91,15 @@ def _draw(draw: Draw, extent: Triple, config: SceneConfig) -> TrainingScene:
                     break
     count = 2 if draw.chance(config.texture_probability) else 0
     textures = [Texture(draw(config.texture_sd), draw.log(config.texture_length), draw.seed()) for _ in range(count)]
-    return TrainingScene(background, vessels, free, tuple(textures))
+    return TrainingScene(background, vessels, free, tuple(textures), tissues)
+
+
+def _draw_tissue(draw: Draw, extent: Triple, config: SceneConfig, background: float, hu: float) -> Solid:
+    """An ellipsoid whose surface passes through a point of the inset."""
+    axes, rotation = draw.axes(config.tissue_size), draw.rotation()
+    on = [draw((-0.5 * e, 0.5 * e)) for e in extent[::-1]]
+    x, y, z = (p - axes[0] * r for p, r in zip(on, rotation[:3], strict=True))
+    return Solid("free", "ellipsoid", hu, (x, y, z), axes, rotation=rotation, contrast=hu - background)
 
 
 def _draw_free(draw: Draw, extent: Triple, config: SceneConfig, background: float, contrast: float) -> Solid:

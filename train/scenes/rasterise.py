@@ -63,6 +63,8 @@ def rasterise(scene: TrainingScene, shape: tuple[int, int, int], spacing_mm: Tri
         values.append(solid.hu)
         roles.append("core" if solid.kind == "core" else solid.kind)
 
+    for solid in scene.tissues:
+        add(solid, -1)
     for index, vessel in enumerate(scene.vessels):
         table = vessel.tables(z)
         steepest = math.sqrt(1.0 + float(np.max(table[2] ** 2 + table[3] ** 2)))

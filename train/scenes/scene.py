@@ -42,6 +42,9 @@ class SceneConfig:
             number, contrast to the background, and semi-axes (log-uniform); wide_probability: of free bodies with
             wide_contrast instead, like bone, air or contrast agent.
         second_vessel: probability of a second vessel.
+        second_tissue: probability of fat beside muscle, or muscle beside fat, behind the vessels or bodies;
+            tissue_size: semi-axes (log-uniform) of the ellipsoid in which it lies, so large that the inset sees one
+            gently curved border.
         diameter, wall, wall_hu, fibrous_hu: outer diameter, thickness and HU of the layers.
         lumen_hu, unenhanced_hu, unenhanced_probability: HU of the lumen with and without contrast agent.
         tilt: largest angle to z in degrees.
@@ -71,6 +74,8 @@ class SceneConfig:
     wide_probability: float = 0.3
     wide_contrast: Range = (-900.0, 1500.0)
     second_vessel: float = 0.25
+    second_tissue: float = 0.3
+    tissue_size: Range = (4.0, 30.0)
     diameter: Range = (2.0, 5.0)
     wall: Range = (0.1, 0.6)
     wall_hu: Range = (0.0, 100.0)
@@ -241,12 +246,14 @@ class TrainingScene:
     Args:
         background: HU.
         textures: of the background (and free bodies) and of wall, fibrous layer and cores, or empty.
+        tissues: bodies of a second tissue behind all others.
     """
 
     background: float
     vessels: tuple[Vessel, ...] = ()
     free: tuple[Solid, ...] = ()
     textures: tuple[Texture, ...] = ()
+    tissues: tuple[Solid, ...] = ()
 
     @property
     def cores(self) -> tuple[Solid, ...]:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.stats import t as student
 from torch import Tensor
 
+from recon.evaluate.store import Pieces
 from recon.fbp.exact_noise import roi_covariance
 from recon.mbir.mbir import Mbir, working_grid
 from recon.pwls.inset_problem import InsetProblem
@@ -26,7 +27,6 @@ from recon.study.bowtie.slices import BOWTIES
 from recon.study.dose_factor.response import RESPONSE_DRAWS, Response, linear_response
 from recon.study.paper import facts as paper
 from recon.study.paper.plaque_scan import PlaqueScan, inset_grid, prepare
-from recon.study.store import Pieces
 from torchpcct.metrics import (
     Estimate,
     combined,

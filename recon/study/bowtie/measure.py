@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from recon.evaluate.store import Pieces
 from recon.study.bowtie.absolute_noise import noise_causes
 from recon.study.bowtie.combined import combine
 from recon.study.bowtie.dose_maps import (
@@ -22,7 +23,6 @@ from recon.study.bowtie.dose_maps import (
 from recon.study.bowtie.muscle_dose import muscle_causes
 from recon.study.bowtie.settings import Settings
 from recon.study.bowtie.slices import Images, cupping, noise, phantom_grid, phantoms, wide_scanners
-from recon.study.store import Pieces
 from recon.study.study import Clock, Progress, silent
 from torchpcct.dose import CtdiDose
 

@@ -7,7 +7,7 @@ from typing import Any
 from recon.study.paper.facts import ASSUMED_FACTOR, DOSES
 from recon.study.report import markdown_table
 
-__all__ = ["answer", "claim", "dose_section"]
+__all__ = ["answer", "claim", "claim_section", "dose_section"]
 
 _LOW_S, _HIGH_S = DOSES["1x"], DOSES["5.7x"]
 
@@ -147,19 +147,24 @@ def dose_section(data: dict[str, Any]) -> str:
                 factor = _interval(ours["factor"], 2) if key == "sd_hu" else ""
                 rows.append([f"{text}: {label}", f"{theirs[key]:.{digits}f}", _interval(ours[key], digits), factor])
         parts.append(markdown_table([f"{e['exposure_s']:.2f} s", "FBP, exact", "MBIR", "dose factor"], rows))
+    return "\n\n".join([*parts, *claim_section(data)])
+
+
+def claim_section(data: dict[str, Any]) -> list[str]:
+    """The paper's claim, tested: a sentence and a table; nothing where no dose factors were measured."""
     tested = data["claim"]
-    if tested is not None:
-        head = [
-            "figure", f"FBP {tested['fbp_s']:.2f} s", f"MBIR {tested['mbir_s']:.2f} s", "dose factor",
-            f"≥ {tested['needed']:.1f}",
-        ]  # fmt: skip
-        table = [
-            [r["figure"], f"{r['fbp']:.{d}f}", _interval(r["mbir"], d), _interval(r["factor"], 2), r["met"]]
-            for r, d in zip(tested["rows"], (1, 2, 1, 1), strict=True)
-        ]
-        parts += [
-            f"The paper's claim: MBIR at {tested['mbir_s']:.2f} s as good as FBP at {tested['fbp_s']:.2f} s, which "
-            f"needs a dose factor of {tested['needed']:.1f}.",
-            markdown_table(head, table),
-        ]
-    return "\n\n".join(parts)
+    if tested is None:
+        return []
+    head = [
+        "figure", f"FBP {tested['fbp_s']:.2f} s", f"MBIR {tested['mbir_s']:.2f} s", "dose factor",
+        f"≥ {tested['needed']:.1f}",
+    ]  # fmt: skip
+    table = [
+        [r["figure"], f"{r['fbp']:.{d}f}", _interval(r["mbir"], d), _interval(r["factor"], 2), r["met"]]
+        for r, d in zip(tested["rows"], (1, 2, 1, 1), strict=True)
+    ]
+    return [
+        f"The paper's claim: MBIR at {tested['mbir_s']:.2f} s as good as FBP at {tested['fbp_s']:.2f} s, which "
+        f"needs a dose factor of {tested['needed']:.1f}.",
+        markdown_table(head, table),
+    ]

@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from recon import reconstruct
+from recon.evaluate.store import Pieces
 from recon.fbp.exact_noise import roi_covariance
 from recon.fbp.inset import InsetFbp
 from recon.mbir.mbir import Mbir
@@ -38,7 +39,6 @@ from recon.study.paper.plaque_scan import (
 )
 from recon.study.paper.rods import RodValues, rod_values
 from recon.study.paper.tables import table_checks
-from recon.study.store import Pieces
 from recon.study.study import Clock, Progress, silent
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.geometry import VolumeGrid

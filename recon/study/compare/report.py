@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from recon.study.checks import Check, around
-from recon.study.compare.answer import answer, claim, dose_section
+from recon.study.compare.answer import answer, claim, claim_section, dose_section
 from recon.study.compare.factors import dose_factors, reference_entry
 from recon.study.compare.figures import sections_figure
 from recon.study.compare.measure import MBIR, PWLS, PWLS_VOXEL_MM, Key, Measured
@@ -59,7 +59,8 @@ def build_report(m: Measured) -> Report:
         _FITTED,
         time_line(m.seconds, f"peak memory {_peak_memory_gib():.1f} GiB"),
     ]
-    return Report("compare", data, "\n\n".join(s for s in sections if s), {"compare.png": sections_figure(m)})
+    text, screen = ("\n\n".join(s for s in part if s) for part in (sections, [data["answer"], *claim_section(data)]))
+    return Report("compare", data, text, {"compare.png": sections_figure(m)}, screen)
 
 
 _FITTED = (

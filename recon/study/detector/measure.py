@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from recon.evaluate.store import Pieces
 from recon.study.detector.efficiency import ENERGIES_KEV, at_energy, cases, efficiencies, repeated_counts_hu
 from recon.study.detector.rate import charge_sharing, counts, pile_up
 from recon.study.detector.settings import Settings
-from recon.study.store import Pieces
 from recon.study.study import Clock, Progress, silent
 
 __all__ = ["Measured", "measure"]

@@ -5,7 +5,7 @@ by rods) with facts that hold exactly: ``tissue_values``, ``exact_fbp``. ``reali
 reconstruct it, ``readings`` (with ``measures``) says what is read off a volume, ``exact_linear`` and ``exact_figures``
 give the same without realisations, ``shape_limit`` and ``stability`` bound what can be had. ``places`` are further
 scenes and ``vessels`` (of ``vessel_shapes``) in any direction, with the ``response`` of a method as its control;
-``measure`` runs it all in resumable pieces (:mod:`recon.study.store`). From readings to figures: ``controls``,
+``measure`` runs it all in resumable pieces (:mod:`recon.evaluate.store`). From readings to figures: ``controls``,
 ``figures_found``, ``merit``, ``exact``, and of places ``seen``, ``further_scenes``, ``vessel_rows``; with ``tables``
 and ``figures`` they make the ``report``.
 """

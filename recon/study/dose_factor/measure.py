@@ -26,6 +26,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from recon.evaluate.store import Store
 from recon.study.dose_factor.exact_figures import fbp_figures, linear_figures
 from recon.study.dose_factor.exact_linear import statistic_covariance
 from recon.study.dose_factor.measures import segmentation
@@ -48,7 +49,6 @@ from recon.study.dose_factor.settings import (
 from recon.study.dose_factor.shape_limit import shape_limits
 from recon.study.dose_factor.stability import worst_case_gains
 from recon.study.dose_factor.vessels import VesselPlace
-from recon.study.store import Store
 from recon.study.study import Clock, Progress, silent
 
 __all__ = ["Measured", "measure"]

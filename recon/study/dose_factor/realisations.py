@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from recon.evaluate.store import Store
 from recon.fbp.inset import InsetFbp
 from recon.study.dose_factor.measures import crop_window
 from recon.study.dose_factor.scene import StudyScene
 from recon.study.dose_factor.settings import FBP_BASE, Settings
-from recon.study.store import Store
 from torchpcct.scan import Scan
 
 __all__ = ["NOISY_SCENE", "Realisations", "joined"]

@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from recon.evaluate.store import Store
 from recon.pwls.inset_problem import InsetProblem
 from recon.study.dose_factor.methods import Method
 from recon.study.dose_factor.settings import LINEAR_METHODS, TISSUE_METHODS
-from recon.study.store import Store
 
 __all__ = ["in_parts", "reconstructed"]
 

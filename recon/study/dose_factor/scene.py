@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from recon.evaluate.store import Store
 from recon.fbp.exact_noise import FILTER_MARGIN_COLUMNS
 from recon.pwls.inset_problem import InsetProblem
 from recon.study.dose_factor.exact_fbp import exact_fbp
@@ -23,7 +24,6 @@ from recon.study.dose_factor.variant import Variant
 from recon.study.paper.facts import FULL_VIEWS
 from recon.study.paper.plaque_scan import REFERENCE_VOXEL_MM, duty, enclosing
 from recon.study.paper.rods import rod_values
-from recon.study.store import Store
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.scan import Scan

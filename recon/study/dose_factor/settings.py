@@ -47,7 +47,7 @@ EXTRA_SCENES = (
 """Scenes that can expose an invention."""
 
 VESSELS = ("straight", "tilted", "in_plane_x", "in_plane_y", "curved_8mm", "curved_5mm", "bifurcating")
-"""Vessels of any direction, :data:`recon.study.dose_factor.vessel_shapes.SHAPES`; the first is what gains are compared
+"""Vessels of any direction, :data:`recon.evaluate.vessels.SHAPES`; the first is what gains are compared
 with."""
 
 VESSEL_ROIS = ("section", "tissue")

@@ -15,10 +15,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from recon.evaluate.vessels import Vessel, vessel
 from recon.pwls.inset_problem import InsetProblem
 from recon.study.dose_factor.realisations import Realisations
 from recon.study.dose_factor.settings import VESSEL_ROIS
-from recon.study.dose_factor.vessel_shapes import Vessel, vessel
 from torchpcct.geometry import VolumeGrid
 from torchpcct.projector import Projector
 from torchpcct.scan import Scan

@@ -20,12 +20,12 @@ import numpy as np
 import torch
 
 from recon import reconstruct
+from recon.evaluate.store import Pieces
 from recon.study.hardcases.body import GRID, body_scan, body_truth
 from recon.study.hardcases.case import untouched
 from recon.study.hardcases.cases import CASES
 from recon.study.hardcases.settings import Settings
 from recon.study.paper.rods import rod_values
-from recon.study.store import Pieces
 from recon.study.study import Clock, Progress, silent
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.geometry import VolumeGrid

@@ -8,13 +8,13 @@ from typing import Any
 
 from torch import Tensor
 
+from recon.evaluate.store import Pieces
 from recon.fbp.inset import InsetFbp, view_motion
 from recon.mbir.mbir import Mbir
 from recon.pwls.inset_problem import InsetProblem, reconstruct_pwls
 from recon.study.motion.observed import Observed, Reference, observe
 from recon.study.motion.settings import Settings
 from recon.study.paper.plaque_scan import REFERENCE_KERNEL
-from recon.study.store import Pieces
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
 

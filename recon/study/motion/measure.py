@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from recon.evaluate.store import Pieces
 from recon.fbp.inset import view_motion
 from recon.study.motion.compensation import Key, compensate, reconstruct_fbp
 from recon.study.motion.observed import Observed, Reference, observe
 from recon.study.motion.settings import Settings
 from recon.study.paper import facts as paper
 from recon.study.paper.plaque_scan import SCANNERS, duty, inset_grid
-from recon.study.store import Pieces
 from recon.study.study import Clock, Progress, silent
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.scan import Scan

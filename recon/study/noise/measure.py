@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from recon.evaluate.store import Pieces
 from recon.fbp.exact_noise import roi_adjoints, roi_covariance
 from recon.fbp.inset import InsetFbp
 from recon.study.noise.equal_dose import equal_dose_rows
@@ -25,7 +26,6 @@ from recon.study.paper.plaque_scan import (
     prepare,
     roi_entry,
 )
-from recon.study.store import Pieces
 from recon.study.study import Clock, Progress, silent
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan

@@ -14,6 +14,7 @@ import torch
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
+from recon.evaluate.store import Pieces
 from recon.fbp.exact_noise import roi_covariance
 from recon.fbp.inset import InsetFbp
 from recon.study.paper.facts import FULL_VIEWS
@@ -31,7 +32,6 @@ from recon.study.paper.plaque_scan import (
 from recon.study.resolution.blur import FWHM_PER_SIGMA, Blurred, blur_series
 from recon.study.resolution.settings import Settings
 from recon.study.resolution.wire import SystemWidth, wire_width
-from recon.study.store import Pieces
 from recon.study.study import Clock, Progress, silent
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.geometry import VolumeGrid

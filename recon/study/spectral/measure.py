@@ -23,6 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from recon.evaluate.store import Pieces
 from recon.fbp.exact_noise import functional_covariance
 from recon.pwls.basis_problem import BasisProblem
 from recon.pwls.qggmrf import DEFAULT_PRIOR
@@ -30,7 +31,6 @@ from recon.study.spectral.calibration import calibration_costs
 from recon.study.spectral.scan import SpectralScan, second_order_bound, starved_rays, water_hu
 from recon.study.spectral.settings import Settings
 from recon.study.spectral.tissues import RULES, Tissues
-from recon.study.store import Pieces
 from recon.study.study import Clock, Progress, silent
 from torchpcct.spectral import MMD_TISSUES, VMI_ENERGIES_KEV, VmiCurve, vmi, vmi_curve
 

@@ -13,10 +13,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from recon.evaluate.store import Pieces
 from recon.fbp.inset import InsetFbp, static_fbp
 from recon.study.paper.plaque_scan import duty, inset_grid
 from recon.study.spectral.settings import Settings
-from recon.study.store import Pieces
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import VolumeGrid

@@ -12,6 +12,7 @@ from tiny_studies import TINY as SMALLEST
 from tiny_studies import assert_report_is_whole
 
 from recon.cli import main
+from recon.evaluate.store import Store
 from recon.fbp.inset import InsetFbp
 from recon.pwls.qggmrf import quadratic
 from recon.study import registry
@@ -34,7 +35,6 @@ from recon.study.dose_factor.scene import StudyScene
 from recon.study.dose_factor.seen import Seen
 from recon.study.dose_factor.settings import MAIN_SCENES, ROIS, Settings
 from recon.study.dose_factor.vessels import VesselPlace
-from recon.study.store import Store
 from torchpcct.acquisition import transmission
 from torchpcct.metrics import RegionNoise
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from tiny_studies import TINY as SMALLEST
 
+from recon.evaluate.store import Store
 from recon.study.dose_factor.measures import crop_window
 from recon.study.dose_factor.methods import (
     LinearFilter,
@@ -15,7 +16,6 @@ from recon.study.dose_factor.methods import (
 from recon.study.dose_factor.settings import METHODS, Settings
 from recon.study.dose_factor.tissue_values import tissue_groups
 from recon.study.dose_factor.variant import Variant
-from recon.study.store import Store
 from torchpcct import VolumeGrid
 
 TINY = Settings(**SMALLEST["dose-factor"])

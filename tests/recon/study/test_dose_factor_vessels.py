@@ -8,10 +8,10 @@ import pytest
 import torch
 from inset_operators import problem
 
+from recon.evaluate.vessels import LENGTH_MM, SHAPES, Centreline, Vessel, vessel
 from recon.gram.gram import Gram
 from recon.study.dose_factor.settings import VESSELS
 from recon.study.dose_factor.vessel_rows import vessel_rows
-from recon.study.dose_factor.vessel_shapes import LENGTH_MM, SHAPES, Centreline, Vessel, vessel
 from recon.study.dose_factor.vessels import FINE_MM, fine_grid, projected
 from torchpcct import VolumeGrid
 from torchpcct.metrics.placement import place_rois

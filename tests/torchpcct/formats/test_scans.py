@@ -18,8 +18,8 @@ from pydicom.uid import ExplicitVRLittleEndian, generate_uid
 
 from recon import reconstruct
 from recon.cli import main
-from recon.cli.config import read_config
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, VolumeGrid, full_turn
+from torchpcct.acquisition.config import read_config
 from torchpcct.formats.damage import read_yaml
 from torchpcct.formats.dicom_ct_pd import read_dicom_ct_pd
 from torchpcct.formats.geometry_yaml import geometry_of, geometry_values

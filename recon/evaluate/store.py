@@ -111,7 +111,7 @@ class Pieces:
 
     def __init__(self, folder: str | Path | None, settings: Any) -> None:
         self._store = None if folder is None else Store(Path(folder) / self.FOLDER)
-        self._key = "" if folder is None else f"{settings!r} {_source()}"
+        self._key = "" if folder is None else f"{settings!r} {source_digest()}"
         self._prefix = ""
         self._asked: set[str] = set()
 
@@ -142,7 +142,7 @@ class Pieces:
 
 
 @functools.cache
-def _source() -> str:
+def source_digest() -> str:
     """SHA-256 of this software: sources and weights."""
     total = hashlib.sha256(VERSION.encode())
     for package in ("torchpcct", "recon"):

@@ -15,9 +15,9 @@ import pytest
 import torch
 from tiny_studies import run_tiny
 
-import recon.study.store as store_module
+import recon.evaluate.store as store_module
+from recon.evaluate.store import Pieces, packed, unpacked
 from recon.study.compare.placements import Placements
-from recon.study.store import Pieces, packed, unpacked
 from recon.study.verify import differences
 from torchpcct import ConeBeam, VolumeGrid, full_turn
 from torchpcct.scan import Scan
@@ -84,7 +84,7 @@ def test_finished_pieces_are_used_again_by_the_same_settings_and_source_only(tmp
 
     assert (run(), run()) == (1, 1)
     assert run(_Settings(seed=1)) == 2
-    monkeypatch.setattr(store_module, "_source", lambda: "another version")
+    monkeypatch.setattr(store_module, "source_digest", lambda: "another version")
     assert run(_Settings(seed=1)) == 3
     assert run(folder=None) == 4
     Pieces.clear(tmp_path)
@@ -153,7 +153,7 @@ _KILLED = """
 import os, signal, sys
 from pathlib import Path
 from tiny_studies import run_tiny
-from recon.study.store import Pieces
+from recon.evaluate.store import Pieces
 left, keep = int(sys.argv[2]), Pieces.__call__
 def call(self, name, compute):
     def dying():

@@ -1,10 +1,10 @@
-"""Scene, scanner and exposure as YAML, for ``torchpcct simulate --config``."""
+"""Scene, scanner and exposure as YAML: for ``torchpcct simulate --config``, and for tasks."""
 
 from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +20,14 @@ from torchpcct.scene.voxels import DENSE, VoxelScene
 from torchpcct.validate import choice, number
 from torchpcct.volume import Volume
 
-__all__ = ["EXAMPLE", "SimulationConfig", "read_config"]
+__all__ = ["EXAMPLE", "SimulationConfig", "configured", "grid_of", "read_config"]
 
 EXAMPLE = """\
 # A simulated scan: torchpcct simulate --config scene.yaml --out scan.h5
 scene:
   kind: bodies              # plaque, thorax, water, bodies, or volume
-  # plaque: the paper's; patient_diameter, core_contrast, motion_amplitude …
+  # plaque: the paper's; patient_diameter, core_contrast, motion_amplitude, the fields of Plaque (vessel_diameter,
+  #         core_scale, position), variant: stent; bodies: further ones, as below
   # water: diameter, length, position
   # volume: file: patient.nii.gz (a CT volume in HU), dense: bone, iodine, water or a file of labels 0, 1, 2 (what is
   #         above muscle), energy_kev: 70 (mean energy of the volume's scan; null: its numbers come back)
@@ -90,18 +91,32 @@ def read_config(path: Path, **changes: Any) -> SimulationConfig:
         FileNotFoundError: no such file.
         ValueError, TypeError: no mapping, unknown names, bad values; the message names them.
     """
-    values = read_yaml(path, "a configuration")
-    values = {**_mapping(str(path), values, _KEYS), **{k: v for k, v in changes.items() if v is not None}}
-    folder = path.parent
+    values = _mapping(str(path), read_yaml(path, "a configuration"), _KEYS)
+    return configured({**values, **{k: v for k, v in changes.items() if v is not None}}, path.parent)
+
+
+def configured(values: Mapping[str, Any], folder: Path) -> SimulationConfig:
+    """The configuration of a mapping as in YAML; ``folder`` is where the files that it names lie.
+
+    Raises:
+        ValueError, TypeError: unknown names, bad values; the message names them.
+    """
+    values = _mapping("the configuration", values, _KEYS)
     scene, scene_values = _scene(values.get("scene"), folder)
     scanner, scanner_values = _scanner(values.get("scanner"))
     region = values.get("region")
-    grid = None if region is None else _made("region", VolumeGrid, _mapping("region", region, _GRID), order="zyx")
+    grid = None if region is None else grid_of("region", region)
     exposure, seed = values.get("exposure_s"), values.get("seed", 0)
     tolerance = number("tolerance_hu", values.get("tolerance_hu", 0.5), low=0.0, unit="HU")
     resolved = {"scene": scene_values, "scanner": scanner_values, "exposure_s": exposure, "seed": seed,
                 "region": region, "tolerance_hu": tolerance}  # fmt: skip
     return SimulationConfig(scene, scanner, grid, exposure, seed, tolerance, resolved)
+
+
+def grid_of(name: str, value: Any) -> VolumeGrid:
+    """A grid of ``shape``, ``spacing`` and ``center``, numbers by axis or ``[z, y, x]``."""
+    made: VolumeGrid = _made(name, VolumeGrid, _mapping(name, value, _GRID), order="zyx")
+    return made
 
 
 def _mapping(name: str, value: Any, keys: Any) -> dict[str, Any]:
@@ -169,12 +184,19 @@ def _scene(value: Any, folder: Path) -> tuple[Scene | VoxelScene, dict[str, Any]
         return Scene([_body(k, b) for k, b in enumerate(given.get("bodies") or [])]), {"kind": kind, **given}
     from torchpcct.scene.phantoms.quality import water_cylinder  # load what is asked for only
     from torchpcct.scene.phantoms.thorax import thorax
-    from torchpcct.scene.plaque import plaque_scene
+    from torchpcct.scene.plaque import Plaque, plaque_scene
+    from torchpcct.scene.plaque.variants import plaque_variant
 
-    make: Any = {"plaque": plaque_scene, "thorax": thorax, "water": water_cylinder}[kind]
-    options = _mapping("scene", given, tuple(_parameters(make)))
-    made = _made("scene", make, options)
-    return (made[0] if kind == "plaque" else made), {"kind": kind, **options}
+    more = [_body(k, b) for k, b in enumerate(given.get("bodies") or [])]
+    own = {k: v for k, v in given.items() if k != "bodies"}
+    if kind == "plaque":
+        variant = own.pop("variant", "paper")
+        known = (*_parameters(plaque_scene), *(f.name for f in fields(Plaque)), "variant", "bodies")
+        made = plaque_variant(variant, **_mapping("scene", own, known))[0]
+    else:
+        make: Any = {"thorax": thorax, "water": water_cylinder}[kind]
+        made = _made("scene", make, _mapping("scene", own, (*_parameters(make), "bodies")))
+    return (made.add(*more) if more else made), {"kind": kind, **given}
 
 
 def _body(k: int, value: Any) -> Body:

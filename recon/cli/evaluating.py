@@ -1,0 +1,148 @@
+"""The commands of the instrument: ``evaluate``, ``show-task``."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+# What loads torch or numba is imported by the commands: help and refusals come at once.
+from recon.cli.parsing import Commands, check_results, command
+
+if TYPE_CHECKING:
+    from recon.study.study import ProgressBars
+
+__all__ = ["add_evaluate", "add_show_task"]
+
+_MEASURED = ("noise", "noise_reference", "dose_factor", "f50", "resolution")
+
+
+def _evaluate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
+    from recon.evaluate.experiment import evaluate, export_scans
+    from recon.evaluate.report import save, text_of
+
+    out = arguments.out or Path("out/evaluate")
+    if out.is_file():
+        raise ValueError(f"{out} is a file: --out names a folder")
+    check_results(arguments, out, lambda report: "records" in report, "report.*", "*.png")
+    # The user's own modules lie where the command is run.
+    sys.path.insert(0, os.getcwd())
+    methods = [*(arguments.method or []), *map(_denoiser, arguments.denoiser or [])]
+    if not methods:
+        methods = ["fbp:soft", "bilateral@fbp:detail", "mbir"]
+    if arguments.scans:
+        _scans(arguments, methods)
+        return
+    if arguments.export is not None:
+        written = export_scans(
+            arguments.task or ["plaque"], arguments.export, exposures_s=arguments.exposure, n=arguments.n,
+            seed=arguments.seed, progress=progress,
+        )  # fmt: skip
+        progress.close()
+        print(
+            f"{len(written)} scans in {arguments.export}: reconstruct each on the grid of its folder's grid.json, save "
+            "the volumes under the same names in another folder, and evaluate --method files:FOLDER"
+        )
+        return
+    found = evaluate(
+        arguments.task or ["plaque"], methods, exposures_s=arguments.exposure, n=arguments.n, seed=arguments.seed,
+        folder=out / "pieces", progress=progress,
+    )  # fmt: skip
+    progress.close()
+    files = save(found, out, f"torchpcct {shlex.join(arguments.command_line)}")
+    print(text_of(found))
+    print(f"all figures, pictures and the page: {', '.join(str(f) for f in files)}")
+
+
+def _scans(arguments: argparse.Namespace, methods: list[str]) -> None:
+    """Measured scans, of which nobody knows the truth."""
+    from recon.cli.scans import grid_of_scan
+    from recon.evaluate.without_truth import evaluate_scans
+    from torchpcct.formats.scans import open_scan
+
+    scans = [open_scan(path) for path in arguments.scans]
+    grid = grid_of_scan(scans[0], arguments)
+    found = evaluate_scans(scans, grid, methods)
+    rows = [("method", "noise", "of FBP as sharp", "dose factor", "f50, lp/mm", "agree up to, lp/mm")]
+    rows += [(r["method"], *(f"{r[k]:.3g}".replace("nan", "–") for k in _MEASURED)) for r in found]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        print("  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip())
+    if any(r["f50"] == float("inf") for r in found):
+        print("no dose factor where the scans show nothing fine enough to tell how sharp a method is (f50 inf)")
+    print(
+        f"noise of one scan in {scans[0].unit}; FBP as sharp: kernel ram-lak with a Gaussian that gives it the same f50"
+    )
+
+
+def _denoiser(text: str) -> str:
+    """``package.module:function@BASE``."""
+    if "@" not in text:
+        raise ValueError(f"a denoiser needs a base: {text}@fbp:detail")
+    return text
+
+
+def _show_task(arguments: argparse.Namespace, progress: ProgressBars) -> None:
+    from recon.evaluate.tasks import TASKS, task_text
+
+    if arguments.name is None:
+        width = max(map(len, TASKS))
+        for name in TASKS:
+            title = next(line for line in task_text(name).splitlines() if line.startswith("title:"))
+            print(f"{name:<{width}}  {title[len('title:') :].strip()}")
+        return
+    print(task_text(arguments.name), end="")
+
+
+def add_evaluate(commands: Commands) -> None:
+    parser = command(
+        commands, "evaluate", _evaluate, "how much dose does a method save at a task?",
+        "Measure reconstruction methods, yours too, at tasks, ready or yours, on the same noise realisations: dose "
+        "factors with intervals beside the limit of the data, noise, error, contrast, detectability, pictures. "
+        "Finished pieces are kept in the folder: the same command goes on after an interruption, and a second one with "
+        "more methods computes only those.",
+        "folder for report.md, .json, .csv, .html and pictures (default out/evaluate)",
+    )  # fmt: skip
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = (
+        "methods: fbp:KERNEL, pwls, mbir, mbir:look=1, mbir:weights=FILE, mbir:tissues,\n"
+        "         FILTER@fbp:KERNEL (gaussian, perona_malik, bilateral, nlm, tv, bm4d),\n"
+        "         package.module:function of (scan, grid), files:FOLDER\n"
+        "examples:\n"
+        "  torchpcct evaluate --task nodule --method mbir --n 20\n"
+        "  torchpcct evaluate --task my.yaml --method mylab.nets:reconstruct --denoiser mylab.nets:denoise@fbp:detail\n"
+    )
+    parser.add_argument(
+        "--task", action="append", metavar="TASK", help="name or YAML file, repeatable (default plaque)"
+    )
+    parser.add_argument("--method", action="append", metavar="METHOD", help="see below (repeatable)")
+    parser.add_argument(
+        "--denoiser", action="append", metavar="FUNCTION@BASE", help="a function of (volume) or (volume, sigma) in HU"
+    )
+    parser.add_argument(
+        "--scans",
+        nargs="+",
+        type=Path,
+        metavar="FILE",
+        help="measured scans instead of tasks: two of one object, or one, which is halved; noise at equal resolution",
+    )
+    parser.add_argument("--voxel", type=float, metavar="MM", help="with --scans: voxel size (default: the detector's)")
+    parser.add_argument("--extent", type=float, nargs="+", metavar="MM", help="with --scans: of the volume, Z Y X")
+    parser.add_argument("--center", type=float, nargs="+", metavar="MM", help="with --scans: of the volume, Z Y X")
+    parser.add_argument(
+        "--export", type=Path, metavar="FOLDER", help="write the noisy scans for another program instead of evaluating"
+    )
+    parser.add_argument("--exposure", type=float, nargs="+", metavar="S", help="in s (default: those of each task)")
+    parser.add_argument("--n", type=int, default=20, help="noise realisations, at least 8 (default 20)")
+
+
+def add_show_task(commands: Commands) -> None:
+    parser = commands.add_parser(
+        "show-task", help="print a ready task as YAML; without a name list them",
+        description="Print a ready task as YAML, to copy and change. Without a name: all of them.",
+    )  # fmt: skip
+    parser.set_defaults(run=_show_task, device="cpu", no_progress=True, verbose=False)
+    parser.add_argument("name", nargs="?", metavar="NAME")

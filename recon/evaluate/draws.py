@@ -1,0 +1,213 @@
+"""Noise realisations of a task: one noisy scan and its twin without the signal, and what methods take of them.
+
+Realisation k draws the readings with the seed ``seed + k``, the same at every exposure and for every method. The twin
+carries the same relative noise: its line integrals before linearisation differ from the scan's by what the signal
+changes without noise. (The counts behind a signal that is worth looking for differ by a few per cent at most.) So what
+is linear is computed once, and the signal's noise-free part added.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from recon.evaluate.methods import Method, noise_of
+from recon.evaluate.store import Store
+from recon.evaluate.task import Facts, Task
+from recon.fbp.exact_noise import roi_covariance
+from recon.fbp.inset import InsetFbp
+from recon.mbir.mbir import Mbir
+from recon.pwls.inset_problem import InsetProblem
+from recon.pwls.pwls import solve_normal
+from recon.pwls.qggmrf import DEFAULT_PRIOR
+from torchpcct.geometry import VolumeGrid
+from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
+from torchpcct.volume import to_hu
+
+__all__ = ["Draws", "Simulated"]
+
+_PWLS_TOLERANCE_HU = 1.0
+_SIGMA_SEEDS = (900_001, 900_002)
+"""Draws that a denoiser's noise level is measured on; none of them is evaluated."""
+
+
+@dataclass(frozen=True, eq=False)
+class Functional:
+    """A mean over voxels, as :func:`recon.fbp.exact_noise.roi_covariance` takes it: weights ``grid.shape`` float64."""
+
+    weights: Tensor
+
+
+class Draws:
+    """All realisations of one task.
+
+    Args:
+        task: what is looked at.
+        store: keeps noise-free scans and what does not depend on a method.
+        seed: of the first realisation.
+        kernels: of FBP that methods ask for.
+    """
+
+    def __init__(self, task: Task, store: Store, seed: int = 0, kernels: Sequence[str] = ()) -> None:
+        self.task, self.store, self.seed = task, store, seed
+        self.kernels = tuple(dict.fromkeys(kernels))
+        self._sigma: dict[tuple[str, float, float], float] = {}
+
+    @cached_property
+    def clean(self) -> tuple[Scan, Scan]:
+        """Noise free, with and without the signal."""
+        return self.task.scans(self.store)
+
+    @cached_property
+    def facts(self) -> Facts:
+        """Of the task."""
+
+        def compute() -> dict[str, Any]:
+            f = self.task.facts(self.store)
+            return {"tissues": np.array(f.tissues), "values": np.array(f.values_hu), "limit": np.array(f.limit_hu)}
+
+        found = self.store.piece("facts", f"1 {self.task.fingerprint}", compute)
+        values = tuple(float(v) for v in found["values"])
+        return Facts(tuple(str(t) for t in found["tissues"]), values, float(found["limit"]))
+
+    @cached_property
+    def problem(self) -> InsetProblem:
+        """Of PWLS and MBIR."""
+        return InsetProblem(self.clean[1], self.task.grid)
+
+    @cached_property
+    def filtered(self) -> InsetFbp:
+        """FBP with all kernels."""
+        return InsetFbp(self.clean[0], [self.task.grid], self.kernels)
+
+    @cached_property
+    def signal_fbp(self) -> Tensor:
+        """What the signal changes in FBP without noise, ``(kernels, z, y, x)`` HU."""
+        return self.filtered(self.clean[0])[0] - self.filtered(self.clean[1])[0]
+
+    @cached_property
+    def signal_statistic(self) -> Tensor:
+        """The same of AᵀWy at 1 s."""
+        return self.problem.statistic(self.clean[0]).b - self.problem.statistic(self.clean[1]).b
+
+    def exact_covariance(self, kernel: str) -> NDArray[np.float64]:
+        """Of the ROI means of FBP at 1 s, ``(rois, 2, rois, 2)`` HU²; it falls as 1 / exposure."""
+        regions = self.task.regions
+        functionals: list[Any] = [Functional(w) for pair in regions.values() for w in pair]
+
+        def compute() -> dict[str, Any]:
+            fbp = InsetFbp(self.clean[0], [self.task.grid], [kernel])
+            return {"c": roi_covariance(self.clean[0], fbp, [functionals], NOISE_FREE_EXPOSURE_S)[0][0]}
+
+        found = self.store.piece(f"exact_{kernel}", f"1 {self.task.fingerprint}", compute)["c"]
+        return np.asarray(found).reshape(len(regions), 2, len(regions), 2)
+
+    def noise_free(self, present: bool, exposure_s: float) -> Simulated:
+        """Without noise; ``exposure_s`` is what a method is told."""
+        scan = self.clean[0 if present else 1]
+        return Simulated(self, scan, exposure_s, -1, present)
+
+    def draw(self, exposure_s: float, k: int) -> tuple[Simulated, Simulated]:
+        """Realisation ``k`` with and without the signal."""
+        noisy = self.clean[0].with_noise(exposure_s, self.seed + k if k < _SIGMA_SEEDS[0] else k)
+        present = Simulated(self, noisy, exposure_s, k, True)
+        return present, Simulated(self, None, exposure_s, k, False, present)
+
+    def sigma(self, method: Method, exposure_s: float, smooths: float) -> float:
+        """Noise in HU of a linear method in the largest tissue."""
+        key = (method.name, exposure_s, smooths)
+        if key not in self._sigma:
+            largest = max(self.task.flat, key=lambda t: len(self.task.flat[t]), default=None)
+            if largest is None:
+                raise ValueError(f"task {self.task.name}: no tissue fills a flat part of the inset: enlarge it")
+            clean = method.run(self.noise_free(True, exposure_s))
+            found = [
+                noise_of(method.run(self.draw(exposure_s, k)[0]) - clean, self.task.flat[largest], smooths)
+                for k in _SIGMA_SEEDS
+            ]
+            self._sigma[key] = float(np.sqrt(np.mean(np.square(found))))
+        return self._sigma[key]
+
+
+class Simulated:
+    """One realisation, as a method sees it.
+
+    Attributes:
+        exposure_s: of the scan; grid: of the volume; label: for files.
+    """
+
+    def __init__(
+        self, draws: Draws, scan: Scan | None, exposure_s: float, k: int, present: bool, twin: Simulated | None = None
+    ) -> None:
+        self._draws, self._scan, self._twin = draws, scan, twin
+        self.exposure_s, self.k, self.present = exposure_s, k, present
+
+    @property
+    def grid(self) -> VolumeGrid:
+        return self._draws.task.grid
+
+    @property
+    def label(self) -> str:
+        number = "clean" if self.k < 0 else f"{self.k:03d}"
+        return f"{self._draws.task.name}/{self.exposure_s:g}s_{number}_{'present' if self.present else 'absent'}"
+
+    @property
+    def problem(self) -> InsetProblem:
+        """The inset's, shared by all realisations."""
+        return self._draws.problem
+
+    @cached_property
+    def scan(self) -> Scan:
+        """The scan itself."""
+        if self._scan is not None:
+            return self._scan
+        assert self._twin is not None
+        present, absent = self._draws.clean
+        return replace(self._twin.scan, counts=self._twin.scan.counts * (absent.counts / present.counts))
+
+    @cached_property
+    def _fbp(self) -> Tensor:
+        if self._twin is not None:
+            return self._twin._fbp - self._draws.signal_fbp
+        return self._draws.filtered(self.scan)[0]
+
+    def fbp(self, kernel: str) -> Tensor:
+        """HU ``(z, y, x)``."""
+        if kernel not in self._draws.kernels:
+            raise ValueError(f"FBP with the kernel {kernel!r} was not announced: Method(..., kernels=({kernel!r},))")
+        return self._fbp[self._draws.kernels.index(kernel)]
+
+    @cached_property
+    def statistic(self) -> Tensor:
+        """AᵀW y ``(z, y, x)`` with the weights of the exposure."""
+        if self._twin is not None:
+            return self._twin.statistic - self.exposure_s * self._draws.signal_statistic
+        b = self.problem.statistic(self.scan).b
+        return b * self.exposure_s if self.scan.noise_free else b
+
+    def pwls(self) -> Tensor:
+        """HU ``(z, y, x)``, with the default prior."""
+        problem = self.problem
+        gram = problem.gram.scaled(self.exposure_s)
+        with torch.no_grad():
+            found = solve_normal(
+                self.statistic[None], gram.apply, gram, DEFAULT_PRIOR, hu=problem.mu_ref / 1000.0,
+                spacing=problem.grid.spacing, tolerance=_PWLS_TOLERANCE_HU,
+            )  # fmt: skip
+        return to_hu(found.x + problem.level, problem.mu_ref)[0]
+
+    def mbir(self, network: Mbir) -> Tensor:
+        """HU ``(z, y, x)``."""
+        with torch.no_grad():
+            return network(self.problem, self.statistic[None], self.exposure_s)[0]
+
+    def sigma(self, method: Method, smooths: float = 0.0) -> float:
+        """Noise in HU of a linear method at this exposure in the largest tissue."""
+        return self._draws.sigma(method, self.exposure_s, smooths)

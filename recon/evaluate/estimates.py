@@ -1,0 +1,226 @@
+"""From readings to figures with intervals, and to dose factors.
+
+One rule makes every dose factor: of two methods the one whose figure is larger sees what the other needs more dose for,
+and every figure here (noise variance, variance of a contrast at slope 1, CNR², d′²) is proportional to the dose for a
+linear method. So the factor is the ratio of the method's figure to the linear reference's at the same dose. Both are of
+the same noise realisations, so what is luck of the draws cancels in the ratio; intervals are jackknife intervals over
+realisations (:mod:`torchpcct.metrics.jackknife`). The reference's own ROI means, whose moments are exactly known, also
+control what is drawn of the other methods (:mod:`torchpcct.metrics.control`); of FBP all but noise and d′ is exact.
+
+* slope: contrast that the signal adds over the true one; a method may buy low noise with it, so contrasts are compared
+  at slope 1: variance over slope²;
+* ``without signal``: contrast that is read where there is none;
+* the paper's CNR: (background − signal) / √(σ² + σ²) of the ROI means over realisations;
+* d′: a Hotelling observer on the channels of :class:`recon.evaluate.measure.Reader`, trained on the other pairs;
+* limit: the variance of the best unbiased estimate if all outlines were known, the same ratio.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.evaluate.measure import OBSERVERS, Readings
+from recon.evaluate.task import Facts
+from torchpcct.metrics.bootstrap import Estimate
+from torchpcct.metrics.control import controlled_log_variance, controlled_mean
+from torchpcct.metrics.jackknife import Jackknifed, combined, log_of_sum
+from torchpcct.metrics.observer import hotelling_scores
+
+__all__ = ["Known", "Record", "pivot", "records_of"]
+
+Floats = NDArray[np.float64]
+Record = dict[str, Any]
+_CONTRAST = (-1.0, 1.0)
+"""Background less signal."""
+_LEAST_SLOPE = 0.05
+"""Less contrast than that of the true one cannot be corrected for."""
+
+
+Figure = Jackknifed | float
+"""A float is exact."""
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What holds without sampling error of the linear reference.
+
+    Attributes:
+        covariance: ``(rois, 2, rois, 2)`` of the ROI means at the exposure, HU².
+        mean: ``(2, rois, 2)`` of noise-free data, with and without the signal.
+        draws: ``(n, 2, rois, 2)`` of the same realisations as those of the methods.
+    """
+
+    covariance: Floats
+    mean: Floats
+    draws: Floats
+
+
+class _Figures:
+    """Of one method at one exposure.
+
+    Args:
+        readings: of its volumes.
+        true: ``(rois,)`` contrasts that the signal adds, HU: background less signal.
+        reference: on the same draws; what is drawn is controlled by it.
+        exact: the method's own covariance of ROI means as :attr:`Known.covariance`; None: it is drawn.
+    """
+
+    def __init__(self, readings: Readings, true: Floats, reference: Known, exact: Floats | None) -> None:
+        self.r, self.true, self.reference, self.exact = readings, true, reference, exact
+        self._sign = np.sign(true)
+
+    def _row(self, roi: int, row: Any) -> Floats:
+        """Weights of an ROI's two means: signal, background."""
+        out = np.zeros((len(self.true), 2))
+        out[roi] = row
+        return out
+
+    def mean(self, weights: Floats, twin: int) -> Figure:
+        """Expectation of a functional of the ROI means, with (0) or without (1) the signal."""
+        if self.exact is not None:
+            return float((weights * self.r.clean_rois[twin]).sum())
+        values, control = (np.einsum("nrs,rs->n", v[:, twin], weights) for v in (self.r.rois, self.reference.draws))
+        return controlled_mean(values, control, float((weights * self.reference.mean[twin]).sum()))
+
+    def log_variance(self, weights: Floats) -> Figure:
+        """ln of its variance with the signal."""
+        if self.exact is not None:
+            return math.log(float(np.einsum("rs,rstu,tu->", weights, self.exact, weights)))
+        values, control = (np.einsum("nrs,rs->n", v[:, 0], weights) for v in (self.r.rois, self.reference.draws))
+        known = float(np.einsum("rs,rstu,tu->", weights, self.reference.covariance, weights))
+        return controlled_log_variance(values, control, known)
+
+    def slope(self, roi: int) -> Figure:
+        """Of the contrast of an ROI."""
+        row, true = self._row(roi, _CONTRAST), float(self.true[roi])
+        if self.exact is not None:
+            return float(((self.r.clean_rois[0] - self.r.clean_rois[1]) * row).sum()) / true
+        return joint(lambda m: m / true, _mean(np.einsum("nrs,rs->n", self.r.rois[:, 0] - self.r.rois[:, 1], row)))
+
+    def without(self, roi: int) -> Figure:
+        """Contrast where there is none, in the direction of the true one."""
+        return joint(lambda m: m * self._sign[roi], self.mean(self._row(roi, _CONTRAST), 1))
+
+    def log_corrected(self, roi: int) -> Figure:
+        """ln of the contrast's variance at slope 1."""
+        return joint(
+            lambda v, s: v - 2.0 * np.log(np.abs(s)), self.log_variance(self._row(roi, _CONTRAST)), self.slope(roi)
+        )
+
+    def cnr(self, roi: int) -> Figure:
+        """The paper's."""
+        sign = self._sign[roi]
+        return joint(
+            lambda c, a, b: sign * c / np.sqrt(np.exp(a) + np.exp(b)), self.mean(self._row(roi, _CONTRAST), 0),
+            self.log_variance(self._row(roi, (1.0, 0.0))), self.log_variance(self._row(roi, (0.0, 1.0))),
+        )  # fmt: skip
+
+    def log_noise(self, tissue: str) -> Jackknifed:
+        """ln of a voxel's variance in a flat tissue."""
+        v = self.r.flat[tissue].astype(np.float64)
+        return log_of_sum(np.square(v - v.mean(0)).mean(1), lost=1)
+
+    def d_prime(self, observer: str) -> Jackknifed | None:
+        """None: too few realisations for the channels."""
+        present, absent = np.moveaxis(self.r.channels[observer], 1, 0)
+        if len(present) < 2 * present.shape[1] + 4:
+            return None
+        one, other = hotelling_scores(present, absent)
+        return combined(
+            lambda a, b, v, w: (a - b) / np.sqrt((np.exp(v) + np.exp(w)) / 2.0),
+            _mean(one), _mean(other), controlled_log_variance(one, None), controlled_log_variance(other, None),
+        )  # fmt: skip
+
+    def rmse(self) -> Jackknifed:
+        """HU."""
+        return combined(np.sqrt, _mean(self.r.square))
+
+
+def joint(function: Callable[..., Any], *figures: Figure) -> Figure:
+    """:func:`torchpcct.metrics.jackknife.combined`, exact where all figures are."""
+    if any(isinstance(f, Jackknifed) for f in figures):
+        return combined(function, *figures)
+    return float(function(*figures))
+
+
+def records_of(
+    task: str, method: str, exposure_s: float, readings: Readings, base: Readings, reference: Known, facts: Facts,
+    true: Floats, rois: tuple[str, ...], exact: Floats | None = None,
+) -> list[Record]:  # fmt: skip
+    """All figures of a method at an exposure, one record each: task, method, exposure, figure, where, value, interval.
+
+    Args:
+        task, method, exposure_s: what was measured.
+        readings: of the method; base: of the linear reference on the same realisations.
+        reference: what is exactly known of the reference.
+        facts: of the task.
+        true: ``(rois,)`` true contrasts, HU.
+        rois: their names.
+        exact: covariance of a linear method's ROI means; None: drawn.
+    """
+    own, other = _Figures(readings, true, reference, exact), _Figures(base, true, reference, reference.covariance)
+    found: list[Record] = []
+
+    def add(figure: str, where: str, value: Any, unit: str = "", transform: float | None = None) -> None:
+        """``transform`` t: of a logarithm, exp(t · value)."""
+        if isinstance(value, Jackknifed):
+            made = value.estimate() if transform is None else value.exponential(scale=transform)
+        else:
+            exactly = float(value) if transform is None else math.exp(transform * float(value))
+            made = Estimate(exactly, math.nan, math.nan)
+        found.append({
+            "task": task, "method": method, "exposure_s": exposure_s, "figure": figure, "where": where,
+            "value": made.value, "low": made.low, "high": made.high, "unit": unit, "n": readings.n,
+        })  # fmt: skip
+
+    def factor(figure: str, where: str, above: Figure, below: Figure) -> None:
+        add(f"dose factor: {figure}", where, joint(lambda a, b: a - b, above, below), transform=1.0)
+
+    for tissue in readings.flat:
+        add("noise", tissue, own.log_noise(tissue), "HU", transform=0.5)
+        factor("noise", tissue, other.log_noise(tissue), own.log_noise(tissue))
+    add("error", "near the bodies", own.rmse(), "HU")
+    add("error without noise", "near the bodies", math.sqrt(readings.clean_square), "HU")
+    for k, roi in enumerate(rois):
+        slope = own.slope(k)
+        add("slope", roi, slope)
+        add("contrast without signal", roi, own.without(k), "HU")
+        if _value(slope) > _LEAST_SLOPE:
+            add("contrast SD at slope 1", roi, own.log_corrected(k), "HU", transform=0.5)
+            factor("contrast at slope 1", roi, other.log_corrected(k), own.log_corrected(k))
+    best = math.log(facts.limit_hu**2 / exposure_s)
+    factor("limit of the data", "lesion", other.log_corrected(rois.index("lesion")), best)
+    add("CNR", rois[0], own.cnr(0))
+    if _value(own.cnr(0)) > 0 and _value(other.cnr(0)) > 0:
+        factor("CNR", rois[0], _log_square(own.cnr(0)), _log_square(other.cnr(0)))
+    for observer in OBSERVERS:
+        d, e = own.d_prime(observer), other.d_prime(observer)
+        if d is not None:
+            add("d'", observer, d)
+        if d is not None and e is not None and d.value > 0 and e.value > 0:
+            factor("d'", observer, _log_square(d), _log_square(e))
+    add("seconds", "a volume", readings.seconds, "s")
+    return found
+
+
+def _value(figure: Figure) -> float:
+    return figure.value if isinstance(figure, Jackknifed) else figure
+
+
+def _log_square(figure: Figure) -> Figure:
+    return joint(lambda v: 2.0 * np.log(np.maximum(np.abs(v), 1e-12)), figure)
+
+
+def _mean(values: Any) -> Jackknifed:
+    return controlled_mean(values, None, None)
+
+
+def pivot(records: list[Record], figure: str) -> Mapping[tuple[str, float, str], Record]:
+    """(method, exposure, where) → record of a figure."""
+    return {(r["method"], r["exposure_s"], r["where"]): r for r in records if r["figure"] == figure}

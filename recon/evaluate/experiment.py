@@ -1,0 +1,197 @@
+"""Tasks × methods × exposures × realisations: the one loop of the instrument."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.evaluate.draws import Draws
+from recon.evaluate.estimates import Known, Record, records_of
+from recon.evaluate.measure import Reader, Readings, measure_method
+from recon.evaluate.methods import Method, method_of
+from recon.evaluate.store import Store
+from recon.evaluate.task import Facts, Task
+from recon.evaluate.tasks import read_task
+from torchpcct.files import written_whole
+from torchpcct.validate import checked, numbers, whole
+
+__all__ = ["Evaluation", "Seen", "evaluate", "export_scans"]
+
+Progress = Callable[[str, float], None]
+LEAST = 8
+"""Realisations: fewer give no intervals."""
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What was seen of one task, for pictures and text.
+
+    Attributes:
+        task, facts: what was looked at.
+        true_hu: ROI → contrast that the signal adds, background less signal.
+        truth: ``(z, y, x)`` HU with the signal.
+        volumes: (method, exposure) → first noisy volume, and that of noise-free data.
+    """
+
+    task: Task
+    facts: Facts
+    true_hu: dict[str, float]
+    truth: NDArray[np.float32]
+    volumes: dict[tuple[str, float], tuple[NDArray[np.float16], NDArray[np.float16]]]
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Result of :func:`evaluate`.
+
+    Attributes:
+        records: one for each figure: task, method, exposure_s, figure, where, value, low, high, unit, n. ``low`` and
+            ``high`` end the 95 % interval; NaN: the value is exact, or a time.
+        seen: of each task.
+        settings: of the run.
+    """
+
+    records: list[Record]
+    seen: list[Seen]
+    settings: dict[str, Any]
+
+
+@checked
+def evaluate(
+    tasks: Any,
+    methods: Any,
+    *,
+    exposures_s: Any = None,
+    n: int = 20,
+    seed: int = 0,
+    folder: str | Path | None = None,
+    progress: Progress | None = None,
+) -> Evaluation:
+    """Measure methods at tasks, all on the same noise realisations.
+
+    Args:
+        tasks: names of ready ones, YAML files, :class:`recon.evaluate.Task` objects; one or a list.
+        methods: names, functions of ``(scan, grid)`` that give a volume in HU, :class:`recon.evaluate.Method` objects,
+            :func:`recon.evaluate.denoiser` of a function of an image; one or a list.
+        exposures_s: of the scans in s; None: those of each task.
+        n: realisations of each, at least 8.
+        seed: of the first.
+        folder: where scans and finished pieces are kept; the same call goes on after an interruption, and a second one
+            with more methods or realisations computes what is new. None: nothing is kept.
+        progress: called with a text and the finished fraction of it.
+
+    Raises:
+        ValueError, TypeError: an unknown task or method, bad values; a method whose volume has another shape or unit,
+            holds NaN or is shifted.
+    """
+    n, seed = whole("n", n, LEAST), whole("seed", seed, 0)
+    todo = [read_task(t) for t in _listed(tasks)]
+    run = [method_of(m) for m in _listed(methods)]
+    for kind, names in (("tasks", [t.name for t in todo]), ("methods", [m.name for m in run])):
+        twice = {name for name in names if names.count(name) > 1}
+        if twice:
+            raise ValueError(f"{kind}: {', '.join(sorted(twice))} given twice; give one of them another name")
+    exposures = None if exposures_s is None else tuple(numbers("exposures_s", exposures_s, positive=True, unit="s"))
+    if folder is None:
+        with TemporaryDirectory() as kept:
+            return evaluate(todo, run, exposures_s=exposures, n=n, seed=seed, folder=kept, progress=progress)
+    records: list[Record] = []
+    seen = []
+    for task in todo:
+        found, what = _task(task, run, exposures or task.exposures_s, n, seed, Path(folder), progress)
+        records += found
+        seen.append(what)
+    settings = {"tasks": [t.name for t in todo], "methods": [m.name for m in run], "n": n, "seed": seed,
+                "exposures_s": exposures}  # fmt: skip
+    return Evaluation(records, seen, settings)
+
+
+def _listed(what: Any) -> Sequence[Any]:
+    return list(what) if isinstance(what, list | tuple) else [what]
+
+
+def _task(
+    task: Task, methods: Sequence[Method], exposures: Sequence[float], n: int, seed: int, folder: Path,
+    progress: Progress | None,
+) -> tuple[list[Record], Seen]:  # fmt: skip
+    store = Store(folder / task.name)
+    reference = method_of(task.reference)
+    if not reference.is_fbp:
+        raise ValueError(f"task {task.name}: factors are quoted against FBP, got {reference.name!r}")
+    everyone = [reference, *(m for m in methods if m.name != reference.name)]
+    draws = Draws(task, store, seed, [k for m in everyone for k in m.kernels])
+    if progress is not None:
+        progress(f"{task.name}: scan", 0.0)
+    facts = draws.facts
+    truth = task.truth(facts)
+    reader = Reader(task, truth)
+    true = np.array([float(((truth[0] - truth[1]).double() * (b - a)).sum()) for a, b in task.regions.values()])
+    records: list[Record] = []
+    volumes = {}
+    asked = {m.name for m in methods}
+    for exposure in exposures:
+        base: Readings | None = None
+        for method in everyone:
+            step = f"{task.name}: {method.name}, {exposure:g} s"
+            found = measure_method(
+                method, draws, reader, exposure, n, store,
+                None if progress is None else partial(progress, step),
+            )  # fmt: skip
+            if base is None:
+                base = found
+                control = Known(draws.exact_covariance(reference.kernels[0]) / exposure, found.clean_rois, found.rois)
+            exact = draws.exact_covariance(method.kernels[0]) / exposure if method.is_fbp else None
+            volumes[method.name, exposure] = (found.first, found.first_clean)
+            if method.name in asked or method is reference:
+                records += records_of(
+                    task.name, method.name, exposure, found, base, control, facts, true, reader.rois, exact
+                )
+    true_hu = dict(zip(reader.rois, true.tolist(), strict=True))
+    return records, Seen(task, facts, true_hu, truth[0].numpy(), volumes)
+
+
+@checked
+def export_scans(
+    tasks: Any, folder: str | Path, *, exposures_s: Any = None, n: int = 20, seed: int = 0,
+    progress: Progress | None = None,
+) -> list[Path]:  # fmt: skip
+    """Write the scans that :func:`evaluate` with the same arguments draws, for a program that cannot be called.
+
+    ``FOLDER/TASK/EXPOSUREs_NUMBER_present.h5`` and ``…_absent.h5``, noise free with ``clean`` for the number, and
+    ``grid.json`` with the inset's shape, spacing and centre ``(z, y, x)`` mm. Give the volumes in HU the scans' names
+    (``.nii.gz``, ``.mha``, ``.h5``) in another folder, and evaluate the method ``files:FOLDER``.
+
+    Returns:
+        The files of the scans.
+
+    Raises:
+        ValueError, TypeError: as of :func:`evaluate`.
+    """
+    n, seed = whole("n", n, LEAST), whole("seed", seed, 0)
+    exposures = None if exposures_s is None else numbers("exposures_s", exposures_s, positive=True, unit="s")
+    written = []
+    for task in map(read_task, _listed(tasks)):
+        with TemporaryDirectory() as kept:
+            draws = Draws(task, Store(Path(kept)), seed)
+            for exposure in exposures or task.exposures_s:
+                pairs = [[draws.noise_free(p, exposure) for p in (True, False)]]
+                for k in range(-1, n):
+                    for draw in pairs[0] if k < 0 else draws.draw(exposure, k):
+                        path = Path(folder) / f"{draw.label}.h5"
+                        path.parent.mkdir(parents=True, exist_ok=True)
+                        draw.scan.save(path)
+                        written.append(path)
+                    if progress is not None:
+                        progress(f"{task.name}: {exposure:g} s", (k + 2) / (n + 1))
+        grid = {"shape": task.grid.shape, "spacing": task.grid.spacing, "center": task.grid.center}
+        with written_whole(Path(folder) / task.name / "grid.json") as part:
+            part.write_text(json.dumps(grid) + "\n", encoding="utf-8")
+    return written

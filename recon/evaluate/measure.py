@@ -1,0 +1,232 @@
+"""What is read of the volumes: every method at every exposure, in pieces that are kept.
+
+A piece is a block of realisations of one method at one exposure. It keeps numbers only: ROI means, channels of the
+observer, errors, and some flat voxels.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import ndimage
+from torch import Tensor
+
+from recon.evaluate.draws import Draws
+from recon.evaluate.methods import Draw, Method
+from recon.evaluate.store import Store
+from recon.evaluate.task import Task
+from torchpcct.geometry import VolumeGrid
+from torchpcct.metrics.observer import dog_channels, template_channel
+from torchpcct.volume import Volume
+
+__all__ = ["Reader", "Readings", "measure_method", "volume_of"]
+
+Floats = NDArray[np.float64]
+
+BLOCK = 8
+"""Realisations of a piece."""
+OBSERVERS = ("axial", "volume")
+_CHANNELS, _LOWEST = 4, 0.15
+"""Difference-of-Gaussians channels of an observer beside the signal's own shape; frequency of the first, lp/mm."""
+_SEEN_MM = 0.3
+"""Standard deviation of the blur through which the observer expects the signal."""
+_SHIFT_VOXELS = 0.5
+"""A volume that lies so much off is on another grid."""
+
+
+@dataclass(frozen=True, eq=False)
+class Readings:
+    """Of one method at one exposure; the first axis is the realisation, the second says with or without the signal.
+
+    Attributes:
+        rois: ``(n, 2, rois, 2)`` means of signal and background, HU.
+        channels: observer → ``(n, 2, channels)``.
+        square: ``(n,)`` mean square error with the signal near the bodies, HU².
+        flat: tissue → ``(n, voxels)`` HU, with the signal.
+        clean_rois: ``(2, rois, 2)`` of noise-free data; clean_square; clean_channels: likewise.
+        first: first volume with the signal, float16, and that of noise-free data.
+        seconds: of a volume.
+    """
+
+    rois: Floats
+    channels: dict[str, Floats]
+    square: Floats
+    flat: dict[str, NDArray[np.float32]]
+    clean_rois: Floats
+    clean_square: float
+    clean_channels: dict[str, Floats]
+    first: NDArray[np.float16]
+    first_clean: NDArray[np.float16]
+    seconds: float
+
+    @property
+    def n(self) -> int:
+        """Realisations."""
+        return len(self.square)
+
+
+class Reader:
+    """Reads volumes of a task.
+
+    Args:
+        task: where its tissues are.
+        truth: HU with and without the signal.
+    """
+
+    def __init__(self, task: Task, truth: tuple[Tensor, Tensor]) -> None:
+        self.task, self.truth = task, truth
+        self.rois = tuple(task.regions)
+        self._weights = torch.stack([w for pair in task.regions.values() for w in pair])
+
+    @cached_property
+    def channels(self) -> dict[str, Tensor]:
+        """Observer → ``(channels, z, y, x)``: the signal as it is expected, then differences of Gaussians about it."""
+        task, grid = self.task, self.task.grid
+        expected = ndimage.gaussian_filter(
+            (self.truth[0] - self.truth[1]).double().numpy(), [_SEEN_MM / s for s in grid.spacing]
+        )
+        dogs = dog_channels(grid, task.middle_mm, _CHANNELS, lowest=_LOWEST)
+        fullest = int(task.shares["signal"].sum((1, 2)).argmax())
+        one = np.zeros((grid.shape[0], 1, 1))
+        one[fullest] = 1.0
+        plane = VolumeGrid((1, *grid.shape[1:]), grid.spacing, (float(grid.axes[0][fullest]), *grid.center[1:]))
+        flat = dog_channels(plane.slice, task.middle_mm[1:], _CHANNELS, lowest=_LOWEST)[:, None] * one
+        return {
+            "axial": torch.from_numpy(np.concatenate([template_channel(expected * one), flat])),
+            "volume": torch.from_numpy(np.concatenate([template_channel(expected), dogs])),
+        }
+
+    def pair(self, volume: Tensor) -> Floats:
+        """``(rois, 2)`` means."""
+        found = torch.einsum("zyx,rzyx->r", volume.double(), self._weights)
+        return np.asarray(found.numpy()).reshape(-1, 2)
+
+    def responses(self, volume: Tensor, observer: str) -> Floats:
+        """Of an observer's channels."""
+        return np.asarray(torch.einsum("zyx,czyx->c", volume.double(), self.channels[observer]).numpy())
+
+    def square(self, volume: Tensor) -> float:
+        """Mean square error with the signal, HU²."""
+        return float((volume - self.truth[0])[self.task.near].double().square().mean())
+
+    def flat(self, volume: Tensor) -> dict[str, Any]:
+        """Voxels of every flat tissue."""
+        return {t: volume.reshape(-1)[at].float().numpy() for t, at in self.task.flat.items()}
+
+
+def volume_of(method: Method, draw: Draw) -> Tensor:
+    """A method's volume, checked: HU ``(z, y, x)`` float32.
+
+    Raises:
+        TypeError, ValueError: what it gave is no volume on the task's grid in HU: another type, shape or grid, NaN.
+    """
+    given = method.run(draw)
+    if isinstance(given, Volume):
+        if given.grid != draw.grid:
+            raise ValueError(f"{method.name} gave a volume on {given.grid}, asked was {draw.grid}")
+        if given.unit != "HU":
+            raise ValueError(f"{method.name} gave a volume in {given.unit}: HU are needed")
+        given = given.data
+    if isinstance(given, np.ndarray):
+        given = torch.from_numpy(np.ascontiguousarray(given))
+    if not isinstance(given, Tensor) or given.is_complex() or given.dtype == torch.bool:
+        kind = given.dtype if isinstance(given, Tensor) else type(given).__name__
+        raise TypeError(f"{method.name} gave {kind}: a real tensor, array or Volume (z, y, x) in HU is needed")
+    if tuple(given.shape) != draw.grid.shape:
+        raise ValueError(f"{method.name} gave a volume of shape {tuple(given.shape)}, the inset has {draw.grid.shape}")
+    bad = int((~torch.isfinite(given)).sum())
+    if bad:
+        raise ValueError(f"{method.name} gave {bad} voxels that are NaN or infinite")
+    return given.detach().float()
+
+
+def check_method(method: Method, reader: Reader, draws: Draws, exposure_s: float) -> None:
+    """A first look at a method's noise-free volume: its unit and its place.
+
+    Raises:
+        ValueError: not in HU, or shifted.
+    """
+    volume = volume_of(method, draws.noise_free(True, exposure_s))
+    truth = reader.truth[0]
+    a, b = truth - truth.mean(), volume - volume.mean()
+    scale = float((a * b).sum() / a.square().sum().clamp_min(1e-9))
+    if not 0.2 < scale < 5.0 or float((volume - truth).mean().abs()) > 300.0:
+        raise ValueError(
+            f"{method.name}: its noise-free volume is {scale:.3g} times the truth, mean {float(volume.mean()):.4g} for "
+            f"{float(truth.mean()):.4g} HU: does it give HU (water 0, air -1000)?"
+        )
+    power = torch.fft.irfftn(torch.fft.rfftn(a).conj() * torch.fft.rfftn(b), s=a.shape)
+    at = np.unravel_index(int(power.argmax()), a.shape)
+    off = [int(k) if k <= n // 2 else int(k) - n for k, n in zip(at, a.shape, strict=True)]
+    if any(abs(k) > _SHIFT_VOXELS for k in off):
+        raise ValueError(
+            f"{method.name}: its noise-free volume is shifted by {off} voxels (z, y, x): voxel centres lie at "
+            "grid.axes, ascending"
+        )
+
+
+def measure_method(
+    method: Method, draws: Draws, reader: Reader, exposure_s: float, n: int, store: Store,
+    progress: Callable[[float], None] | None = None,
+) -> Readings:  # fmt: skip
+    """``n`` realisations of a method."""
+    place = f"{_file_name(method.name)}/{exposure_s:g}s"
+    key = f"3 {method.name} {method.key} {draws.seed} {draws.task.fingerprint}"
+
+    def clean() -> dict[str, Any]:
+        check_method(method, reader, draws, exposure_s)
+        return _of([[draws.noise_free(p, exposure_s) for p in (True, False)]], method, reader, keep=True)
+
+    def block(k: range) -> dict[str, Any]:
+        return _of([draws.draw(exposure_s, i) for i in k], method, reader, keep=k.start == 0)
+
+    without_noise = store.piece(f"{place}/clean", key, clean)
+    pieces = []
+    for start in range(0, n, BLOCK):
+        k = range(start, min(start + BLOCK, n))
+        pieces.append(store.piece(f"{place}/{k.start}-{k.stop}", key, partial(block, k)))
+        if progress is not None:
+            progress(k.stop / n)
+    joined = {name: np.concatenate([p[name] for p in pieces]) for name in pieces[0] if name not in ("first", "seconds")}
+    return Readings(
+        joined["rois"], {o: joined[f"channels_{o}"] for o in OBSERVERS}, joined["square"],
+        {t: joined[f"flat_{t}"] for t in draws.task.flat}, without_noise["rois"][0], float(without_noise["square"][0]),
+        {o: without_noise[f"channels_{o}"][0] for o in OBSERVERS}, pieces[0]["first"], without_noise["first"],
+        float(np.mean([p["seconds"] for p in pieces])),
+    )  # fmt: skip
+
+
+def _of(pairs: Sequence[Sequence[Draw]], method: Method, reader: Reader, keep: bool) -> dict[str, Any]:
+    rois, square, seconds = [], [], []
+    channels: dict[str, list[Any]] = {o: [] for o in OBSERVERS}
+    flat: dict[str, list[Any]] = {t: [] for t in reader.task.flat}
+    first = None
+    for pair in pairs:
+        volumes = []
+        for draw in pair:
+            began = time.perf_counter()
+            volumes.append(volume_of(method, draw))
+            seconds.append(time.perf_counter() - began)
+        rois.append([reader.pair(v) for v in volumes])
+        for o in OBSERVERS:
+            channels[o].append([reader.responses(v, o) for v in volumes])
+        square.append(reader.square(volumes[0]))
+        for t, values in reader.flat(volumes[0]).items():
+            flat[t].append(values)
+        if keep and first is None:
+            first = volumes[0].numpy().astype(np.float16)
+    found = {"rois": np.array(rois), "square": np.array(square), "seconds": np.array(np.median(seconds))}
+    found |= {f"channels_{o}": np.array(v) for o, v in channels.items()}
+    found |= {f"flat_{t}": np.array(v, dtype=np.float32) for t, v in flat.items()}
+    return found if first is None else {**found, "first": first}
+
+
+def _file_name(name: str) -> str:
+    return "".join(c if c.isalnum() or c in "-_." else "_" for c in name)

@@ -1,0 +1,257 @@
+"""Methods under test: ours by name, anybody's as a Python function, trained weights, or volumes in files.
+
+A method's name says all:
+
+* ``fbp:KERNEL``, ``pwls``, ``mbir``; ``mbir:look=1``, ``mbir:weights=mine.safetensors``, ``mbir:tissues``;
+* ``FILTER@BASE``: a filter of :mod:`recon.evaluate.rivals` after a linear method, ``bilateral@fbp:detail``;
+* ``package.module:function``: a function of ``(scan, grid)`` that gives a volume in HU; with ``@BASE`` a denoiser, a
+  function of ``(volume)`` or ``(volume, sigma)`` in HU, tensors ``(z, y, x)`` float32;
+* ``files:FOLDER``: volumes that another program has made of scans that
+  :func:`recon.evaluate.export_scans` wrote.
+
+Whatever it is, it becomes a :class:`Method`, a function of one realisation of a scan (:class:`Draw`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from recon.evaluate.rivals import FILTERS, SMOOTHED_BY, flat_noise, tuned
+from recon.fbp.ramp import KERNELS
+from recon.mbir.mbir import Mbir
+from recon.mbir.tissues import TissueMbir
+from torchpcct.geometry import VolumeGrid
+from torchpcct.scan import Scan
+from torchpcct.validate import checked, choice, number
+from torchpcct.volume import Volume
+
+__all__ = ["Draw", "Method", "deepinv_denoiser", "denoiser", "method_of"]
+
+
+class Draw(Protocol):
+    """One realisation, as a method sees it: simulated (:mod:`recon.evaluate.draws`) or measured."""
+
+    @property
+    def scan(self) -> Scan:
+        """The scan."""
+        ...
+
+    @property
+    def exposure_s(self) -> float:
+        """Of the scan."""
+        ...
+
+    @property
+    def grid(self) -> VolumeGrid:
+        """Of the volume that is asked for."""
+        ...
+
+    @property
+    def label(self) -> str:
+        """Name of its files."""
+        ...
+
+    def fbp(self, kernel: str) -> Tensor:
+        """FBP, HU ``(z, y, x)``."""
+        ...
+
+    def pwls(self) -> Tensor:
+        """PWLS with the default prior, HU."""
+        ...
+
+    def mbir(self, network: Mbir) -> Tensor:
+        """MBIR, HU."""
+        ...
+
+    def sigma(self, method: Method, smooths: float = 0.0) -> float:
+        """Noise in HU of a linear method, of its volume smoothed with so many voxels."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Method:
+    """A reconstruction under test.
+
+    Args:
+        name: for tables.
+        run: from a :class:`recon.evaluate.draws.Draw` to HU ``(z, y, x)``.
+        key: what its results depend on beside its name (weights, source), so that kept ones are not mixed up.
+        kernels: of FBP that it asks a draw for.
+        is_fbp: its volume is FBP with the first of them: means and variances of its ROIs are exact.
+    """
+
+    name: str
+    run: Callable[[Draw], Tensor]
+    key: str = ""
+    kernels: tuple[str, ...] = ()
+    is_fbp: bool = False
+
+
+def method_of(spec: Any) -> Method:
+    """A method from its name, see the module; a :class:`Method` or a function of ``(scan, grid)`` as it is.
+
+    Raises:
+        ValueError, TypeError: an unknown name or option, with those that there are.
+        ImportError, AttributeError: a module or function that cannot be loaded.
+        FileNotFoundError: weights or a folder that do not exist.
+    """
+    if isinstance(spec, Method):
+        return spec
+    if callable(spec):
+        return _of_function(getattr(spec, "__name__", "function"), spec)
+    if not isinstance(spec, str):
+        raise TypeError(f"a method must be a name or a function of (scan, grid), got {type(spec).__name__}")
+    head, _, base = spec.partition("@")
+    if base:
+        return _filtered(head, base, spec) if head in FILTERS else denoiser(_loaded(head), base, spec)
+    name, _, rest = spec.partition(":")
+    if name == "fbp":
+        kernel = choice("kernel", rest or "standard", KERNELS)
+        return Method(f"fbp:{kernel}", lambda draw: draw.fbp(kernel), kernels=(kernel,), is_fbp=True)
+    if name == "pwls" and not rest:
+        return Method("pwls", lambda draw: draw.pwls())
+    if name == "mbir":
+        return _mbir(spec, rest)
+    if name == "files":
+        return _of_files(spec, Path(rest))
+    if rest:
+        return _of_function(spec, _loaded(spec))
+    known = "fbp:KERNEL, pwls, mbir, FILTER@BASE, package.module:function, files:FOLDER"
+    raise ValueError(f"unknown method {spec!r}: one of {known}")
+
+
+def denoiser(function: Callable[..., Any], base: Any, name: str = "") -> Method:
+    """A function of an image after a linear method.
+
+    Args:
+        function: of ``(volume)`` or ``(volume, sigma)``: HU ``(z, y, x)`` float32, and the standard deviation of the
+            base's noise in the largest tissue, HU; it gives the same shape.
+        base: a linear method.
+        name: for tables.
+
+    Raises:
+        ValueError: a base that is not linear.
+    """
+    before = method_of(base)
+    if not before.is_fbp:
+        raise ValueError(f"a denoiser needs FBP before it, got {before.name!r}: fbp:KERNEL")
+    plain = getattr(function, "__name__", "denoiser")
+    with_sigma = len(inspect.signature(function).parameters) > 1
+
+    def run(draw: Draw) -> Any:
+        volume = before.run(draw)
+        return function(volume, draw.sigma(before)) if with_sigma else function(volume)
+
+    return Method(name or f"{plain}@{before.name}", run, key=_source_of(function), kernels=before.kernels)
+
+
+@checked
+def deepinv_denoiser(model: Callable[..., Any], *, unit_hu: float = 1000.0, slices: bool = False) -> Any:
+    """A denoiser of deepinv (``model(x, sigma)`` of ``(batch, channel, …)``) as :func:`denoiser` takes it.
+
+    Args:
+        model: of images whose values are about 0 … 1.
+        unit_hu: HU that are 1 to the model; 0 HU stays 0.
+        slices: a 2-D model: the slices are its batch. Otherwise the volume is one 3-D image.
+    """
+    unit = number("unit_hu", unit_hu, positive=True, unit="HU")
+
+    def run(volume: Tensor, sigma: float) -> Tensor:
+        x = (volume[:, None] if slices else volume[None, None]) / unit
+        with torch.no_grad():
+            found: Tensor = model(x, sigma / unit)
+        return found.reshape(volume.shape) * unit
+
+    run.__name__ = type(model).__name__
+    return run
+
+
+def _filtered(name: str, base: str, spec: str) -> Method:
+    """A filter of :mod:`recon.evaluate.rivals` with the settings that were tuned for it."""
+    before = method_of(base)
+    if not before.is_fbp:
+        raise ValueError(f"a filter needs FBP before it, got {before.name!r}: fbp:KERNEL")
+
+    def run(draw: Draw) -> Tensor:
+        settings = tuned(name, before.kernels[0], draw.exposure_s)
+        smooths = settings.get("sigma", SMOOTHED_BY.get(name, 0.0)) if name in SMOOTHED_BY else 0.0
+        found: Tensor = FILTERS[name](before.run(draw), draw.sigma(before, smooths), **settings)
+        return found
+
+    return Method(spec, run, key="tuned", kernels=before.kernels)
+
+
+def _mbir(spec: str, rest: str) -> Method:
+    given: dict[str, str] = {}
+    for part in filter(None, rest.split(",")):
+        key, _, value = part.partition("=")
+        given[choice("option of mbir", key, ("weights", "look", "tissues"))] = value
+    network = Mbir.load(given.get("weights"))
+    if "look" in given:
+        network = network.looking(number("look", float(given["look"]), low=0.0, high=1.0))
+    if "tissues" in given:
+        network = TissueMbir(network)
+
+    return Method(spec, lambda draw: draw.mbir(network), key=network.weights_sha256)
+
+
+def _of_function(name: str, function: Callable[..., Any]) -> Method:
+    return Method(name, lambda draw: function(draw.scan, draw.grid), key=_source_of(function))
+
+
+def _of_files(spec: str, folder: Path) -> Method:
+    if not folder.is_dir():
+        raise FileNotFoundError(f"no folder {folder} with volumes")
+
+    def run(draw: Draw) -> Tensor:
+        found = sorted(folder.glob(f"{draw.label}.*"))
+        if not found:
+            raise FileNotFoundError(
+                f"{folder} holds no volume {draw.label}.*: reconstruct the exported scan of that name"
+            )
+        volume = Volume.load(found[0])
+        if volume.grid != draw.grid:
+            raise ValueError(f"{found[0]} lies on {volume.grid}, the task on {draw.grid}")
+        if volume.unit != "HU":
+            raise ValueError(f"{found[0]} is in {volume.unit}, not in HU")
+        return volume.data
+
+    return Method(spec, run, key=str(folder.resolve()))
+
+
+def _loaded(spec: str) -> Callable[..., Any]:
+    module, _, name = spec.partition(":")
+    if not name:
+        raise ValueError(f"unknown method {spec!r}: a function is package.module:function, a filter one of "
+                         f"{', '.join(FILTERS)}")  # fmt: skip
+    try:
+        found = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"cannot load {spec!r}: {error} (is its folder on PYTHONPATH?)") from error
+    if not callable(found):
+        raise TypeError(f"{spec} is no function")
+    return found
+
+
+def _source_of(function: Callable[..., Any]) -> str:
+    try:
+        text = inspect.getsource(function)
+    except (OSError, TypeError):
+        text = repr(function)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def noise_of(volume: Tensor, flat: Tensor, smooths: float) -> float:
+    """Standard deviation in HU of noise alone in flat voxels, smoothed as a filter does that looks at smoothed ones."""
+    mask = torch.zeros(volume.numel(), dtype=torch.bool)
+    mask[flat] = True
+    return flat_noise(volume, mask.reshape(volume.shape), sigma=smooths)

@@ -1,0 +1,351 @@
+"""A task: a thing to see or to measure, what it lies in, and the scanner that looks at it.
+
+A task is data. It has a scene, a *signal* (one body of it, or several) and a *background* (the body around); its twin
+is the same scene with the background's material in the signal. From these follows what is read of every volume:
+
+* ``lesion``: mean over the whole signal less mean over the background around it; ``slice``: the same in the axial slice
+  that holds most of the signal; ``small``: of some voxels in the signal's middle and the nearest of the background;
+* the root mean square error near the bodies, and the noise in every tissue that fills a part of the inset;
+* whether the signal is there, by an observer who knows where (:mod:`recon.evaluate.estimates`).
+
+Ready ones are in :mod:`recon.evaluate.tasks`; ``torchpcct show-task NAME`` prints one as YAML to start from.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import ndimage
+from torch import Tensor
+
+from recon.evaluate.store import Store, source_digest
+from recon.fbp.exact_noise import line_integral_variance
+from torchpcct.acquisition.acquire import acquire
+from torchpcct.acquisition.path_lengths import tissue_path_lengths
+from torchpcct.detector_window import DetectorWindow
+from torchpcct.geometry import VolumeGrid
+from torchpcct.metrics.data_limit import ceiling, information_matrix
+from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
+from torchpcct.scanner.scanner import Scanner
+from torchpcct.scene.scene import Scene
+from torchpcct.validate import numbers
+
+__all__ = ["ROIS", "Facts", "Task"]
+
+Floats = NDArray[np.float64]
+Pair = tuple[Tensor, Tensor]
+
+ROIS = ("small", "slice", "lesion")
+_PURE, _MOSTLY = 0.99, 0.8
+"""Share of a tissue in the voxels that are read; where there are too few, the second."""
+_FEW = 4
+_AROUND_MM = 1.5
+"""The background is read as far from the signal."""
+_SMALL_MM2 = 0.25
+"""Area of the small ROIs, about that of the paper's."""
+_NEAR_MM = 0.4
+"""The error is that of bodies and of what lies so close to them."""
+_FLAT_MM, _FLAT_VOXELS, _KEPT_VOXELS = 1.0, 150, 2000
+"""Noise is that of voxels so far from any edge; of tissues with so many; of so many at most."""
+_VIEWS, _SUB_RAYS = 246, 16
+"""Views that values and limit are summed over (path lengths change slowly from view to view), beam samples."""
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What holds of a task without noise.
+
+    Attributes:
+        tissues: names, the signal first, then the background.
+        values_hu: what each reads on this scanner at this place, by least squares on the noise-free readings.
+        limit_hu: smallest SD at 1 s of any unbiased estimate of background less signal, all outlines known.
+    """
+
+    tissues: tuple[str, ...]
+    values_hu: tuple[float, ...]
+    limit_hu: float
+
+    @property
+    def contrast_hu(self) -> float:
+        """Background less signal."""
+        return self.values_hu[1] - self.values_hu[0]
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """See the module.
+
+    Args:
+        name: short, for tables and files.
+        title: one line on what is asked.
+        scene: with the signal, standing still.
+        signal: name of its body, or names.
+        background: name of the body around; None: the parent of the signal.
+        scanner: counting, cone beam.
+        grid: ``(z, y, x)`` cubic voxels about the signal, small against the field of view.
+        exposures_s: at which it is usually looked at.
+        reference: FBP that factors are quoted against (:func:`recon.evaluate.methods.method_of`).
+        rois: name → weights of signal and background ``grid.shape`` that add up to 1 each; None: see the module.
+        tolerance_hu: effects of the scan below it are left out (:func:`torchpcct.acquire`).
+
+    Raises:
+        ValueError: no such bodies, a signal that does not touch the inset, voxels too large for it.
+    """
+
+    name: str
+    scene: Scene
+    signal: tuple[str, ...]
+    scanner: Scanner
+    grid: VolumeGrid
+    background: str = ""
+    title: str = ""
+    exposures_s: tuple[float, ...] = (0.35, 2.0)
+    reference: str = "fbp:soft"
+    rois: Mapping[str, Pair] = field(default_factory=dict)
+    tolerance_hu: float = 0.5
+
+    def __post_init__(self) -> None:
+        signal = (self.signal,) if isinstance(self.signal, str) else tuple(self.signal)
+        if not signal:
+            raise ValueError(f"task {self.name}: signal names no body of the scene")
+        for name in (*signal, *([self.background] if self.background else [])):
+            if name not in self.scene.names:
+                raise ValueError(f"task {self.name}: no body {name!r} in the scene, which has "
+                                 f"{', '.join(self.scene.names)}")  # fmt: skip
+        background = self.background or self.scene[signal[0]].parent
+        if background is None:
+            raise ValueError(f"task {self.name}: {signal[0]!r} lies in no other body: name the background")
+        if background in signal:
+            raise ValueError(f"task {self.name}: {background!r} is both signal and background")
+        if self.grid.ndim != 3 or max(abs(s / self.grid.spacing[0] - 1.0) for s in self.grid.spacing) > 0.01:
+            raise ValueError(f"task {self.name}: the inset must have cubic voxels (z, y, x), got {self.grid}")
+        exposures = tuple(numbers("exposures_s", self.exposures_s, positive=True, unit="s"))
+        for name, value in (("signal", signal), ("background", background), ("exposures_s", exposures)):
+            object.__setattr__(self, name, value)
+
+    @cached_property
+    def absent(self) -> Scene:
+        """The twin without the signal."""
+        scene = self.scene
+        for name in self.signal:
+            scene = scene.replace_material(name, self.scene[self.background].material)
+        return scene
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Of all that a task's results depend on: itself, and this software."""
+        plain = [_plain(getattr(self, f.name)) for f in fields(self) if f.name not in ("title", "exposures_s")]
+        return hashlib.sha256(f"{plain} {source_digest()}".encode()).hexdigest()[:16]
+
+    # --- noise-free scans and what they say ---------------------------------------------------------------------
+
+    def scans(self, store: Store) -> tuple[Scan, Scan]:
+        """Noise-free scans with and without the signal, kept in ``store``."""
+        found = []
+        for name, scene in (("present", self.scene), ("absent", self.absent)):
+            path = self.scan_file(store, name)
+            if not path.exists():
+                try:
+                    scan = acquire(scene, self.scanner, region=self.grid, tolerance_hu=self.tolerance_hu)
+                except ValueError as error:
+                    raise ValueError(
+                        f"task {self.name}: {error} (outside of the inset a task's scene must be round about the axis)"
+                    ) from error
+                scan.save(path)
+            found.append(Scan.load(path))
+        return found[0], found[1]
+
+    def scan_file(self, store: Store, name: str) -> Path:
+        """Where a noise-free scan is kept; those of the task before it was changed are removed."""
+        path = store.path(f"{name}-{self.fingerprint}.h5")
+        for old in path.parent.glob(f"{name}-*.h5"):
+            if old != path:
+                old.unlink()
+        return path
+
+    def facts(self, store: Store) -> Facts:
+        """Values of the tissues and the limit of the data; bodies of one material count as one tissue."""
+        return self._facts_of(*self.scans(store))
+
+    def _facts_of(self, present: Scan, absent: Scan) -> Facts:
+        g, w = present.geometry, present.window
+        assert w is not None
+        stride = max(1, g.views // _VIEWS)
+        views = list(range(0, g.views, stride))
+        window = DetectorWindow(w.first_column[views], w.columns, w.first_row, w.rows)
+        maps = tissue_path_lengths(
+            self.scene, list(self._groups.values()), g.select(views), window, sub_rays=_SUB_RAYS,
+            focal_spot=self.scanner.source.focal_spot,
+        )  # fmt: skip
+        weight = 1.0 / line_integral_variance(present, NOISE_FREE_EXPOSURE_S)[views]
+        scale, share = present.linearisation.mu_ref / 1000.0, g.views / len(views)
+        information = information_matrix(maps, weight, scale=scale) * share
+        lines = present.line_integrals()[views]
+        right = scale * share * np.array([_inner(m, weight * lines) for m in maps])
+        values = np.linalg.solve(information, right) - 1000.0
+        # The signal by what it changes: whatever else the readings hold drops out.
+        change = lines - absent.line_integrals()[views]
+        differs = _inner(maps[0], weight * change) * scale * share / information[0, 0]
+        values[0] = values[1] + differs
+        limit = ceiling(information, np.eye(len(maps))[1] - np.eye(len(maps))[0])
+        return Facts(tuple(self._groups), tuple(float(v) for v in values), float(limit.functional_sd[0]))
+
+    @cached_property
+    def _groups(self) -> dict[str, list[str]]:
+        """Tissue → bodies."""
+        found = {"signal": list(self.signal), self.background: [self.background]}
+        tissue = {self.scene.materials[self.scene.index(self.background)].name: self.background}
+        for body, material in zip(self.scene.bodies, self.scene.materials, strict=True):
+            if body.name not in (*self.signal, self.background):
+                found.setdefault(tissue.setdefault(material.name, body.name), []).append(body.name)
+        return found
+
+    # --- where is what -------------------------------------------------------------------------------------------
+
+    @cached_property
+    def shares(self) -> dict[str, Floats]:
+        """Tissue → its share of every voxel, ``grid.shape``; the signal's under ``signal``."""
+        fractions = self._fractions
+        return {tissue: np.sum([fractions[n] for n in names], axis=0) for tissue, names in self._groups.items()}
+
+    @cached_property
+    def _fractions(self) -> dict[str, Floats]:
+        """Body → its share of every voxel."""
+        return dict(zip(self.scene.names, self.scene.volume_fractions(self.grid), strict=True))
+
+    @property
+    def _beside(self) -> Floats:
+        """Share of the background's own body, without others of its material."""
+        return self._fractions[self.background]
+
+    def truth(self, facts: Facts) -> tuple[Tensor, Tensor]:
+        """HU of every voxel with and without the signal, ``grid.shape`` float32; outside of all bodies air."""
+        values = dict(zip(facts.tissues, facts.values_hu, strict=True))
+        outside = 1.0 - np.sum(list(self.shares.values()), axis=0)
+        absent = np.sum(
+            [share * values[self.background if t == "signal" else t] for t, share in self.shares.items()], axis=0
+        )
+        absent = absent - 1000.0 * outside
+        present = absent - facts.contrast_hu * self.shares["signal"]
+        return torch.from_numpy(present).float(), torch.from_numpy(absent).float()
+
+    @cached_property
+    def regions(self) -> dict[str, Pair]:
+        """ROI → weights of signal and background, float64, each of sum 1."""
+        signal = self._pure("signal", self.shares["signal"])
+        away = ndimage.distance_transform_edt(~signal, sampling=self.grid.spacing)
+        around = self._pure(self.background, self._beside) & (away <= _AROUND_MM)
+        rows = np.asarray(signal.any((1, 2)))
+        fullest = int(signal.sum((1, 2)).argmax())
+        one = np.zeros_like(signal)
+        one[fullest] = True
+        small = self._small(signal, around, one)
+        found = {
+            "small": small,
+            "slice": (signal & one, around & one),
+            "lesion": (signal, around & rows[:, None, None]),
+        }
+        for name, (_, outer) in found.items():
+            if not outer.any():
+                raise ValueError(
+                    f"task {self.name}: no voxel beside the signal lies wholly in {self.background!r} (ROI {name}): "
+                    "take smaller voxels, or name another background"
+                )
+        pairs = {n: (_mean(a), _mean(b)) for n, (a, b) in found.items()}
+        return {**pairs, **self.rois}
+
+    def _pure(self, name: str, share: Floats) -> NDArray[np.bool_]:
+        for least in (_PURE, _MOSTLY):
+            if (share > least).sum() >= _FEW:
+                return np.asarray(share > least)
+        raise ValueError(
+            f"task {self.name}: {int((share > _MOSTLY).sum())} voxels of the inset lie in {name!r}, {_FEW} are needed: "
+            "take smaller voxels, or an inset that holds it"
+        )
+
+    def _small(self, signal: Any, around: Any, here: Any) -> tuple[Any, Any]:
+        """Voxels of one slice in the middle of the signal, and near to them where the background is not thin."""
+        step = self.grid.spacing
+        count = max(_FEW, round(_SMALL_MM2 / (step[1] * step[2])))
+        depth = np.where(signal & here, _depth(signal, step), -1.0)
+        inner = _nearest(signal & here, np.unravel_index(int(depth.argmax()), depth.shape), count)
+        beside = np.where(around & here, _depth(around, step), -1.0)
+        return inner, _nearest(beside >= 0.5 * beside.max(), ndimage.center_of_mass(inner), count)
+
+    @cached_property
+    def near(self) -> Tensor:
+        """Mask ``grid.shape`` in which the error counts: all but the largest tissue, and what is close to it."""
+        largest = max(self.shares, key=lambda t: float(self.shares[t].sum()))
+        bodies = self.shares[largest] < 0.5
+        bodies |= self.shares["signal"] > 0.5
+        away = ndimage.distance_transform_edt(~bodies, sampling=self.grid.spacing)
+        return torch.from_numpy(away <= _NEAR_MM)
+
+    @cached_property
+    def flat(self) -> dict[str, Tensor]:
+        """Tissue → indices (of the flat volume) of voxels away from its edges and the rim of the inset."""
+        found = {}
+        width = math.ceil(0.8 / self.grid.spacing[0])
+        inner = np.zeros(self.grid.shape, bool)
+        inner[(slice(width, -width),) * 3] = True
+        for tissue, share in self.shares.items():
+            deep = _depth(share > 1.0 - 1e-6, self.grid.spacing) > _FLAT_MM
+            at = np.flatnonzero(deep & inner)
+            if len(at) >= _FLAT_VOXELS:
+                found[tissue] = torch.from_numpy(at[:: -(-len(at) // _KEPT_VOXELS)])
+        return found
+
+    @cached_property
+    def middle_mm(self) -> tuple[float, float, float]:
+        """``(z, y, x)`` of the signal's centre of mass."""
+        at = ndimage.center_of_mass(self.shares["signal"])
+        z, y, x = (float(np.interp(p, np.arange(len(a)), a)) for p, a in zip(at, self.grid.axes, strict=True))
+        return z, y, x
+
+
+def _plain(value: Any) -> Any:
+    """What a value is made of, without what it has kept of its own computations."""
+    if isinstance(value, np.ndarray | Tensor):
+        array = np.ascontiguousarray(value)
+        return str(array.dtype), array.shape, hashlib.sha256(array.tobytes()).hexdigest()
+    if is_dataclass(value) and not isinstance(value, type):
+        return type(value).__name__, [(f.name, _plain(getattr(value, f.name))) for f in fields(value)]
+    if isinstance(value, Scene):
+        return [_plain(b) for b in value.bodies], [_plain(m) for m in value.motion]
+    if isinstance(value, Mapping):
+        return [(str(k), _plain(v)) for k, v in value.items()]
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    return repr(value)
+
+
+def _inner(a: Tensor, b: Tensor) -> float:
+    return float((a * b).sum((-1, -2), dtype=torch.float64).sum())
+
+
+def _mean(mask: Any) -> Tensor:
+    weights = torch.from_numpy(np.asarray(mask, dtype=np.float64))
+    return weights / weights.sum()
+
+
+def _depth(mask: Any, step: Any) -> Floats:
+    """Distance in mm to where the mask ends."""
+    return np.asarray(ndimage.distance_transform_edt(np.pad(mask, 1, mode="edge"), sampling=step))[1:-1, 1:-1, 1:-1]
+
+
+def _nearest(mask: Any, point: Any, count: int) -> NDArray[np.bool_]:
+    """The ``count`` voxels of a mask that are nearest to a point (in voxels)."""
+    at = np.argwhere(mask)
+    order = np.square(at - np.asarray(point)).sum(1).argsort(kind="stable")[:count]
+    out = np.zeros(mask.shape, bool)
+    out[tuple(at[order].T)] = True
+    return out

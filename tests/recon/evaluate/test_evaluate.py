@@ -1,0 +1,314 @@
+"""The instrument: tasks, methods, figures, on a scan of few views."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from scipy import ndimage
+
+from recon.cli import main
+from recon.evaluate.estimates import pivot
+from recon.evaluate.experiment import evaluate, export_scans
+from recon.evaluate.methods import Method, deepinv_denoiser, denoiser, method_of
+from recon.evaluate.report import COLUMNS, save, text_of
+from recon.evaluate.rivals import tuned
+from recon.evaluate.store import Store
+from recon.evaluate.tasks import TASKS, read_task, task_text
+from recon.evaluate.without_truth import evaluate_scans, evaluate_volumes
+from torchpcct import Volume
+from torchpcct.geometry import VolumeGrid
+
+INSERT = """
+title: an insert of 3 mm
+scene:
+  kind: bodies
+  bodies:
+    - {name: patient, shape: cylinder, semi_axes: 100, material: water}
+    - {name: insert, shape: ellipsoid, semi_axes: 1.5, position: {x: 30, y: 10, z: 0}, material: soft_tissue,
+       parent: patient}
+signal: insert
+scanner: {preset: pcct, views: 90}
+inset: {size: [6, 8, 8], voxel_mm: 0.4}
+exposures_s: 20
+"""
+
+
+@pytest.fixture(scope="module")
+def task(tmp_path_factory):
+    path = tmp_path_factory.mktemp("task") / "insert.yaml"
+    path.write_text(INSERT, encoding="utf-8")
+    return read_task(path)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("pieces")
+
+
+def halved(scan, grid):
+    """The user's own reconstruction: FBP with half of the contrast to water."""
+    from recon import reconstruct
+
+    return reconstruct(scan, grid, "fbp", kernel="soft").data / 2
+
+
+def shrunk(volume, sigma):
+    """The user's own denoiser, told the noise."""
+    assert 1.0 < sigma < 1000.0
+    return volume.mean() + 0.5 * (volume - volume.mean())
+
+
+@pytest.fixture(scope="module")
+def found(task, folder):
+    methods = ["fbp:soft", "fbp:detail", "gaussian@fbp:soft", denoiser(shrunk, "fbp:soft"), Method("mine", run_half)]
+    return evaluate(task, methods, n=16, folder=folder)
+
+
+def run_half(draw):
+    return halved(draw.scan, draw.grid)
+
+
+def value(found, figure, method, where):
+    (record,) = [r for r in found.records if (r["figure"], r["method"], r["where"]) == (figure, method, where)]
+    return record
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_ready_tasks_have_regions(name):
+    ready = read_task(name)
+    assert ready.title
+    for signal, background in ready.regions.values():
+        assert float(signal.sum()) == pytest.approx(1.0)
+        assert float(background.sum()) == pytest.approx(1.0)
+        # No voxel is read as both.
+        assert not bool(((signal > 1e-3) & (background > 1e-3)).any()) or name.startswith(("plaque", "half_contrast"))
+    assert ready.near.any()
+    assert yaml.safe_load(task_text(name))["signal"]
+
+
+def test_what_a_task_knows(task, found):
+    (seen,) = found.seen
+    values = dict(zip(seen.facts.tissues, seen.facts.values_hu, strict=True))
+    assert values["patient"] == pytest.approx(0.0, abs=1.0)
+    assert 30.0 < values["signal"] < 70.0
+    assert seen.true_hu["lesion"] == pytest.approx(-values["signal"] + values["patient"], abs=0.5)
+    # Information grows with the exposure; the limit holds for one second.
+    soft = value(found, "contrast SD at slope 1", "fbp:soft", "lesion")["value"]
+    assert seen.facts.limit_hu / math.sqrt(20.0) < soft
+
+
+def test_linear_methods_are_exact(found):
+    for figure in ("slope", "contrast SD at slope 1", "contrast without signal"):
+        record = value(found, figure, "fbp:detail", "lesion")
+        assert math.isnan(record["low"])
+    assert value(found, "slope", "fbp:detail", "lesion")["value"] == pytest.approx(0.9, abs=0.15)
+    factor = value(found, "dose factor: contrast at slope 1", "fbp:soft", "slice")
+    assert factor["value"] == pytest.approx(1.0)
+
+
+def test_exact_variance_is_that_of_draws(task, folder):
+    """FBP passed off as a nonlinear method: drawn figures about the exact ones."""
+    other = Method("drawn", lambda draw: draw.fbp("detail"), kernels=("detail",))
+    both = evaluate(task, ["fbp:detail", other], n=40, folder=folder)
+    for figure, where in (("contrast SD at slope 1", "lesion"), ("CNR", "small"), ("slope", "slice"),
+                          ("contrast without signal", "small")):  # fmt: skip
+        exact, drawn = (value(both, figure, name, where) for name in ("fbp:detail", "drawn"))
+        half = (drawn["high"] - drawn["low"]) / 2
+        assert abs(drawn["value"] - exact["value"]) <= 2.0 * half + 1e-6, figure
+
+
+def test_a_users_denoiser_and_reconstruction(found):
+    shrink = value(found, "slope", "shrunk@fbp:soft", "lesion")
+    soft = value(found, "slope", "fbp:soft", "lesion")
+    assert shrink["value"] == pytest.approx(0.5 * soft["value"], rel=0.02)
+    # What only scales saves no dose at slope 1, however quiet it looks.
+    factor = value(found, "dose factor: contrast at slope 1", "shrunk@fbp:soft", "lesion")
+    assert factor["low"] < 1.02
+    assert factor["high"] > 0.98
+    assert value(found, "dose factor: noise", "shrunk@fbp:soft", "patient")["value"] == pytest.approx(4.0, rel=0.02)
+    assert value(found, "slope", "mine", "lesion")["value"] == pytest.approx(0.5 * soft["value"], rel=0.05)
+
+
+def test_a_second_call_computes_nothing_again(task, folder, found):
+    def never(draw):
+        raise AssertionError("this piece was finished")
+
+    again = evaluate(task, ["fbp:soft", Method("mine", never)], n=16, folder=folder)
+    assert value(again, "error", "mine", "near the bodies") == value(found, "error", "mine", "near the bodies")
+
+
+def test_a_changed_task_takes_no_old_results(tmp_path):
+    """The same name in the same folder, another scene: other scans, other figures."""
+    texts = INSERT, INSERT.replace("material: soft_tissue", "material: adipose")
+    slopes = []
+    for text in texts:
+        (tmp_path / "insert.yaml").write_text(text, encoding="utf-8")
+        again = read_task(tmp_path / "insert.yaml")
+        (seen,) = evaluate(again, "fbp:soft", n=8, folder=tmp_path / "pieces").seen
+        slopes.append(seen.true_hu["lesion"])
+    assert slopes[0] < -20.0
+    assert slopes[1] > 50.0
+    assert len(list((tmp_path / "pieces").rglob("present-*.h5"))) == 1
+    assert read_task(tmp_path / "insert.yaml").fingerprint == again.fingerprint
+
+
+def test_report_and_tidy_table(found, tmp_path):
+    files = {p.name: p for p in save(found, tmp_path, "torchpcct evaluate")}
+    assert {"report.md", "report.json", "report.csv", "report.html", "insert.png"} == set(files)
+    lines = files["report.csv"].read_text(encoding="utf-8").splitlines()
+    assert lines[0].split(",") == list(COLUMNS)
+    assert len(lines) == 1 + len(found.records)
+    data = json.loads(files["report.json"].read_text(encoding="utf-8"))
+    assert len(data["records"]) == len(found.records)
+    assert "http" not in files["report.html"].read_text(encoding="utf-8").replace("http-equiv", "")
+    text = text_of(found)
+    assert "Least dose" in text
+    assert "nan" not in text
+    assert pivot(found.records, "slope")["fbp:soft", 20.0, "lesion"]["n"] == 16
+
+
+@pytest.mark.parametrize(
+    ("run", "said"),
+    [
+        (lambda d: d.fbp("soft")[1:], "shape"),
+        (lambda d: d.fbp("soft") * math.nan, "NaN"),
+        (lambda d: (d.fbp("soft") / 1000 + 1) * 0.02, "does it give HU"),
+        (lambda d: d.fbp("soft").roll(1, 0), "shifted by"),
+        (lambda d: "volume", "str"),
+        (lambda d: Volume(d.fbp("soft"), VolumeGrid(d.grid.shape, 0.4)), "asked was"),
+    ],
+)  # fmt: skip
+def test_what_a_method_gives_is_checked(task, folder, run, said):
+    with pytest.raises((ValueError, TypeError), match=said):
+        evaluate(task, Method(said, run, kernels=("soft",)), n=8, folder=folder)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"signal": "core"}, "no body 'core'"),
+        ({"signal": []}, "names no body"),
+        ({"background": "insert"}, "both signal and background"),
+        ({"inset": {"size": [6, 8, 8], "voxel_mm": 0.4, "center": [0, 0, 0]}}, "wholly|lie in"),
+        ({"inset": {"size": [6, 8, 8], "voxels": 0.4}}, "unknown voxels"),
+        ({"colour": "red"}, "unknown colour"),
+        ({"exposures_s": -1}, "exposures_s"),
+        ({"scene": {"kind": "volume", "file": "a.nii"}}, "a.nii"),
+    ],
+)
+def test_bad_tasks_are_named(tmp_path, folder, changes, said):
+    path = tmp_path / "bad.yaml"
+    path.write_text(yaml.safe_dump({**yaml.safe_load(INSERT), **changes}), encoding="utf-8")
+    with pytest.raises((ValueError, TypeError, OSError), match=said):
+        assert read_task(path).regions
+
+
+@pytest.mark.parametrize(
+    ("spec", "said"),
+    [
+        ("fbp:hard", "kernel"), ("mbir:sharp=1", "option of mbir"), ("nothing", "unknown method"),
+        ("bilateral@pwls", "needs FBP"), ("no.such.module:run", "cannot load"), ("files:nowhere", "no folder"),
+        ("json:loads@nowhere", "unknown method"), (3, "must be a name"),
+    ],
+)  # fmt: skip
+def test_bad_methods_are_named(spec, said):
+    with pytest.raises((ValueError, TypeError, FileNotFoundError), match=said):
+        method_of(spec)
+
+
+def test_volumes_of_another_program(task, folder, tmp_path, found):
+    files = export_scans(task, tmp_path / "scans", n=8)
+    assert len(files) == 2 * (8 + 1)
+    from recon import reconstruct
+    from torchpcct import Scan
+
+    for path in files:
+        volume = reconstruct(Scan.load(path), task.grid, "fbp", kernel="soft")
+        out = tmp_path / "volumes" / path.parent.name / path.name
+        out.parent.mkdir(parents=True, exist_ok=True)
+        volume.save(out)
+    theirs = evaluate(task, f"files:{tmp_path / 'volumes'}", n=8, folder=folder)
+    slope = value(theirs, "slope", f"files:{tmp_path / 'volumes'}", "lesion")
+    assert slope["value"] == pytest.approx(value(found, "slope", "fbp:soft", "lesion")["value"], abs=0.01)
+    files[3].unlink()
+    (tmp_path / "volumes" / "insert" / files[3].name).unlink()
+    with pytest.raises(FileNotFoundError, match="holds no volume"):
+        evaluate(task, f"files:{tmp_path / 'volumes'}", n=8)
+
+
+@pytest.mark.parametrize("slices", [False, True])
+def test_a_denoiser_of_deepinv(slices):
+    """Its unit and its axes; the model sees values about 1."""
+    seen = []
+
+    def model(x, sigma):
+        seen.append((tuple(x.shape), float(x.max()), sigma))
+        return x * 0.5
+
+    volume = torch.full((3, 4, 5), 500.0)
+    found = deepinv_denoiser(model, slices=slices)(volume, 20.0)
+    torch.testing.assert_close(found, volume / 2)
+    assert seen == [((3, 1, 4, 5) if slices else (1, 1, 3, 4, 5), 0.5, 0.02)]
+
+
+def test_rivals_come_with_their_tuned_settings():
+    assert tuned("bilateral", "detail", 2.0) == {"edge": 2.0, "reach": 2.5, "sigma": 1.4}
+    assert tuned("bilateral", "detail", 0.3) == tuned("bilateral", "detail", 0.35) != tuned("bilateral", "detail", 2.0)
+    assert tuned("bilateral", "bone", 2.0) == {}
+
+
+def test_commands(tmp_path, capsys, monkeypatch):
+    """Ready tasks are listed and printed; a user's task and denoiser from the folder where the command runs."""
+    monkeypatch.chdir(tmp_path)
+    assert main(["show-task"]) == 0
+    assert {line.split()[0] for line in capsys.readouterr().out.splitlines()} == set(TASKS)
+    assert main(["show-task", "rod"]) == 0
+    assert yaml.safe_load(capsys.readouterr().out)["signal"] == "rod"
+    (tmp_path / "insert.yaml").write_text(INSERT, encoding="utf-8")
+    (tmp_path / "my_own_filter.py").write_text("def half(volume):\n    return volume / 2\n", encoding="utf-8")
+    command = ["evaluate", "--task", "insert.yaml", "--denoiser", "my_own_filter:half@fbp:soft", "--n", "8"]
+    assert main([*command, "--out", "o", "--no-progress"]) == 0
+    out = capsys.readouterr().out
+    assert "my_own_filter:half@fbp:soft" in out
+    assert "o/report.csv" in out
+    assert main([*command, "--denoiser", "my_own_filter:half", "--out", "o"]) == 2
+    assert "needs a base" in capsys.readouterr().err
+    (tmp_path / "f").write_bytes(b"mine")
+    assert main([*command, "--out", "f"]) == 2
+    assert "is a file" in capsys.readouterr().err
+
+
+def test_two_measured_scans(task, tmp_path):
+    present, _ = task.scans(Store(tmp_path))
+    scans = [present.with_noise(5000.0, k) for k in range(2)]
+    soft, bone = evaluate_scans(scans, task.grid, ["fbp:soft", "fbp:bone"])
+    assert soft["noise"] < bone["noise"]
+    # One smooth ball does not tell how sharp they are: no factor that a blur would win.
+    assert math.isinf(soft["f50"])
+    assert math.isnan(soft["dose_factor"])
+    with pytest.raises(ValueError, match="two of the same object"):
+        evaluate_scans([scans[0], object()], task.grid, "fbp:soft")
+
+
+def test_pairs_of_volumes():
+    generator = torch.Generator().manual_seed(0)
+    object_ = torch.zeros(4, 64, 64)
+    object_[:, 20:44, 20:44] = 100.0
+    pair = [object_ + torch.randn(object_.shape, generator=generator) * 10 for _ in range(2)]
+
+    def blurred(v, sigma):
+        return torch.from_numpy(ndimage.gaussian_filter(v.numpy(), [0, sigma, sigma]))
+
+    soft_pair = [blurred(v, 1.5) for v in pair]
+    half_pair = [blurred(object_, 1.5) + blurred(v - object_, 1.5) / 2 for v in pair]
+    soft, half = (evaluate_volumes({"x": made}, pair, 0.5)[0] for made in (soft_pair, half_pair))
+    assert 0.1 < soft["f50"] < 0.4
+    # A blur saves nothing; half of its noise is four times the dose.
+    assert soft["dose_factor"] == pytest.approx(1.0, rel=0.15)
+    assert half["dose_factor"] == pytest.approx(4.0 * soft["dose_factor"], rel=0.05)
+    assert soft["noise"] < 5.0
+    with pytest.raises(ValueError, match="shape"):
+        evaluate_volumes({"other": [np.zeros((4, 64, 32))] * 2}, pair, 0.5)

@@ -1,0 +1,121 @@
+"""The joint bilateral filter as a layer, and as a view of the network."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from recon.mbir.bilateral import REACH, joint_bilateral
+from recon.mbir.network import GUIDE_VOXELS, Network, NetworkConfig, local_mean
+from recon.mbir.unrolled import Unrolled, guide_noise
+
+T = torch.tensor([0.6, 1.1])
+
+
+def volumes(shape=(2, 6, 7, 8), seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(shape, generator=generator), 0.5 * torch.randn(shape, generator=generator)
+
+
+def by_definition(u, guide, threshold):
+    """The sum over all pairs of voxels."""
+    out = torch.empty_like(u, dtype=torch.float64)
+    at = torch.stack(torch.meshgrid(*[torch.arange(n) for n in u.shape[1:]], indexing="ij"), -1).reshape(-1, 3).double()
+    square = (at[:, None] - at).square().sum(-1)
+    near = torch.exp(-0.5 * square / REACH**2) * (square <= (2 * REACH) ** 2)
+    for b in range(len(u)):
+        g, v = guide[b].double().flatten(), u[b].double().flatten()
+        alike = (1 - ((g[:, None] - g) / threshold[b]).square() / 4).clamp_min(0).square()
+        weights = near * alike
+        out[b] = (weights @ v / weights.sum(1)).reshape(u.shape[1:])
+    return out
+
+
+def test_it_is_what_it_says():
+    u, guide = volumes()
+    torch.testing.assert_close(joint_bilateral(u, guide, T).double(), by_definition(u, guide, T), rtol=1e-4, atol=1e-5)
+
+
+def test_constants_pass_and_edges_stay():
+    u, guide = volumes()
+    torch.testing.assert_close(joint_bilateral(u + 7.0, guide + 3.0, T), joint_bilateral(u, guide, T) + 7.0)
+    step = torch.zeros(1, 5, 6, 10)
+    step[..., 5:] = 100.0
+    torch.testing.assert_close(joint_bilateral(step, step, T[:1]), step)
+
+
+def test_a_turned_volume_gives_the_turned_result():
+    u, guide = volumes((1, 4, 8, 8))
+    turned = joint_bilateral(*(torch.rot90(v, 1, (-2, -1)) for v in (u, guide)), T[:1])
+    torch.testing.assert_close(turned, torch.rot90(joint_bilateral(u, guide, T[:1]), 1, (-2, -1)))
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_gradients(which):
+    given = list(volumes((2, 4, 5, 6)))
+    push, seen = (torch.randn(2, 4, 5, 6, generator=torch.Generator().manual_seed(k)) for k in (3, 4))
+    given[which].requires_grad_()
+    (joint_bilateral(*given, T) * seen).sum().backward()
+    slope = float((given[which].grad * push).sum())
+    ends = []
+    for sign in (1, -1):
+        moved = [v.detach() for v in given]
+        moved[which] = moved[which] + sign * 1e-2 * push
+        ends.append(float((joint_bilateral(*moved, T).double() * seen).sum()))
+    assert (ends[0] - ends[1]) / 2e-2 == pytest.approx(slope, rel=0.02, abs=0.02)
+
+
+CONFIG = NetworkConfig((6, 8, 8), 0.4, local_mm=1.6, turns=True, bilateral=True)
+
+
+def test_the_network_starts_from_half_of_it():
+    """With its last layer off it gives the filtered volume's share; turned and shifted scenes come along."""
+    torch.manual_seed(0)
+    network = Network(CONFIG).eval().requires_grad_(False)
+    u, towards = volumes((1, 8, 8, 8))
+    condition, noise = torch.zeros(1, 3), torch.tensor([0.3])
+    found = network(u, towards, condition, noise)
+    torch.testing.assert_close(network(u + 5, towards + 5, condition, noise), found + 5, rtol=1e-4, atol=1e-4)
+    turned = network(*(torch.rot90(v, 1, (-2, -1)) for v in (u, towards)), condition, noise)
+    torch.testing.assert_close(turned, torch.rot90(found, 1, (-2, -1)), rtol=1e-4, atol=1e-4)
+    network.leave.weight.zero_()
+    level = local_mean(u, 4.0)
+    smooth = joint_bilateral(towards, local_mean(towards, GUIDE_VOXELS), 2.0 * noise)
+    torch.testing.assert_close(network(u, towards, condition, noise), 0.5 * (level + smooth), rtol=1e-4, atol=1e-4)
+    with pytest.raises(ValueError, match="guide_noise"):
+        network(u, towards, condition)
+
+
+def test_noise_of_the_guide_is_that_of_draws(normalised):
+    """White spectra of two sizes: the formula against drawn noise through the same steps."""
+    problem, towards = normalised
+    found = guide_noise(problem.spectrum(), problem.beta.shape[-3:], problem.voxel_mm)
+    inner = local_mean(towards, GUIDE_VOXELS)[:, 6:-6, 6:-6, 6:-6]
+    assert float(inner.std()) == pytest.approx(float(found[0]), rel=0.1)
+
+
+@pytest.fixture(scope="module")
+def normalised():
+    """Noise alone, and the first step towards it."""
+    from recon.mbir.problem import filtered
+    from recon.mbir.unrolled import start
+    from train.config import DataConfig
+    from train.data import Data
+
+    data = Data(DataConfig(shape=(28, 28, 28), views=120))
+    batch = data.batch(0, 0, range(4))
+    first, clean = batch.problem, batch.with_noise_free
+    problem = replace(first, beta=first.beta - torch.cat([clean.beta[8:], clean.beta[8:]]))
+    spectrum = problem.spectrum()
+    v = start(problem, spectrum)
+    return problem, v + filtered(problem.beta - problem.apply(v), 1.0 / (spectrum + 0.1))
+
+
+def test_unrolled_with_the_filter_is_differentiable_in_the_data(normalised):
+    problem, _ = normalised
+    model = Unrolled(replace(CONFIG, voxel_mm=0.2), steps=1).eval()
+    beta = problem.beta[:1].clone().requires_grad_()
+    one = replace(problem, beta=beta, scale_hu=problem.scale_hu[:1], factor=problem.factor[:1])
+    model(one).square().sum().backward()
+    assert bool(torch.isfinite(beta.grad).all())
+    assert float(beta.grad.abs().max()) > 0
