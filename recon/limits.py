@@ -168,7 +168,7 @@ def deformation_limit(
     paper's cap (0.17 mm) or wall (0.19 mm) they are extrapolated, for a layer cannot vanish or turn over here.
 
     The figure hinges on the voxels, which must be small beside the layers: on large ones outlines that lie close
-    together change the same voxels and cannot be told apart (``tests/bench/shape_limit.py``: the paper's plaque).
+    together change the same voxels and cannot be told apart (the paper's plaque: not converged at 0.2 mm).
 
     Args:
         gram: AᵀWA of the inset at the exposure in question (``apply``), in mm⁻¹.

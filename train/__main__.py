@@ -39,7 +39,12 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--resume", action="store_true", help="continue the run in --out")
     parser.add_argument("--steps", type=int, metavar="N", help="optimisation steps, instead of the configuration's")
     parser.add_argument("--seed", type=int, metavar="N", help="seed, instead of the configuration's")
-    parser.add_argument("--weights", type=Path, metavar="FILE", help="start from the weights of another run, of a network as wide or less")
+    parser.add_argument(
+        "--weights",
+        type=Path,
+        metavar="FILE",
+        help="start from the weights of another run, of a network as wide or less",
+    )
     parser.add_argument("--threads", type=int, metavar="N", help="threads per process (default: torch's choice)")
     parser.add_argument("--no-progress", action="store_true", help="no progress line")
     parser.add_argument("--no-tensorboard", action="store_true", help="no TensorBoard events")

@@ -17,7 +17,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from recon.cli.evaluating import add_evaluate, add_show_task
+from recon.cli.evaluating import add_dose_factor, add_evaluate, add_show_task
 from recon.cli.looking import add_info, add_view
 from recon.cli.parsing import Commands, as_options, check_results, command, saying
 
@@ -80,33 +80,29 @@ def _own_study(arguments: argparse.Namespace, progress: ProgressBars) -> None:
 
 
 def _verify(arguments: argparse.Namespace, progress: ProgressBars) -> None:
-    from recon.study import verify
+    from recon.study import results
 
-    results, readme = arguments.root / "notebooks", arguments.root / "README.md"
-    claims, text = verify.load_claims(results / "claims.yaml"), readme.read_text(encoding="utf-8")
-    if arguments.write:
-        text = verify.rewrite(text, claims, results)
-        with written_whole(readme) as part:
-            part.write_text(text, encoding="utf-8")
-    wrong = [v for v in verify.verify(text, claims, results) if not v.ok]
-    for v in wrong:
-        print(f"FAIL  the results say: {v.said}\n      README.md says:  {v.found or 'nothing like it'}")
-    bare = [f"no claim covers the figures of: {line}" for line in verify.uncovered(text, claims, verify.RESULTS)]
-    bare += verify.unproven(claims)
-    for line in bare:
-        print(f"FAIL  {line}")
-    print(f"{len(claims) - len(wrong)} of {len(claims)} sentences with figures say what the results say")
+    root = arguments.root
+    stale = []
+    for name, text in results.render(root).items():
+        if not (root / name).exists() or (root / name).read_text(encoding="utf-8") != text:
+            stale.append(name)
+            if arguments.write:
+                with written_whole(root / name) as part:
+                    part.write_text(text, encoding="utf-8")
+    outcome = "say what the results say" if not stale else f"rendered: {', '.join(stale)}"
+    print(outcome if arguments.write or not stale else f"stale: {', '.join(stale)} (--write renders them)")
     changed = []
     for name in arguments.again:
-        committed = json.loads((results / registry.folder(name) / "report.json").read_text(encoding="utf-8"))
+        committed = json.loads((root / "notebooks" / registry.folder(name) / "report.json").read_text(encoding="utf-8"))
         settings = registry.settings_of(name, committed["settings"])
         again = json.loads(registry.run(name, settings, progress).json)
-        found = list(verify.differences(committed, again))
+        found = list(results.differences(committed, again))
         progress.close()
         print("\n".join([f"{name}: {len(found)} figures differ from the committed ones", *found]))
         changed += found
-    if wrong or bare or changed:
-        raise ValueError("README.md and the committed results do not agree: see above (--write mends the README)")
+    if (stale and not arguments.write) or changed:
+        raise ValueError("README.md, notebooks/RESULTS.md and the committed reports do not agree: see above")
 
 
 # --- parsing ------------------------------------------------------------------------------------------------------
@@ -115,39 +111,16 @@ def _verify(arguments: argparse.Namespace, progress: ProgressBars) -> None:
 def _add_compare(commands: Commands) -> None:
     parser = command(
         commands, "compare", _own_study, registry.STUDIES["compare"],
-        "Simulate the paper's plaque scan at full size, reconstruct it by FBP (kernels × voxel sizes), PWLS and MBIR "
-        "at 1×, 2×, 5.7× and 8× dose, and print what dose MBIR saves and the paper's tables beside its numbers. "
+        "Simulate the paper's plaque scan at full size, reconstruct it by FBP (kernels × voxel sizes) at 1×, "
+        "2×, 5.7× and 8× dose, measure what dose MBIR, PWLS and the best simple filter save, and print that; the "
+        "paper's tables beside ours go into the report. "
         "After an interruption the same command goes on.",
         "folder for report.json, report.md and compare.png (default out/compare)",
     )  # fmt: skip
     parser.add_argument("--realizations", type=int, metavar="N", help="per dose (default 10)")
     parser.add_argument("--quick", action="store_true", help="reduced views and settings: a first look, < 45 s")
-    parser.add_argument("--no-pwls", dest="pwls", action="store_const", const=False, help="leave PWLS out")
-    parser.add_argument("--no-mbir", dest="mbir", action="store_const", const=False, help="no MBIR, no dose factors")
-
-
-def _add_dose_factor(commands: Commands) -> None:
-    parser = command(
-        commands, "dose-factor", _own_study, registry.STUDIES["dose-factor"],
-        "Reconstruct the same noise realisations of the paper's scan by every method and measure the dose "
-        "at which FBP reaches the same figure: the paper's CNR, slope-corrected contrast variance, observer. Finished "
-        "pieces in the folder are kept: after an interruption the same command goes on.",
-        "folder for pieces, report.json, report.md and figures (default out/dose-factor)",
-    )  # fmt: skip
-    parser.add_argument("--n", type=int, help="paired realisations per dose and scene (default 200)")
-    parser.add_argument("--slow-n", type=int, help="the same for the slow baselines (default 48)")
-    parser.add_argument("--tissue-n", type=int, help="realisations of MBIR + tissues (default 100)")
-    parser.add_argument("--scene-n", type=int, help="realisations of each further scene and vessel (default 100)")
-    parser.add_argument("--doses", type=float, nargs="+", metavar="S", help="exposures in s")
-    parser.add_argument("--scene-doses", type=float, nargs="+", metavar="S", help="of further scenes")
-    parser.add_argument("--methods", nargs="+", metavar="M", help="linear quadratic qggmrf tv mbir mbir_measuring …")
-    parser.add_argument("--scenes", nargs="*", metavar="NAME", help="further scenes (none: leave out)")
-    parser.add_argument("--scene-methods", nargs="+", metavar="M", help="methods of further scenes and vessels")
-    parser.add_argument("--vessels", nargs="*", metavar="NAME", help="vessels of other directions (none: leave out)")
-    parser.add_argument(
-        "--fast-noise", action="store_const", const=True, help="draw the noise of AᵀW y, not that of the readings"
-    )
-    parser.add_argument("--quick", action="store_true", help="12 realisations, one dose, 164 views: about a minute")
+    parser.add_argument("--methods", nargs="*", metavar="METHOD", help="beside FBP, as of evaluate (none: FBP alone)")
+    parser.add_argument("--method-draws", type=int, metavar="N", help="realisations of these (default 16)")
 
 
 def _add_hardcases(commands: Commands) -> None:
@@ -185,14 +158,14 @@ def _add_study(commands: Commands) -> None:
 
 
 def _add_verify(commands: Commands) -> None:
-    text = "Compare every figure of the README with the key of the committed result that it comes from "
     parser = commands.add_parser(
-        "verify", help="do the README's figures say what the committed results say?",
-        description=f"{text}(notebooks/claims.yaml), and compute studies again if asked.",
+        "verify", help="do README and RESULTS.md say what the committed reports say?",
+        description="Render the results again from the committed reports (notebooks/results.template.md) and compare; "
+        "compute studies again if asked.",
     )  # fmt: skip
     parser.set_defaults(run=_verify, device="cpu", no_progress=False, verbose=False)
     parser.add_argument("--root", type=Path, default=Path(), help="folder of the repository (default: this one)")
-    parser.add_argument("--write", action="store_true", help="put the committed figures into the README")
+    parser.add_argument("--write", action="store_true", help="write what is rendered")
     parser.add_argument("--again", nargs="*", default=[], metavar="STUDY", help="compute these studies again, in full")
 
 
@@ -204,8 +177,8 @@ def _parser() -> tuple[argparse.ArgumentParser, Commands]:
     parser.add_argument("--version", action="version", version=f"torchpcct {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     scans = (add_simulate, add_show_config, add_reconstruct, add_lower_dose, add_info, add_view)
-    studies = (_add_compare, _add_dose_factor, _add_hardcases, _add_study)
-    for add in (add_evaluate, add_show_task, *studies, *scans, add_plaque, _add_verify):
+    studies = (_add_compare, _add_hardcases, _add_study)
+    for add in (add_evaluate, add_dose_factor, add_show_task, *studies, *scans, add_plaque, _add_verify):
         add(commands)
     return parser, commands
 

@@ -15,7 +15,38 @@ from recon.cli.parsing import Commands, check_results, command
 if TYPE_CHECKING:
     from recon.study.study import ProgressBars
 
-__all__ = ["add_evaluate", "add_show_task"]
+__all__ = ["add_dose_factor", "add_evaluate", "add_show_task"]
+
+_STUDY_TASKS = (
+    "plaque",
+    "half_contrast",
+    "half_size_core",
+    "two_cores",
+    "small_vessel",
+    "tilted",
+    "in_plane",
+    "curved",
+    "muscle_sphere",
+    "line_pairs_10",
+    "line_pairs_14",
+    "rod",
+)
+_STUDY_METHODS = (
+    "fbp:soft",
+    "fbp:standard",
+    "fbp:detail",
+    "gaussian@fbp:standard",
+    "perona_malik@fbp:standard",
+    "nlm@fbp:standard",
+    "tv@fbp:standard",
+    "bilateral@fbp:detail",
+    "pwls",
+    "mbir:look=0",
+    "mbir",
+    "mbir:look=1",
+    "mbir:tissues",
+)
+"""Of ``dose-factor``: every method of the package, and each filter on the kernel on which it has the least error."""
 
 _MEASURED = ("noise", "noise_reference", "dose_factor", "f50", "resolution")
 
@@ -24,7 +55,7 @@ def _evaluate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     from recon.evaluate.experiment import evaluate, export_scans
     from recon.evaluate.report import save, text_of
 
-    out = arguments.out or Path("out/evaluate")
+    out = arguments.out or Path(f"out/{arguments.command}")
     if out.is_file():
         raise ValueError(f"{out} is a file: --out names a folder")
     check_results(arguments, out, lambda report: "records" in report, "report.*", "*.png")
@@ -32,13 +63,14 @@ def _evaluate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     sys.path.insert(0, os.getcwd())
     methods = [*(arguments.method or []), *map(_denoiser, arguments.denoiser or [])]
     if not methods:
-        methods = ["fbp:soft", "bilateral@fbp:detail", "mbir"]
+        methods = list(arguments.methods)
+    tasks = arguments.task or list(arguments.tasks)
     if arguments.scans:
         _scans(arguments, methods)
         return
     if arguments.export is not None:
         written = export_scans(
-            arguments.task or ["plaque"], arguments.export, exposures_s=arguments.exposure, n=arguments.n,
+            tasks, arguments.export, exposures_s=arguments.exposure, n=arguments.n,
             seed=arguments.seed, progress=progress,
         )  # fmt: skip
         progress.close()
@@ -48,7 +80,7 @@ def _evaluate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         )
         return
     found = evaluate(
-        arguments.task or ["plaque"], methods, exposures_s=arguments.exposure, n=arguments.n, seed=arguments.seed,
+        tasks, methods, exposures_s=arguments.exposure, n=arguments.n, seed=arguments.seed,
         folder=out / "pieces", progress=progress,
     )  # fmt: skip
     progress.close()
@@ -106,6 +138,7 @@ def add_evaluate(commands: Commands) -> None:
         "more methods computes only those.",
         "folder for report.md, .json, .csv, .html and pictures (default out/evaluate)",
     )  # fmt: skip
+    parser.set_defaults(tasks=("plaque",), methods=("fbp:soft", "bilateral@fbp:detail", "mbir"))
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = (
         "methods: fbp:KERNEL, pwls, mbir, mbir:look=1, mbir:weights=FILE, mbir:tissues,\n"
@@ -115,13 +148,7 @@ def add_evaluate(commands: Commands) -> None:
         "  torchpcct evaluate --task nodule --method mbir --n 20\n"
         "  torchpcct evaluate --task my.yaml --method mylab.nets:reconstruct --denoiser mylab.nets:denoise@fbp:detail\n"
     )
-    parser.add_argument(
-        "--task", action="append", metavar="TASK", help="name or YAML file, repeatable (default plaque)"
-    )
-    parser.add_argument("--method", action="append", metavar="METHOD", help="see below (repeatable)")
-    parser.add_argument(
-        "--denoiser", action="append", metavar="FUNCTION@BASE", help="a function of (volume) or (volume, sigma) in HU"
-    )
+    _add_common(parser, n=20)
     parser.add_argument(
         "--scans",
         nargs="+",
@@ -135,8 +162,28 @@ def add_evaluate(commands: Commands) -> None:
     parser.add_argument(
         "--export", type=Path, metavar="FOLDER", help="write the noisy scans for another program instead of evaluating"
     )
+
+
+def add_dose_factor(commands: Commands) -> None:
+    parser = command(
+        commands, "dose-factor", _evaluate, "the whole measurement: every method of the package at every plaque task",
+        "evaluate with the methods of this package, the simple filters among them, at the paper's plaque, its "
+        "variants, vessels of other directions, a sphere in muscle, line pairs and a low-contrast rod, with 200 "
+        "realisations: hours on two cores, kept piece by piece.",
+        "folder for report.md, .json, .csv, .html and pictures (default out/dose-factor)",
+    )  # fmt: skip
+    parser.set_defaults(tasks=_STUDY_TASKS, methods=_STUDY_METHODS, scans=None, export=None)
+    _add_common(parser, n=200)
+
+
+def _add_common(parser: argparse.ArgumentParser, n: int) -> None:
+    parser.add_argument("--task", action="append", metavar="TASK", help="name or YAML file, repeatable")
+    parser.add_argument("--method", action="append", metavar="METHOD", help="see below (repeatable)")
+    parser.add_argument(
+        "--denoiser", action="append", metavar="FUNCTION@BASE", help="a function of (volume) or (volume, sigma) in HU"
+    )
     parser.add_argument("--exposure", type=float, nargs="+", metavar="S", help="in s (default: those of each task)")
-    parser.add_argument("--n", type=int, default=20, help="noise realisations, at least 8 (default 20)")
+    parser.add_argument("--n", type=int, default=n, help=f"noise realisations, at least 8 (default {n})")
 
 
 def add_show_task(commands: Commands) -> None:

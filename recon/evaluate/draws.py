@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.evaluate.methods import Method, noise_of
+from recon.evaluate.response import response, statistic_covariance
 from recon.evaluate.store import Store
 from recon.evaluate.task import Facts, Task
 from recon.fbp.exact_noise import roi_covariance
@@ -108,6 +109,17 @@ class Draws:
 
         found = self.store.piece(f"exact_{kernel}", f"1 {self.task.fingerprint}", compute)["c"]
         return np.asarray(found).reshape(len(regions), 2, len(regions), 2)
+
+    def response(self, network: Mbir, reader: Any, exposure_s: float) -> dict[str, Any]:
+        """``adjoints`` ``(2 · rois, z, y, x)`` of MBIR's ROI means, ``mean`` and ``covariance`` of what they give."""
+        twins = [self.noise_free(p, exposure_s).statistic for p in (True, False)]
+        g = response(
+            lambda b: network(self.problem, b, exposure_s), self.problem, reader.weights, twins[0], exposure_s
+        )  # fmt: skip
+        covariance = statistic_covariance(self.problem, g, exposure_s, self.clean[0])
+        rois = len(g) // 2
+        mean = np.stack([torch.einsum("zyx,rzyx->r", b.double(), g).numpy().reshape(rois, 2) for b in twins])
+        return {"adjoints": g.numpy(), "mean": mean, "covariance": covariance.reshape(rois, 2, rois, 2)}
 
     def noise_free(self, present: bool, exposure_s: float) -> Simulated:
         """Without noise; ``exposure_s`` is what a method is told."""

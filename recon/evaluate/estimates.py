@@ -4,8 +4,9 @@ One rule makes every dose factor: of two methods the one whose figure is larger 
 and every figure here (noise variance, variance of a contrast at slope 1, CNR², d′²) is proportional to the dose for a
 linear method. So the factor is the ratio of the method's figure to the linear reference's at the same dose. Both are of
 the same noise realisations, so what is luck of the draws cancels in the ratio; intervals are jackknife intervals over
-realisations (:mod:`torchpcct.metrics.jackknife`). The reference's own ROI means, whose moments are exactly known, also
-control what is drawn of the other methods (:mod:`torchpcct.metrics.control`); of FBP all but noise and d′ is exact.
+realisations (:mod:`torchpcct.metrics.jackknife`). What is drawn is controlled (:mod:`torchpcct.metrics.control`) by
+linear functionals of the same noise, whose moments are exactly known: of MBIR by its own response
+(:mod:`recon.evaluate.response`), of other methods by the reference's ROI means. Of FBP all but noise and d′ is exact.
 
 * slope: contrast that the signal adds over the true one; a method may buy low noise with it, so contrasts are compared
   at slope 1: variance over slope²;
@@ -164,7 +165,11 @@ def records_of(
         rois: their names.
         exact: covariance of a linear method's ROI means; None: drawn.
     """
-    own, other = _Figures(readings, true, reference, exact), _Figures(base, true, reference, reference.covariance)
+    control = reference
+    if readings.control is not None:
+        drawn, mean, covariance = readings.control
+        control = Known(covariance, mean, drawn)
+    own, other = _Figures(readings, true, control, exact), _Figures(base, true, reference, reference.covariance)
     found: list[Record] = []
 
     def add(figure: str, where: str, value: Any, unit: str = "", transform: float | None = None) -> None:

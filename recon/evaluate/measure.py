@@ -51,6 +51,8 @@ class Readings:
         square: ``(n,)`` mean square error with the signal near the bodies, HU².
         flat: tissue → ``(n, voxels)`` HU, with the signal.
         clean_rois: ``(2, rois, 2)`` of noise-free data; clean_square; clean_channels: likewise.
+        control: ``(n, 2, rois, 2)`` HU: linear functionals of the same draws that follow ``rois``, with their mean
+            ``(2, rois, 2)`` and covariance ``(rois, 2, rois, 2)``; None: the reference's ROI means serve.
         first: first volume with the signal, float16, and that of noise-free data.
         seconds: of a volume.
     """
@@ -62,6 +64,7 @@ class Readings:
     clean_rois: Floats
     clean_square: float
     clean_channels: dict[str, Floats]
+    control: tuple[Floats, Floats, Floats] | None
     first: NDArray[np.float16]
     first_clean: NDArray[np.float16]
     seconds: float
@@ -83,7 +86,7 @@ class Reader:
     def __init__(self, task: Task, truth: tuple[Tensor, Tensor]) -> None:
         self.task, self.truth = task, truth
         self.rois = tuple(task.regions)
-        self._weights = torch.stack([w for pair in task.regions.values() for w in pair])
+        self.weights = torch.stack([w for pair in task.regions.values() for w in pair])
 
     @cached_property
     def channels(self) -> dict[str, Tensor]:
@@ -105,7 +108,7 @@ class Reader:
 
     def pair(self, volume: Tensor) -> Floats:
         """``(rois, 2)`` means."""
-        found = torch.einsum("zyx,rzyx->r", volume.double(), self._weights)
+        found = torch.einsum("zyx,rzyx->r", volume.double(), self.weights)
         return np.asarray(found.numpy()).reshape(-1, 2)
 
     def responses(self, volume: Tensor, observer: str) -> Floats:
@@ -178,16 +181,21 @@ def measure_method(
 ) -> Readings:  # fmt: skip
     """``n`` realisations of a method."""
     place = f"{_file_name(method.name)}/{exposure_s:g}s"
-    key = f"3 {method.name} {method.key} {draws.seed} {draws.task.fingerprint}"
+    key = f"4 {method.name} {method.key} {draws.seed} {draws.task.fingerprint}"
 
     def clean() -> dict[str, Any]:
         check_method(method, reader, draws, exposure_s)
         return _of([[draws.noise_free(p, exposure_s) for p in (True, False)]], method, reader, keep=True)
 
     def block(k: range) -> dict[str, Any]:
-        return _of([draws.draw(exposure_s, i) for i in k], method, reader, keep=k.start == 0)
+        return _of([draws.draw(exposure_s, i) for i in k], method, reader, keep=k.start == 0, adjoints=adjoints)
 
     without_noise = store.piece(f"{place}/clean", key, clean)
+    adjoints = known = None
+    if method.network is not None:
+        respond = partial(draws.response, method.network, reader, exposure_s)
+        known = store.piece(f"{place}/response", key, respond)
+        adjoints = torch.from_numpy(known["adjoints"])
     pieces = []
     for start in range(0, n, BLOCK):
         k = range(start, min(start + BLOCK, n))
@@ -198,13 +206,17 @@ def measure_method(
     return Readings(
         joined["rois"], {o: joined[f"channels_{o}"] for o in OBSERVERS}, joined["square"],
         {t: joined[f"flat_{t}"] for t in draws.task.flat}, without_noise["rois"][0], float(without_noise["square"][0]),
-        {o: without_noise[f"channels_{o}"][0] for o in OBSERVERS}, pieces[0]["first"], without_noise["first"],
+        {o: without_noise[f"channels_{o}"][0] for o in OBSERVERS},
+        None if known is None else (joined["control"], known["mean"], known["covariance"]),
+        pieces[0]["first"], without_noise["first"],
         float(np.mean([p["seconds"] for p in pieces])),
     )  # fmt: skip
 
 
-def _of(pairs: Sequence[Sequence[Draw]], method: Method, reader: Reader, keep: bool) -> dict[str, Any]:
-    rois, square, seconds = [], [], []
+def _of(
+    pairs: Sequence[Sequence[Any]], method: Method, reader: Reader, keep: bool, adjoints: Tensor | None = None
+) -> dict[str, Any]:
+    rois, square, seconds, control = [], [], [], []
     channels: dict[str, list[Any]] = {o: [] for o in OBSERVERS}
     flat: dict[str, list[Any]] = {t: [] for t in reader.task.flat}
     first = None
@@ -215,6 +227,8 @@ def _of(pairs: Sequence[Sequence[Draw]], method: Method, reader: Reader, keep: b
             volumes.append(volume_of(method, draw))
             seconds.append(time.perf_counter() - began)
         rois.append([reader.pair(v) for v in volumes])
+        if adjoints is not None:
+            control.append([functionals(adjoints, draw.statistic) for draw in pair])
         for o in OBSERVERS:
             channels[o].append([reader.responses(v, o) for v in volumes])
         square.append(reader.square(volumes[0]))
@@ -223,9 +237,15 @@ def _of(pairs: Sequence[Sequence[Draw]], method: Method, reader: Reader, keep: b
         if keep and first is None:
             first = volumes[0].numpy().astype(np.float16)
     found = {"rois": np.array(rois), "square": np.array(square), "seconds": np.array(np.median(seconds))}
+    found |= {"control": np.array(control)} if control else {}
     found |= {f"channels_{o}": np.array(v) for o, v in channels.items()}
     found |= {f"flat_{t}": np.array(v, dtype=np.float32) for t, v in flat.items()}
     return found if first is None else {**found, "first": first}
+
+
+def functionals(adjoints: Tensor, statistic: Tensor) -> Floats:
+    """Of AᵀWy ``(z, y, x)``: ``(rois, 2)`` HU, of adjoints ``(2 · rois, z, y, x)``."""
+    return np.asarray(torch.einsum("zyx,rzyx->r", statistic.double(), adjoints).numpy()).reshape(-1, 2)
 
 
 def _file_name(name: str) -> str:

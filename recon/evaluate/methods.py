@@ -87,6 +87,7 @@ class Method:
         key: what its results depend on beside its name (weights, source), so that kept ones are not mixed up.
         kernels: of FBP that it asks a draw for.
         is_fbp: its volume is FBP with the first of them: means and variances of its ROIs are exact.
+        network: it is this MBIR, whose own response to noise controls what is drawn.
     """
 
     name: str
@@ -94,6 +95,7 @@ class Method:
     key: str = ""
     kernels: tuple[str, ...] = ()
     is_fbp: bool = False
+    network: Mbir | None = None
 
 
 def method_of(spec: Any) -> Method:
@@ -199,9 +201,9 @@ def _mbir(spec: str, rest: str) -> Method:
     if "look" in given:
         network = network.looking(number("look", float(given["look"]), low=0.0, high=1.0))
     if "tissues" in given:
-        network = TissueMbir(network)
-
-    return Method(spec, lambda draw: draw.mbir(network), key=network.weights_sha256)
+        fitted = TissueMbir(network)
+        return Method(spec, lambda draw: draw.mbir(fitted), key=network.weights_sha256)
+    return Method(spec, lambda draw: draw.mbir(network), key=network.weights_sha256, network=network)
 
 
 def _of_function(name: str, function: Callable[..., Any]) -> Method:

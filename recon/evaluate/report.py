@@ -18,7 +18,7 @@ from recon.evaluate.estimates import Record, pivot
 from recon.evaluate.experiment import Evaluation, Seen
 from torchpcct.files import written_whole
 
-__all__ = ["save", "text_of"]
+__all__ = ["plain", "save", "task_sections", "text_of"]
 
 COLUMNS = ("task", "method", "exposure_s", "figure", "where", "value", "low", "high", "unit", "n")
 _WINDOW_HU = (-160.0, 240.0)
@@ -32,11 +32,20 @@ look. Limit: an unbiased estimate that knows all outlines."""
 
 def text_of(evaluation: Evaluation) -> str:
     """Markdown."""
+    return "\n".join(["# Evaluation\n", *task_sections(evaluation)])
+
+
+def task_sections(evaluation: Evaluation) -> list[str]:
+    """Markdown of each task."""
     n = evaluation.settings["n"]
-    parts = ["# Evaluation\n"]
-    for seen in evaluation.seen:
-        parts.append(_task_text(seen, [r for r in evaluation.records if r["task"] == seen.task.name], n))
-    return "\n".join(parts)
+    return [
+        _task_text(seen, [r for r in evaluation.records if r["task"] == seen.task.name], n) for seen in evaluation.seen
+    ]
+
+
+def plain(records: list[Record]) -> list[Record]:
+    """JSON values: None for NaN."""
+    return [{k: None if isinstance(v, float) and math.isnan(v) else v for k, v in r.items()} for r in records]
 
 
 def _task_text(seen: Seen, records: list[Record], n: int) -> str:
@@ -120,9 +129,7 @@ def save(evaluation: Evaluation, folder: str | os.PathLike[str], command: str = 
     writer.writeheader()
     writer.writerows([{k: "" if isinstance(v, float) and math.isnan(v) else v for k, v in r.items()}
                       for r in evaluation.records])  # fmt: skip
-    plain = [{k: None if isinstance(v, float) and math.isnan(v) else v for k, v in r.items()}
-             for r in evaluation.records]  # fmt: skip
-    data = {"settings": evaluation.settings, "command": command, "records": plain}
+    data = {"settings": evaluation.settings, "command": command, "records": plain(evaluation.records)}
     pictures = {f"{s.task.name}.png": _picture(s) for s in evaluation.seen}
     files: dict[str, bytes] = {
         "report.md": text.encode(), "report.csv": table.getvalue().encode(),

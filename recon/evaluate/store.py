@@ -87,10 +87,6 @@ class Store:
                 log.info("cleared while it was written: %s", error)
         return arrays
 
-    def drop(self, name: str) -> None:
-        """Forget what lies below a piece's name: its parts, of no use once the piece is there."""
-        clear_folder(self.folder / name)
-
 
 T = TypeVar("T")
 
@@ -134,6 +130,10 @@ class Pieces:
         other = copy.copy(self)
         other._prefix = f"{self._prefix}{prefix}/"
         return other
+
+    def folder(self, name: str) -> Path | None:
+        """For an evaluation that is part of the study and keeps its own pieces; None: nothing is kept."""
+        return None if self._store is None else self._store.folder / self._prefix / name
 
     @classmethod
     def clear(cls, folder: str | Path) -> None:

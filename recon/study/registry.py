@@ -22,7 +22,6 @@ __all__ = ["STUDIES", "build_settings", "folder", "part", "run", "settings_of"]
 
 STUDIES: dict[str, str] = {
     "compare": "what dose MBIR saves against FBP, and the paper's CNR tables by FBP, PWLS and MBIR",
-    "dose-factor": "the dose that each method saves against FBP, measured, beside what the data allow",
     "phantom": "the plaque itself: densities, mass fractions, CT numbers and lengths beside the paper's",
     "detector": "the silicon detector: counts, DQE beside the published one, pile-up, charge sharing",
     "bowtie": "ROI bowtie: CTDI and thorax dose, noise inside and outside, and its product with MBIR",

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from recon.evaluate.vessels import vessel
 from recon.plaque import TissueData, read_plaque
-from recon.study.dose_factor.vessels import fine_grid, projected
+from torchpcct import Projector
 from torchpcct.files import written_whole
 from torchpcct.geometry import VolumeGrid
 
@@ -65,7 +65,8 @@ def statistic(draws: Draws, kind: str, k: int, exposure_s: float) -> Tensor:
         image = draws._held_out(8 * seed + k // 2)[0]
         b = gram.apply(image * hu + problem.mu_ref - problem.level)
     else:
-        fine, fat = fine_grid(problem.grid), TISSUES_HU["fat"]
+        g, fat = problem.grid, TISSUES_HU["fat"]
+        fine = VolumeGrid(tuple(2 * n for n in g.shape), g.spacing[0] / 2, g.center)
         blood = PLAIN_BLOOD_HU if kind == "no contrast agent" else TISSUES_HU["lumen"]
         values = {n: TISSUES_HU[n] - fat for n in ("wall", "fibrous")} | {"lumen": blood - fat}
         values["core"] = values["fibrous"]
@@ -73,7 +74,8 @@ def statistic(draws: Draws, kind: str, k: int, exposure_s: float) -> Tensor:
         if kind == "second vessel":
             for part, value in zip(tube(fine, k), (WALL_HU, TISSUES_HU["lumen"]), strict=True):
                 above[part] = value - fat
-        b = projected(problem, above * hu, fine).to(gram.dtype) * exposure_s
+        lines = Projector(problem.geometry, fine, problem.window)(torch.as_tensor(above * hu, dtype=gram.dtype))
+        b = problem.projector.T(problem.weights * lines).to(gram.dtype) * exposure_s
     return b + gram.noise(generator=torch.Generator().manual_seed(seed))
 
 
@@ -98,7 +100,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--particles", type=int, default=300)
     parser.add_argument("--work", type=Path, default=Path("out/bench-beside"), help="folder for finished readings")
-    parser.add_argument("--scans", type=Path, help="folder scans/ of the dose-factor study")
+    parser.add_argument("--scans", type=Path, help="folder with noise-free scans")
     draws = Draws((options := parser.parse_args()).work, options.scans)
     options.work.mkdir(parents=True, exist_ok=True)
     for k, (kind, n), e in product(range(max(COUNTS.values())), COUNTS.items(), EXPOSURES_S["sound"]):

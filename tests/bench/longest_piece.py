@@ -38,11 +38,7 @@ COMMANDS: dict[str, list[str]] = {
     "bowtie": ["study", "bowtie"],
     "hardcases": ["hardcases"],
     "motion": ["study", "motion"],
-    "dose-factor": [
-        "dose-factor", "--n", "8", "--slow-n", "8", "--tissue-n", "8", "--doses", "0.35", "--methods", "linear",
-        "quadratic", "mbir", "mbir_tissues", "fbp_cnn", "qggmrf", "tv", "--scenes", "stent", "--vessels", "curved_5mm",
-        "--scene-n", "8", "--scene-doses", "0.35", "--scene-methods", "linear", "mbir", "mbir_tissues",
-    ],
+    "dose-factor": ["dose-factor", "--n", "8", "--exposure", "0.35", "--task", "plaque", "--task", "curved"],
     "train": [],
 }  # fmt: skip
 

@@ -8,7 +8,7 @@ same readings. What the model does not have (texture, soft edges, a calcificatio
 (``train.scenes.held_out``) are drawn through the operator, without readings. Finished draws in the work folder are
 kept: after an interruption the same command goes on; ``--summary`` tells what there is, ``--mbir`` reads MBIR of the
 package's weights over the regions of the finished draws. True values are those of rods of each tissue at the plaque's
-place (``torchpcct dose-factor``), areas and volumes those of the scene.
+place (least squares on noise-free readings), areas and volumes those of the scene.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ CASES = {
 }
 POINT_SD_MM = 0.4
 TISSUES_HU = {**ROD_HU, "contrast": ROD_HU["fibrous"] - ROD_HU["core"]}
-"""By rods of 4 mm (``notebooks/dose_factor``). Blood with iodine hardens its own beam: least squares with exact path
+"""By rods of 4 mm. Blood with iodine hardens its own beam: least squares with exact path
 lengths gives the narrower lumen 484.7 HU in the plaque (``notebooks/fbp_vs_mbir.ipynb``), where readings of scans
 find 485.0; of what is drawn through the operator they find the 480.0 that were drawn."""
 TEXTURE_HU, TEXTURE_MM, SOFT_MM, CALCIFICATION_HU = 10.0, 0.3, 0.12, 1500.0
@@ -76,7 +76,7 @@ _FINE = 5
 """Points along each edge of a voxel, where a scene is drawn through the operator."""
 PLAQUE_ONLY = ("core", "contrast", "core volume", "cap thickness")
 FBP_PAPER_SD_HU = 28.2
-"""Of soft FBP's contrast in the paper's ROIs at 2.0 s, exact (``notebooks/dose_factor``)."""
+"""Of soft FBP's contrast in the paper's ROIs at 2.0 s, exact."""
 
 
 def truth(**changed: float) -> dict[str, float]:
@@ -436,7 +436,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--n", type=int, default=48, help="draws of every case")
     parser.add_argument("--work", type=Path, default=Path("out/bench-plaque"), help="folder for finished draws")
-    parser.add_argument("--scans", type=Path, help="folder scans/ of the dose-factor study, to save the simulation")
+    parser.add_argument("--scans", type=Path, help="folder with noise-free scans, to save the simulation")
     parser.add_argument("--out", type=Path, default=Path("notebooks/plaque"), help="folder for the report")
     parser.add_argument("--cases", nargs="+", default=list(CASES), choices=list(CASES))
     parser.add_argument("--mbir", action="store_true", help="read MBIR over the regions of finished draws")

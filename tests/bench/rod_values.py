@@ -1,4 +1,4 @@
-"""CT numbers of 4 mm rods of each tissue at the plaque's place: ``truth`` of ``notebooks/dose_factor/report.json``."""
+"""CT numbers of 4 mm rods of each tissue at the plaque's place (:mod:`recon.study.paper.rods`)."""
 
 from __future__ import annotations
 

@@ -11,12 +11,7 @@ from recon.study.report import Report
 TINY: dict[str, dict[str, Any]] = {
     "compare": {
         "realizations": 3, "views": 48, "kernels": ("soft",), "voxels_mm": (0.4,), "doses": {"1x": 0.35, "5.7x": 2.0},
-        "pwls": False, "mbir": False, "placements": False,
-    },
-    "dose-factor": {
-        "n": 14, "slow_n": 12, "scene_n": 9, "doses": (2.0,), "scene_doses": (2.0,), "methods": ("linear", "qggmrf"),
-        "scenes": ("half_size_core",), "scene_methods": ("linear", "qggmrf"), "views": 24, "voxel_mm": 0.4,
-        "kernels": ("soft",), "block": 7, "vessels": ("curved_5mm",),
+        "methods": (), "placements": False,
     },
     "phantom": {"voxel_mm": 0.05, "sections": 2, "energies_kev": (55.0, 64.0)},
     "detector": {"photons": 4000, "dead_times_ns": (50.0,), "charge_sharing": (0.1,)},

@@ -17,6 +17,7 @@ from analytic import Ellipsoid, line_integrals
 
 from recon.cli import main
 from recon.cli.parsing import as_options, saying
+from recon.study.results import README_MARKS
 from torchpcct import ParallelBeam, Scan, Volume, VolumeGrid, __version__
 from torchpcct.acquisition.config import read_config
 from torchpcct.formats.geometry_yaml import geometry_of
@@ -327,20 +328,21 @@ def test_help(command, capsys):
 
 
 def test_verify_finds_a_stale_readme_and_mends_it(tmp_path, capsys):
-    (tmp_path / "notebooks").mkdir()
-    (tmp_path / "notebooks" / "r.json").write_text('{"a": 1.26}', encoding="utf-8")
-    (tmp_path / "notebooks" / "claims.yaml").write_text(
-        '- {text: "it is {a:.1f}×", values: {a: "r.json: a"}}\n', encoding="utf-8"
+    folder = tmp_path / "notebooks"
+    folder.mkdir()
+    (folder / "r.json").write_text('{"a": 1.26}', encoding="utf-8")
+    first, last = README_MARKS
+    (folder / "results.template.md").write_text(
+        f"{first}\nSo it is {{{{r.json: a | .1f}}}}× now.\n{last}\n", encoding="utf-8"
     )
     readme = tmp_path / "README.md"
-    readme.write_text("# T\n\n## The studies\n\nSo it is 1.2× now.\n", encoding="utf-8")
+    readme.write_text(f"# T\n{first}\nSo it is 1.2× now.\n{last}\n", encoding="utf-8")
     assert main(["verify", "--root", str(tmp_path)]) == 2
-    assert "the results say: it is 1.3×" in capsys.readouterr().out
+    assert "stale: README.md, notebooks/RESULTS.md" in capsys.readouterr().out
     assert main(["verify", "--root", str(tmp_path), "--write"]) == 0
     assert "So it is 1.3× now." in readme.read_text(encoding="utf-8")
-    readme.write_text("# T\n\n## The studies\n\nSo it is 1.3× now, of 7.\n", encoding="utf-8")
-    assert main(["verify", "--root", str(tmp_path)]) == 2
-    assert "no claim covers the figures of: So it is" in capsys.readouterr().out
+    assert (folder / "RESULTS.md").read_text(encoding="utf-8") == "So it is 1.3× now.\n"
+    assert main(["verify", "--root", str(tmp_path)]) == 0
 
 
 def test_a_report_says_what_it_was_made_of_and_how(tmp_path, capsys):

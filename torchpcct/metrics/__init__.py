@@ -1,27 +1,17 @@
-"""Figures of merit: CNR, the limit of the data, dose factor, observer, resolution, noise.
+"""Figures of merit: CNR, the limit of the data, observer, resolution, noise.
 
 Reading order: ``placement`` and ``roi`` say where is measured, ``cnr`` is the paper's figure over realisations,
-``data_limit`` the best that any unbiased method can reach. ``bootstrap`` gives every figure its interval. With it
-``dose_curve`` → ``contrast_slope`` → ``dose_factor`` answer what dose FBP needs for what a method shows. ``observer``
-asks whether the core is seen, ``resolution`` and ``noise_power`` how sharp and how noisy an image is, and
+``data_limit`` the best that any unbiased method can reach. ``bootstrap`` and ``jackknife`` give figures their
+intervals, ``control`` narrows them. (What they are for, the dose factor, is :mod:`recon.evaluate`.) ``observer`` asks
+whether the core is seen, ``resolution`` and ``noise_power`` how sharp and how noisy an image is, and
 ``plaque_measures`` what a reader takes from it: lumen, core and cap. ``residual_test`` asks whether a volume explains
 its data at all, ``half_split`` what noise and resolution a real scan has, without a truth.
 """
 
 from torchpcct.metrics.bootstrap import Estimate
 from torchpcct.metrics.cnr import Interval, cnr, cnr_from_moments, cnr_interval, cnr_range, mean_interval, sd_interval
-from torchpcct.metrics.contrast_slope import ContrastSlope, contrast_slope, roi_bias
-from torchpcct.metrics.control import (
-    controlled_cnr,
-    controlled_log_variance,
-    controlled_mean,
-    controlled_slope,
-    expected_half_width,
-    variance_factor,
-)
+from torchpcct.metrics.control import controlled_log_variance, controlled_mean
 from torchpcct.metrics.data_limit import Ceiling, ceiling, information_matrix, paper_cnr_ceiling
-from torchpcct.metrics.dose_curve import DoseCurve, MeasuredDoseCurve
-from torchpcct.metrics.dose_factor import DoseFactor, dose_factor, efficiency
 from torchpcct.metrics.image_noise import RegionNoise, central_frequency_ratio, noise_magnitude_ratio
 from torchpcct.metrics.jackknife import Jackknifed, combined
 from torchpcct.metrics.matched_resolution import (
@@ -60,15 +50,11 @@ from torchpcct.metrics.resolution import (
 
 __all__ = [
     "Ceiling",
-    "ContrastSlope",
-    "DoseCurve",
-    "DoseFactor",
     "Estimate",
     "Interval",
     "Jackknifed",
     "LinearReference",
     "MatchedNoise",
-    "MeasuredDoseCurve",
     "NoiseCovariance",
     "NoisePower",
     "ObserverResult",
@@ -86,20 +72,14 @@ __all__ = [
     "cnr_interval",
     "cnr_range",
     "combined",
-    "contrast_slope",
-    "controlled_cnr",
     "controlled_log_variance",
     "controlled_mean",
-    "controlled_slope",
     "d_prime",
     "dog_channels",
-    "dose_factor",
     "edge_mask",
     "edge_profile",
     "edge_width",
-    "efficiency",
     "ellipsoid_distance",
-    "expected_half_width",
     "false_positive_difference",
     "false_positive_rate",
     "gaussian_to_reach",
@@ -115,10 +95,8 @@ __all__ = [
     "observe",
     "paper_cnr_ceiling",
     "residual_test",
-    "roi_bias",
     "sd_interval",
     "task_transfer",
     "template_channel",
     "threshold_contour",
-    "variance_factor",
 ]

@@ -28,19 +28,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
 
-from torchpcct.metrics.bootstrap import Estimate
-from torchpcct.metrics.jackknife import Jackknifed, combined
-from torchpcct.validate import checked, coverage
+from torchpcct.metrics.jackknife import Jackknifed
+from torchpcct.validate import checked
 
 __all__ = [
-    "controlled_cnr",
     "controlled_log_variance",
     "controlled_mean",
-    "controlled_slope",
-    "expected_half_width",
-    "variance_factor",
 ]
 
 Floats = NDArray[np.float64]
@@ -156,100 +150,3 @@ def controlled_log_variance(
     if not (value > 0 and (left_out > 0).all()):
         raise ValueError("the values do not vary over the realisations: they must be noisy")
     return Jackknifed(math.log(value), np.log(left_out))
-
-
-@checked
-def controlled_slope(
-    true_contrasts: ArrayLike, measured: ArrayLike, controls: ArrayLike | None, control_mean: ArrayLike | None
-) -> Jackknifed:
-    """Slope of the measured against the true contrast over scenes, as :func:`contrast_slope`, but with controls.
-
-    Args:
-        true_contrasts: ``(scenes,)`` HU, at least 2 different values.
-        measured: ``(scenes, n)`` HU; realisation k has the noise seed k in every scene.
-        controls, control_mean: as in :func:`controlled_mean`; columns of every scene whose noise differs.
-
-    Raises:
-        ValueError: as in :func:`controlled_mean`; equal true contrasts.
-    """
-    t, y = np.asarray(true_contrasts, dtype=np.float64), np.asarray(measured, dtype=np.float64)
-    if t.ndim != 1 or y.ndim != 2 or len(y) != t.size or not np.isfinite(y).all():
-        raise ValueError(f"true_contrasts must be (scenes,), measured finite (scenes, n), got {t.shape} and {y.shape}")
-    weight = 1.0 / np.maximum(y.var(1, ddof=1), np.finfo(np.float64).tiny)
-    weight /= weight.sum()
-    centered = t - weight @ t
-    spread = float(weight @ centered**2)
-    if not spread > 0:
-        raise ValueError("true_contrasts must hold at least 2 different values")
-    # Linear in the contrasts: the slope is the mean of what each realisation alone would give.
-    return controlled_mean((weight * centered / spread) @ y, controls, control_mean)
-
-
-@checked
-def controlled_cnr(
-    foreground: ArrayLike,
-    background: ArrayLike,
-    controls: ArrayLike | None,
-    control_mean: ArrayLike | None,
-    control_covariance: ArrayLike | None,
-) -> Jackknifed:
-    """The paper's CNR, (μ_bg − μ_fg) / √(σ²_bg + σ²_fg), with means and variances controlled.
-
-    Args:
-        foreground, background: ``(n,)`` ROI means in HU of the same realisations.
-        controls, control_mean, control_covariance: as in :func:`controlled_mean` and :func:`controlled_log_variance`;
-            best both ROI means of a linear method.
-
-    Raises:
-        ValueError: as there.
-    """
-    means = [controlled_mean(v, controls, control_mean) for v in (foreground, background)]
-    logs = [controlled_log_variance(v, controls, control_covariance) for v in (foreground, background)]
-    return combined(lambda f, b, vf, vb: (b - f) / np.sqrt(np.exp(vf) + np.exp(vb)), *means, *logs)
-
-
-@checked
-def variance_factor(
-    log_variance: Jackknifed,
-    reference: Jackknifed | float,
-    slope: Jackknifed | float = 1.0,
-    reference_slope: Jackknifed | float = 1.0,
-    level: float = 0.95,
-) -> Estimate:
-    """How many times the method's slope-corrected variance is contained in the reference's.
-
-    FBP's variance falls as 1 / dose, so against FBP this is the dose factor by variance.
-
-    Args:
-        log_variance: of the method (:func:`controlled_log_variance`).
-        reference: exact variance of the reference, or :func:`controlled_log_variance` of it on the same draws.
-        slope, reference_slope: contrast slopes, positive: exact numbers or :func:`controlled_slope`.
-        level: coverage.
-
-    Raises:
-        ValueError: a variance or slope that is not positive, figures of different numbers of realisations.
-    """
-    known = not isinstance(reference, Jackknifed)
-    for name, v in (("reference", reference if known else 1.0), ("slope", slope), ("reference_slope", reference_slope)):
-        if not np.min(v.left_out if isinstance(v, Jackknifed) else v) > 0:
-            raise ValueError(f"{name} must be positive: contrast of the wrong sign cannot be corrected")
-    log_reference = reference if isinstance(reference, Jackknifed) else math.log(reference)
-    ratio = combined(
-        lambda v, r, s, t: r - v + 2.0 * (np.log(s) - np.log(t)), log_variance, log_reference, slope, reference_slope
-    )
-    return ratio.exponential(level)
-
-
-@checked
-def expected_half_width(realizations: int, correlation: float, level: float = 0.95) -> float:
-    """Half-width (as a factor) of a variance factor's interval for normal values: exp(z √(2 (1 − R⁴) / n)).
-
-    Args:
-        realizations: n.
-        correlation: R, multiple correlation of the values with the controls; 0 unpaired.
-        level: coverage.
-    """
-    if realizations < 2 or not 0 <= correlation <= 1:
-        raise ValueError(f"need realizations ≥ 2 and 0 ≤ correlation ≤ 1, got {realizations} and {correlation}")
-    coverage("level", level)
-    return math.exp(float(stats.norm.ppf(0.5 + level / 2)) * math.sqrt(2.0 * (1.0 - correlation**4) / realizations))

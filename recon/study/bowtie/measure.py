@@ -100,8 +100,8 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
 
     step = "plaque: MBIR and ROI bowtie"
     saved: dict[str, float] = {k: 1.0 / parts["ctdi_ratios"][k]["weighted"] for k in ("plane", "total") if k in ctdi}
-    parts["combined"], parts["plaque_plan"] = combine(
-        s.plaque_doses, s.plaque_realizations, s.plaque_views, s.seed, saved, pieces, lambda f: progress(step, f)
+    parts["combined"] = combine(
+        s.plaque_doses, s.plaque_realizations, s.plaque_views, s.seed, saved, pieces.folder("evaluate"), progress
     )
     clock.lap(step)
     images = {name: image for name, (_, image) in found.items()}

@@ -1,170 +1,82 @@
-"""The answer in one sentence, and the dose factors as tables."""
+"""The answer in one sentence: what MBIR saves at the paper's plaque, and whether it is what the paper assumes."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from recon.study.paper.facts import ASSUMED_FACTOR, DOSES
-from recon.study.report import markdown_table
 
-__all__ = ["answer", "claim", "claim_section", "dose_section"]
+__all__ = ["answer", "claim"]
 
 _LOW_S, _HIGH_S = DOSES["1x"], DOSES["5.7x"]
-
-_CONTRASTS = {"roi": "ROI contrast", "whole": "lesion contrast"}
-_ROWS = {
-    "sd_hu": ("SD, HU", 1), "slope": ("slope", 2), "bias_hu": ("bias, HU", 1),
-    "false_contrast_hu": ("without the core, HU", 1),
-}  # fmt: skip
+_METHOD = "mbir"
+FULL_VIEWS, FEW_DRAWS = 1968, 16
 
 
-def _at(rows: list[dict[str, Any]], exposure_s: float) -> dict[str, Any] | None:
-    return next((e for e in rows if e["exposure_s"] == exposure_s), None)
+def _found(records: list[dict[str, Any]], method: str, exposure_s: float, figure: str, where: str) -> Any:
+    """The record, or None."""
+    wanted = {"method": method, "exposure_s": exposure_s, "figure": figure, "where": where}
+    return next((r for r in records if wanted.items() <= r.items()), None)
 
 
-def _interval(e: dict[str, float], digits: int) -> str:
-    return f"{e['value']:.{digits}f} [{e['low']:.{digits}f}, {e['high']:.{digits}f}]"
+def _interval(record: dict[str, Any]) -> str:
+    low, high = record["low"], record["high"]
+    if low is None or not math.isfinite(low):
+        return f"{record['value']:.2f}"
+    return f"{record['value']:.2f} [{low:.2f}, {high:.2f}]"
 
 
-def claim(factors: list[dict[str, Any]], references: list[dict[str, Any]]) -> dict[str, Any] | None:
-    """The paper's claim made testable: MBIR at 0.35 s against the reference FBP at 2 s, figure by figure.
+def claim(records: list[dict[str, Any]]) -> dict[str, Any] | None:
+    """The paper's claim made testable: MBIR at 0.35 s has the CNR of FBP at 2 s.
 
     Args:
-        factors: of :func:`recon.study.compare.factors.dose_factors`; references: of
-            :func:`recon.study.compare.factors.reference_entry`.
+        records: of :func:`recon.evaluate.evaluate`.
 
     Returns:
-        ``needed``, the ratio of both doses, and for every figure FBP's value, MBIR's and the dose factor, with whether
-        it is as large as needed: ``"yes"`` or ``"no"`` where the whole interval is, else ``"open"``; None where one of
-        the two was not measured.
+        Both CNRs, the dose factor at 0.35 s, the one that is needed, and whether it is as large: ``"yes"`` or ``"no"``
+        where the whole interval is, else ``"open"``; None where one of the two was not measured.
     """
-    low, fbp = _at(factors, _LOW_S), _at(references, _HIGH_S)
-    if low is None or fbp is None:
+    ours = _found(records, _METHOD, _LOW_S, "CNR", "small")
+    factor = _found(records, _METHOD, _LOW_S, "dose factor: CNR", "small")
+    fbp = _found(records, "fbp:soft", _HIGH_S, "CNR", "small")
+    if ours is None or factor is None or fbp is None:
         return None
     needed = _HIGH_S / _LOW_S
-
-    def row(figure: str, of_fbp: float, of_mbir: dict[str, float], factor: dict[str, float]) -> dict[str, Any]:
-        met = "yes" if factor["low"] >= needed else "no" if factor["high"] < needed else "open"
-        return {"figure": figure, "fbp": of_fbp, "mbir": of_mbir, "factor": factor, "met": met}
-
-    rows = [
-        row("SD of a voxel in plain fat, HU", fbp["fat_sd_hu"], low["fat_sd_hu"], low["fat_factor"]),
-        row("the paper's CNR", fbp["paper_cnr"], low["paper_cnr"], low["paper_cnr_factor"]),
-    ]
-    for name, text in _CONTRASTS.items():
-        ours, theirs = low["contrast"][name], fbp["contrast"][name]
-        # Both SDs as they would be at slope 1: what the factor compares.
-        corrected = {k: v / ours["slope"]["value"] for k, v in ours["sd_hu"].items()}
-        of_fbp = theirs["sd_hu"] / theirs["slope"]
-        rows.append(row(f"{text}: SD / slope, HU", of_fbp, corrected, ours["factor"]))
-    return {"mbir_s": _LOW_S, "fbp_s": _HIGH_S, "needed": needed, "rows": rows}
+    met = "yes" if factor["low"] >= needed else "no" if factor["high"] < needed else "open"
+    return {"mbir_s": _LOW_S, "fbp_s": _HIGH_S, "needed": needed, "mbir": ours, "fbp": fbp, "factor": factor,
+            "met": met}  # fmt: skip
 
 
 def answer(data: dict[str, Any]) -> str:
     """The result in one sentence, from the report's values; empty without MBIR."""
-    factors, tested = data["dose_factors"], data["claim"]
-    best = _at(factors, _HIGH_S) or (factors[-1] if factors else None)
-    if best is None:
-        return ""
+    records, tested = data["records"], data["claim"]
     text = ""
     if tested is not None:
-        cnr = tested["rows"][1]
         verdict, reaches = {
             "yes": ("Yes", "reaches"), "no": ("No", "does not reach"), "open": ("Open", "may or may not reach"),
-        }[cnr["met"]]  # fmt: skip
-        controlled = "controlled " if data["settings"]["control"] else ""
-        against = "and not" if cnr["met"] == "no" else "against"
+        }[tested["met"]]  # fmt: skip
         text = (
-            f"{verdict}: at {tested['mbir_s']:.2f} s MBIR's {controlled}CNR of {_interval(cnr['mbir'], 2)} {reaches} "
-            "the "
-            f"{cnr['fbp']:.2f} of FBP (soft kernel, 0.25 mm) at {tested['fbp_s']:.2f} s, as it is worth "
-            f"{_interval(cnr['factor'], 2)} times the dose {against} the {ASSUMED_FACTOR:g} times that the paper "
-            "assumes; "
+            f"{verdict}: at {tested['mbir_s']:.2f} s MBIR's CNR of {_interval(tested['mbir'])} {reaches} the "
+            f"{tested['fbp']['value']:.2f} of FBP (soft kernel) at {tested['fbp_s']:.2f} s, for which it would have to "
+            f"save {ASSUMED_FACTOR:g} times the dose, as the paper assumes; it saves "
+            f"{_interval(tested['factor'])} times there"
         )
-    text += (
-        f"at {best['exposure_s']:.2f} s MBIR is worth {_interval(best['paper_cnr_factor'], 2)} times the dose of FBP "
-        "by the paper's CNR"
-    )
-    for name, label in (("roi", "in the paper's ROIs"), ("whole", "over the whole lesion")):
-        e = best["contrast"][name]
-        text += (
-            f", {_interval(e['factor'], 2)} times by the variance of the contrast {label} (slope "
-            f"{e['slope']['value']:.2f}, bias {e['bias_hu']['value']:+.0f} HU)"
-        )
-    text += f" and {_interval(best['fat_factor'], 2)} times by the noise of a voxel in plain fat, the tissue it is told"
-    text = text[0].upper() + text[1:]
-    s = data["settings"]
-    reduced = s["views"] < 1968 or not s["control"]
-    warning = (
-        f" (WARNING: {s['views']} views, {s['realizations']} realisations{'' if s['control'] else ', no control'}: a "
-        "test of the program, which says nothing about the question)"
-    )
-    return f"**{text}{warning if reduced else ''}.**"
-
-
-def dose_section(data: dict[str, Any]) -> str:
-    """Dose factors with what they are made of, per exposure, and the paper's claim."""
-    if not data["dose_factors"]:
+    exposures = sorted({r["exposure_s"] for r in records if r["method"] == _METHOD}, reverse=True)
+    if not exposures:
         return ""
-    truth = data["true_values"]
-    first = data["dose_factors"][0]
-    counts = " / ".join(str(e["realizations"]) for e in data["dose_factors"])
+    best = exposures[0]
     parts = [
-        "## Dose factors of MBIR against FBP soft 0.25 mm",
-        "How many times the dose FBP needs for the same figure; square brackets: 95 %. FBP: exact. "
-        + (
-            f"MBIR: {counts} paired draws with a linear control whose moments are exact (correlation of "
-            "the contrasts, paper's ROIs / whole lesion: "
-            + ", ".join(
-                f"{e['exposure_s']:.2f} s {e['contrast']['roi']['correlation']:.3f} / "
-                f"{e['contrast']['whole']['correlation']:.3f}"
-                for e in data["dose_factors"]
-            )
-            + "). "
-            if first["controlled"]
-            else f"MBIR: {counts} paired draws. "
+        (_found(records, _METHOD, best, f"dose factor: {figure}", where), what)
+        for figure, where, what in (
+            ("CNR", "small", "by the paper's CNR"), ("contrast at slope 1", "lesion", "by the contrast of the lesion"),
+            ("d'", "volume", "by detectability"), ("noise", "patient", "by the noise of a voxel in fat"),
         )
-        + f"True contrast {truth['contrast_hu']:.1f} HU (rods of each tissue at the plaque's place). Slope: change of "
-        "the contrast with the core put in, over the true one, from a twin without core and with the same noise; "
-        "“without the core”: the contrast read in that twin, where there is none. ROI contrast: between the paper's "
-        "two ROIs; lesion contrast: between all core and all fibrous tissue of the core's slices. The factor of a "
-        "contrast is that of its variance at slope 1: never read it without slope and bias. Noise in fat is that of "
-        f"single voxels (FBP 0.25 mm, MBIR {data['mbir_voxel_mm']:.2f} mm), in the tissue that "
-        "MBIR is told as the surround: it says how smooth the image is there, not what can be seen.",
-    ]
-    for e in data["dose_factors"]:
-        fbp = _at(data["reference"], e["exposure_s"])
-        assert fbp is not None
-        rows = [
-            ["noise in plain fat: SD, HU", f"{fbp['fat_sd_hu']:.1f}", _interval(e["fat_sd_hu"], 1),
-             _interval(e["fat_factor"], 2)],
-            ["the paper's CNR", f"{fbp['paper_cnr']:.2f}", _interval(e["paper_cnr"], 2),
-             _interval(e["paper_cnr_factor"], 2)],
-        ]  # fmt: skip
-        for name, text in _CONTRASTS.items():
-            ours, theirs = e["contrast"][name], fbp["contrast"][name]
-            for key, (label, digits) in _ROWS.items():
-                factor = _interval(ours["factor"], 2) if key == "sd_hu" else ""
-                rows.append([f"{text}: {label}", f"{theirs[key]:.{digits}f}", _interval(ours[key], digits), factor])
-        parts.append(markdown_table([f"{e['exposure_s']:.2f} s", "FBP, exact", "MBIR", "dose factor"], rows))
-    return "\n\n".join([*parts, *claim_section(data)])
-
-
-def claim_section(data: dict[str, Any]) -> list[str]:
-    """The paper's claim, tested: a sentence and a table; nothing where no dose factors were measured."""
-    tested = data["claim"]
-    if tested is None:
-        return []
-    head = [
-        "figure", f"FBP {tested['fbp_s']:.2f} s", f"MBIR {tested['mbir_s']:.2f} s", "dose factor",
-        f"≥ {tested['needed']:.1f}",
     ]  # fmt: skip
-    table = [
-        [r["figure"], f"{r['fbp']:.{d}f}", _interval(r["mbir"], d), _interval(r["factor"], 2), r["met"]]
-        for r, d in zip(tested["rows"], (1, 2, 1, 1), strict=True)
-    ]
-    return [
-        f"The paper's claim: MBIR at {tested['mbir_s']:.2f} s as good as FBP at {tested['fbp_s']:.2f} s, which "
-        f"needs a dose factor of {tested['needed']:.1f}.",
-        markdown_table(head, table),
-    ]
+    said = ", ".join(f"{_interval(r)} {what}" for r, what in parts if r is not None)
+    text += f"{'; at' if text else 'At'} {best:.2f} s MBIR saves {said}"
+    s = data["settings"]
+    if s["views"] < FULL_VIEWS or s["method_draws"] < FEW_DRAWS:
+        text += (f" (WARNING: {s['views']} views, {s['method_draws']} realisations: a test of the program, which says "
+                 "nothing about the question)")  # fmt: skip
+    return f"**{text}.**"

@@ -13,11 +13,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy import stats
 
+from recon.fbp.exact_noise import line_integral_variance, roi_adjoints
 from recon.fbp.inset import InsetFbp
-from recon.study.compare.reference import exact_variances
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.placement import RoiPair
 from torchpcct.metrics.roi import RoiMean
@@ -96,6 +97,18 @@ def vary_placement(clean: Scan, grid: VolumeGrid, rois: RoiPair, kernels: Sequen
         variances.append(found.reshape(len(volumes), -1, 2))
     mean, variance = np.concatenate(means, axis=1), np.concatenate(variances, axis=1)
     return [Placements(k, grid.spacing[0], mean[i], variance[i]) for i, k in enumerate(kernels)]
+
+
+def exact_variances(clean: Scan, fbp: InsetFbp, rows: Sequence[Sequence[Any]]) -> list[Floats]:
+    """Variance at 1 s of functionals after FBP, without their covariances: for every grid ``(kernels, rows)`` HU²."""
+    adjoints = roi_adjoints(clean, fbp, rows)
+    variance = line_integral_variance(clean.crop(adjoints.window), 1.0)
+    return [
+        np.array(
+            [[float((h * h * variance).sum((-1, -2), dtype=torch.float64).sum()) for h in kernel] for kernel in vectors]
+        )
+        for vectors in adjoints.vectors
+    ]
 
 
 def _moved(grid: VolumeGrid, phase: Sequence[float]) -> VolumeGrid:

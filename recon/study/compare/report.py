@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from recon.evaluate.report import plain, task_sections
 from recon.study.checks import Check, around
-from recon.study.compare.answer import answer, claim, claim_section, dose_section
-from recon.study.compare.factors import dose_factors, reference_entry
+from recon.study.compare.answer import answer, claim
 from recon.study.compare.figures import sections_figure
-from recon.study.compare.measure import MBIR, PWLS, PWLS_VOXEL_MM, Key, Measured
+from recon.study.compare.measure import Key, Measured
 from recon.study.compare.placements import SHIFT_MM
 from recon.study.compare.tables import is_reference, noise_free_table, tables
 from recon.study.paper import facts as paper
@@ -27,16 +27,17 @@ __all__ = ["build_report"]
 
 def build_report(m: Measured) -> Report:
     """Report of :func:`recon.study.compare.measure.measure`: ``report.json``, ``report.md``, ``compare.png``."""
+    records = m.evaluation.records if m.evaluation else []
     data: dict[str, Any] = {
         "study": "compare",
         "settings": asdict(m.settings),
         "plan": m.plan,
         "rois": m.rois.as_dict(),
-        **_answered(m),
+        "claim": claim(records),
+        "records": plain(records),
         "noise_free": m.noise_free,
         "statistics": [_statistics(key, means) for key, means in m.means.items()],
         "noise_against_dose": _noise_against_dose(m),
-        "pwls": m.pwls,
         "placements": [p.as_dict() for p in m.placements],
         "seconds": {k: round(v, 2) for k, v in m.seconds.items()},
     }
@@ -46,20 +47,20 @@ def build_report(m: Measured) -> Report:
     data["checks"] = [_noted(c, cause).as_dict() for c, cause in zip(checks, causes, strict=True)]
     data["causes"] = [cause for cause in causes if cause is not None]
     data["environment"] = environment()
+    measured = task_sections(m.evaluation) if m.evaluation else []
     sections = [
-        "# Plaque CNR by FBP, PWLS and MBIR, beside the paper",
+        "# What MBIR saves at the paper's plaque, and the paper's CNR tables",
         data["answer"],
-        dose_section(data),
+        *measured,
         _intro(data),
         noise_free_table(data),
         *(tables(data, name, exposure) for name, exposure in m.settings.doses.items()),
         _noise_table(data),
-        _pwls_table(data),
         _agreement(checks, data),
         _FITTED,
         time_line(m.seconds, f"peak memory {_peak_memory_gib():.1f} GiB"),
     ]
-    text, screen = ("\n\n".join(s for s in part if s) for part in (sections, [data["answer"], *claim_section(data)]))
+    text, screen = ("\n\n".join(s for s in part if s) for part in (sections, [data["answer"], *measured]))
     return Report("compare", data, text, {"compare.png": sections_figure(m)}, screen)
 
 
@@ -78,25 +79,9 @@ _FITTED = (
 # --- figures ------------------------------------------------------------------------------------------------------
 
 
-def _answered(m: Measured) -> dict[str, Any]:
-    """The dose factors, what they refer to, and the paper's claim."""
-    if m.reference is None or m.rods is None:
-        return {"dose_factors": [], "reference": [], "claim": None}
-    truth = m.rods.contrast()
-    factors = [{"method": MBIR[0], **dose_factors(draws, m.reference, truth)} for _, draws in sorted(m.draws.items())]
-    references = [reference_entry(m.reference, exposure, truth) for exposure in m.settings.doses.values()]
-    return {
-        "true_values": {**m.rods.as_dict(), "contrast_hu": truth},
-        "mbir_voxel_mm": next(voxel for method, _, voxel, _ in m.means if method == MBIR[0]),
-        "dose_factors": factors,
-        "reference": references,
-        "claim": claim(factors, references),
-    }
-
-
 def _statistics(key: Key, means: Any) -> dict[str, Any]:
     """Means, standard deviations and CNR with their 95 % intervals."""
-    result: dict[str, Any] = dict(zip(("method", "kernel", "voxel_mm", "exposure_s"), key, strict=True))
+    result: dict[str, Any] = dict(zip(("kernel", "voxel_mm", "exposure_s"), key, strict=True))
     result["realizations"] = len(means)
     foreground, background = means.T
     for name, values in (("foreground", foreground), ("background", background)):
@@ -114,20 +99,20 @@ def _statistics(key: Key, means: Any) -> dict[str, Any]:
 
 
 def _noise_against_dose(m: Measured) -> list[dict[str, Any]]:
-    """Slope of log σ against log dose per method, kernel, voxel size and ROI: −½ for pure counting noise.
+    """Slope of log σ against log dose per kernel, voxel size and ROI: −½ for pure counting noise.
 
     The noise of the voxels (entry ``pixel``, SD across realisations, rms over the inset) pins the slope down; that of
     two ROI means over few realisations does not.
     """
-    groups: dict[tuple[str, str, float], list[Key]] = {}
+    groups: dict[tuple[str, float], list[Key]] = {}
     for key in m.means:
-        groups.setdefault(key[:3], []).append(key)
+        groups.setdefault(key[:2], []).append(key)
     slopes = []
-    for (method, kernel, voxel), keys in groups.items():
+    for (kernel, voxel), keys in groups.items():
         if len(keys) < 2:
             continue
         x = np.log([exposure for *_, exposure in keys])
-        entry: dict[str, Any] = {"method": method, "kernel": kernel, "voxel_mm": voxel}
+        entry: dict[str, Any] = {"kernel": kernel, "voxel_mm": voxel}
         for i, roi in enumerate(("foreground", "background")):
             sds = [np.std(m.means[key][:, i], ddof=1) for key in keys]
             entry[roi] = float(np.polyfit(x, np.log(sds), 1)[0])
@@ -149,7 +134,7 @@ def _checks(data: dict[str, Any]) -> list[Check]:
             found = table_checks(e["kernel"], e["voxel_mm"], (e["foreground_hu"], e["background_hu"]), covariance)
             checks += found
     for e in data["noise_against_dose"]:
-        if e["method"] == "fbp" and "pixel" in e:
+        if "pixel" in e:
             name = f"slope of voxel noise against dose, {e['kernel']} {e['voxel_mm']:.2f} mm"
             checks.append(Check(name, e["pixel"], -0.5, -0.515, -0.485))
     return checks
@@ -189,43 +174,19 @@ def _noted(check: Check, cause: dict[str, Any] | None) -> Check:
 
 def _intro(data: dict[str, Any]) -> str:
     s, r = data["settings"], data["rois"]
-    iterative = []
-    if s["pwls"]:
-        at = ", ".join(f"{e:.2f}" for e in s["doses"].values() if e in s["pwls_s"])
-        iterative.append(f"PWLS ({PWLS[1]}) is run at {at} s on {PWLS_VOXEL_MM:.2f} mm")
-    if s["mbir"]:
-        at = ", ".join(f"{e:.2f}" for e in s["doses"].values() if e in s["mbir_s"])
-        iterative.append(f"MBIR at {at} s on {data['mbir_voxel_mm']:.2f} mm, the voxels of its network")
     n = s["realizations"]
     low, high = sd_interval(1.0, n)
     half = float(mean_interval(np.linspace(-1.0, 1.0, n))[1] / np.std(np.linspace(-1.0, 1.0, n), ddof=1))
     return (
-        f"## The paper's tables\n\n{n} noise realisations per dose (seeds {s['seed']}…{s['seed'] + n - 1}, the "
+        f"## The paper's tables\n\n{n} noise realisations of FBP per dose (seeds {s['seed']}…{s['seed'] + n - 1}, the "
         f"same for every method), {s['views']} views. Foreground ROI (necrotic core): {r['foreground_pixels']} pixels "
         f"of {r['pixel_mm']} mm, {r['foreground_mm2']:.2f} mm²; background ROI (fibrous tissue): "
         f"{r['background_pixels']} pixels, {r['background_mm2']:.2f} mm². "
         "CNR = (mean_bg − mean_fg) / sqrt(var_bg + var_fg) of the ROI means across "
         "realisations. “exact”: expectation and SD of FBP without sampling error (one adjoint pass per ROI). "
         f"“{n} runs”: as the paper measures; the 95 % interval of such a mean is ± {half:.2f} SD, of an SD "
-        f"×{low:.2f}…{high:.2f} (all intervals, those of the CNR too, are in report.json).{_controlled(data)} "
-        f"“paper”: its tables, which "
-        f"are for {paper.TABLE_EXPOSURE_S:g} s (our inference). {'; '.join(iterative)}{'.' if iterative else ''}"
-    )
-
-
-def _controlled(data: dict[str, Any]) -> str:
-    """Why MBIR's CNR of the tables' runs is not that of the dose factors."""
-    if not data["dose_factors"] or not data["settings"]["control"]:
-        return ""
-    first = data["dose_factors"][0]
-    runs = next(e for e in data["statistics"] if e["method"] == MBIR[0] and e["exposure_s"] == first["exposure_s"])
-    low, high = runs["cnr_interval"]
-    return (
-        " “controlled”: the CNR of the dose factors above, of the same draws less the part of their noise that a "
-        "linear control with exact moments explains. So few draws alone hardly tell a CNR: MBIR's at "
-        f"{first['exposure_s']:.2f} s is {runs['cnr']:.2f} [{low:.2f}, {high:.2f}] by them, "
-        f"{first['paper_cnr']['value']:.2f} [{first['paper_cnr']['low']:.2f}, {first['paper_cnr']['high']:.2f}] "
-        "controlled; FBP's own draws err alike, see “exact”."
+        f"×{low:.2f}…{high:.2f} (all intervals, those of the CNR too, are in report.json). "
+        f"“paper”: its tables, which are for {paper.TABLE_EXPOSURE_S:g} s (our inference)."
     )
 
 
@@ -266,31 +227,12 @@ def _noise_table(data: dict[str, Any]) -> str:
     slopes = data["noise_against_dose"]
     if not slopes:
         return ""
-    rows = [
-        [f"{e['method'].upper()} {e['kernel']}", f"{e['voxel_mm']:.2f}", f"{e['pixel']:.3f}"]
-        for e in slopes
-        if "pixel" in e
-    ]
+    rows = [[e["kernel"], f"{e['voxel_mm']:.2f}", f"{e['pixel']:.3f}"] for e in slopes if "pixel" in e]
     text = (
         "## Noise against dose\n\n"
         "Slope of log σ (voxel noise over the inset) against log exposure; −0.5 for counting noise."
     )
-    return f"{text}\n\n{markdown_table(['method', 'voxel, mm', 'slope'], rows)}"
-
-
-def _pwls_table(data: dict[str, Any]) -> str:
-    if not data["pwls"]:
-        return ""
-    rows = [
-        [
-            f"{e['exposure_s']:.2f} s, {e['voxel_mm']:.2f} mm", str(e["exact_pairs"]), str(sum(e["inner_iterations"])),
-            f"{e['gradient'][-1]:.1e}", f"{e['largest_rmsd_hu']:.2f}", f"{e['seconds_per_volume']:.1f}",
-        ]
-        for e in data["pwls"]
-    ]  # fmt: skip
-    header = ["PWLS", "exact pairs", "inner steps", "gradient left", "HU from minimum", "s / volume"]
-    text = "## PWLS, convergence\n\nFirst realisation; “HU from minimum” is the worst of all, rms over the volume."
-    return f"{text}\n\n{markdown_table(header, rows)}"
+    return f"{text}\n\n{markdown_table(['kernel', 'voxel, mm', 'slope'], rows)}"
 
 
 def _peak_memory_gib() -> float:

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from recon.study.compare.measure import MBIR, PWLS
 from recon.study.paper import facts as paper
 from recon.study.paper.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM
 from recon.study.paper.tables import published
@@ -40,19 +39,12 @@ def noise_free_table(data: dict[str, Any]) -> str:
     )
 
 
-def _controlled(data: dict[str, Any]) -> list[dict[str, Any]]:
-    """MBIR's dose factors, if a control takes most of their noise off."""
-    return list(data.get("dose_factors", [])) if data["settings"].get("control") else []
-
-
 def tables(data: dict[str, Any], dose: str, exposure: float) -> str:
     """Exact, measured and published moments of both ROIs and the CNR at an exposure."""
     s = data["settings"]
-    measured = {(e["method"], e["kernel"], e["voxel_mm"]): e for e in data["statistics"] if e["exposure_s"] == exposure}
+    measured = {(e["kernel"], e["voxel_mm"]): e for e in data["statistics"] if e["exposure_s"] == exposure}
     exact = {(e["kernel"], e["voxel_mm"]): e for e in data["noise_free"] if "covariance_hu2_s" in e}
-    fbp = [("fbp", kernel) for kernel in s["kernels"]]
-    methods = fbp + [m for m in (PWLS, MBIR) if any((e["method"], e["kernel"]) == m for e in data["statistics"])]
-    voxels = sorted({v for *_, v in measured} | set(s["voxels_mm"]))
+    voxels = sorted({v for _, v in measured} | set(s["voxels_mm"]))
 
     def moments(roi: int) -> tuple[Callable[[Any], str], Callable[[Any, Any], str]]:
         name = ("foreground", "background")[roi]
@@ -62,33 +54,29 @@ def tables(data: dict[str, Any], dose: str, exposure: float) -> str:
         )
 
     def table(
-        title: str, entries: Any, form: str, runs: Callable[[Any], str], known: Callable[[Any, Any], str],
-        controlled: str = "",
+        title: str, entries: Any, form: str, runs: Callable[[Any], str], known: Callable[[Any, Any], str]
     ) -> str:  # fmt: skip
-        def of_exact(method: str, kernel: str, voxel: float) -> str:
-            e = exact.get((kernel, voxel)) if method == "fbp" else None
+        def of_exact(kernel: str, voxel: float) -> str:
+            e = exact.get((kernel, voxel))
             if e is None:
                 return ""
             return known((e["foreground_hu"], e["background_hu"]), np.diag(e["covariance_hu2_s"]) / exposure)
 
-        def of_runs(method: str, kernel: str, voxel: float) -> str:
-            e = measured.get((method, kernel, voxel))
+        def of_runs(kernel: str, voxel: float) -> str:
+            e = measured.get((kernel, voxel))
             return "" if e is None else runs(e)
 
-        def of_paper(method: str, kernel: str, voxel: float) -> str:
-            entry = published(entries, kernel, voxel, exposure) if method == "fbp" else None
+        def of_paper(kernel: str, voxel: float) -> str:
+            entry = published(entries, kernel, voxel, exposure)
             return "" if entry is None else form.format(*np.atleast_1d(entry))
 
         rows = []
         for voxel in voxels:
             for source, cell in (("exact", of_exact), (f"{s['realizations']} runs", of_runs), ("paper", of_paper)):
-                cells = [cell(m, k, voxel) for m, k in methods]
+                cells = [cell(k, voxel) for k in s["kernels"]]
                 if any(cells):
                     rows.append([f"{voxel:.2f} mm, {source}", *cells])
-            if controlled and voxel == data.get("mbir_voxel_mm"):
-                rows.append([f"{voxel:.2f} mm, controlled", *[controlled if m == MBIR else "" for m in methods]])
-        header = [kernel if method == "fbp" else method.upper() for method, kernel in methods]
-        return f"{title}\n\n" + markdown_table(["", *header], rows)
+        return f"{title}\n\n" + markdown_table(["", *s["kernels"]], rows)
 
     return "\n\n".join(
         [
@@ -101,7 +89,6 @@ def tables(data: dict[str, Any], dose: str, exposure: float) -> str:
                 "{:.2f}",
                 lambda e: f"{e['cnr']:.2f}",
                 lambda means, variances: f"{(means[1] - means[0]) / np.sqrt(variances.sum()):.2f}",
-                next((f"{e['paper_cnr']['value']:.2f}" for e in _controlled(data) if e["exposure_s"] == exposure), ""),
             ),
         ]
     )

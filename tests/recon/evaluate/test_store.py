@@ -18,7 +18,7 @@ from tiny_studies import run_tiny
 import recon.evaluate.store as store_module
 from recon.evaluate.store import Pieces, packed, unpacked
 from recon.study.compare.placements import Placements
-from recon.study.verify import differences
+from recon.study.results import differences
 from torchpcct import ConeBeam, VolumeGrid, full_turn
 from torchpcct.scan import Scan
 

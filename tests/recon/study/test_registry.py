@@ -40,7 +40,7 @@ def test_effects_say_what_is_modelled():
 
 
 COUNTS = {
-    "compare": "views", "dose-factor": "views", "detector": "photons", "bowtie": "views", "hardcases": "views",
+    "compare": "views", "detector": "photons", "bowtie": "views", "hardcases": "views",
     "motion": "thinning",
     "noise": "views", "phantom": "sections", "resolution": "thinning", "spectral": "views",
 }  # fmt: skip
@@ -71,14 +71,14 @@ def test_settings_of_every_study(name):
         registry.build_settings(name, changes=["nonsense=1"])
     with pytest.raises(FrozenInstanceError):
         setattr(full, COUNTS[name], 9)
-    other = registry.build_settings("compare" if name != "compare" else "dose-factor")
+    other = registry.build_settings("compare" if name != "compare" else "noise")
     with pytest.raises(TypeError, match="settings must be"):
         registry.run(name, other)
 
 
 def test_changes_from_the_command_line():
-    settings = registry.build_settings("compare", quick=True, changes=["views=96", "kernels=['bone']", "pwls=False"])
-    assert (settings.views, settings.kernels, settings.pwls) == (96, ("bone",), False)
+    settings = registry.build_settings("compare", quick=True, changes=["views=96", "kernels=['bone']", "methods=()"])
+    assert (settings.views, settings.kernels, settings.methods) == (96, ("bone",), ())
     with pytest.raises(ValueError, match="give field=value"):
         registry.build_settings("compare", changes=["views"])
 

@@ -1,0 +1,92 @@
+"""Sentences rendered from committed results."""
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+
+from recon.study.results import README_MARKS, differences, lookup, render
+
+DATA = {"rows": [{"m": "a", "s": 2.0, "v": 1.234}, {"m": "b", "s": 2.0, "v": [5.0, 6.6]}], "n": {"k": 200}}
+RECORD = {"task": "plaque", "method": "mbir", "exposure_s": 2.0, "figure": "CNR", "where": "small", "value": 1.531,
+          "low": 1.47, "high": 1.594}  # fmt: skip
+FIRST, LAST = README_MARKS
+
+
+@pytest.fixture
+def root(tmp_path):
+    folder = tmp_path / "notebooks" / "r"
+    folder.mkdir(parents=True)
+    (folder / "report.json").write_text(json.dumps({**DATA, "records": [RECORD], "shift": -4.6}), encoding="utf-8")
+    (tmp_path / "README.md").write_text(f"# T\n\n{FIRST}\nold\n{LAST}\n\nend\n", encoding="utf-8")
+    return tmp_path
+
+
+def rendered(root, text):
+    path = root / "notebooks" / "results.template.md"
+    path.write_text(f"# R\n\n{FIRST}\n{text}\n{LAST}\nmore\n", encoding="utf-8")
+    found = render(root)
+    assert found["README.md"].startswith(f"# T\n\n{FIRST}\n")
+    assert found["README.md"].endswith(f"\n{LAST}\n\nend\n")
+    assert found["notebooks/RESULTS.md"].startswith("# R\n\n")
+    assert found["notebooks/RESULTS.md"].endswith("\nmore\n")
+    said = found["notebooks/RESULTS.md"].splitlines()[2]
+    assert f"\n{said}\n" in found["README.md"]
+    return said
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("{{r: rows[m=a]/v | .1f}}× of {{r/report.json: n/k | }}", "1.2× of 200"),
+        ("{{r: plaque, mbir, 2, CNR, small | .1f}}", "1.5"),
+        ("{{r: plaque, mbir, 2, CNR, small | interval .2f}}", "1.53 [1.47, 1.59]"),
+        ("it {{r: shift ? gains | loses}} {{r: shift | abs .1f}} %", "it loses 4.6 %"),
+        ("{{r: n/k > 199 ? many | few}}, {{r: plaque, mbir, 2, CNR, small > 1.6 ? more | less}}", "many, less"),
+    ],
+)
+def test_fields(root, text, said):
+    assert rendered(root, text) == said
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{{x: n/k | .1f}}", "cannot read"),
+        ("{{r: n/x | .1f}}", "no /n/x"),
+        ("{{r: plaque, mbir, 3, CNR, small | .1f}}", "0 rows fit"),
+        ("{{r: rows[m=a]/m | .1f}}", "no figure that"),
+        (FIRST, "once"),
+    ],
+)
+def test_what_cannot_be_rendered_is_refused(root, text, message):
+    with pytest.raises(ValueError, match=message):
+        rendered(root, text)
+
+
+def test_the_repository_is_rendered():
+    root = Path(__file__).parents[3]
+    for name, text in render(root).items():
+        assert (root / name).read_text(encoding="utf-8") == text, f"{name}: torchpcct verify --write"
+
+
+def test_lookup_by_key_row_and_index():
+    assert lookup(DATA, "rows[m=b]/v/0") == 5.0
+    assert lookup(DATA, "n/k") == 200
+    for path, message in (("n/x", "no /n/x"), ("rows[s=2]/v", "2 rows fit"), ("rows[m=c]/v", "0 rows fit")):
+        with pytest.raises(ValueError, match=message):
+            lookup(DATA, path)
+
+
+def test_differences_are_named_and_runs_may_take_another_time():
+    again = json.loads(json.dumps(DATA))
+    assert not list(differences({**DATA, "seconds": 1}, {**again, "seconds": 2}))
+    assert not list(differences({"core_mm2": math.nan}, {"core_mm2": math.nan}))
+    assert list(differences({"core_mm2": math.nan}, {"core_mm2": 1.0}))
+    again["rows"][0]["v"] *= 1.0005
+    assert not list(differences(DATA, again))
+    again["rows"][0]["v"] *= 1.01
+    again["rows"][1]["m"] = "c"
+    del again["n"]["k"]
+    assert [line.split(":")[0] for line in differences(DATA, again)] == ["/n/k", "/rows/0/v", "/rows/1/m"]
