@@ -111,16 +111,14 @@ def _verify(arguments: argparse.Namespace, progress: ProgressBars) -> None:
 def _add_compare(commands: Commands) -> None:
     parser = command(
         commands, "compare", _own_study, registry.STUDIES["compare"],
-        "Simulate the paper's plaque scan at full size, reconstruct it by FBP (kernels × voxel sizes) at 1×, "
-        "2×, 5.7× and 8× dose, measure what dose MBIR, PWLS and the best simple filter save, and print that; the "
-        "paper's tables beside ours go into the report. "
-        "After an interruption the same command goes on.",
+        "Simulate the paper's plaque scan at full size, reconstruct it by FBP, PWLS, the best simple filter and MBIR "
+        "on the same noise realisations at 1× and 5.7× dose, and print what dose each saves. After an interruption the "
+        "same command goes on.",
         "folder for report.json, report.md and compare.png (default out/compare)",
     )  # fmt: skip
-    parser.add_argument("--realizations", type=int, metavar="N", help="per dose (default 10)")
-    parser.add_argument("--quick", action="store_true", help="reduced views and settings: a first look, < 45 s")
-    parser.add_argument("--methods", nargs="*", metavar="METHOD", help="beside FBP, as of evaluate (none: FBP alone)")
-    parser.add_argument("--method-draws", type=int, metavar="N", help="realisations of these (default 16)")
+    parser.add_argument("--n", type=int, metavar="N", help="realisations (default 16)")
+    parser.add_argument("--methods", nargs="+", metavar="METHOD", help="as of evaluate --method")
+    parser.add_argument("--quick", action="store_true", help="reduced views and methods: a first look, < 45 s")
 
 
 def _add_hardcases(commands: Commands) -> None:

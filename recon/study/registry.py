@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["STUDIES", "build_settings", "folder", "part", "run", "settings_of"]
 
 STUDIES: dict[str, str] = {
-    "compare": "what dose MBIR saves against FBP, and the paper's CNR tables by FBP, PWLS and MBIR",
+    "compare": "what dose MBIR saves at the paper's plaque, beside FBP, PWLS and the best simple filter",
     "phantom": "the plaque itself: densities, mass fractions, CT numbers and lengths beside the paper's",
     "detector": "the silicon detector: counts, DQE beside the published one, pile-up, charge sharing",
     "bowtie": "ROI bowtie: CTDI and thorax dose, noise inside and outside, and its product with MBIR",

@@ -9,10 +9,7 @@ from recon.study import registry
 from recon.study.report import Report
 
 TINY: dict[str, dict[str, Any]] = {
-    "compare": {
-        "realizations": 3, "views": 48, "kernels": ("soft",), "voxels_mm": (0.4,), "doses": {"1x": 0.35, "5.7x": 2.0},
-        "methods": (), "placements": False,
-    },
+    "compare": {"n": 8, "views": 48, "methods": ("fbp:soft", "gaussian@fbp:soft"), "exposures_s": (2.0,)},
     "phantom": {"voxel_mm": 0.05, "sections": 2, "energies_kev": (55.0, 64.0)},
     "detector": {"photons": 4000, "dead_times_ns": (50.0,), "charge_sharing": (0.1,)},
     "bowtie": {
@@ -31,7 +28,7 @@ TINY: dict[str, dict[str, Any]] = {
     },
     "noise": {
         "realizations": 24, "views": 48, "kernels": ("soft", "bone"), "voxels_mm": (0.25, 0.40),
-        "doses": {"1x": 0.35, "5.7x": 2.0}, "reconstructed": 2, "experiments": 500,
+        "doses": {"1x": 0.35, "5.7x": 2.0}, "reconstructed": 2, "experiments": 500, "placements": False,
     },
     "resolution": {"thinning": 32, "sigmas_px": (0.0, 3.75, 10.0), "bulges_mm": ()},
     "spectral": {

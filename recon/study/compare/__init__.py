@@ -1,7 +1,5 @@
-"""The main job: what dose MBIR saves against FBP, with intervals, and the paper's CNR tables beside its numbers.
+"""What dose MBIR saves at the paper's plaque, beside FBP, PWLS and the best simple filter: the main job.
 
-``settings`` → ``measure``, which scans and reconstructs by FBP and PWLS itself; for MBIR ``regions`` says where is
-read, ``draws`` reconstructs with and without the core beside a linear control, ``reference`` has the exact FBP.
-``placements`` moves ROIs and grid under the figures outside their tolerance. → ``report`` with ``factors`` (dose
-factors), ``answer`` (the sentence on top and their tables), ``tables`` (the paper's) and ``figures``.
+``settings`` → ``measure`` (one task of :mod:`recon.evaluate`) → ``answer`` (the result in a sentence) → ``report`` →
+``figures``.
 """

@@ -76,7 +76,7 @@ def answer(data: dict[str, Any]) -> str:
     said = ", ".join(f"{_interval(r)} {what}" for r, what in parts if r is not None)
     text += f"{'; at' if text else 'At'} {best:.2f} s MBIR saves {said}"
     s = data["settings"]
-    if s["views"] < FULL_VIEWS or s["method_draws"] < FEW_DRAWS:
-        text += (f" (WARNING: {s['views']} views, {s['method_draws']} realisations: a test of the program, which says "
+    if s["views"] < FULL_VIEWS or s["n"] < FEW_DRAWS:
+        text += (f" (WARNING: {s['views']} views, {s['n']} realisations: a test of the program, which says "
                  "nothing about the question)")  # fmt: skip
     return f"**{text}.**"

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from recon.study.paper import facts as paper
 from recon.study.study import StudySettings
+from torchpcct.validate import numbers
 
 __all__ = ["Settings"]
 
@@ -17,40 +18,29 @@ class Settings(StudySettings):
     """Settings of the comparison.
 
     Args:
-        realizations: noise realisations of FBP per dose (paper: 10), at least 3 for an interval.
-        seed: first seed.
-        views: views per rotation. Fewer than the paper's keep the tube load of the whole scan.
-        kernels, voxels_mm, doses: the axes of the tables.
-        methods: measured against FBP (:func:`recon.evaluate.evaluate`, task ``plaque``); none: the tables alone.
-        method_s: exposures of these; method_draws: their realisations, at least 8.
-        placements: whether the checks outside their tolerance are computed again with ROIs and grid moved.
+        methods: what is measured, see :mod:`recon.evaluate.methods`.
+        n: noise realisations of each, at least 8.
+        seed: of the first.
+        views: views per rotation.
+        exposures_s: of the scans in s.
 
     Raises:
         ValueError, TypeError: a count out of range, or none.
     """
 
-    realizations: int = paper.REALIZATIONS
+    methods: tuple[str, ...] = (
+        "fbp:soft", "fbp:standard", "fbp:detail", "fbp:bone", "pwls", "bilateral@fbp:detail", "mbir"
+    )  # fmt: skip
+    n: int = 16
     seed: int = 0
     views: int = paper.FULL_VIEWS["PCCT"]
-    kernels: tuple[str, ...] = paper.KERNELS
-    voxels_mm: tuple[float, ...] = paper.VOXELS_MM
-    doses: dict[str, float] = field(default_factory=lambda: dict(paper.DOSES))
-    methods: tuple[str, ...] = ("pwls", "bilateral@fbp:detail", "mbir")
-    method_s: tuple[float, ...] = (0.35, 2.00)
-    method_draws: int = 16
-    placements: bool = True
+    exposures_s: tuple[float, ...] = (0.35, 2.0)
 
-    # An eighth of the views, two kernels, two voxel sizes, two doses, 8 realisations, no PWLS: ≤ 45 s.
-    QUICK: ClassVar[Mapping[str, Any]] = {
-        "realizations": 8,
-        "views": 246,
-        "kernels": ("soft", "standard"),
-        "voxels_mm": (0.25, 0.40),
-        "doses": {"1x": 0.35, "5.7x": 2.00},
-        "methods": ("bilateral@fbp:detail", "mbir"),
-        "method_draws": 8,
-        "placements": False,
-    }
+    # An eighth of the views, 8 realisations, no PWLS: ≤ 45 s.
+    QUICK: ClassVar[Mapping[str, Any]] = {"views": 246, "n": 8, "methods": ("fbp:soft", "bilateral@fbp:detail", "mbir")}
 
     def __post_init__(self) -> None:
-        self.check_whole(realizations=3, method_draws=8 if self.methods else 0, seed=0, views=8)
+        self.check_whole(n=8, seed=0, views=8)
+        numbers("exposures_s", self.exposures_s, positive=True, unit="s")
+        if not self.methods:
+            raise ValueError("methods must name at least one method")

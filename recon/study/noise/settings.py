@@ -24,6 +24,7 @@ class Settings(StudySettings):
         reconstructed: realisations at the tables' dose that are reconstructed in full, at least 1.
         experiments: number of simulated experiments of 10 realisations.
         eid: whether to set an energy-integrating scan of equal dose beside.
+        placements: whether settings with a figure outside its tolerance are computed with ROIs and grid moved.
 
     Raises:
         TypeError: a value of a wrong type.
@@ -39,6 +40,7 @@ class Settings(StudySettings):
     reconstructed: int = 3
     experiments: int = 20_000
     eid: bool = True
+    placements: bool = True
 
     # An eighth of the views, two kernels, three voxel sizes, two doses.
     QUICK: ClassVar[dict[str, Any]] = {
@@ -49,6 +51,7 @@ class Settings(StudySettings):
         "doses": {"1x": 0.35, "5.7x": 2.00},
         "reconstructed": 2,
         "experiments": 4000,
+        "placements": False,
     }
 
     def __post_init__(self) -> None:

@@ -21,11 +21,16 @@ from recon.study.noise.few_runs import (
     pair_differences,
     resampled_tables,
 )
+from recon.study.noise.placements import vary_placement
 from recon.study.noise.settings import Settings
 from recon.study.paper import facts as paper
-from recon.study.paper.plaque_scan import Functional
+from recon.study.paper.plaque_scan import Functional, inset_grid, prepare
 from recon.study.paper.tables import published, table_checks
 from torchpcct.metrics.bootstrap import resampling
+from torchpcct.metrics.placement import RoiRule, place_rois
+from torchpcct.metrics.roi import axial_grid
+from torchpcct.scanner import presets
+from torchpcct.scene.plaque import plaque_scene
 
 
 @pytest.fixture
@@ -256,3 +261,44 @@ def test_table_checks_are_those_of_the_paper():
     assert table_checks("soft", 0.5, means, covariance) == []
     assert published(paper.CNR, "soft", 0.25, 2.0) == 2.20
     assert published(paper.CNR, "soft", 0.25, 0.35) is None
+
+
+def test_rois_lie_inside_their_tissues():
+    scene, plaque = plaque_scene()
+    image = axial_grid(inset_grid(plaque, 0.1).center)
+    rois = place_rois(scene, image)
+    labels = scene.labels(image)
+    assert (labels[rois.foreground] == scene.index("core")).all()
+    assert (labels[rois.background] == scene.index("fibrous")).all()
+    assert rois.background.sum() < rois.foreground.sum()
+    with pytest.raises(ValueError, match="foreground ROI is empty"):
+        place_rois(scene, image, rule=RoiRule(core_margin=3.0))
+
+
+@pytest.fixture(scope="module")
+def scanned():
+    """A thinned scan of the plaque on 0.4 mm voxels."""
+    return prepare(("soft", "bone"), (0.4,), plaque_scene(), presets.pcct(views=48), paper.FULL_VIEWS["PCCT"])
+
+
+def test_placements_start_with_the_nominal_one(scanned):
+    scan = scanned
+    grid = scan.grids[0]
+    soft, bone = vary_placement(scan.clean, grid, scan.rois, ("soft", "bone"))
+    assert (soft.kernel, bone.kernel) == ("soft", "bone")
+    assert soft.means.shape == soft.variances.shape == (16, 2)
+    volumes = scan.fbp(scan.clean)[0]
+    expected = roi_covariance(scan.clean, scan.fbp, scan.pairs, 1.0)[0]
+    for k, found in enumerate((soft, bone)):
+        np.testing.assert_allclose(found.means[0], [float(r(volumes[k])) for r in scan.pairs[0]], atol=0.02)
+        np.testing.assert_allclose(found.variances[0], np.diag(expected[k]), rtol=2e-3)
+        low, high = found.range_of("core", "SD", 4.0)
+        assert low <= np.sqrt(found.variances[0, 0] / 4.0) <= high
+        few, many = found.range_of("core", "SD", 4.0, 10), found.range_of("core", "mean", 4.0, 10)
+        assert few == pytest.approx((0.548 * low, 1.454 * high), rel=1e-3)  # chi-squared, 9 degrees of freedom
+        assert many[0] < found.means[:, 0].min() - 0.3 * low
+        assert many[1] > found.means[:, 0].max() + 0.3 * low
+    # Half a voxel of 0.4 mm matters to a sharp kernel: the range is a range.
+    low, high = bone.range_of("fibrous", "SD", 2.0)
+    assert high > 1.02 * low
+    assert len(np.unique(bone.means.round(6), axis=0)) == 16

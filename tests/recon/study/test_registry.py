@@ -77,8 +77,8 @@ def test_settings_of_every_study(name):
 
 
 def test_changes_from_the_command_line():
-    settings = registry.build_settings("compare", quick=True, changes=["views=96", "kernels=['bone']", "methods=()"])
-    assert (settings.views, settings.kernels, settings.methods) == (96, ("bone",), ())
+    settings = registry.build_settings("compare", quick=True, changes=["views=96", "methods=['fbp:bone']"])
+    assert (settings.views, settings.methods) == (96, ("fbp:bone",))
     with pytest.raises(ValueError, match="give field=value"):
         registry.build_settings("compare", changes=["views"])
 
