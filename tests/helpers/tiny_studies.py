@@ -13,7 +13,7 @@ TINY: dict[str, dict[str, Any]] = {
     "phantom": {"voxel_mm": 0.05, "sections": 2, "energies_kev": (55.0, 64.0)},
     "detector": {"photons": 4000, "dead_times_ns": (50.0,), "charge_sharing": (0.1,)},
     "bowtie": {
-        "views": 96, "realizations": 2, "map_mm": 12.0, "cause_views": 24, "histories": 20_000, "plaque_views": 40,
+        "views": 96, "realizations": 2, "map_mm": 12.0, "histories": 20_000, "plaque_views": 40,
         "plaque_doses": (2.0,), "plaque_realizations": 8,
     },
     "hardcases": {

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from recon.evaluate.store import Pieces
-from recon.study.bowtie.absolute_noise import noise_causes
 from recon.study.bowtie.combined import combine
 from recon.study.bowtie.dose_maps import (
     DoseMaps,
@@ -20,7 +19,6 @@ from recon.study.bowtie.dose_maps import (
     thorax_ratios,
     transmission,
 )
-from recon.study.bowtie.muscle_dose import muscle_causes
 from recon.study.bowtie.settings import Settings
 from recon.study.bowtie.slices import Images, cupping, noise, phantom_grid, phantoms, wide_scanners
 from recon.study.study import Clock, Progress, silent
@@ -87,16 +85,6 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     parts["cupping_hu"] = cupping(wide_scanners(min(s.views, 492), s.detector), s.kernel)
     progress("beam hardening", 1.0)
     clock.lap("beam hardening")
-
-    if s.cause_views:
-        first = range(s.seed, s.seed + min(s.realizations, 2))
-        of_noise = partial(
-            noise_causes, s.cause_views, s.exposure_s, s.kernel, first, lambda f: progress("causes", 0.8 * f)
-        )
-        parts["noise_causes"] = pieces("noise_causes", of_noise)
-        of_dose = partial(muscle_causes, max(s.map_mm, 4.0), s.exposure_s, lambda f: progress("causes", 0.8 + 0.2 * f))
-        parts["muscle_causes"] = pieces("muscle_causes", of_dose)
-        clock.lap("causes")
 
     step = "plaque: MBIR and ROI bowtie"
     saved: dict[str, float] = {k: 1.0 / parts["ctdi_ratios"][k]["weighted"] for k in ("plane", "total") if k in ctdi}

@@ -16,7 +16,7 @@ DETECTORS = ("eid", "silicon")
 
 @dataclass(frozen=True)
 class Settings(StudySettings):
-    """Settings of the study; the quick ones: a quarter of the views, coarse maps, few photons, no look for causes.
+    """Settings of the study; the quick ones: a quarter of the views, coarse maps, few photons.
 
     Args:
         exposure_s: of the scans for dose and noise, at 1000 mA.
@@ -25,7 +25,6 @@ class Settings(StudySettings):
         realizations: of the slices' noise.
         detector: ``"eid"`` as the paper, or ``"silicon"``; see :func:`recon.study.bowtie.slices.wide_scanners`.
         map_mm: voxels of the thorax's dose map; that of the phantom has half of them, at least 1 mm.
-        cause_views: of the scans that look for the causes of other noise than the paper's; 0: no look for causes.
         histories: photons of each Monte Carlo run; 0: no scatter.
         plaque_views: of the plaque's scans; fewer than the paper's keep the tube load.
         plaque_doses: exposures of the plaque's scans in s.
@@ -42,7 +41,6 @@ class Settings(StudySettings):
     realizations: int = 4
     detector: str = "eid"
     map_mm: float = 2.0
-    cause_views: int = 246
     histories: int = 2_000_000
     plaque_views: int = paper.FULL_VIEWS["PCCT"] // 2
     plaque_doses: tuple[float, ...] = (0.35, 2.0)
@@ -50,17 +48,14 @@ class Settings(StudySettings):
     seed: int = 0
 
     QUICK: ClassVar = {
-        "views": 492, "realizations": 2, "map_mm": 6.0, "cause_views": 0, "histories": 100_000,
+        "views": 492, "realizations": 2, "map_mm": 6.0, "histories": 100_000,
         "plaque_views": 123, "plaque_doses": (2.0,), "plaque_realizations": 8,
     }  # fmt: skip
 
     def __post_init__(self) -> None:
-        self.check_whole(cause_views=0)
         self.check_whole(views=8, realizations=2, histories=0, plaque_views=8, plaque_realizations=8, seed=0)
         if 0 < self.histories < 10_000:
             raise ValueError(f"histories must be 0 (no scatter) or at least 10000, got {self.histories}")
-        if 0 < self.cause_views < 8:
-            raise ValueError(f"cause_views must be 0 (no look for causes) or at least 8, got {self.cause_views}")
         number("exposure_s", self.exposure_s, positive=True, unit="s")
         number("map_mm", self.map_mm, positive=True, unit="mm")
         doses = numbers("plaque_doses", self.plaque_doses, positive=True, unit="s")
