@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import safetensors
+import torch
 from torch import Tensor
 
 from recon.mbir.mbir import WEIGHTS_FORMAT
@@ -44,7 +45,7 @@ def finite(value: Any) -> Any:
 
 
 def export(folder: Path, weights: Mapping[str, Tensor], config: TrainConfig, state: Mapping[str, Any]) -> None:
-    """Write ``weights.safetensors``, ``card.json`` and ``card.md``.
+    """Write ``weights.safetensors`` (float16), ``card.json`` and ``card.md``.
 
     Args:
         folder: existing.
@@ -53,6 +54,8 @@ def export(folder: Path, weights: Mapping[str, Tensor], config: TrainConfig, sta
         state: fields of :class:`train.run.State` as of now; ``best`` describes the weights.
     """
     best = state["best"]
+    # Half the bytes, and 0.05 % of a weight: no volume changes by a tenth of a HU.
+    stored = {k: w.to(torch.float16) if k.startswith("network.") else w for k, w in weights.items()}
     versions = {**environment(), "safetensors": safetensors.__version__}
     system = f"{platform.system()} {versions.pop('machine')}"
     card = {
@@ -63,7 +66,7 @@ def export(folder: Path, weights: Mapping[str, Tensor], config: TrainConfig, sta
         "seconds_to_these_weights": round(best["seconds"], 1),
         "seconds": round(state["seconds"], 1),
         "parameters": sum(w.numel() for w in weights.values()),
-        "sha256_of_tensors": digest(weights),
+        "sha256_of_tensors": digest({k: w.to(weights[k].dtype) for k, w in stored.items()}),
         "seed": config.seed,
         "config": finite(config.as_dict()),
         "sessions": state["sessions"],
@@ -80,7 +83,7 @@ def export(folder: Path, weights: Mapping[str, Tensor], config: TrainConfig, sta
         "step": best["step"],
         "score": best["score"],
     }
-    write_tensors(folder / "weights.safetensors", WEIGHTS_FORMAT, weights, header)
+    write_tensors(folder / "weights.safetensors", WEIGHTS_FORMAT, stored, header)
     texts = {"card.json": json.dumps(card, indent=2, ensure_ascii=False) + "\n", "card.md": _markdown(card, config)}
     for name, text in texts.items():
         with written_whole(folder / name) as part:

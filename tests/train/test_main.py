@@ -6,9 +6,13 @@ import subprocess
 import sys
 
 import pytest
+import torch
 from tiny_training import ROOT, StubData, StubObjective, assert_same_run, send, stub_model
 
+from recon.mbir.network import NetworkConfig
+from recon.mbir.unrolled import Unrolled
 from train import __main__ as command_line
+from train.checkpoint import start_from
 
 
 @pytest.fixture
@@ -69,3 +73,24 @@ def test_nothing_heavy_is_loaded_before_the_numbers_of_threads_are_set():
     code = "import sys, train.__main__; print({'torch', 'numpy', 'numba'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     assert done.stdout == "set()\n"
+
+
+def test_a_wider_network_starts_where_the_narrower_one_stood():
+    torch.manual_seed(0)
+    narrow, wide = (
+        Unrolled(NetworkConfig(channels, 0.2, 1.6, bilateral=True), 1) for channels in ((4, 6, 8), (8, 9, 8))
+    )
+    with torch.no_grad():
+        narrow.network.share.fill_(0.3)
+        for block in narrow.network.down:
+            block.gain.weight.normal_()
+    start_from(wide, narrow.state_dict())
+    volumes, condition = torch.randn(2, 1, 16, 16, 16), torch.randn(1, 3)
+    found = [m.network.eval()(*volumes, condition, torch.ones(1)) for m in (narrow, wide)]
+    torch.testing.assert_close(found[0], found[1])
+    found[1].square().sum().backward()
+    assert wide.network.leave.weight.grad[:, 4:].abs().max() > 0  # the new channels learn
+    with pytest.raises(ValueError, match="same or wider"):
+        start_from(narrow, wide.state_dict())
+    with pytest.raises(ValueError, match="share has the shape none"):
+        start_from(narrow, {k: v for k, v in narrow.state_dict().items() if k != "network.share"})
