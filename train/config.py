@@ -142,7 +142,8 @@ class ObjectiveConfig:
 
     Args:
         data: of eᵀH e.
-        white: of ‖e‖², against ``data``; edge: by how much more within two voxels of an edge.
+        white: of ‖e‖², against ``data``; edge: by how much more within two voxels of an edge; body: in
+            bodies and one voxel about them.
         noise_free: of ``data`` and ``white`` of the same scene without noise, against those with noise: what is left
             there is blur and overshoot.
         contrast: of the ROI contrasts' errors at look 1; viewing: share of it that is left at look 0, linear between.
@@ -159,6 +160,7 @@ class ObjectiveConfig:
     data: float = 60.0
     white: float = 0.2
     edge: float = 2.0
+    body: float = 0.0
     noise_free: float = 0.0
     contrast: float = 0.2
     viewing: float = 1.0
@@ -169,7 +171,7 @@ class ObjectiveConfig:
     validation_draws: int = 6
 
     def __post_init__(self) -> None:
-        for name in ("data", "white", "edge", "noise_free", "contrast"):
+        for name in ("data", "white", "edge", "body", "noise_free", "contrast"):
             _set(self, **{name: number(name, getattr(self, name), low=0.0)})
         _set(self, viewing=number("viewing", self.viewing, low=0.0, high=1.0))
         _set(self, contrast_sd=number("contrast_sd", self.contrast_sd, positive=True))

@@ -5,7 +5,7 @@ terms, all from two independent noise draws of each scene with errors e₁, e₂
 
 * ``data``: eᵀH e per voxel, the error as the scanner would see it, which is the noise-whitened squared error;
 * ``white``: ‖e‖² per voxel, for the frequencies that the scanner does not see; more on both sides of edges, where blur
-  and undershoot are;
+  and undershoot are, and in bodies, which are small beside what surrounds them;
 * ``noise_free``: both of the same scene without noise, where all that is left is blur and overshoot beside edges;
 * ``contrast``: the errors d of ROI contrasts, small ones and that of a whole core, (d₁² + d₂²) / 2 + κ d₁ d₂. The
   product of two draws is an unbiased estimate of the squared bias, so κ trades variance against bias.
@@ -104,7 +104,8 @@ class Objective:
         truth = batch.truth.repeat(copies, 1, 1, 1)
         error = model(problem, look.repeat(copies), steps=steps) - truth / problem.scale_hu.reshape(-1, 1, 1, 1)
         data = (error * problem.apply(error)).mean(dim=(1, 2, 3))
-        weight = 1.0 + c.edge * _edges(batch.truth).repeat(copies, 1, 1, 1)
+        places = c.edge * _edges(batch.truth) + c.body * _bodies(batch.truth)
+        weight = 1.0 + places.repeat(copies, 1, 1, 1)
         white = (error.square() * weight).mean(dim=(1, 2, 3))
         image = c.data * (data + c.white * white) / (1.0 + data.detach() / _TAME_ERROR)
         noisy, error = image[: 2 * n], error[: 2 * n]

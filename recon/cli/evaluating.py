@@ -7,7 +7,7 @@ import os
 import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 # What loads torch or numba is imported by the commands: help and refusals come at once.
 from recon.cli.parsing import Commands, check_results, command
@@ -59,6 +59,9 @@ def _evaluate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     if out.is_file():
         raise ValueError(f"{out} is a file: --out names a folder")
     check_results(arguments, out, lambda report: "records" in report, "report.*", "*.png")
+    if getattr(arguments, "volumes", None):
+        _volumes(arguments.volumes[0], arguments.volumes[1], arguments.reference)
+        return
     # The user's own modules lie where the command is run.
     sys.path.insert(0, os.getcwd())
     methods = [*(arguments.method or []), *map(_denoiser, arguments.denoiser or [])]
@@ -97,17 +100,47 @@ def _scans(arguments: argparse.Namespace, methods: list[str]) -> None:
 
     scans = [open_scan(path) for path in arguments.scans]
     grid = grid_of_scan(scans[0], arguments)
-    found = evaluate_scans(scans, grid, methods)
-    rows = [("method", "noise", "of FBP as sharp", "dose factor", "f50, lp/mm", "agree up to, lp/mm")]
+    _print_measured(evaluate_scans(scans, grid, methods), scans[0].unit, "FBP", "FBP as sharp: kernel ram-lak")
+
+
+def _volumes(first: Path, second: Path, reference: str) -> None:
+    """Volumes of two scans of one object that other programs made, one folder a scan."""
+    from recon.evaluate.without_truth import evaluate_volumes
+    from torchpcct.volume import Volume
+
+    for folder in (first, second):
+        if not folder.is_dir():
+            raise ValueError(f"{folder} is no folder: --volumes takes two, with one volume a method in each")
+    stems = [{p.name.partition(".")[0]: p for p in sorted(f.iterdir()) if p.is_file()} for f in (first, second)]
+    names = [name for name in stems[0] if name in stems[1]]
+    if reference not in names:
+        raise ValueError(
+            f"{first} and {second} hold {', '.join(names) or 'no volumes of one name'}: --reference names the one of a "
+            "linear method that has smoothed nothing (FBP, kernel ram-lak)"
+        )
+    pairs = {name: [Volume.load(s[name]) for s in stems] for name in names}
+    grid, unit = pairs[reference][0].grid, pairs[reference][0].unit
+    for name, both in pairs.items():
+        if any(v.grid != grid or v.unit != unit for v in both):
+            raise ValueError(
+                f"{name} lies on another grid or has another unit than {reference}: {both[0].grid}, {grid}"
+            )
+    data = {name: [v.data for v in both] for name, both in pairs.items()}
+    base = data.pop(reference)
+    found = evaluate_volumes(data, base, grid.spacing[-1])
+    _print_measured(found, unit, reference, f"{reference} as sharp: that volume")
+
+
+def _print_measured(found: list[dict[str, Any]], unit: str, reference: str, meaning: str) -> None:
+    """Table of noise at equal resolution."""
+    rows = [("method", "noise", f"of {reference} as sharp", "dose factor", "f50, lp/mm", "agree up to, lp/mm")]
     rows += [(r["method"], *(f"{r[k]:.3g}".replace("nan", "–") for k in _MEASURED)) for r in found]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         print("  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip())
     if any(r["f50"] == float("inf") for r in found):
         print("no dose factor where the scans show nothing fine enough to tell how sharp a method is (f50 inf)")
-    print(
-        f"noise of one scan in {scans[0].unit}; FBP as sharp: kernel ram-lak with a Gaussian that gives it the same f50"
-    )
+    print(f"noise of one scan in {unit}; {meaning} with a Gaussian that gives it the same f50")
 
 
 def _denoiser(text: str) -> str:
@@ -155,6 +188,19 @@ def add_evaluate(commands: Commands) -> None:
         type=Path,
         metavar="FILE",
         help="measured scans instead of tasks: two of one object, or one, which is halved; noise at equal resolution",
+    )
+    parser.add_argument(
+        "--volumes",
+        nargs=2,
+        type=Path,
+        metavar="FOLDER",
+        help="volumes of two scans of one object instead of tasks: a file of the same name a method in each folder",
+    )
+    parser.add_argument(
+        "--reference",
+        default="fbp",
+        metavar="NAME",
+        help="with --volumes: of a linear method, unsmoothed (default fbp)",
     )
     parser.add_argument("--voxel", type=float, metavar="MM", help="with --scans: voxel size (default: the detector's)")
     parser.add_argument("--extent", type=float, nargs="+", metavar="MM", help="with --scans: of the volume, Z Y X")

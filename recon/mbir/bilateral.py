@@ -23,21 +23,18 @@ from torch import Tensor
 
 from torchpcct.threads import run
 
-__all__ = ["REACH", "joint_bilateral"]
-
-REACH = 2.0
-"""Standard deviation of s in voxels; it ends at twice that."""
+__all__ = ["joint_bilateral"]
 
 
 @cache
-def _offsets() -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """``(n, 3)`` neighbours z, y, x within reach, and their weights."""
-    radius = math.ceil(2.0 * REACH - 1e-9)
-    axis = np.arange(-radius, radius + 1)
+def _offsets(reach: float, step: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """``(n, 3)`` neighbours z, y, x within twice the reach, and their weights."""
+    radius = math.floor(2.0 * reach / step + 1e-9)
+    axis = step * np.arange(-radius, radius + 1)
     at = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
     square = np.square(at).sum(1)
-    kept = (square <= (2.0 * REACH) ** 2) & (square > 0)
-    return at[kept].astype(np.int64), np.exp(-0.5 * square[kept] / REACH**2).astype(np.float32)
+    kept = (square <= (2.0 * reach) ** 2) & (square > 0)
+    return at[kept].astype(np.int64), np.exp(-0.5 * square[kept] / reach**2).astype(np.float32)
 
 
 @njit(cache=True, nogil=True, fastmath=True)
@@ -98,37 +95,38 @@ def _backward(begin, end, u, g, scale, offsets, weights, out, total, grad, grad_
 
 class _Bilateral(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, u: Tensor, guide: Tensor, threshold: Tensor) -> Tensor:
+    def forward(ctx: Any, u: Tensor, guide: Tensor, threshold: Tensor, reach: float, step: int) -> Tensor:
         values, g = (v.detach().float().contiguous().numpy() for v in (u, guide))
         scale = (1.0 / threshold.detach().float()).numpy()
         out, total = np.empty_like(values), np.empty_like(values)
         rows = values.shape[0] * values.shape[1] * values.shape[2]
-        offsets, weights = _offsets()
+        offsets, weights = _offsets(reach, step)
         run(_forward, rows, values, g, scale, offsets, weights, out, total,
             operations=8 * len(weights) * values.shape[3])  # fmt: skip
-        ctx.kept = (values, g, scale, out, total, u.dtype)
+        ctx.kept = (values, g, scale, out, total, u.dtype, offsets, weights)
         return torch.from_numpy(out).to(u.dtype)
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> Any:
-        values, g, scale, out, total, dtype = ctx.kept
+        values, g, scale, out, total, dtype, offsets, weights = ctx.kept
         slope = grad.detach().float().contiguous().numpy()
         found = np.empty_like(values), np.empty_like(values)
-        offsets, weights = _offsets()
         rows = values.shape[0] * values.shape[1] * values.shape[2]
         run(_backward, rows, values, g, scale, offsets, weights, out, total, slope, *found,
             operations=20 * len(weights) * values.shape[3])  # fmt: skip
-        return (*(torch.from_numpy(f).to(dtype) for f in found), None)
+        return (*(torch.from_numpy(f).to(dtype) for f in found), None, None, None)
 
 
-def joint_bilateral(u: Tensor, guide: Tensor, threshold: Tensor) -> Tensor:
+def joint_bilateral(u: Tensor, guide: Tensor, threshold: Tensor, reach: float = 2.5, step: int = 1) -> Tensor:
     """Filtered volumes ``(batch, z, y, x)``, differentiable in volume and guide; on the CPU in float32.
 
     Args:
         u: volumes.
         guide: of the same shape, smooth enough that its differences tell of edges and not of noise.
         threshold: ``(batch,)`` differences of the guide that weigh about exp(−½) (t above).
+        reach: standard deviation of s in voxels; it ends at twice that.
+        step: only every so many voxels along each axis are neighbours: of smooth volumes the others add nothing.
     """
     device = u.device
-    found: Tensor = _Bilateral.apply(u.cpu(), guide.cpu(), threshold.cpu())
+    found: Tensor = _Bilateral.apply(u.cpu(), guide.cpu(), threshold.cpu(), reach, step)
     return found.to(device)

@@ -34,8 +34,11 @@ __all__ = ["GUIDE_VOXELS", "Network", "NetworkConfig"]
 
 CONDITIONS = 3
 """Numbers that steer the gains: logarithm of the noise scale, look, step."""
-GUIDE_VOXELS, _THRESHOLD = 1.4, 2.8
-"""Of the bilateral filter: width of its guide's Gaussian, and differences of it, in noise, that count as an edge."""
+GUIDE_VOXELS = 1.4
+"""Width of the Gaussian that makes the bilateral filter's guide."""
+_FIRST, _SECOND = (2.8, 2.5, 1), (1.4, 4.0, 2)
+"""The filter is run twice, the second time guided by what the first has left: difference of the guide, in noise, that
+counts as an edge, reach and step in voxels."""
 _SLOPE = 0.1
 _BLOCK = 2
 _DEPTH = 3
@@ -49,7 +52,7 @@ class NetworkConfig:
         channels: of the three levels.
         voxel_mm: size of the cubic voxels that it is for.
         local_mm: standard deviation of the Gaussian mean that it works relative to, mm; 0: relative to the surround.
-        bilateral: a third view of the data: the step towards them through a joint bilateral filter
+        bilateral: a third view of the data: the step towards them through a joint bilateral filter, twice
             (:mod:`recon.mbir.bilateral`), to which the network adds what the filter has taken away.
         turns: once trained, average over the eight turns and mirror images about z.
     """
@@ -116,7 +119,8 @@ class Network(nn.Module):
             if guide_noise is None:
                 raise ValueError("a network with a bilateral filter needs guide_noise")
             guide = local_mean(towards, GUIDE_VOXELS)
-            views.append(joint_bilateral(towards, guide, _THRESHOLD * guide_noise))
+            seen = joint_bilateral(towards, guide, _FIRST[0] * guide_noise, *_FIRST[1:])
+            views.append(joint_bilateral(seen, seen, _SECOND[0] * guide_noise, *_SECOND[1:]))
         if not self.config.local_mm:
             return self._symmetric(views, condition)
         level = local_mean(estimate, self.config.local_mm / self.config.voxel_mm)

@@ -293,6 +293,27 @@ def test_two_measured_scans(task, tmp_path):
         evaluate_scans([scans[0], object()], task.grid, "fbp:soft")
 
 
+def test_volumes_in_two_folders(tmp_path, capsys):
+    """Of other programs: noise at equal resolution, a row a method."""
+    generator, grid = torch.Generator().manual_seed(0), VolumeGrid((4, 64, 64), 0.5)
+    object_ = torch.zeros(grid.shape)
+    object_[:, 20:44, 20:44] = 100.0
+    for folder in ("one", "two"):
+        (tmp_path / folder).mkdir()
+        plain = object_ + torch.randn(grid.shape, generator=generator) * 10
+        soft = torch.from_numpy(ndimage.gaussian_filter(plain.numpy(), [0, 1.5, 1.5]))
+        for name, data in (("fbp", plain), ("mine", soft)):
+            Volume(data, grid).save(tmp_path / folder / f"{name}.nii.gz")
+    folders = [str(tmp_path / folder) for folder in ("one", "two")]
+    assert main(["evaluate", "--volumes", *folders]) == 0
+    row = next(line.split() for line in capsys.readouterr().out.splitlines() if line.startswith("mine"))
+    assert float(row[3]) == pytest.approx(1.0, rel=0.2)  # a blur saves nothing
+    assert main(["evaluate", "--volumes", *folders, "--reference", "other"]) == 2
+    assert "hold fbp, mine" in capsys.readouterr().err
+    assert main(["evaluate", "--volumes", folders[0], str(tmp_path / "no")]) == 2
+    assert "is no folder" in capsys.readouterr().err
+
+
 def test_pairs_of_volumes():
     generator = torch.Generator().manual_seed(0)
     object_ = torch.zeros(4, 64, 64)

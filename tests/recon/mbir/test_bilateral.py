@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from recon.mbir.bilateral import REACH, joint_bilateral
+from recon.mbir.bilateral import joint_bilateral
 from recon.mbir.network import GUIDE_VOXELS, Network, NetworkConfig, local_mean
 from recon.mbir.unrolled import Unrolled, guide_noise
 
@@ -17,12 +17,13 @@ def volumes(shape=(2, 6, 7, 8), seed=0):
     return torch.randn(shape, generator=generator), 0.5 * torch.randn(shape, generator=generator)
 
 
-def by_definition(u, guide, threshold):
+def by_definition(u, guide, threshold, reach=2.5, step=1):
     """The sum over all pairs of voxels."""
     out = torch.empty_like(u, dtype=torch.float64)
     at = torch.stack(torch.meshgrid(*[torch.arange(n) for n in u.shape[1:]], indexing="ij"), -1).reshape(-1, 3).double()
-    square = (at[:, None] - at).square().sum(-1)
-    near = torch.exp(-0.5 * square / REACH**2) * (square <= (2 * REACH) ** 2)
+    apart = at[:, None] - at
+    square = apart.square().sum(-1)
+    near = torch.exp(-0.5 * square / reach**2) * (square <= (2 * reach) ** 2) * (apart % step == 0).all(-1)
     for b in range(len(u)):
         g, v = guide[b].double().flatten(), u[b].double().flatten()
         alike = (1 - ((g[:, None] - g) / threshold[b]).square() / 4).clamp_min(0).square()
@@ -31,9 +32,11 @@ def by_definition(u, guide, threshold):
     return out
 
 
-def test_it_is_what_it_says():
+@pytest.mark.parametrize(("reach", "step"), [(2.5, 1), (1.2, 1), (3.0, 2)])
+def test_it_is_what_it_says(reach, step):
     u, guide = volumes()
-    torch.testing.assert_close(joint_bilateral(u, guide, T).double(), by_definition(u, guide, T), rtol=1e-4, atol=1e-5)
+    found = joint_bilateral(u, guide, T, reach, step).double()
+    torch.testing.assert_close(found, by_definition(u, guide, T, reach, step), rtol=1e-4, atol=1e-5)
 
 
 def test_constants_pass_and_edges_stay():
@@ -80,7 +83,8 @@ def test_the_network_starts_from_half_of_it():
     torch.testing.assert_close(turned, torch.rot90(found, 1, (-2, -1)), rtol=1e-4, atol=1e-4)
     network.leave.weight.zero_()
     level = local_mean(u, 4.0)
-    smooth = joint_bilateral(towards, local_mean(towards, GUIDE_VOXELS), 2.0 * noise)
+    smooth = joint_bilateral(towards, local_mean(towards, GUIDE_VOXELS), 2.8 * noise, 2.5)
+    smooth = joint_bilateral(smooth, smooth, 1.4 * noise, 4.0, 2)
     torch.testing.assert_close(network(u, towards, condition, noise), 0.5 * (level + smooth), rtol=1e-4, atol=1e-4)
     with pytest.raises(ValueError, match="guide_noise"):
         network(u, towards, condition)
