@@ -192,6 +192,7 @@ def records_of(
         factor("noise", tissue, other.log_noise(tissue), own.log_noise(tissue))
     add("error", "near the bodies", own.rmse(), "HU")
     add("error without noise", "near the bodies", math.sqrt(readings.clean_square), "HU")
+    add("undershoot without noise", "beside the bodies", readings.clean_rim, "HU")
     for k, roi in enumerate(rois):
         slope = own.slope(k)
         add("slope", roi, slope)

@@ -50,7 +50,8 @@ class Readings:
         channels: observer → ``(n, 2, channels)``.
         square: ``(n,)`` mean square error with the signal near the bodies, HU².
         flat: tissue → ``(n, voxels)`` HU, with the signal.
-        clean_rois: ``(2, rois, 2)`` of noise-free data; clean_square; clean_channels: likewise.
+        clean_rois: ``(2, rois, 2)`` of noise-free data; clean_square; clean_channels: likewise; clean_rim: least error
+            there in the rim of the largest tissue, HU.
         control: ``(n, 2, rois, 2)`` HU: linear functionals of the same draws that follow ``rois``, with their mean
             ``(2, rois, 2)`` and covariance ``(rois, 2, rois, 2)``; None: the reference's ROI means serve.
         first: first volume with the signal, float16, and that of noise-free data.
@@ -63,6 +64,7 @@ class Readings:
     flat: dict[str, NDArray[np.float32]]
     clean_rois: Floats
     clean_square: float
+    clean_rim: float
     clean_channels: dict[str, Floats]
     control: tuple[Floats, Floats, Floats] | None
     first: NDArray[np.float16]
@@ -118,6 +120,11 @@ class Reader:
     def square(self, volume: Tensor) -> float:
         """Mean square error with the signal, HU²."""
         return float((volume - self.truth[0])[self.task.near].double().square().mean())
+
+    def rim(self, volume: Tensor) -> float:
+        """Least error beside the bodies, HU; below 0 a dark rim."""
+        mask = self.task.rim
+        return float((volume - self.truth[0])[mask].min()) if mask.any() else 0.0
 
     def flat(self, volume: Tensor) -> dict[str, Any]:
         """Voxels of every flat tissue."""
@@ -184,7 +191,7 @@ def measure_method(
 ) -> Readings:  # fmt: skip
     """``n`` realisations of a method."""
     place = f"{_file_name(method.name)}/{exposure_s:g}s"
-    key = f"4 {method.name} {method.key} {draws.seed} {draws.task.fingerprint}"
+    key = f"5 {method.name} {method.key} {draws.seed} {draws.task.fingerprint}"
 
     def clean() -> dict[str, Any]:
         check_method(method, reader, draws, exposure_s)
@@ -209,6 +216,7 @@ def measure_method(
     return Readings(
         joined["rois"], {o: joined[f"channels_{o}"] for o in OBSERVERS}, joined["square"],
         {t: joined[f"flat_{t}"] for t in draws.task.flat}, without_noise["rois"][0], float(without_noise["square"][0]),
+        float(without_noise["rim"][0]),
         {o: without_noise[f"channels_{o}"][0] for o in OBSERVERS},
         None if known is None else (joined["control"], known["mean"], known["covariance"]),
         pieces[0]["first"], without_noise["first"],
@@ -219,7 +227,7 @@ def measure_method(
 def _of(
     pairs: Sequence[Sequence[Any]], method: Method, reader: Reader, keep: bool, adjoints: Tensor | None = None
 ) -> dict[str, Any]:
-    rois, square, seconds, control = [], [], [], []
+    rois, square, rim, seconds, control = [], [], [], [], []
     channels: dict[str, list[Any]] = {o: [] for o in OBSERVERS}
     flat: dict[str, list[Any]] = {t: [] for t in reader.task.flat}
     first = None
@@ -235,11 +243,17 @@ def _of(
         for o in OBSERVERS:
             channels[o].append([reader.responses(v, o) for v in volumes])
         square.append(reader.square(volumes[0]))
+        rim.append(reader.rim(volumes[0]))
         for t, values in reader.flat(volumes[0]).items():
             flat[t].append(values)
         if keep and first is None:
             first = volumes[0].numpy().astype(np.float16)
-    found = {"rois": np.array(rois), "square": np.array(square), "seconds": np.array(np.median(seconds))}
+    found = {
+        "rois": np.array(rois),
+        "square": np.array(square),
+        "rim": np.array(rim),
+        "seconds": np.array(np.median(seconds)),
+    }
     found |= {"control": np.array(control)} if control else {}
     found |= {f"channels_{o}": np.array(v) for o, v in channels.items()}
     found |= {f"flat_{t}": np.array(v, dtype=np.float32) for t, v in flat.items()}

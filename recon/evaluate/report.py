@@ -25,9 +25,10 @@ _WINDOW_HU = (-160.0, 240.0)
 _INTRO = """\
 Dose factor: how many times the dose {reference} needs for the same figure. Brackets: 95 % intervals over {n} noise
 realisations, the same for all methods; figures without are exact. Noise: of a voxel, over realisations. Error: root
-mean square near the bodies. Slope: contrast that the signal adds over the true one; contrasts are compared at slope 1.
-Without signal: contrast read where there is none. CNR: of the paper's protocol. d′: of an observer who knows where to
-look. Limit: an unbiased estimate that knows all outlines."""
+mean square near the bodies. Undershoot: least error beside them without noise; far below 0 it is a dark rim. Slope:
+contrast that the signal adds over the true one; contrasts are compared at slope 1. Without signal: contrast read where
+there is none. CNR: of the paper's protocol. d′: of an observer who knows where to look. Limit: an unbiased estimate
+that knows all outlines."""
 
 
 def text_of(evaluation: Evaluation) -> str:
@@ -63,6 +64,7 @@ def _task_text(seen: Seen, records: list[Record], n: int) -> str:
         *((f"noise in {'background' if t == task.background else t}, HU", "noise", t) for t in tissues),
         ("error, HU", "error", "near the bodies"),
         ("error without noise, HU", "error without noise", "near the bodies"),
+        ("undershoot, HU", "undershoot without noise", "beside the bodies"),
         *((f"slope, {roi}", "slope", roi) for roi in seen.true_hu),
         ("without signal, lesion, HU", "contrast without signal", "lesion"), ("CNR", "CNR", "small"),
         ("d′, slice", "d'", "axial"), ("d′, volume", "d'", "volume"), ("s", "seconds", "a volume"),

@@ -52,8 +52,8 @@ _AROUND_MM = 1.5
 """The background is read as far from the signal."""
 _SMALL_MM2 = 0.25
 """Area of the small ROIs, about that of the paper's."""
-_NEAR_MM = 0.4
-"""The error is that of bodies and of what lies so close to them."""
+_NEAR_MM, _RIM_MM = 0.4, 0.8
+"""The error is that of bodies and of what lies so close to them; a rim is looked for so far from them."""
 _FLAT_MM, _FLAT_VOXELS, _KEPT_VOXELS = 1.0, 150, 2000
 """Noise is that of voxels so far from any edge; of tissues with so many; of so many at most."""
 _VIEWS, _SUB_RAYS = 246, 16
@@ -281,14 +281,24 @@ class Task:
         beside = np.where(around & here, _depth(around, step), -1.0)
         return inner, _nearest(beside >= 0.5 * beside.max(), ndimage.center_of_mass(inner), count)
 
+    @property
+    def _largest(self) -> str:
+        """The tissue that fills most of the inset."""
+        return max(self.shares, key=lambda t: float(self.shares[t].sum()))
+
     @cached_property
     def near(self) -> Tensor:
         """Mask ``grid.shape`` in which the error counts: all but the largest tissue, and what is close to it."""
-        largest = max(self.shares, key=lambda t: float(self.shares[t].sum()))
-        bodies = self.shares[largest] < 0.5
+        bodies = self.shares[self._largest] < 0.5
         bodies |= self.shares["signal"] > 0.5
         away = ndimage.distance_transform_edt(~bodies, sampling=self.grid.spacing)
         return torch.from_numpy(away <= _NEAR_MM)
+
+    @cached_property
+    def rim(self) -> Tensor:
+        """Mask ``grid.shape`` of the largest tissue's pure voxels beside bodies, where sharpening undershoots."""
+        pure = self.shares[self._largest] > 1.0 - 1e-6
+        return torch.from_numpy(pure & (_depth(pure, self.grid.spacing) <= _RIM_MM))
 
     @cached_property
     def flat(self) -> dict[str, Tensor]:
