@@ -69,4 +69,4 @@ def test_bad_values_name_the_key(text, message, tmp_path):
 
 def test_packaged():
     assert packaged_config("default").steps > packaged_config("quick").steps
-    assert packaged_config("default").network == {}
+    assert packaged_config("default").network["bilateral"]

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from train.scenes.drawing import draw_scene
-from train.scenes.held_out import unseen_plaque, validation_scenes
+from train.scenes.held_out import validation_scenes
 from train.scenes.rasterise import random_scene, rasterise
 from train.scenes.scene import SceneConfig, Solid, Texture, TrainingScene, Vessel, is_paper_family
 
@@ -213,15 +213,6 @@ def test_texture_has_its_sd_and_length() -> None:
     points = np.stack([Texture(8.0, 0.6, seed).field((10, 10, 10), (0.06, 0.06, 0.6)) for seed in range(80)])
     correlation = np.mean(points[..., 1:] * points[..., :-1]) / np.mean(points**2)
     assert correlation == pytest.approx(math.exp(-0.5), abs=0.12)
-
-
-def test_plaques_that_weights_are_tested_on_chose_no_checkpoint() -> None:
-    shape, spacing = (24, 24, 29), (0.375, 0.375, 0.375)
-    chose = validation_scenes(shape, spacing, contrasts=(-60.0,)).scenes
-    tested = [unseen_plaque(k, shape, spacing, contrasts=(-60.0,)) for k in (0, 7, 8)]
-    assert [i for _, i in tested] == [0, 7, 0]
-    assert not any(held.scenes[i] in chose for held, i in tested)
-    assert tested[0][0].scenes[0] != tested[2][0].scenes[0]
 
 
 def test_validation_scenes() -> None:

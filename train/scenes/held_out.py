@@ -13,7 +13,7 @@ from train.scenes.drawing import Draw
 from train.scenes.rasterise import check_grid, rasterise
 from train.scenes.scene import Solid, TrainingScene, Triple, Vessel
 
-__all__ = ["CHECKPOINT_SEED", "CHECKPOINT_SIZE", "ValidationScenes", "unseen_plaque", "validation_scenes"]
+__all__ = ["CHECKPOINT_SEED", "CHECKPOINT_SIZE", "ValidationScenes", "validation_scenes"]
 
 CHECKPOINT_SEED, CHECKPOINT_SIZE = 0, 8
 """Seed and number of the plaques that checkpoints are chosen by: those of any other seed took no part in a training."""
@@ -80,17 +80,6 @@ def validation_scenes(
         scenes.append(_with_contrast(scene, contrasts[0]))
     image, core, inside, around = (torch.from_numpy(np.stack(maps)) for maps in zip(*found, strict=True))
     return ValidationScenes(image, torch.tensor(contrasts, dtype=torch.float32), core, inside, around, tuple(scenes))
-
-
-def unseen_plaque(
-    k: int, grid_shape: tuple[int, int, int], spacing_mm: Triple, *, contrasts: tuple[float, ...]
-) -> tuple[ValidationScenes, int]:
-    """The k-th plaque of the family that chose no checkpoint: for tests of weights. The scenes that hold it, and where.
-
-    Arguments and errors as of :func:`validation_scenes`.
-    """
-    seed = CHECKPOINT_SEED + 1 + k // CHECKPOINT_SIZE
-    return validation_scenes(grid_shape, spacing_mm, seed=seed, contrasts=contrasts), k % CHECKPOINT_SIZE
 
 
 def _with_contrast(scene: TrainingScene, contrast: float) -> TrainingScene:
