@@ -13,9 +13,7 @@ Both solves are a few conjugate gradients with the circulant H_c for H as precon
 safe: at the rim of the inset its eigenvalues reach 2.2.)
 
 f_c is the *look*, the one trade-off that a user cares about: 0 for viewing, quiet images; 1 for measuring, more of the
-contrast at more noise (on the paper's plaque a slope of 0.86 for 0.81 in small ROIs and 0.75 for 0.70 over the lesion
-at 2 s, 0.77 for 0.71 and 0.67 for 0.61 at 0.35 s). The network knows it, so the noise that it must leave alone does not
-surprise it.
+contrast at more noise. The network knows it, so the noise that it must leave alone does not surprise it.
 """
 
 from __future__ import annotations
@@ -36,8 +34,7 @@ __all__ = ["DEFAULT_LOOK", "REFERENCE_SCALE_HU", "Unrolled", "guide_noise", "loo
 REFERENCE_SCALE_HU = 200.0
 """Noise scale at which its conditioning variable is 0: about 1 s of the paper's scan."""
 DEFAULT_LOOK = 0.5
-"""Between the least error (0.3 on held-out plaques, the training card has the curve) and contrast, which a higher look
-gives and noise pays for."""
+"""Between the least error, at look 0, and contrast, which a higher look gives and noise pays for."""
 
 _START = (0.01, 0.8)
 """λ and μ of the start: the Wiener filter whose contrast slope is that of soft FBP (the study's ``linear``)."""
