@@ -56,7 +56,7 @@ def test_damaged_weights_are_refused(shipped, tmp_path):
     path = tmp_path / "weights.safetensors"
     path.write_bytes(good)
     Mbir.load(path)
-    for at in (*range(2000, len(good), 9999), len(good) - 1):
+    for at in (*range(9999, len(good), 19999), len(good) - 1):
         path.write_bytes(good[:at] + bytes([good[at] ^ 1]) + good[at + 1 :])
         with pytest.raises(ValueError, match=rf"{re.escape(str(path))} .*checksum.*another copy.*new installation"):
             Mbir.load(path)
