@@ -56,11 +56,12 @@ def answer(data: dict[str, Any]) -> str:
         verdict, reaches = {
             "yes": ("Yes", "reaches"), "no": ("No", "does not reach"), "open": ("Open", "may or may not reach"),
         }[tested["met"]]  # fmt: skip
+        against = "not" if tested["met"] == "no" else "against"
         text = (
             f"{verdict}: at {tested['mbir_s']:.2f} s MBIR's CNR of {_interval(tested['mbir'])} {reaches} the "
-            f"{tested['fbp']['value']:.2f} of FBP (soft kernel) at {tested['fbp_s']:.2f} s, for which it would have to "
-            f"save {ASSUMED_FACTOR:g} times the dose, as the paper assumes; it saves "
-            f"{_interval(tested['factor'])} times there"
+            f"{tested['fbp']['value']:.2f} of FBP (soft kernel) at {tested['fbp_s']:.2f} s: FBP needs "
+            f"{_interval(tested['factor'])} times its dose for that CNR, {against} the {ASSUMED_FACTOR:g} times "
+            "that the paper assumes"
         )
     exposures = sorted({r["exposure_s"] for r in records if r["method"] == _METHOD}, reverse=True)
     if not exposures:
@@ -69,12 +70,14 @@ def answer(data: dict[str, Any]) -> str:
     parts = [
         (_found(records, _METHOD, best, f"dose factor: {figure}", where), what)
         for figure, where, what in (
-            ("CNR", "small", "by the paper's CNR"), ("contrast at slope 1", "lesion", "by the contrast of the lesion"),
-            ("d'", "volume", "by detectability"), ("noise", "patient", "by the noise of a voxel in fat"),
+            ("CNR", "small", "for the paper's CNR"),
+            ("contrast at slope 1", "lesion", "for the contrast of the lesion"),
+            ("d'", "volume", "for the detectability"),
+            ("noise", "patient", "for the noise of a voxel in fat"),
         )
     ]  # fmt: skip
     said = ", ".join(f"{_interval(r)} {what}" for r, what in parts if r is not None)
-    text += f"{'; at' if text else 'At'} {best:.2f} s MBIR saves {said}"
+    text += f"{'; at' if text else 'At'} {best:.2f} s FBP needs, in doses of MBIR, {said}"
     s = data["settings"]
     if s["views"] < FULL_VIEWS or s["n"] < FEW_DRAWS:
         text += (f" (WARNING: {s['views']} views, {s['n']} realisations: a test of the program, which says "
