@@ -26,6 +26,10 @@ from torchpcct.threads import run
 __all__ = ["joint_bilateral"]
 
 
+_LEAST = 1e-12
+"""Of a threshold: its square is a float32 still."""
+
+
 @cache
 def _offsets(reach: float, step: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """``(n, 3)`` neighbours z, y, x within twice the reach, and their weights."""
@@ -37,7 +41,7 @@ def _offsets(reach: float, step: int) -> tuple[NDArray[np.int64], NDArray[np.flo
     return at[kept].astype(np.int64), np.exp(-0.5 * square[kept] / reach**2).astype(np.float32)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _forward(begin, end, u, g, scale, offsets, weights, out, total):
     """Rows (batch · z · y) ``begin … end``: the filtered volume and the sums of weights."""
     nz, ny, nx = u.shape[1:]
@@ -64,7 +68,7 @@ def _forward(begin, end, u, g, scale, offsets, weights, out, total):
             sums[x] = mine[x] + sums[x] / counts[x]
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _backward(begin, end, u, g, scale, offsets, weights, out, total, grad, grad_u, grad_g):
     """Gradients by volume and guide, gathered: what row ``begin … end`` gives to others, and they to it."""
     nz, ny, nx = u.shape[1:]
@@ -97,7 +101,8 @@ class _Bilateral(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, u: Tensor, guide: Tensor, threshold: Tensor, reach: float, step: int) -> Tensor:
         values, g = (v.detach().float().contiguous().numpy() for v in (u, guide))
-        scale = (1.0 / threshold.detach().float()).numpy()
+        # Where there is no noise (and so no threshold) every difference is an edge.
+        scale = (1.0 / threshold.detach().float().clamp_min(_LEAST)).numpy()
         out, total = np.empty_like(values), np.empty_like(values)
         rows = values.shape[0] * values.shape[1] * values.shape[2]
         offsets, weights = _offsets(reach, step)

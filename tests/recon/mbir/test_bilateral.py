@@ -39,6 +39,16 @@ def test_it_is_what_it_says(reach, step):
     torch.testing.assert_close(found, by_definition(u, guide, T, reach, step), rtol=1e-4, atol=1e-5)
 
 
+def test_without_noise_nothing_is_filtered_and_nan_raises_nothing():
+    u, guide = volumes()
+    torch.testing.assert_close(joint_bilateral(u, guide, 0.0 * T), u)
+    bad = u.clone()
+    bad[0, 2, 3, 4] = float("nan")
+    found = joint_bilateral(bad, guide, T)
+    assert bool(found[0].isnan().any())
+    assert bool(found[1].isfinite().all())
+
+
 def test_constants_pass_and_edges_stay():
     u, guide = volumes()
     torch.testing.assert_close(joint_bilateral(u + 7.0, guide + 3.0, T), joint_bilateral(u, guide, T) + 7.0)
