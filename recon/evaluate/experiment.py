@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from recon.evaluate.draws import Draws
 from recon.evaluate.estimates import Known, Record, records_of
-from recon.evaluate.measure import Reader, Readings, measure_method
+from recon.evaluate.measure import BLOCK, Measurement, Reader
 from recon.evaluate.methods import Method, method_of
 from recon.evaluate.store import Store
 from recon.evaluate.task import Facts, Task
@@ -118,6 +118,10 @@ def _listed(what: Any) -> Sequence[Any]:
     return list(what) if isinstance(what, list | tuple) else [what]
 
 
+def _pairs(draws: Draws, exposure_s: float, k: range) -> list[Any]:
+    return [draws.draw(exposure_s, i) for i in k]
+
+
 def _task(
     task: Task, methods: Sequence[Method], exposures: Sequence[float], n: int, seed: int, folder: Path,
     progress: Progress | None,
@@ -136,24 +140,24 @@ def _task(
     true = np.array([float(((truth[0] - truth[1]).double() * (b - a)).sum()) for a, b in task.regions.values()])
     records: list[Record] = []
     volumes = {}
-    asked = {m.name for m in methods}
     for exposure in exposures:
-        base: Readings | None = None
+        running = [Measurement(method, draws, reader, exposure, store) for method in everyone]
+        for start in range(0, n, BLOCK):
+            k = range(start, min(start + BLOCK, n))
+            # Drawn once for all methods, if one needs them.
+            pairs = cache(partial(_pairs, draws, exposure, k))
+            for measurement in running:
+                measurement.block(k, pairs)
+                if progress is not None:
+                    progress(f"{task.name}: {measurement.method.name}, {exposure:g} s", k.stop / n)
+        found = {m.method.name: m.readings() for m in running}
+        base = found[reference.name]
+        control = Known(draws.exact_covariance(reference.kernels[0]) / exposure, base.clean_rois, base.rois)
         for method in everyone:
-            step = f"{task.name}: {method.name}, {exposure:g} s"
-            found = measure_method(
-                method, draws, reader, exposure, n, store,
-                None if progress is None else partial(progress, step),
-            )  # fmt: skip
-            if base is None:
-                base = found
-                control = Known(draws.exact_covariance(reference.kernels[0]) / exposure, found.clean_rois, found.rois)
+            own = found[method.name]
             exact = draws.exact_covariance(method.kernels[0]) / exposure if method.is_fbp else None
-            volumes[method.name, exposure] = (found.first, found.first_clean)
-            if method.name in asked or method is reference:
-                records += records_of(
-                    task.name, method.name, exposure, found, base, control, facts, true, reader.rois, exact
-                )
+            volumes[method.name, exposure] = (own.first, own.first_clean)
+            records += records_of(task.name, method.name, exposure, own, base, control, facts, true, reader.rois, exact)
     true_hu = dict(zip(reader.rois, true.tolist(), strict=True))
     return records, Seen(task, facts, true_hu, truth[0].numpy(), volumes)
 

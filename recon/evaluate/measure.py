@@ -26,7 +26,7 @@ from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.observer import dog_channels, template_channel
 from torchpcct.volume import Volume
 
-__all__ = ["Reader", "Readings", "measure_method", "volume_of"]
+__all__ = ["BLOCK", "Measurement", "Reader", "Readings", "volume_of"]
 
 Floats = NDArray[np.float64]
 
@@ -185,43 +185,55 @@ def check_method(method: Method, reader: Reader, draws: Draws, exposure_s: float
         )
 
 
-def measure_method(
-    method: Method, draws: Draws, reader: Reader, exposure_s: float, n: int, store: Store,
-    progress: Callable[[float], None] | None = None,
-) -> Readings:  # fmt: skip
-    """``n`` realisations of a method."""
-    place = f"{_file_name(method.name)}/{exposure_s:g}s"
-    key = f"5 {method.name} {method.key} {draws.seed} {draws.task.fingerprint}"
+class Measurement:
+    """A method at one exposure: what is read of noise-free data, then of block after block of realisations.
 
-    def clean() -> dict[str, Any]:
-        check_method(method, reader, draws, exposure_s)
-        return _of([[draws.noise_free(p, exposure_s) for p in (True, False)]], method, reader, keep=True)
+    Args:
+        method: what reconstructs.
+        draws: of the task; reader: of its volumes.
+        exposure_s: in s.
+        store: keeps what is finished.
+    """
 
-    def block(k: range) -> dict[str, Any]:
-        return _of([draws.draw(exposure_s, i) for i in k], method, reader, keep=k.start == 0, adjoints=adjoints)
+    def __init__(self, method: Method, draws: Draws, reader: Reader, exposure_s: float, store: Store) -> None:
+        self.method, self.reader, self.store = method, reader, store
+        self._place = f"{_file_name(method.name)}/{exposure_s:g}s"
+        self._key = f"5 {method.name} {method.key} {draws.seed} {draws.task.fingerprint}"
+        self._pieces: list[dict[str, Any]] = []
 
-    without_noise = store.piece(f"{place}/clean", key, clean)
-    adjoints = known = None
-    if method.network is not None:
-        respond = partial(draws.response, method.network, reader, exposure_s)
-        known = store.piece(f"{place}/response", key, respond)
-        adjoints = torch.from_numpy(known["adjoints"])
-    pieces = []
-    for start in range(0, n, BLOCK):
-        k = range(start, min(start + BLOCK, n))
-        pieces.append(store.piece(f"{place}/{k.start}-{k.stop}", key, partial(block, k)))
-        if progress is not None:
-            progress(k.stop / n)
-    joined = {name: np.concatenate([p[name] for p in pieces]) for name in pieces[0] if name not in ("first", "seconds")}
-    return Readings(
-        joined["rois"], {o: joined[f"channels_{o}"] for o in OBSERVERS}, joined["square"],
-        {t: joined[f"flat_{t}"] for t in draws.task.flat}, without_noise["rois"][0], float(without_noise["square"][0]),
-        float(without_noise["rim"][0]),
-        {o: without_noise[f"channels_{o}"][0] for o in OBSERVERS},
-        None if known is None else (joined["control"], known["mean"], known["covariance"]),
-        pieces[0]["first"], without_noise["first"],
-        float(np.mean([p["seconds"] for p in pieces])),
-    )  # fmt: skip
+        def clean() -> dict[str, Any]:
+            check_method(method, reader, draws, exposure_s)
+            return _of([[draws.noise_free(p, exposure_s) for p in (True, False)]], method, reader, keep=True)
+
+        self._clean = store.piece(f"{self._place}/clean", self._key, clean)
+        self._known: dict[str, Any] | None = None
+        self._adjoints: Tensor | None = None
+        if method.network is not None:
+            respond = partial(draws.response, method.network, reader, exposure_s)
+            self._known = store.piece(f"{self._place}/response", self._key, respond)
+            self._adjoints = torch.from_numpy(self._known["adjoints"])
+
+    def block(self, k: range, pairs: Callable[[], Sequence[Sequence[Draw]]]) -> None:
+        """Realisations ``k``; ``pairs`` gives them, if they have not been measured before."""
+
+        def compute() -> dict[str, Any]:
+            return _of(pairs(), self.method, self.reader, keep=k.start == 0, adjoints=self._adjoints)
+
+        self._pieces.append(self.store.piece(f"{self._place}/{k.start}-{k.stop}", self._key, compute))
+
+    def readings(self) -> Readings:
+        """Of all blocks."""
+        pieces, clean, known = self._pieces, self._clean, self._known
+        joined = {
+            name: np.concatenate([p[name] for p in pieces]) for name in pieces[0] if name not in ("first", "seconds")
+        }
+        return Readings(
+            joined["rois"], {o: joined[f"channels_{o}"] for o in OBSERVERS}, joined["square"],
+            {t: joined[f"flat_{t}"] for t in self.reader.task.flat}, clean["rois"][0], float(clean["square"][0]),
+            float(clean["rim"][0]), {o: clean[f"channels_{o}"][0] for o in OBSERVERS},
+            None if known is None else (joined["control"], known["mean"], known["covariance"]),
+            pieces[0]["first"], clean["first"], float(np.mean([p["seconds"] for p in pieces])),
+        )  # fmt: skip
 
 
 def _of(

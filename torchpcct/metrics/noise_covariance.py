@@ -77,7 +77,7 @@ class NoiseCovariance:
 
     @classmethod
     def exact(cls, row: Any, spacing: Any) -> NoiseCovariance:
-        """From the covariance of one voxel with those around it, e.g. of ``recon.study.dose_factor.exact_linear``.
+        """From the covariance of one voxel with those around it, of :func:`recon.fbp.exact_noise.voxel_covariance`.
 
         Args:
             row: ``(z, y, x)`` HU², odd sizes, the voxel in the middle.
