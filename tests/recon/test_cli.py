@@ -281,7 +281,7 @@ def test_names_and_grey_scale_of_their_own(tmp_path, capsys, monkeypatch):
         (["reconstruct", "{tmp}/none.h5", "--out", "{tmp}/a.png"], "unknown volume format"),
         (["reconstruct", "{tmp}/none.h5", "--voxel", "0", "--out", "{tmp}/a.h5"], "--voxel must be greater than 0 mm"),
         (["plaque", "{tmp}/none.h5", "--out", "{tmp}/a"], "none.h5"),
-        (["compare", "--realizations", "2", "--out", "{tmp}/o"], "realizations must be at least 3"),
+        (["compare", "--n", "2", "--out", "{tmp}/o"], "n must be at least 8"),
         (["dose-factor", "--n", "2", "--out", "{tmp}/o"], "n must be at least 8"),
         (["study", "magic", "--out", "{tmp}/o"], "unknown study 'magic'"),
         (["study", "noise", "--set", "views", "--out", "{tmp}/o"], "give field=value"),
