@@ -16,7 +16,6 @@ from torchpcct.acquisition.acquire import plan
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.geometry import view_step
 from torchpcct.metrics import cnr_interval, mean_interval, sd_interval
-from torchpcct.metrics.control import expected_half_width
 from torchpcct.scanner.linearisation import WaterLinearisation
 from torchpcct.scene.materials import material
 from torchpcct.spectral import Basis, vmi_noise
@@ -175,7 +174,6 @@ def test_intervals_refuse_an_impossible_coverage(level):
         lambda: mean_interval(values, level=level),
         lambda: sd_interval(1.0, 10, level=level),
         lambda: cnr_interval(values, values[::-1] + 0.1, level=level),
-        lambda: expected_half_width(200, 0.9, level=level),
     ):
         with pytest.raises(ValueError, match="level must"):
             call()
