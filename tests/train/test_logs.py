@@ -84,7 +84,7 @@ def test_card(uninterrupted):
     assert card["hardware"]["cpu"]
     assert card["validation"]["bias"] == "nan"
     assert card["parameters"] == 65 + 33
-    assert 0 < card["seconds_to_these_weights"] <= card["seconds"] + 0.1
+    assert 0 <= card["seconds_to_these_weights"] <= card["seconds"] + 0.1
     text = (uninterrupted / "card.md").read_text()
     assert "python -m train --out whole" in text
     assert yaml.safe_load(text.split("```yaml\n")[1].split("```")[0])["validate_every"] == 5
