@@ -30,7 +30,7 @@ LOST_S = 120.0
 STUDY = """
 import sys, time
 from pathlib import Path
-from tiny_studies import TINY
+from tiny_studies import INSERT, TINY
 from recon.cli import main
 from recon.study import registry
 from recon.evaluate.store import Store
@@ -48,27 +48,13 @@ def noted(self, at, key, compute):
 Store.piece = noted
 Path(out + ".begun").touch()
 if name == "evaluate":
-    Path(out + ".yaml").write_text(TASK)
+    # On the voxels that the network knows.
+    Path(out + ".yaml").write_text("name: insert" + INSERT.replace("voxel_mm: 0.4", "voxel_mm: 0.2"))
     start = ["evaluate", "--task", out + ".yaml", "--method", "mbir", "--method", "gaussian@fbp:soft", "--n", "16"]
 else:
     start = [name, "--quick"] if name == "compare" else ["study", name, "--quick"]
 assert main([*start, "--out", out]) == 0
 """
-TASK = """
-name: insert
-scene:
-  kind: bodies
-  bodies:
-    - {name: patient, shape: cylinder, semi_axes: 100, material: water}
-    - {name: insert, shape: ellipsoid, semi_axes: 1.5, position: {x: 30, y: 10, z: 0}, material: soft_tissue,
-       parent: patient}
-signal: insert
-scanner: {preset: pcct, views: 90}
-inset: {size: [6, 8, 8], voxel_mm: 0.2}
-exposures_s: 20
-"""
-STUDY = f"TASK = {TASK!r}\n{STUDY}"
-
 TRAIN = """
 import sys
 from pathlib import Path

@@ -204,9 +204,3 @@ def _html(text: str, pictures: dict[str, bytes]) -> str:
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>Evaluation</title><style>{style}</style>'
         f"<body>{''.join(body)}</body></html>\n"
     )
-
-
-def records_of_file(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
-    """The records of a ``report.json``."""
-    found: list[dict[str, Any]] = json.loads(Path(path).read_text(encoding="utf-8"))["records"]
-    return found

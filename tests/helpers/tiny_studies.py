@@ -39,6 +39,22 @@ TINY: dict[str, dict[str, Any]] = {
 """Study → settings."""
 
 
+INSERT = """
+title: an insert of 3 mm
+scene:
+  kind: bodies
+  bodies:
+    - {name: patient, shape: cylinder, semi_axes: 100, material: water}
+    - {name: insert, shape: ellipsoid, semi_axes: 1.5, position: {x: 30, y: 10, z: 0}, material: soft_tissue,
+       parent: patient}
+signal: insert
+scanner: {preset: pcct, views: 90}
+inset: {size: [6, 8, 8], voxel_mm: 0.4}
+exposures_s: 20
+"""
+"""A task of the instrument on few views."""
+
+
 @dataclass
 class TinyStudy:
     """A study that ran: what it measured, its report, the folder of both, and the steps that it told."""

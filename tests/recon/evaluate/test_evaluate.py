@@ -8,6 +8,7 @@ import pytest
 import torch
 import yaml
 from scipy import ndimage
+from tiny_studies import INSERT
 
 from recon.cli import main
 from recon.evaluate.estimates import pivot
@@ -20,20 +21,6 @@ from recon.evaluate.tasks import TASKS, read_task, task_text
 from recon.evaluate.without_truth import evaluate_scans, evaluate_volumes
 from torchpcct import Volume
 from torchpcct.geometry import VolumeGrid
-
-INSERT = """
-title: an insert of 3 mm
-scene:
-  kind: bodies
-  bodies:
-    - {name: patient, shape: cylinder, semi_axes: 100, material: water}
-    - {name: insert, shape: ellipsoid, semi_axes: 1.5, position: {x: 30, y: 10, z: 0}, material: soft_tissue,
-       parent: patient}
-signal: insert
-scanner: {preset: pcct, views: 90}
-inset: {size: [6, 8, 8], voxel_mm: 0.4}
-exposures_s: 20
-"""
 
 
 @pytest.fixture(scope="module")
