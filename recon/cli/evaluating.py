@@ -41,6 +41,7 @@ _STUDY_METHODS = (
     "tv@fbp:standard",
     "bilateral@fbp:detail",
     "pwls",
+    "mbir:prior=bilateral",
     "mbir:look=0",
     "mbir",
     "mbir:look=1",

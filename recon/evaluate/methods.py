@@ -2,7 +2,8 @@
 
 A method's name says all:
 
-* ``fbp:KERNEL``, ``pwls``, ``mbir``; ``mbir:look=1``, ``mbir:weights=mine.safetensors``, ``mbir:tissues``;
+* ``fbp:KERNEL``, ``pwls``, ``mbir``; ``mbir:look=1``, ``mbir:weights=mine.safetensors``, ``mbir:tissues``, and
+  ``mbir:prior=bilateral``, the same data steps with the bilateral filter that the network is given and no network;
 * ``FILTER@BASE``: a filter of :mod:`recon.evaluate.rivals` after a linear method, ``bilateral@fbp:detail``;
 * ``package.module:function``: a function of ``(scan, grid)`` that gives a volume in HU; with ``@BASE`` a denoiser, a
   function of ``(volume)`` or ``(volume, sigma)`` in HU, tensors ``(z, y, x)`` float32;
@@ -28,6 +29,7 @@ from torch import Tensor
 from recon.evaluate.rivals import FILTERS, SMOOTHED_BY, flat_noise, tuned
 from recon.fbp.ramp import KERNELS
 from recon.mbir.mbir import Mbir
+from recon.mbir.network import bilateral_prior
 from recon.mbir.tissues import TissueMbir
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
@@ -196,10 +198,13 @@ def _mbir(spec: str, rest: str) -> Method:
     given: dict[str, str] = {}
     for part in filter(None, rest.split(",")):
         key, _, value = part.partition("=")
-        given[choice("option of mbir", key, ("weights", "look", "tissues"))] = value
+        given[choice("option of mbir", key, ("weights", "look", "tissues", "prior"))] = value
     network = Mbir.load(given.get("weights"))
     if "look" in given:
         network = network.looking(number("look", float(given["look"]), low=0.0, high=1.0))
+    if "prior" in given:
+        choice("prior of mbir", given["prior"], ("bilateral",))
+        network = Mbir(network.model, network.look, prior=bilateral_prior)
     if "tissues" in given:
         fitted = TissueMbir(network)
         return Method(spec, lambda draw: draw.mbir(fitted), key=network.weights_sha256)

@@ -32,9 +32,8 @@ import torch
 from torch import Tensor
 
 from recon.mbir.mbir import Mbir, average_onto
-from recon.mbir.network import Network
 from recon.mbir.problem import NormalisedProblem, filtered
-from recon.mbir.unrolled import REFERENCE_SCALE_HU, consistent, guide_noise, low_residual, start
+from recon.mbir.unrolled import REFERENCE_SCALE_HU, Prior, consistent, guide_noise, low_residual, start
 from recon.pwls.field_model import FieldModel
 from recon.pwls.field_problem import FieldProblem, field_prior
 from recon.pwls.memory import require_memory
@@ -150,13 +149,13 @@ def trained_grid(grid: VolumeGrid, geometry: Any) -> VolumeGrid:
 
 
 def blockwise(
-    network: Network, estimate: Tensor, towards: Tensor, condition: Callable[[tuple[slice, ...]], Tensor],
+    network: Prior, estimate: Tensor, towards: Tensor, condition: Callable[[tuple[slice, ...]], Tensor],
     block: int = BLOCK, halo: int = HALO, guide_noise: Tensor | None = None,
 ) -> Tensor:  # fmt: skip
     """The network on volumes ``(1, z, y, x)`` of any size, block by block; neighbours fade into each other.
 
     Args:
-        network: the learned prior.
+        network: the learned prior, or what stands for it.
         estimate, towards: see :meth:`recon.mbir.network.Network.forward`.
         condition: ``(1, 3)`` of the voxels that it is given.
         block: voxels along each axis that a block gives; with those it shares with its neighbours ``2 · halo`` more. A
@@ -292,7 +291,7 @@ def _one(
             here = torch.log(scales[part] / REFERENCE_SCALE_HU).mean().clamp(-3.0, 3.0)
             return torch.tensor([[float(here), network.look - 0.5, float(k)]])
 
-        v = blockwise(model.network, v, towards, condition, guide_noise=noise)
+        v = blockwise(network.parts.get("prior", model.network), v, towards, condition, guide_noise=noise)
     looks = torch.full((1,), float(network.look))
     u = consistent(normal, spectrum, v, looks, SOLVES[1]) if network.parts.get("last_word", True) else v
     left = normal.beta - normal.apply(u)

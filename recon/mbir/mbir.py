@@ -59,7 +59,7 @@ class Mbir:
     Args:
         model: with its weights.
         look: 0 (viewing) … 1 (measuring), see :mod:`recon.mbir.unrolled`.
-        parts: for ablations, ``steps`` and ``last_word`` of :meth:`recon.mbir.unrolled.Unrolled.forward`.
+        parts: for ablations, ``steps``, ``last_word`` and ``prior`` of :meth:`recon.mbir.unrolled.Unrolled.forward`.
 
     Raises:
         ValueError: a look outside of 0 … 1.

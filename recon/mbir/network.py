@@ -30,7 +30,7 @@ from torch.nn import functional as F
 from recon.mbir.bilateral import joint_bilateral
 from torchpcct.validate import number, whole
 
-__all__ = ["GUIDE_VOXELS", "Network", "NetworkConfig"]
+__all__ = ["GUIDE_VOXELS", "Network", "NetworkConfig", "bilateral_prior"]
 
 CONDITIONS = 3
 """Numbers that steer the gains: logarithm of the noise scale, look, step."""
@@ -118,9 +118,7 @@ class Network(nn.Module):
         if self.config.bilateral:
             if guide_noise is None:
                 raise ValueError("a network with a bilateral filter needs guide_noise")
-            guide = local_mean(towards, GUIDE_VOXELS)
-            seen = joint_bilateral(towards, guide, _FIRST[0] * guide_noise, *_FIRST[1:])
-            views.append(joint_bilateral(seen, seen, _SECOND[0] * guide_noise, *_SECOND[1:]))
+            views.append(edge_preserved(towards, guide_noise))
         if not self.config.local_mm:
             return self._symmetric(views, condition)
         level = local_mean(estimate, self.config.local_mm / self.config.voxel_mm)
@@ -153,6 +151,21 @@ class Network(nn.Module):
             out = self.leave(fine)
         made: Tensor = from_blocks(out.float())[..., : shape[0], : shape[1], : shape[2]]
         return made + self.share * views[2] if self.config.bilateral else made
+
+
+def edge_preserved(towards: Tensor, guide_noise: Tensor) -> Tensor:
+    """Two passes of the joint bilateral filter over a step towards the data, ``(batch, z, y, x)``.
+
+    Args:
+        towards, guide_noise: see :meth:`Network.forward`.
+    """
+    once = joint_bilateral(towards, local_mean(towards, GUIDE_VOXELS), _FIRST[0] * guide_noise, *_FIRST[1:])
+    return joint_bilateral(once, once, _SECOND[0] * guide_noise, *_SECOND[1:])
+
+
+def bilateral_prior(estimate: Tensor, towards: Tensor, condition: Tensor, guide_noise: Tensor) -> Tensor:
+    """Called as a :class:`Network`, and nothing learned: :func:`edge_preserved` alone."""
+    return edge_preserved(towards, guide_noise)
 
 
 def local_mean(v: Tensor, sigma: float) -> Tensor:

@@ -31,6 +31,8 @@ from torchpcct.validate import number, whole
 
 __all__ = ["DEFAULT_LOOK", "REFERENCE_SCALE_HU", "Unrolled", "guide_noise", "look_frequency", "low_residual", "start"]
 
+Prior = Callable[..., Tensor]
+"""A :class:`recon.mbir.network.Network`, or a function with the arguments of its ``forward``."""
 REFERENCE_SCALE_HU = 200.0
 """Noise scale at which its conditioning variable is 0: about 1 s of the paper's scan."""
 DEFAULT_LOOK = 0.5
@@ -83,6 +85,7 @@ class Unrolled(nn.Module):
         callback: Callable[[int, Tensor], None] | None = None,
         steps: int | None = None,
         last_word: bool = True,
+        prior: Prior | None = None,
     ) -> Tensor:
         """The reconstruction ``(batch, z, y, x)`` in noise units (times ``problem.scale_hu``: HU above background).
 
@@ -92,6 +95,7 @@ class Unrolled(nn.Module):
             callback: called with the number of each step and the volume after it.
             steps: fewer than K; None: K. With 0 the reconstruction is linear, and the solves go on until it is.
             last_word: whether the data have it; without, the network's last volume is the result, whatever the look.
+            prior: in the place of the network, for comparisons (:func:`recon.mbir.network.bilateral_prior`).
         """
         scale = problem.scale_hu
         if self.training:
@@ -109,7 +113,7 @@ class Unrolled(nn.Module):
         for k in range(self.steps if steps is None else steps):
             towards = v + filtered(problem.beta - problem.apply(v), 1.0 / (spectrum + _TOWARDS))
             condition = torch.stack([level, looks - 0.5, torch.full_like(level, float(k))], 1)
-            v = self.network(v, towards, condition, noise)
+            v = (prior or self.network)(v, towards, condition, noise)
             if callback is not None:
                 callback(k + 1, v)
         return consistent(problem, spectrum, v, looks, solves[1]) if last_word else v

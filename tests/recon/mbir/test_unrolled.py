@@ -7,7 +7,7 @@ import torch
 from inset_operators import HU, matrix, problem, tissue
 
 from recon.gram.gram import Gram
-from recon.mbir.network import NetworkConfig
+from recon.mbir.network import NetworkConfig, bilateral_prior
 from recon.mbir.problem import NormalisedProblem, filtered, squared_frequencies
 from recon.mbir.unrolled import Unrolled, look_frequency, low_residual, start
 
@@ -85,6 +85,14 @@ def test_the_data_have_the_last_word(scan):
         apart = [filtered(quiet(p, look, last_word=w) - loud(p, look, last_word=w), low).norm() for w in (False, True)]
         assert apart[1] < 0.6 * apart[0]
     assert low_residual(p, p.beta, 0.5) == pytest.approx(1.0)
+
+
+def test_another_prior_takes_the_place_of_the_network(scan):
+    """The filter alone asks nothing of the weights, and what it gives is made consistent with the data."""
+    p = normal(scan, noise=1.0)
+    first, second = (model(seed)(p, 0.5, prior=bilateral_prior) for seed in (0, 1))
+    torch.testing.assert_close(first, second, rtol=0, atol=0)
+    assert not torch.equal(first, model(0)(p, 0.5))
 
 
 def test_noise_grows_with_the_look(scan):
