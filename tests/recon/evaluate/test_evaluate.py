@@ -196,7 +196,8 @@ def test_bad_tasks_are_named(tmp_path, folder, changes, said):
 @pytest.mark.parametrize(
     ("spec", "said"),
     [
-        ("fbp:hard", "kernel"), ("mbir:sharp=1", "option of mbir"), ("mbir:prior=tv", "prior of mbir"), ("nothing", "unknown method"),
+        ("fbp:hard", "kernel"), ("mbir:sharp=1", "option of mbir"), ("mbir:prior=tv", "prior of mbir"),
+        ("nothing", "unknown method"),
         ("bilateral@pwls", "needs FBP"), ("no.such.module:run", "cannot load"), ("files:nowhere", "no folder"),
         ("json:loads@nowhere", "unknown method"), (3, "must be a name"),
     ],
