@@ -1,17 +1,38 @@
-"""Linear operators: one autograd function for all that are given with their exact transpose, and separable filters."""
+"""Linear operators: what a data term is to solvers, one autograd function for all that are given with their exact
+transpose, and separable filters."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-__all__ = ["apply_linear", "gaussian_kernel", "separable_filter"]
+__all__ = ["NormalOperator", "apply_linear", "gaussian_kernel", "separable_filter"]
 
 Linear = Callable[[Tensor], Tensor]
+
+
+@runtime_checkable
+class NormalOperator(Protocol):
+    """AᵀWA of a scan, exact or a model of it: all that PWLS and MBIR ask of the data beside AᵀW y.
+
+    Of an inset it is :class:`recon.gram.gram.Gram`, of a whole field :class:`recon.mbir.field.FieldGram`.
+    """
+
+    def apply(self, x: Tensor, /) -> Tensor:
+        """AᵀWA x, ``(..., *grid.shape)``."""
+        ...
+
+    def periodic_spectrum(self) -> Tensor:
+        """Eigenvalues of a circulant approximation on the frequencies of ``rfftn``."""
+        ...
+
+    def information(self, hu: float) -> float:
+        """On a wave of 0.5 lp/mm, 1/(HU² mm³) (2-D: mm²); ``hu`` is 1 HU in mm⁻¹."""
+        ...
 
 
 class _Linear(torch.autograd.Function):

@@ -248,28 +248,11 @@ def fbp(
     refuse_helix(geometry, motion)
     for text in check_rows(geometry, grid, motion):
         _LOG.warning("%s", text)
-    sinogram = _without_dead(sinogram, geometry)
-    rows = Rows(sinogram, geometry, _check_weights(weights, geometry, grid), 0)
-    known = sinogram.numel() > 0 and not _transformed()
-    if (outside is None or number("outside", outside, low=0.0, unit="mm⁻¹") > 0) and known:
-        sides = cut_off(sinogram, geometry, rows.weights)
-        if any(sides) and outside is None:
-            warnings.warn(
-                f"the rows end inside the object at the {' and the '.join(_SIDES[i] for i in (0, 1) if sides[i])} "
-                "column: CT numbers will be wrong, most near the edge of the field of view; pass outside= the "
-                "attenuation in mm⁻¹ of what lies beyond (0 to do without)",
-                UserWarning,
-                stacklevel=2,
-            )
-        rows = continued(rows, sides, outside or 0.0)
-    shift = 0.0 if motion is None else float(np.hypot(*np.asarray(motion, dtype=np.float64)[:, -2:].T).max())
-    rows = mirrored(rows, grid, shift)
-    if window is None:
-        window = _shadow_or_whole(rows.geometry, grid, motion)
-    elif rows.added:
-        window = DetectorWindow(window.first_column + rows.added, window.columns, window.first_row, window.rows)
-    plan = BackprojectionPlan(rows.geometry, grid, window, motion)
+    repaired = _without_dead(sinogram, geometry)
+    rows = _completed(Rows(repaired, geometry, _check_weights(weights, geometry, grid), 0), grid, motion, outside)
+    window = _read_window(rows, grid, window, motion)
     filtered = filter_sinogram(rows.lines, rows.geometry, kernel, window, weights=rows.weights)
+    plan = BackprojectionPlan(rows.geometry, grid, window, motion)
     return apply_linear(filtered, plan.forward, plan.transpose)
 
 
@@ -300,13 +283,34 @@ def _without_dead(sinogram: Tensor, geometry: Geometry) -> Tensor:
         f"{int(dead.sum())} of {dead.numel()} readings are NaN or Inf: they are taken for dead and bridged by their "
         "neighbours",
         UserWarning,
-        stacklevel=3,
+        stacklevel=4,
     )
     return bridge(sinogram, dead, isinstance(geometry, ConeBeam))
 
 
-def _shadow_or_whole(geometry: Geometry, grid: VolumeGrid, motion: Any = None) -> DetectorWindow:
+def _completed(rows: Rows, grid: VolumeGrid, motion: Any, outside: float | None) -> Rows:
+    """Rows that end inside the object continued, those of an offset detector mirrored."""
+    known = rows.lines.numel() > 0 and not _transformed()
+    if (outside is None or number("outside", outside, low=0.0, unit="mm⁻¹") > 0) and known:
+        sides = cut_off(rows.lines, rows.geometry, rows.weights)
+        if any(sides) and outside is None:
+            warnings.warn(
+                f"the rows end inside the object at the {' and the '.join(_SIDES[i] for i in (0, 1) if sides[i])} "
+                "column: CT numbers will be wrong, most near the edge of the field of view; pass outside= the "
+                "attenuation in mm⁻¹ of what lies beyond (0 to do without)",
+                UserWarning,
+                stacklevel=4,
+            )
+        rows = continued(rows, sides, outside or 0.0)
+    shift = 0.0 if motion is None else float(np.hypot(*np.asarray(motion, dtype=np.float64)[:, -2:].T).max())
+    return mirrored(rows, grid, shift)
+
+
+def _read_window(rows: Rows, grid: VolumeGrid, window: DetectorWindow | None, motion: Any) -> DetectorWindow:
+    """``window`` on the completed rows; None: the shadow of the grid."""
+    if window is not None:
+        return DetectorWindow(window.first_column + rows.added, window.columns, window.first_row, window.rows)
     try:
-        return shadow(geometry, grid, margin=1, motion=motion)
+        return shadow(rows.geometry, grid, margin=1, motion=motion)
     except ValueError:
-        return DetectorWindow.full(geometry)  # a grid larger than the field of view: the backprojection decides
+        return DetectorWindow.full(rows.geometry)  # a grid larger than the field of view: the backprojection decides

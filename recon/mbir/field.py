@@ -26,14 +26,15 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from recon.mbir.mbir import Mbir, average_onto
-from recon.mbir.problem import NormalisedProblem, filtered
-from recon.mbir.unrolled import REFERENCE_SCALE_HU, Prior, consistent, guide_noise, low_residual, start
+from recon.mbir.problem import NormalisedProblem
+from recon.mbir.unrolled import REFERENCE_SCALE_HU, Prior, low_residual
 from recon.pwls.field_model import FieldModel
 from recon.pwls.field_problem import FieldProblem, field_prior
 from recon.pwls.memory import require_memory
@@ -59,8 +60,6 @@ SURROUND_STRENGTH, SURROUND_STEP_HU = 10.0, 75.0
 which it is one. A threshold that follows the noise would leave a starved scan the outline of the body."""
 SURROUND_HU, SURROUND_PAIRS = 5.0, 60
 """Its tolerance, and the most projection pairs."""
-_TOWARDS = 0.1
-_PERIOD = 8
 
 
 class FieldGram:
@@ -149,27 +148,31 @@ def trained_grid(grid: VolumeGrid, geometry: Any) -> VolumeGrid:
 
 
 def blockwise(
-    network: Prior, estimate: Tensor, towards: Tensor, condition: Callable[[tuple[slice, ...]], Tensor],
-    block: int = BLOCK, halo: int = HALO, guide_noise: Tensor | None = None,
+    network: Prior, scales: Tensor, estimate: Tensor, towards: Tensor, condition: Tensor, guide_noise: Tensor,
+    block: int = BLOCK, halo: int = HALO,
 ) -> Tensor:  # fmt: skip
     """The network on volumes ``(1, z, y, x)`` of any size, block by block; neighbours fade into each other.
 
     Args:
         network: the learned prior, or what stands for it.
-        estimate, towards: see :meth:`recon.mbir.network.Network.forward`.
-        condition: ``(1, 3)`` of the voxels that it is given.
+        scales: ``(z, y, x)`` noise scale of each voxel, HU: each block is told its own.
+        estimate, towards, condition, guide_noise: see :meth:`recon.mbir.network.Network.forward`.
         block: voxels along each axis that a block gives; with those it shares with its neighbours ``2 · halo`` more. A
             multiple of 8, as ``halo``: blocks of voxels must be those of the whole.
         halo: voxels on each side that help only, or fade.
-        guide_noise: ``(1,)``, see :meth:`recon.mbir.network.Network.forward`.
     """
     shape = estimate.shape[-3:]
+
+    def told(part: tuple[slice, ...]) -> Tensor:
+        level = torch.log(scales[part] / REFERENCE_SCALE_HU).mean().clamp(-3.0, 3.0)
+        return torch.cat([level.reshape(1, 1).to(condition), condition[:, 1:]], 1)
+
     if max(shape) <= block + 2 * halo:
-        return network(estimate, towards, condition((slice(None),) * 3), guide_noise)
+        return network(estimate, towards, told((slice(None),) * 3), guide_noise)
     total, weight = torch.zeros_like(estimate), torch.zeros(shape, dtype=estimate.dtype, device=estimate.device)
     for part in _parts(shape, block, halo):
         here: Any = (..., *part)
-        out = network(estimate[here], towards[here], condition(part), guide_noise)
+        out = network(estimate[here], towards[here], told(part), guide_noise)
         fade = torch.ones((), dtype=estimate.dtype, device=estimate.device)
         for axis, (s, n) in enumerate(zip(part, shape, strict=True)):
             fade = fade * _fade(s, n, halo).to(estimate).reshape(-1, *[1] * (2 - axis))
@@ -280,20 +283,9 @@ def _one(
     b = gram.ratio * _stacked(problem, projected)
     normal = NormalisedProblem.from_statistic(gram, b[None], torch.ones(1), hu, network.voxel_mm)
     scales = normal.scale_hu * gram.ratio
-    spectrum = normal.spectrum()
-    v = start(normal, spectrum, SOLVES[0])
-    noise = guide_noise(spectrum, v.shape[-3:], network.voxel_mm)
-    steps = network.parts.get("steps")
-    for k in range(model.steps if steps is None else steps):
-        towards = v + filtered(normal.beta - normal.apply(v), 1.0 / (spectrum + _TOWARDS))
-
-        def condition(part: tuple[slice, ...], k: int = k) -> Tensor:
-            here = torch.log(scales[part] / REFERENCE_SCALE_HU).mean().clamp(-3.0, 3.0)
-            return torch.tensor([[float(here), network.look - 0.5, float(k)]])
-
-        v = blockwise(network.parts.get("prior", model.network), v, towards, condition, guide_noise=noise)
-    looks = torch.full((1,), float(network.look))
-    u = consistent(normal, spectrum, v, looks, SOLVES[1]) if network.parts.get("last_word", True) else v
+    parts = {"prior": model.network, **network.parts}
+    prior = partial(blockwise, parts.pop("prior"), scales)
+    u = model(normal, network.look, prior=prior, solves=SOLVES, **parts)
     left = normal.beta - normal.apply(u)
     whole = normal.beta + normal.apply(_stacked(problem, around)[None] / (scales * hu))
     rest = (u[0] * scales) * hu

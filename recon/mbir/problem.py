@@ -11,10 +11,11 @@ So the same tissue at four times the dose looks to the network like twice the co
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
+
+from recon.linear_operator import NormalOperator
 
 __all__ = ["NormalisedProblem", "filtered", "from_frequencies", "squared_frequencies", "to_frequencies"]
 
@@ -24,27 +25,29 @@ class NormalisedProblem:
     """A batch of normalised problems that share one Gram operator.
 
     Args:
-        gram: ``apply`` and ``periodic_spectrum`` of G at unit exposure, in mm⁻¹ units (:class:`recon.gram.gram.Gram`).
+        gram: G, AᵀWA at unit exposure, in mm⁻¹ units.
         beta: ``(batch, z, y, x)``, c·b in HU units.
         scale_hu: ``(batch,)`` noise scales c.
         factor: ``(batch,)`` so that H = factor · G.
         voxel_mm: voxel size.
     """
 
-    gram: Any
+    gram: NormalOperator
     beta: Tensor
     scale_hu: Tensor
     factor: Tensor
     voxel_mm: float
 
     @classmethod
-    def from_statistic(cls, gram: Any, b: Tensor, exposure: Tensor, hu: float, voxel_mm: float) -> NormalisedProblem:
+    def from_statistic(
+        cls, gram: NormalOperator, b: Tensor, exposure: Tensor, hu: float, voxel_mm: float
+    ) -> NormalisedProblem:
         """From AᵀW y.
 
         Args:
-            gram: Gram operator at unit exposure.
+            gram: AᵀWA at unit exposure.
             b: ``(batch, z, y, x)``, AᵀW y with the weights of the exposures, y in line integrals of mm⁻¹.
-            exposure: ``(batch,)`` factors on the Gram operator's weights.
+            exposure: ``(batch,)`` factors on its weights.
             hu: 1 HU in mm⁻¹.
             voxel_mm: size of the cubic voxels.
         """

@@ -86,6 +86,7 @@ class Unrolled(nn.Module):
         steps: int | None = None,
         last_word: bool = True,
         prior: Prior | None = None,
+        solves: tuple[int, int] | None = None,
     ) -> Tensor:
         """The reconstruction ``(batch, z, y, x)`` in noise units (times ``problem.scale_hu``: HU above background).
 
@@ -95,7 +96,9 @@ class Unrolled(nn.Module):
             callback: called with the number of each step and the volume after it.
             steps: fewer than K; None: K. With 0 the reconstruction is linear, and the solves go on until it is.
             last_word: whether the data have it; without, the network's last volume is the result, whatever the look.
-            prior: in the place of the network, for comparisons (:func:`recon.mbir.network.bilateral_prior`).
+            prior: in the place of the network: block by block (:mod:`recon.mbir.field`), or for comparisons
+                (:func:`recon.mbir.network.bilateral_prior`).
+            solves: conjugate gradients of start and data consistency; None: those of an inset's model.
         """
         scale = problem.scale_hu
         if self.training:
@@ -105,7 +108,7 @@ class Unrolled(nn.Module):
         looks = torch.as_tensor(look, dtype=scale.dtype, device=scale.device).expand(scale.shape)
         level = torch.log(scale / REFERENCE_SCALE_HU).clamp(-3.0, 3.0)
         spectrum = problem.spectrum()
-        solves = _LINEAR_SOLVES if steps == 0 else _SOLVES
+        solves = solves or (_LINEAR_SOLVES if steps == 0 else _SOLVES)
         v = start(problem, spectrum, solves[0])
         if callback is not None:
             callback(0, v)

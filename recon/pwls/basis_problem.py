@@ -76,7 +76,14 @@ class BasisProblem:
         return self.whitening.apply(inside - self.window.take(self.background.to(lines.dtype)))
 
     def solve(
-        self, lines: Tensor, window: DetectorWindow, prior: QGGMRF | None = None, *, dose: float = 1.0, **options: Any
+        self,
+        lines: Tensor,
+        window: DetectorWindow,
+        prior: QGGMRF | None = None,
+        *,
+        dose: float = 1.0,
+        tolerance: float = 0.2,
+        max_exact: int = 20,
     ) -> tuple[Tensor, dict[str, Any]]:
         """Basis images.
 
@@ -84,7 +91,7 @@ class BasisProblem:
             lines, window: decomposed line integrals, see :meth:`data`.
             prior: None: :data:`recon.pwls.qggmrf.DEFAULT_PRIOR`.
             dose: of the data relative to the model's exposure; it scales the information.
-            options: ``tolerance``, ``max_exact``, ``callback`` of :func:`recon.pwls.joint.joint_pwls`.
+            tolerance, max_exact: of :func:`recon.pwls.joint.joint_pwls`.
 
         Returns:
             ``(..., 2, z, y, x)`` basis coefficients (dimensionless), and the solver's report.
@@ -95,7 +102,7 @@ class BasisProblem:
         number("dose", dose, positive=True, unit="of the model's exposure")
         result = joint_pwls(
             self.projector, self.data(lines, window), self.information * dose, prior or DEFAULT_PRIOR,
-            gram=self.gram.scaled(dose), **options,
+            gram=self.gram.scaled(dose), tolerance=tolerance, max_exact=max_exact,
         )  # fmt: skip
         images = self.whitening.undo(result.x) + self.level.to(lines.dtype).reshape(2, 1, 1, 1)
         return images, dict(result.report)

@@ -12,7 +12,7 @@ import time
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ from torch.nn import functional as F
 
 from recon.fbp.coverage import check_rows
 from recon.fbp.fbp import fbp
-from recon.pwls.pwls import pwls
+from recon.pwls.pwls import PwlsOptions, pwls
 from recon.pwls.qggmrf import DEFAULT_PRIOR, QGGMRF
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid
 from torchpcct.projector import Projector
@@ -214,8 +214,7 @@ def reconstruct_field(
     *,
     progress: Callable[[float], None] | None = None,
     prior: QGGMRF | None = None,
-    tolerance: float = 1.0,
-    **options: Any,
+    **options: Unpack[PwlsOptions],
 ) -> list[Volume]:
     """PWLS of whole fields, slice by slice for parallel and fan beams, from FBP as the first volume.
 
@@ -224,8 +223,7 @@ def reconstruct_field(
         grid: see :class:`FieldProblem`.
         progress: called with the finished fraction.
         prior: None: :func:`field_prior` of the grid.
-        tolerance: stop within so many HU (root mean square) of the minimum.
-        options: ``max_exact``, ``memory``, ``callback`` of :func:`recon.pwls.pwls.pwls`.
+        options: of :func:`recon.pwls.pwls.pwls`; ``tolerance`` is 1 HU unless given.
 
     Returns:
         Volumes in HU. Report: that of :func:`recon.pwls.pwls.pwls` (of several slices the sum of ``exact_pairs`` and
@@ -235,6 +233,7 @@ def reconstruct_field(
         ValueError, TypeError: see :class:`FieldProblem` and :func:`recon.pwls.pwls.pwls`.
     """
     began = time.perf_counter()
+    options = {"tolerance": 1.0, **options}
     problem = FieldProblem(scans[0], grid)
     prior = prior or field_prior(grid.spacing[-1], problem.work.ndim)
     volumes = []
@@ -243,8 +242,7 @@ def reconstruct_field(
         results, tests = [], []
         for k, (y, w) in enumerate(slices):
             result = pwls(
-                problem.projector, y, w, prior, hu=problem.mu_ref / 1000.0, start=problem.start(y),
-                tolerance=tolerance, **options,
+                problem.projector, y, w, prior, hu=problem.mu_ref / 1000.0, start=problem.start(y), **options,
             )  # fmt: skip
             results.append(result)
             if not scan.noise_free:

@@ -8,7 +8,7 @@ import time
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from recon.fbp.inset import require_inside, require_same_surround, static_fbp
 from recon.gram.gram import Gram
 from recon.pwls.field_model import FieldModel
 from recon.pwls.field_problem import is_whole_field, reconstruct_field, unfinished
-from recon.pwls.pwls import data_model, pwls
+from recon.pwls.pwls import PwlsOptions, data_model, pwls
 from recon.pwls.qggmrf import DEFAULT_PRIOR, QGGMRF
 from recon.pwls.surround import UnknownSurround
 from torchpcct.detector_window import DetectorWindow, shadow
@@ -227,7 +227,7 @@ class InsetProblem:
         return float(exposures.pop())
 
     def solve(
-        self, scans: Sequence[Scan], prior: QGGMRF, data: Sequence[Tensor] | None = None, **options: Any
+        self, scans: Sequence[Scan], prior: QGGMRF, data: Sequence[Tensor] | None = None, **options: Unpack[PwlsOptions]
     ) -> tuple[Tensor, dict[str, Any]]:
         """PWLS of several realisations of one exposure: ``(scans, z, y, x)`` HU, and the solver's report.
 
@@ -263,8 +263,7 @@ def reconstruct_pwls(
     prior: QGGMRF | None = None,
     problem: InsetProblem | None = None,
     batch: int = 1,
-    tolerance: float = 1.0,
-    **options: Any,
+    **options: Unpack[PwlsOptions],
 ) -> list[Volume]:
     """PWLS with a q-GGMRF prior, to convergence: of an inset, or of a whole field of view
     (:func:`recon.pwls.field_problem.reconstruct_field`, for every scan of a parallel or fan beam).
@@ -277,8 +276,7 @@ def reconstruct_pwls(
             :func:`recon.pwls.field_problem.field_prior`.
         problem: kept from an earlier call with the same scan and grid; None: made here.
         batch: volumes solved at a time; they iterate until the slowest has converged.
-        tolerance: stop within so many HU (root mean square) of the exact minimum.
-        options: ``max_exact``, ``callback`` of :func:`recon.pwls.pwls.pwls`.
+        options: of :func:`recon.pwls.pwls.pwls`; ``tolerance`` is 1 HU unless given.
 
     Returns:
         Volumes in HU with the solver's report; of noisy scans also ``chi2`` (weighted squared residual per reading),
@@ -291,14 +289,15 @@ def reconstruct_pwls(
         ValueError, TypeError: see :class:`InsetProblem` and :func:`recon.pwls.pwls.pwls`.
     """
     if problem is None and is_whole_field(scans[0], grid):
-        return reconstruct_field(scans, grid, progress=progress, prior=prior, tolerance=tolerance, **options)
+        return reconstruct_field(scans, grid, progress=progress, prior=prior, **options)
     start = time.perf_counter()
+    options = {"tolerance": 1.0, **options}
     problem = problem or InsetProblem(scans[0], grid)
     volumes: list[Volume] = []
     for i in range(0, len(scans), batch):
         part = scans[i : i + batch]
         data = [problem.data(s) for s in part]
-        found, report = problem.solve(part, prior or DEFAULT_PRIOR, data, tolerance=tolerance, **options)
+        found, report = problem.solve(part, prior or DEFAULT_PRIOR, data, **options)
         open_ends = [] if report["converged"] else [unfinished(report)]
         for text in open_ends:
             warnings.warn(text, RuntimeWarning, stacklevel=2)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
 from recon.conjugate_gradient import dot, per_volume
+from recon.linear_operator import NormalOperator
 from recon.pwls.qggmrf import BoundPrior
 
 __all__ = ["ModelSolver", "line_search", "mean_share"]
@@ -20,14 +19,16 @@ class ModelSolver:
     """Minimises d ↦ gᵀd + ½ dᵀG d + R(x + d) for a model G of the data term's Hessian.
 
     Args:
-        gram: ``apply(x)`` and ``periodic_spectrum()``.
+        gram: G.
         prior: R.
         x: volumes ``(batch, *shape)``; only their shape, dtype and device matter.
         reduction: stop when the preconditioned gradient norm has fallen by this factor.
         most: largest number of iterations.
     """
 
-    def __init__(self, gram: Any, prior: BoundPrior, x: Tensor, reduction: float = 3e-3, most: int = 60) -> None:
+    def __init__(
+        self, gram: NormalOperator, prior: BoundPrior, x: Tensor, reduction: float = 3e-3, most: int = 60
+    ) -> None:
         self.gram, self.prior, self.reduction, self.most = gram, prior, reduction, most
         self._floor: Tensor | None = None
         self._grid = x.shape[-len(prior.spacing) :]

@@ -19,13 +19,14 @@ import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypedDict
 
 import torch
 from torch import Tensor
 
 from recon.conjugate_gradient import dot, per_volume
 from recon.gram.gram import Gram, check_weights
+from recon.linear_operator import NormalOperator
 from recon.pwls.approach import Approach
 from recon.pwls.field_model import FieldModel, GradientStep
 from recon.pwls.memory import gram_bytes, require_memory
@@ -34,7 +35,7 @@ from recon.pwls.qggmrf import QGGMRF, BoundPrior
 from torchpcct.detector_window import shadow
 from torchpcct.validate import checked, number, whole
 
-__all__ = ["PwlsResult", "data_model", "pwls", "solve_normal", "weighted_data"]
+__all__ = ["PwlsOptions", "PwlsResult", "data_model", "pwls", "solve_normal", "weighted_data"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -79,6 +80,15 @@ class PwlsResult:
     report: Mapping[str, Any] = field(default_factory=dict)
 
 
+class PwlsOptions(TypedDict, total=False):
+    """Options of :func:`pwls` that whoever calls it for a scan hands on; each is described there."""
+
+    tolerance: float
+    max_exact: int
+    memory: int | None
+    callback: Callable[[dict[str, Any]], None] | None
+
+
 @checked
 def pwls(
     A: Any,
@@ -87,7 +97,7 @@ def pwls(
     prior: QGGMRF | BoundPrior,
     *,
     hu: float = 2e-5,
-    gram: Any = None,
+    gram: NormalOperator | FieldModel | None = None,
     start: Tensor | None = None,
     tolerance: float = 0.2,
     max_exact: int = 200,
@@ -350,7 +360,7 @@ def _solve(
     return PwlsResult(x.reshape(*lead, *shape), report), 0.5 * dot(x, data_gradient - b, axes)
 
 
-def _misfit(gram: Any, step: Tensor, curved: Tensor, axes: int) -> float:
+def _misfit(gram: NormalOperator, step: Tensor, curved: Tensor, axes: int) -> float:
     """Relative error of the model on a step whose exact image is known, worst volume."""
     error = gram.apply(step) - curved
     size = dot(curved, curved, axes).clamp_min(torch.finfo(torch.float64).tiny)
