@@ -66,7 +66,7 @@ class Place:
 
     Attributes:
         fbp: ``(kernels, z, y, x)`` HU; b: ``(z, y, x)`` at 1 s; true: ``(z, y, x)`` HU.
-        inside, flat: masks of the error and of the noise.
+        inside, flat: masks of the error and of the noise; core, around: of the core and of the fibrous tissue about it.
     """
 
     fbp: Tensor
@@ -74,6 +74,8 @@ class Place:
     true: Tensor
     inside: Tensor
     flat: Tensor
+    core: Tensor
+    around: Tensor
 
 
 class Bench:
@@ -115,12 +117,15 @@ class Bench:
         return to_hu(images, p.mu_ref), b
 
     @lru_cache(maxsize=8)  # noqa: B019
-    def held_out(self, name: str) -> Place:
-        """Of the tuning."""
+    def held_out(self, name: str, core: bool = True) -> Place:
+        """Of the tuning; without ``core`` its place is fibrous."""
         line, geometry, hu = _HELD_OUT[name]
         shape = Plaque(position=(0.0, 0.0, 0.0), vessel_length=8.0, **geometry)
         values = dict(zip(TISSUES, (hu[0] + PAPER_HU["patient"], *hu[1:]), strict=True))
-        return self.vessel(f"held_out_{name}", Vessel(line, self.grid.center, plaque=shape), values)
+        if not core:
+            values["core"] = values["fibrous"]
+        kept = f"held_out_{name}" + ("" if core else "_without_core")
+        return self.vessel(kept, Vessel(line, self.grid.center, plaque=shape), values)
 
     def vessel(self, name: str, vessel: Vessel, values: dict[str, float]) -> Place:
         """Of a vessel with a plaque."""
@@ -136,7 +141,10 @@ class Bench:
         away = torch.from_numpy(ndimage.distance_transform_edt(fat.numpy(), self.grid.spacing))
         flat = torch.zeros_like(fat)
         flat[4:-4, 4:-4, 4:-4] = (away > 1.5)[4:-4, 4:-4, 4:-4]
-        return Place(**found, true=true, inside=share["patient"] < 0.5, flat=flat)
+        core = share["core"] > 0.8
+        beside = torch.from_numpy(ndimage.distance_transform_edt(~core.numpy(), self.grid.spacing) < 1.2)
+        around = (share["fibrous"] > 0.8) & beside
+        return Place(**found, true=true, inside=share["patient"] < 0.5, flat=flat, core=core, around=around)
 
     def shares(self, labels: Callable[[Any], Any], names: Any) -> dict[str, Tensor]:
         """Tissue → share of every voxel."""
