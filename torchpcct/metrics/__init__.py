@@ -11,18 +11,8 @@ its data at all, ``half_split`` what noise and resolution a real scan has, witho
 from torchpcct.metrics.bootstrap import Estimate
 from torchpcct.metrics.cnr import Interval, cnr, cnr_from_moments, cnr_interval, cnr_range, mean_interval, sd_interval
 from torchpcct.metrics.control import controlled_log_variance, controlled_mean
-from torchpcct.metrics.data_limit import Ceiling, ceiling, information_matrix, paper_cnr_ceiling
-from torchpcct.metrics.image_noise import RegionNoise, central_frequency_ratio, noise_magnitude_ratio
+from torchpcct.metrics.data_limit import Ceiling, ceiling, information_matrix
 from torchpcct.metrics.jackknife import Jackknifed, combined
-from torchpcct.metrics.matched_resolution import (
-    LinearReference,
-    MatchedNoise,
-    edge_mask,
-    gaussian_to_reach,
-    jackknifed_f50,
-    matched_noise_ratio,
-)
-from torchpcct.metrics.noise_covariance import NoiseCovariance
 from torchpcct.metrics.noise_power import NoisePower, noise_power_spectrum
 from torchpcct.metrics.observer import (
     ObserverResult,
@@ -53,19 +43,14 @@ __all__ = [
     "Estimate",
     "Interval",
     "Jackknifed",
-    "LinearReference",
-    "MatchedNoise",
-    "NoiseCovariance",
     "NoisePower",
     "ObserverResult",
-    "RegionNoise",
     "ResidualTest",
     "TransferFunction",
     "auc",
     "auc_from_d_prime",
     "cap_thickness",
     "ceiling",
-    "central_frequency_ratio",
     "channel_responses",
     "cnr",
     "cnr_from_moments",
@@ -76,24 +61,18 @@ __all__ = [
     "controlled_mean",
     "d_prime",
     "dog_channels",
-    "edge_mask",
     "edge_profile",
     "edge_width",
     "ellipsoid_distance",
     "false_positive_difference",
     "false_positive_rate",
-    "gaussian_to_reach",
     "hotelling_scores",
     "information_matrix",
-    "jackknifed_f50",
     "lumen_area",
     "match_edge_width",
-    "matched_noise_ratio",
     "mean_interval",
-    "noise_magnitude_ratio",
     "noise_power_spectrum",
     "observe",
-    "paper_cnr_ceiling",
     "residual_test",
     "sd_interval",
     "task_transfer",

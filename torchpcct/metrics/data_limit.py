@@ -21,10 +21,9 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from torchpcct.metrics.roi import as_array
 from torchpcct.validate import checked, number
 
-__all__ = ["Ceiling", "ceiling", "information_matrix", "paper_cnr_ceiling"]
+__all__ = ["Ceiling", "ceiling", "information_matrix"]
 
 Floats = NDArray[np.float64]
 
@@ -151,41 +150,3 @@ def ceiling(information: ArrayLike, functionals: ArrayLike, dose: float = 1.0) -
     covariance = half @ half.T
     spread = h @ half
     return Ceiling(covariance, h, spread @ spread.T)
-
-
-@checked
-def paper_cnr_ceiling(
-    information: ArrayLike, amplitudes: ArrayLike, foreground: ArrayLike, background: ArrayLike, dose: float = 1.0
-) -> float:
-    """The paper's CNR of the best unbiased ROI means, ``(μ_bg − μ_fg) / sqrt(σ²_bg + σ²_fg)``.
-
-    Generalised least squares minimises both variances at once, so no unbiased method exceeds this.
-
-    Args:
-        information: as in :func:`ceiling`.
-        amplitudes: ``(tissues,)`` true values in HU.
-        foreground, background: index of the tissue that fills the ROI, or the ROI's ``(tissues,)`` area fractions.
-        dose: exposure relative to that of ``information``.
-
-    Raises:
-        ValueError: as in :func:`ceiling`; amplitudes of another length; an index out of range.
-    """
-    c = np.asarray(amplitudes, dtype=np.float64)
-    tissues = len(np.atleast_1d(information))
-    if c.shape != (tissues,):
-        raise ValueError(f"amplitudes must have the shape ({tissues},), one per tissue, got {c.shape}")
-    rows = np.stack([_functional("foreground", foreground, tissues), _functional("background", background, tissues)])
-    limit = ceiling(information, rows, dose)
-    fg, bg = rows @ c
-    return float((bg - fg) / np.sqrt(np.trace(limit.functional_covariance)))
-
-
-def _functional(name: str, value: Any, tissues: int) -> Floats:
-    h = as_array(value)
-    if h.ndim:
-        if h.shape != (tissues,):
-            raise ValueError(f"{name} must be a tissue's index or ({tissues},) area fractions, got shape {h.shape}")
-        return h.astype(np.float64)
-    if not np.issubdtype(h.dtype, np.integer) or not 0 <= int(h) < tissues:
-        raise ValueError(f"{name} must be an index 0…{tissues - 1} or area fractions, got {value!r}")
-    return np.eye(tissues)[int(h)]

@@ -54,24 +54,6 @@ class Jackknifed:
         value, *ends = (math.exp(scale * v) for v in self.estimate(level))
         return Estimate(value, *sorted(ends))
 
-    def among(self, realizations: int) -> Jackknifed:
-        """The same figure as one of more realisations, of which those after its own leave it as it is.
-
-        So a figure of the first k of n draws combines with one of all n. Standard error, and covariance with the other
-        in large samples, stay; Student's quantile is that of n − 1.
-
-        Args:
-            realizations: n, at least those of the figure.
-        """
-        k, n = self.left_out.size, realizations
-        if n < k:
-            raise ValueError(f"realizations must be at least the {k} of the figure, got {n}")
-        # The jackknife's sum of squares has the factor (n − 1) / n.
-        spread = math.sqrt((k - 1) / k * n / (n - 1))
-        left_out = np.full(n, float(self.left_out.mean()))
-        left_out[:k] += spread * (self.left_out - self.left_out.mean())
-        return Jackknifed(self.value, left_out)
-
 
 @checked
 def combined(function: Callable[..., Any], *figures: Jackknifed | float) -> Jackknifed:

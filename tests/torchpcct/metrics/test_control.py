@@ -136,22 +136,6 @@ def test_combined_and_sums():
     assert half.low < half.value < half.high
 
 
-def test_a_figure_of_the_first_draws_among_all():
-    """Standard error kept; of a mean of k and a mean of n draws it gives the covariance that theory asks for."""
-    k, n = 200, 900
-    x, y = np.random.default_rng(2).multivariate_normal([0, 0], [[1.0, 0.6], [0.6, 2.0]], n).T
-    few, many = controlled_mean(x[:k], None, None), controlled_mean(y, None, None)
-    spread = few.among(n)
-    assert (spread.value, spread.left_out.size) == (few.value, n)
-    assert spread.standard_error == pytest.approx(few.standard_error, rel=1e-12)
-    difference = combined(lambda a, b: a - b, spread, many)
-    expected = math.sqrt(1.0 / k + 2.0 / n - 2 * 0.6 / n)
-    assert difference.standard_error == pytest.approx(expected, rel=0.1)
-    np.testing.assert_allclose(few.among(k).left_out, few.left_out)
-    with pytest.raises(ValueError, match="at least the 200"):
-        few.among(199)
-
-
 def test_refusals():
     y, x, _ = draws(20)
     with pytest.raises(ValueError, match="controls must be"):
