@@ -132,10 +132,9 @@ def viewer_page(volumes: Sequence[tuple[str, Volume, float, float]], title: str)
         step = 10.0 ** math.ceil(math.log10(span / (_CODES - 2)))
         step = max(step, _LEAST_STEP_HU) if volume.unit == "HU" else step
         low = math.floor(low / step) * step
-        codes = np.where(finite, np.rint((np.where(finite, values, low) - low) / step), _CODES).astype(np.int64)
-        # Differences of neighbours, low bytes before high ones: noise packs into 3/4 of the bytes, smooth images into less.
-        steps = np.diff(codes.ravel(), prepend=0).astype("<u2").view(np.uint8)
-        packed = zlib.compress(np.concatenate([steps[::2], steps[1::2]]).tobytes(), 9)
+        codes = np.where(finite, np.rint((np.where(finite, values, low) - low) / step), _CODES)
+        split = codes.ravel().astype("<u2").view(np.uint8)  # low bytes before high ones: a tenth less than mixed
+        packed = zlib.compress(np.concatenate([split[::2], split[1::2]]).tobytes(), 9)
         data.append(f'<script id="data{number}" type="text/plain">{base64_text(packed)}</script>')
         grid = {"shape": flat.grid.shape, "spacing": flat.grid.spacing, "center": flat.grid.center}
         about.append(

@@ -130,12 +130,11 @@ def _view(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         size = arguments.out.stat().st_size / 1e6
         print(f"{arguments.out}: {', '.join(labels)}, {size:.1f} MB; open it in a browser (no network is needed)")
         return
-    drawn = _draw_slice(volumes[0], arguments.plane, arguments.slice, *scales[0])
+    level, width = scales[0]
+    figure, index = _draw_slice(volumes[0], arguments.plane, arguments.slice, level, width)
     with written_whole(arguments.out) as part:
-        drawn[0].savefig(part)
-    print(
-        f"{arguments.out}: slice {drawn[1]} along {arguments.plane}, level {scales[0][0]:.4g}, window {scales[0][1]:.4g}"
-    )
+        figure.savefig(part)
+    print(f"{arguments.out}: slice {index} along {arguments.plane}, level {level:.4g}, window {width:.4g}")
 
 
 def _is_page(path: Path) -> bool:

@@ -61,9 +61,8 @@ def demo_steps(arguments: argparse.Namespace, run: Callable[[list[str]], int]) -
             return status
         print(flush=True)
     print(
-        f"{time.perf_counter() - start:.0f} s in all. Open {page} in a browser: the dark core beside the bright lumen is "
-        "what the paper looks for.\nThe lines after $ do the same when you type them; so far nothing has been measured: "
-        "torchpcct compare does that."
+        f"{time.perf_counter() - start:.0f} s in all. Open {page} in a browser: the paper looks for the dark core "
+        "beside the bright lumen.\nThe lines after $ do the same when you type them. What MBIR saves: torchpcct compare"
     )
     return 0
 
@@ -71,8 +70,8 @@ def demo_steps(arguments: argparse.Namespace, run: Callable[[list[str]], int]) -
 def add_demo(commands: Commands) -> None:
     parser = commands.add_parser(
         "demo", help="simulate a plaque scan, reconstruct it twice, look at it in the browser: 1 min",
-        description="Simulate the paper's plaque scan, reconstruct it by FBP and MBIR, write a page that shows both, and "
-        "print the commands that do this. About half a minute on two cores; the first time kernels are compiled, too.",
+        description="Simulate the paper's plaque scan, reconstruct it by FBP and MBIR, write a page that shows both, "
+        "and print the commands that do this. Half a minute on two cores; the first time kernels are compiled, too.",
     )  # fmt: skip
     examples(parser, "torchpcct demo --out first_look")
     parser.add_argument(
@@ -171,7 +170,8 @@ def _threads() -> str:
     names = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OMP_WAIT_POLICY")
     said = ", ".join(f"{n}={os.environ[n]}" for n in names if n in os.environ)
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return f"{usable} of {os.cpu_count()} cores usable, torch {torch.get_num_threads()}, kernels {get_num_threads()}; {said}"
+    used = f"torch {torch.get_num_threads()}, kernels {get_num_threads()}; {said}"
+    return f"{usable} of {os.cpu_count()} cores usable, {used}"
 
 
 def _processor() -> str:
@@ -189,7 +189,8 @@ def _gpu() -> str:
     if not _installed("triton"):
         raise ValueError("torch finds one, but the GPU kernels need triton: pip install triton")
     about = torch.cuda.get_device_properties(0)
-    return f"{about.name}, {about.total_memory / 2**30:.0f} GiB, CUDA {torch.version.cuda}, triton {metadata.version('triton')}"
+    versions = f"CUDA {torch.version.cuda}, triton {metadata.version('triton')}"
+    return f"{about.name}, {about.total_memory / 2**30:.0f} GiB, {versions}"
 
 
 def _cache() -> str:

@@ -57,16 +57,11 @@ def _screen(m: Measured, sentence: str) -> str:
     ]  # fmt: skip
     table = markdown_table(["dose factor", *(label for label, _, _ in columns)], rows)
     reference = m.evaluation.seen[0].task.reference
-    return "\n\n".join(
-        (
-            textwrap.fill(sentence.strip("*"), 110),
-            table,
-            textwrap.fill(
-                f"Dose factor: how many times the dose {reference} needs for the same figure, with its 95 % interval from "
-                f"{m.settings.n} noise realisations. Contrasts, errors, resolution, pictures: report.html.", 110
-            ),
-        )
-    )  # fmt: skip
+    meaning = (
+        f"Dose factor: how many times the dose {reference} needs for the same figure, and its 95 % interval from "
+        f"{m.settings.n} noise realisations. Contrasts, errors, resolution, pictures: report.html."
+    )
+    return "\n\n".join((textwrap.fill(sentence.strip("*"), 110), table, textwrap.fill(meaning, 110)))
 
 
 def _peak_memory_gib() -> float:
