@@ -25,7 +25,8 @@ COLUMNS = ("task", "method", "exposure_s", "figure", "where", "value", "low", "h
 _WINDOW_HU = (-160.0, 240.0)
 _STYLE = (
     "body{font:15px/1.5 system-ui,sans-serif;color:#222;max-width:75rem;margin:2rem auto;padding:0 1rem}"
-    "p{max-width:55rem}table{border-collapse:collapse;margin:1rem 0;font-size:13px;display:block;overflow-x:auto;"
+    "td{white-space:nowrap}p{max-width:55rem}"
+    "table{border-collapse:collapse;margin:1rem 0;font-size:13px;display:block;overflow-x:auto;"
     "font-variant-numeric:tabular-nums}td,th{border:1px solid #ccc;padding:.2rem .5rem;text-align:right}"
     "th{background:#f2f4f6}tr:hover td{background:#f7f9fb}td:first-child,th:first-child{text-align:left}"
     "img{max-width:100%}code{background:#f2f4f6;overflow-wrap:anywhere}"

@@ -51,6 +51,8 @@ def _screen(m: Measured, sentence: str) -> str:
         r = found.get((method, exposure, f"dose factor: {figure}", where))
         return "–" if r is None else interval(r)
 
+    measured = {key[2:] for key in found}
+    columns = tuple(c for c in columns if (f"dose factor: {c[1]}", c[2]) in measured)
     rows = [
         [f"{method}, {exposure:g} s", *(cell(method, exposure, *column[1:]) for column in columns)]
         for exposure in m.settings.exposures_s for method in m.settings.methods
@@ -61,7 +63,8 @@ def _screen(m: Measured, sentence: str) -> str:
         f"Dose factor: how many times the dose {reference} needs for the same figure, and its 95 % interval from "
         f"{m.settings.n} noise realisations. Contrasts, errors, resolution, pictures: report.html."
     )
-    return "\n\n".join((textwrap.fill(sentence.strip("*"), 110), table, textwrap.fill(meaning, 110)))
+    parts = (textwrap.fill(sentence.strip("*"), 110), table, textwrap.fill(meaning, 110))
+    return "\n\n".join(part for part in parts if part)
 
 
 def _peak_memory_gib() -> float:
