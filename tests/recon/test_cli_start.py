@@ -12,7 +12,7 @@ import torch
 
 import recon.api
 from recon.cli import _parser as make_parser
-from recon.cli import main, starting
+from recon.cli import doctor, main, starting
 from torchpcct import Volume
 
 ROOT = Path(__file__).parent.parent.parent
@@ -108,18 +108,21 @@ def test_the_demo_does_what_its_lines_do(quick, tmp_path, capsys, monkeypatch):
 def test_doctor_names_what_is_broken_and_what_to_do(capsys, monkeypatch):
     assert main(["doctor"]) == 0
     said = capsys.readouterr().out
-    assert len(re.findall("^ok ", said, re.MULTILINE)) == len(starting._CHECKS)
+    assert len(re.findall("^ok ", said, re.MULTILINE)) == len(doctor._CHECKS)
     assert re.search("weights +sha256 [0-9a-f]{64}, as their card says", said)
     monkeypatch.setattr("torchpcct.projector.Projector.T", lambda self, y: 1.001 * torch.ones(8, 20, 20))
     monkeypatch.setattr("recon.mbir.mbir.Mbir.weights_sha256", "0" * 64)
     monkeypatch.setattr("recon.api.reconstruct", lambda *_, **__: Volume(torch.full((40, 40), 9.0), _[1]))
-    monkeypatch.setattr(starting, "require_writable", lambda folder: (_ for _ in ()).throw(PermissionError("no")))
+    monkeypatch.setattr(doctor, "require_writable", lambda folder: (_ for _ in ()).throw(PermissionError("no")))
     monkeypatch.setattr("importlib.metadata.requires", lambda name: ["numpy>=99", "nonesuch>=1", "x>=1; extra == 'io'"])
     assert main(["doctor"]) == 1
     lines = dict(re.findall(r"^BROKEN +(\S+(?: \S+)?)  +(.*)$", capsys.readouterr().out, re.MULTILINE))
     assert set(lines) == {"packages", "kernel cache", "weights", "adjoint", "FBP"}
     assert "is older than 99" in lines["packages"]
-    assert "nonesuch" in lines["packages"]
+    assert lines["packages"].endswith("pip install --force-reinstall 'numpy>=99' 'nonesuch>=1'")
+    assert "sha256 0000" in lines["weights"]
+    assert "reads up to 9.0 HU off" in lines["FBP"]
+    assert "differ by" in lines["adjoint"]
     assert all("pip install" in text or "set NUMBA_CACHE_DIR" in text for text in lines.values())
 
 
