@@ -43,16 +43,20 @@ def build_report(m: Measured) -> Report:
 
 def _screen(m: Measured, sentence: str) -> str:
     """What fits on one: the answer, the dose factors of every method, and where the rest is."""
-    columns = (("CNR", "CNR", "small"), ("contrast, lesion", "contrast at slope 1", "lesion"),
-               ("d′, volume", "d'", "volume"), ("noise in fat", "noise", "patient"))  # fmt: skip
     found = {(r["method"], r["exposure_s"], r["figure"], r["where"]): r for r in m.evaluation.records}
+    measured = {key[2:] for key in found}
+    columns = [
+        column
+        for column in (
+            ("CNR", "CNR", "small"), ("contrast, lesion", "contrast at slope 1", "lesion"),
+            ("d′, volume", "d'", "volume"), ("noise in fat", "noise", "patient"),
+        ) if (f"dose factor: {column[1]}", column[2]) in measured
+    ]  # fmt: skip
 
     def cell(method: str, exposure: float, figure: str, where: str) -> str:
         r = found.get((method, exposure, f"dose factor: {figure}", where))
         return "–" if r is None else interval(r)
 
-    measured = {key[2:] for key in found}
-    columns = tuple(c for c in columns if (f"dose factor: {c[1]}", c[2]) in measured)
     rows = [
         [f"{method}, {exposure:g} s", *(cell(method, exposure, *column[1:]) for column in columns)]
         for exposure in m.settings.exposures_s for method in m.settings.methods
