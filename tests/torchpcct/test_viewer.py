@@ -140,6 +140,17 @@ def test_the_page_does_what_it_says(page):
                 continue
             assert float(cells[1].split()[0]) == pytest.approx(float(volume.data[tuple(index)]), abs=0.051)
             checked += 1
+            if volume is volumes[0]:  # and so grey is the picture there: window 0 ± 450 HU
+                grey = 255 * min(max(float(volume.data[tuple(index)]) / 900 + 0.5, 0), 1)
+                found = (
+                    page.locator("canvas")
+                    .nth(0)
+                    .evaluate(
+                        "(canvas, [a, b]) => canvas.getContext('2d').getImageData(a, b, 1, 1).data[0]",
+                        [int(across * box["width"]), int(down * box["height"])],
+                    )
+                )
+                assert found == pytest.approx(grey, abs=1.1)
     assert checked >= 6
     # The wheel moves through the slices of both.
     before = [_pixels(page, k) for k in (0, 3)]
