@@ -57,7 +57,13 @@ def test_the_version_is_the_projects():
     assert torchpcct.__version__ == project["version"]
 
 
-MODULES = {"yaml": "pyyaml", "skimage": "scikit-image", "PIL": "pillow", "llvmlite": "numba"}
+MODULES = {
+    "yaml": "pyyaml",
+    "skimage": "scikit-image",
+    "PIL": "pillow",
+    "llvmlite": "numba",
+    "markdown_it": "markdown-it-py",
+}
 """Modules whose package has another name, or comes with one that pins it."""
 
 

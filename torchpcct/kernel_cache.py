@@ -10,9 +10,8 @@ import sys
 import time
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
-__all__ = ["OURS", "forget_outdated", "sources"]
+__all__ = ["OURS", "folders", "forget_outdated", "sources"]
 
 OURS = ("torchpcct.", "recon.", "train.")
 """What the names of our modules begin with."""
@@ -52,12 +51,11 @@ def forget_outdated(name: str, *constants: str) -> int:
         How many were forgotten. Files that cannot be removed stay.
     """
     module = sys.modules[name]
-    folders = {_folder(v) for v in vars(module).values() if getattr(v, "__module__", None) == name} - {None}
     # A file from the future (a wrong clock) would have the kernels compiled by every process.
     newest = max((t for t in map(_changed, sources(name, *constants)) if t <= time.time()), default=0.0)
     forgotten = 0
-    for folder in folders:
-        for index in Path(str(folder)).glob(f"{Path(str(module.__file__)).stem}.*.nbi"):
+    for folder in folders(name):
+        for index in Path(folder).glob(f"{Path(str(module.__file__)).stem}.*.nbi"):
             try:
                 if _changed(index) < newest:
                     index.unlink()
@@ -67,9 +65,11 @@ def forget_outdated(name: str, *constants: str) -> int:
     return forgotten
 
 
-def _folder(kernel: Any) -> str | None:
-    """Where a kernel's compiled code lies; None: it is no kernel, or is not kept."""
-    return getattr(getattr(kernel, "stats", None), "cache_path", None)
+def folders(name: str) -> set[str]:
+    """Where the compiled code of an imported module's kernels lies."""
+    kernels = [v for v in vars(sys.modules[name]).values() if getattr(v, "__module__", None) == name]
+    found = {getattr(getattr(kernel, "stats", None), "cache_path", None) for kernel in kernels}
+    return {path for path in found if path is not None}
 
 
 def _changed(path: Path) -> float:

@@ -11,7 +11,9 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-__all__ = ["UNITS", "broadcast", "checked", "choice", "coverage", "number", "numbers", "per_axis", "reals", "whole"]
+__all__ = [
+    "UNITS", "broadcast", "checked", "choice", "coverage", "meant", "number", "numbers", "per_axis", "reals", "whole",
+]  # fmt: skip
 
 UNITS = ("HU", "mm^-1", "pixel^-1")
 """Of scans and volumes; of ``pixel^-1`` all lengths are in pixels."""
@@ -131,8 +133,16 @@ def choice(name: str, value: Any, options: Collection[str]) -> str:
         ValueError: it is not; the message lists them.
     """
     if not isinstance(value, str) or value not in options:
-        raise ValueError(f"unknown {name} {value!r}: use one of {', '.join(options)}")
+        raise ValueError(f"unknown {name} {value!r}: use one of {', '.join(options)}{meant(value, options)}")
     return str(value)
+
+
+def meant(given: Any, options: Iterable[str]) -> str:
+    """`` (did you mean 'pwls'?)`` where an option is like the text that was given, else nothing."""
+    import difflib  # of refusals only
+
+    near = difflib.get_close_matches(str(given), options, 1)
+    return f" (did you mean {near[0]!r}?)" if near else ""
 
 
 def reals(name: str, value: Any) -> Any:

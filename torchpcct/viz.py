@@ -1,14 +1,23 @@
-"""Figures, drawn without a display."""
+"""Figures, drawn without a display, and the page that shows volumes in a browser."""
 
 from __future__ import annotations
 
+import base64
+import html
+import json
+import math
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from importlib import resources
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-__all__ = ["WINDOW_HU", "Panel", "panels"]
+if TYPE_CHECKING:
+    from torchpcct.volume import Volume
+
+__all__ = ["WINDOW_HU", "Panel", "base64_text", "panels", "viewer_page"]
 
 WINDOW_HU = (150.0, 600.0)
 """Centre and width of the paper's display window (C150 / W600)."""
@@ -81,3 +90,65 @@ def panels(grid: Sequence[Sequence[Panel]], row_labels: Sequence[str] = (), titl
     if footer:
         figure.supxlabel(footer, fontsize=7)
     return figure
+
+
+_LEAST_STEP_HU = 0.1
+_MOST_VOXELS = 2**26
+_CODES = 65535
+"""Of a volume in a page: 0 … 65534 are values, 65535 stands for what is none (NaN, infinity)."""
+
+
+def viewer_page(volumes: Sequence[tuple[str, Volume, float, float]], title: str) -> str:
+    """One HTML page, without network, in which a browser shows volumes side by side (``viewer.html``).
+
+    Values are rounded to a power of ten, at most 10 / 65533 of the volume's range: to 0.1 HU up to a range of 6553 HU.
+
+    Args:
+        volumes: label, volume, and level and width of its first grey scale.
+        title: of the page.
+
+    Raises:
+        ValueError: no volume, or lengths in different units (mm, pixels); a volume without a finite value; more voxels
+            than a browser holds.
+    """
+    lengths = {"pixels" if v.unit == "pixel^-1" else "mm" for _, v, _, _ in volumes}
+    if len(lengths) != 1:
+        raise ValueError(f"a page shows volumes in one unit of length, got {' and '.join(sorted(lengths)) or 'none'}")
+    voxels = sum(v.data.numel() for _, v, _, _ in volumes)
+    if voxels > _MOST_VOXELS:
+        raise ValueError(
+            f"{voxels / 1e6:.0f} million voxels are too many for one page (at most {_MOST_VOXELS / 1e6:.0f} million): "
+            "show fewer volumes, or reconstruct a smaller extent or larger voxels"
+        )
+    about, data = [], []
+    for number, (label, volume, level, width) in enumerate(volumes):
+        flat = volume.slices()
+        values = flat.data.detach().cpu().numpy().astype(np.float64)
+        finite = np.isfinite(values)
+        if not finite.any():
+            raise ValueError(f"{label} holds no finite value")
+        low, high = float(values[finite].min()), float(values[finite].max())
+        span = max(high - low, 1e-3 * max(abs(low), abs(high)), 1e-30)
+        step = 10.0 ** math.ceil(math.log10(span / (_CODES - 2)))
+        step = max(step, _LEAST_STEP_HU) if volume.unit == "HU" else step
+        low = math.floor(low / step) * step
+        codes = np.where(finite, np.rint((np.where(finite, values, low) - low) / step), _CODES)
+        split = codes.ravel().astype("<u2").view(np.uint8)  # low bytes before high ones: a tenth less than mixed
+        packed = zlib.compress(np.concatenate([split[::2], split[1::2]]).tobytes(), 9)
+        data.append(f'<script id="data{number}" type="text/plain">{base64_text(packed)}</script>')
+        grid = {"shape": flat.grid.shape, "spacing": flat.grid.spacing, "center": flat.grid.center}
+        about.append(
+            {"label": label, "unit": flat.unit, **grid, "low": low, "step": step, "level": level, "width": width}
+        )
+    page = (resources.files("torchpcct") / "viewer.html").read_text(encoding="utf-8")
+    for name, text in (
+        ("title", html.escape(title)), ("length", lengths.pop()), ("data", "\n".join(data)),
+        ("volumes", json.dumps(about).replace("<", "\\u003c")),
+    ):  # fmt: skip
+        page = page.replace("{{" + name + "}}", text)
+    return page
+
+
+def base64_text(content: bytes) -> str:
+    """Base64 for a page: broken where it would by chance read like an address, which browsers skip."""
+    return base64.b64encode(content).decode().replace("http", "ht\ntp")

@@ -1,4 +1,4 @@
-"""Training of the learned prior: ``python -m train``, see :mod:`train.__main__`.
+"""Training of the learned prior: ``torchpcct train``, see :mod:`train.__main__`.
 
 Reading order: :mod:`train.config` (what a run is); :mod:`train.scenes`, :mod:`train.data` and :mod:`train.objective`
 (what it sees and minimises); :mod:`train.loop`, which drives a :mod:`train.run` with the gradients of

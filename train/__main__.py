@@ -1,4 +1,6 @@
-"""Command line: ``python -m train``, or ``torchrun --nproc_per_node=N -m train`` for N processes.
+"""Command line: ``torchpcct train``, or ``torchrun --nproc_per_node=N -m recon.cli train`` for N processes.
+
+``python -m train`` does the same where the user has no folder of that name.
 
 The numbers of threads are set before torch and numba are loaded, so this module imports all that needs them late.
 """
@@ -27,9 +29,12 @@ __all__ = ["build", "main"]
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="python -m train",
-        description="Train the unrolled reconstruction's prior on scenes that are made as it goes. Interrupt it at any "
-        "moment: --resume continues bit for bit. With torchrun --nproc_per_node=N -m train, N processes share a step.",
+        prog="torchpcct train",
+        description="Train the unrolled reconstruction's prior on scenes that are made as it goes.\n"
+        "Interrupt it at any moment: --resume continues bit for bit.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog="examples:\n  torchpcct train --quick --out runs/first\n  torchpcct train --out runs/mine --resume\n"
+        "N processes share a step with\n  torchrun --nproc_per_node=N -m recon.cli train --out runs/mine\n",
     )
     parser.add_argument("--config", type=Path, metavar="FILE", help="YAML file (default: train/configs/default.yaml)")
     parser.add_argument("--quick", action="store_true", help="train/configs/quick.yaml: a look at whether it works")
@@ -125,7 +130,7 @@ def _run(arguments: argparse.Namespace, command: str) -> int:
         return 0
     if state.step < config.steps:
         print(f"stopped at step {state.step} of {config.steps}; continue with: "
-              f"python -m train --out {shlex.quote(str(arguments.out))} --resume")  # fmt: skip
+              f"torchpcct train --out {shlex.quote(str(arguments.out))} --resume")  # fmt: skip
         return 128 + number if number else 1
     skipped = f", {state.skipped} steps skipped" if state.skipped else ""
     score = f"{state.best['score']:.5g}" if state.best else "none"
@@ -152,7 +157,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     logging.basicConfig(format="%(message)s")
     logging.getLogger("train").setLevel(logging.INFO)
     try:
-        return _run(arguments, shlex.join(["python", "-m", "train", *words]))
+        return _run(arguments, shlex.join(["torchpcct", "train", *words]))
     except KeyboardInterrupt:
         # The second Ctrl-C, or one before the first step.
         print(f"stopped at once; --resume continues from the last checkpoint in {arguments.out}", file=sys.stderr)

@@ -1,16 +1,20 @@
-"""Command line: ``torchpcct compare | dose-factor | study | simulate | reconstruct | lower-dose | info | …``.
+"""Command line: ``torchpcct`` alone says where to begin.
 
-Here stand the studies and :func:`main`; :mod:`~recon.cli.scans` has the commands that make scans and volumes,
-:mod:`~recon.cli.looking` those that show files, :mod:`~recon.cli.plaque` reads tissues,
+Here stand the studies and :func:`main`; :mod:`~recon.cli.starting` has the first commands of a newcomer,
+:mod:`~recon.cli.scans` those that make scans and volumes, :mod:`~recon.cli.evaluating` the measurement of methods,
+:mod:`~recon.cli.looking` what shows files, :mod:`~recon.cli.plaque` reads tissues,
 :mod:`~torchpcct.acquisition.config` reads what ``simulate`` is told, :mod:`~recon.cli.parsing` is what all share.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import shlex
+import shutil
 import sys
+import textwrap
 import time
 from collections.abc import Sequence
 from dataclasses import fields
@@ -19,11 +23,12 @@ from typing import TYPE_CHECKING, Any
 
 from recon.cli.evaluating import add_dose_factor, add_evaluate, add_show_task
 from recon.cli.looking import add_info, add_view
-from recon.cli.parsing import Commands, as_options, check_results, command, saying
+from recon.cli.parsing import Commands, Parser, as_options, check_results, command, examples, saying
 
 # What loads torch or numba is imported by the commands: help and refusals come at once.
 from recon.cli.plaque import add_plaque
 from recon.cli.scans import add_lower_dose, add_reconstruct, add_show_config, add_simulate
+from recon.cli.starting import add_demo, add_doctor, add_train, demo_steps, train
 from recon.study import registry
 from torchpcct import __version__
 from torchpcct.files import WriteError, require_writable, written_whole
@@ -45,7 +50,7 @@ def _run_study(name: str, settings: Any, arguments: argparse.Namespace, progress
     folder = arguments.out or Path("out") / name
     require_writable(folder)
     names = (name, registry.folder(name).replace("_", "-"))
-    check_results(arguments, folder, lambda report: report.get("study") in names, "report.json", "report.md", "*.png")
+    check_results(arguments, folder, lambda report: report.get("study") in names, "report.*", "*.png")
     minutes = {part: seconds / 60 for part, seconds in settings.estimated_seconds().items()}
     if minutes:
         listed = ", ".join(f"{part} {value:.1f}" for part, value in minutes.items())
@@ -114,8 +119,9 @@ def _add_compare(commands: Commands) -> None:
         "Simulate the paper's plaque scan at full size, reconstruct it by FBP, PWLS, the best simple filter and MBIR "
         "on the same noise realisations at 1× and 5.7× dose, and print what dose each saves. After an interruption the "
         "same command goes on.",
-        "folder for report.json, report.md and compare.png (default out/compare)",
+        "folder for report.html, .md, .json and compare.png (default out/compare)",
     )  # fmt: skip
+    examples(parser, "torchpcct compare --quick", "torchpcct compare --n 200 --methods fbp:soft pwls mbir:look=1")
     parser.add_argument("--n", type=int, metavar="N", help="realisations (default 16)")
     parser.add_argument("--methods", nargs="+", metavar="METHOD", help="as of evaluate --method")
     parser.add_argument("--quick", action="store_true", help="reduced views and methods: a first look, < 45 s")
@@ -126,8 +132,9 @@ def _add_hardcases(commands: Commands) -> None:
         commands, "hardcases", _own_study, registry.STUDIES["hardcases"],
         "Break the plaque's scan in many ways, reconstruct what is left by every method, and print the error, what was "
         "said, and whether it was wrong without a word.",
-        "folder for report.json, report.md and the figure (default out/hardcases)",
+        "folder for report.html, .md, .json and the figure (default out/hardcases)",
     )  # fmt: skip
+    examples(parser, "torchpcct hardcases --quick", "torchpcct hardcases --methods fbp pwls --views 246")
     parser.add_argument("--quick", action="store_true", help="an eighth of the views, by FBP alone")
     parser.add_argument("--methods", nargs="+", metavar="M", help="fbp pwls mbir (default: all)")
     parser.add_argument("--cases", nargs="+", metavar="NAME", help="only these cases")
@@ -136,13 +143,14 @@ def _add_hardcases(commands: Commands) -> None:
 
 def _add_study(commands: Commands) -> None:
     parser = command(
-        commands, "study", _study, "one of the paper's studies; torchpcct study --help lists them",
+        commands, "study", _study, "any study of the paper by its name; torchpcct study --help lists them",
         "Run a study of the paper at full scale and print its figures beside the published ones. After an interruption "
         "the same command goes on.",
-        "folder for report.json, report.md and the figures (default out/NAME)",
+        "folder for report.html, .md, .json and the figures (default out/NAME)",
     )  # fmt: skip
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = "studies:\n" + "".join(f"  {name:<12} {text}\n" for name, text in registry.STUDIES.items())
+    listed = "".join(f"  {name:<12} {text}\n" for name, text in registry.STUDIES.items())
+    before = f"studies:\n{listed}\n"
+    examples(parser, "torchpcct study noise --quick", "torchpcct study motion --set views=492", before=before)
     parser.add_argument("name", metavar="NAME", help="of the study")
     parser.add_argument("--quick", action="store_true", help="reduced settings: a first look, < 60 s")
     parser.add_argument(
@@ -161,31 +169,96 @@ def _add_verify(commands: Commands) -> None:
         description="Render the results again from the committed reports (notebooks/results.template.md) and compare; "
         "compute studies again if asked.",
     )  # fmt: skip
+    examples(parser, "torchpcct verify --write", "torchpcct verify --again phantom")
     parser.set_defaults(run=_verify, device="cpu", no_progress=False, verbose=False)
     parser.add_argument("--root", type=Path, default=Path(), help="folder of the repository (default: this one)")
     parser.add_argument("--write", action="store_true", help="write what is rendered")
     parser.add_argument("--again", nargs="*", default=[], metavar="STUDY", help="compute these studies again, in full")
 
 
-def _parser() -> tuple[argparse.ArgumentParser, Commands]:
-    parser = argparse.ArgumentParser(
+_GROUPS = {
+    "begin": (add_demo, add_doctor),
+    "simulate and reconstruct": (add_simulate, add_show_config, add_reconstruct, add_lower_dose, add_train),
+    "look": (add_view, add_info),
+    "measure": (add_evaluate, add_show_task, add_plaque),
+    "studies": (_add_compare, add_dose_factor, _add_hardcases, _add_study, _add_verify),
+}
+_BEGIN = """\
+torchpcct {version}: simulate a photon-counting CT scan, reconstruct it, measure how much dose a method really saves.
+
+A first look, 1 min     torchpcct demo
+Does all work here?     torchpcct doctor
+Your own scan           torchpcct info scan.h5
+                        torchpcct reconstruct scan.h5 --find-axis --out volume.nii.gz
+Look at volumes         torchpcct view a.nii.gz b.nii.gz --html view.html
+The main result, 5 min  torchpcct compare
+Your own method         torchpcct evaluate --task nodule --method mylab.nets:reconstruct
+
+{groups}
+
+torchpcct --help says what each command does; torchpcct COMMAND --help has its options and examples.
+"""
+
+
+def _parser() -> tuple[Parser, Commands, str]:
+    """Parser, its commands, and what ``torchpcct`` alone says."""
+    parser = Parser(
         prog="torchpcct",
         description="Photon-counting CT: simulate, reconstruct, and measure what model-based reconstruction saves.",
+        epilog="commands and options by Tab, in bash:\n"
+        "  torchpcct --print-completion bash > ~/.local/share/bash-completion/completions/torchpcct\n",
     )
     parser.add_argument("--version", action="version", version=f"torchpcct {__version__}")
+    parser.add_argument(
+        "--print-completion", action=_Completion, choices=("bash", "zsh", "tcsh"), metavar="SHELL",
+        help="print the completion of bash, zsh or tcsh (needs the extra completion)",
+    )  # fmt: skip
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    scans = (add_simulate, add_show_config, add_reconstruct, add_lower_dose, add_info, add_view)
-    studies = (_add_compare, _add_hardcases, _add_study)
-    for add in (add_evaluate, add_dose_factor, add_show_task, *studies, *scans, add_plaque, _add_verify):
-        add(commands)
-    return parser, commands
+    groups, listing, width = [], [], shutil.get_terminal_size().columns - 2
+    for title, adders in _GROUPS.items():
+        first = len(commands.choices)
+        for add in adders:
+            add(commands)
+        added = commands._choices_actions[first:]
+        groups.append(f"{title + ':':<25} {', '.join(a.dest for a in added)}")
+        rows = (textwrap.wrap(f"  {a.dest:<12} {a.help}", width, subsequent_indent=" " * 15) for a in added)
+        listing += [f"{title}:", *itertools.chain(*rows), ""]
+    parser.listing = "\n".join(listing)
+    return parser, commands, _BEGIN.format(version=__version__, groups="\n".join(groups))
+
+
+class _Completion(argparse.Action):
+    """Print the completion of a shell, and end."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+        try:
+            import shtab
+        except ImportError:
+            parser.error("--print-completion needs shtab: pip install 'torchpcct[completion]'")
+        for sub in next(a for a in parser._actions if a.dest == "command").choices.values():
+            for action in sub._actions:
+                if action.type is Path:
+                    action.complete = shtab.FILE
+        print(shtab.complete(parser, values))
+        parser.exit()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; returns the exit status: 0 done, 1 not written (a full disk), 2 refused input, 130 interrupted."""
-    parser, commands = _parser()
-    options = parser.parse_args(arguments)
-    options.command_line = list(sys.argv[1:] if arguments is None else arguments)
+    """Run a command; returns the exit status: 0 done, 1 not written (a full disk) or, of ``doctor``, something is
+    broken, 2 refused input, 130 interrupted. Without a command it says where to begin, which is no error."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if words[:1] == ["train"]:
+        return train(words[1:])
+    parser, commands, begin = _parser()
+    if not words:
+        print(begin, end="")
+        return 0
+    options, rest = parser.parse_known_args(words)
+    if rest:
+        commands.choices[options.command].error(f"unrecognized arguments: {' '.join(rest)}")
+    if options.command == "demo":
+        return demo_steps(options, main)
+    options.command_line = words
     actions = commands.choices[options.command]._actions
     with saying(actions, options.verbose) as options.warn:
         return _run(options, actions)
@@ -199,7 +272,7 @@ def _run(options: argparse.Namespace, actions: Any) -> int:
         progress = ProgressBars(not options.no_progress and sys.stderr.isatty())
         if options.device == "cuda" and not _cuda():
             raise ValueError("--device cuda: PyTorch finds no CUDA device here; use --device cpu")
-        options.run(options, progress)
+        return options.run(options, progress) or 0
     except WriteError as error:
         return _failed(options.command, progress, str(error), 1)
     except (ValueError, TypeError, OSError, ImportError, OverflowError, MemoryError) as error:
@@ -212,7 +285,6 @@ def _run(options: argparse.Namespace, actions: Any) -> int:
         return _failed(options.command, progress, text, 2)
     except KeyboardInterrupt:
         return _failed(options.command, progress, "interrupted, nothing half written", 130)
-    return 0
 
 
 def _cuda() -> bool:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 # What loads torch or numba is imported by the commands: help and refusals come at once.
-from recon.cli.parsing import Commands, check_results, command
+from recon.cli.parsing import Commands, check_results, command, examples
 
 if TYPE_CHECKING:
     from recon.study.study import ProgressBars
@@ -74,7 +74,7 @@ def _evaluate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         return
     if arguments.export is not None:
         written = export_scans(
-            tasks, arguments.export, exposures_s=arguments.exposure, n=arguments.n,
+            tasks, arguments.export, exposures_s=arguments.exposures_s, n=arguments.n,
             seed=arguments.seed, progress=progress,
         )  # fmt: skip
         progress.close()
@@ -84,7 +84,7 @@ def _evaluate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         )
         return
     found = evaluate(
-        tasks, methods, exposures_s=arguments.exposure, n=arguments.n, seed=arguments.seed,
+        tasks, methods, exposures_s=arguments.exposures_s, n=arguments.n, seed=arguments.seed,
         folder=out / "pieces", progress=progress,
     )  # fmt: skip
     progress.close()
@@ -173,39 +173,40 @@ def add_evaluate(commands: Commands) -> None:
         "folder for report.md, .json, .csv, .html and pictures (default out/evaluate)",
     )  # fmt: skip
     parser.set_defaults(tasks=("plaque",), methods=("fbp:soft", "bilateral@fbp:detail", "mbir"))
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = (
-        "methods: fbp:KERNEL, pwls, mbir, mbir:look=1, mbir:weights=FILE, mbir:tissues,\n"
+    examples(
+        parser, "torchpcct evaluate --task nodule --method mbir --n 20",
+        "torchpcct evaluate --task my.yaml --method mylab.nets:reconstruct --denoiser mylab.nets:denoise@fbp:detail",
+        before="methods: fbp:KERNEL, pwls, mbir, mbir:look=1, mbir:weights=FILE, mbir:tissues,\n"
         "         FILTER@fbp:KERNEL (gaussian, perona_malik, bilateral, nlm, tv, bm4d),\n"
-        "         package.module:function of (scan, grid), files:FOLDER\n"
-        "examples:\n"
-        "  torchpcct evaluate --task nodule --method mbir --n 20\n"
-        "  torchpcct evaluate --task my.yaml --method mylab.nets:reconstruct --denoiser mylab.nets:denoise@fbp:detail\n"
-    )
+        "         package.module:function of (scan, grid), files:FOLDER\n\n",
+    )  # fmt: skip
     _add_common(parser, n=20)
-    parser.add_argument(
+    measured = parser.add_argument_group("measured scans and volumes, of which nobody knows the truth")
+    measured.add_argument(
         "--scans",
         nargs="+",
         type=Path,
         metavar="FILE",
         help="measured scans instead of tasks: two of one object, or one, which is halved; noise at equal resolution",
     )
-    parser.add_argument(
+    measured.add_argument(
         "--volumes",
         nargs=2,
         type=Path,
         metavar="FOLDER",
         help="volumes of two scans of one object instead of tasks: a file of the same name a method in each folder",
     )
-    parser.add_argument(
+    measured.add_argument(
         "--reference",
         default="fbp",
         metavar="NAME",
         help="with --volumes: of a linear method, unsmoothed (default fbp)",
     )
-    parser.add_argument("--voxel", type=float, metavar="MM", help="with --scans: voxel size (default: the detector's)")
-    parser.add_argument("--extent", type=float, nargs="+", metavar="MM", help="with --scans: of the volume, Z Y X")
-    parser.add_argument("--center", type=float, nargs="+", metavar="MM", help="with --scans: of the volume, Z Y X")
+    measured.add_argument(
+        "--voxel", type=float, metavar="MM", help="with --scans: voxel size (default: the detector's)"
+    )
+    measured.add_argument("--extent", type=float, nargs="+", metavar="MM", help="with --scans: of the volume, Z Y X")
+    measured.add_argument("--center", type=float, nargs="+", metavar="MM", help="with --scans: of the volume, Z Y X")
     parser.add_argument(
         "--export", type=Path, metavar="FOLDER", help="write the noisy scans for another program instead of evaluating"
     )
@@ -219,6 +220,7 @@ def add_dose_factor(commands: Commands) -> None:
         "realisations: hours on two cores, kept piece by piece.",
         "folder for report.md, .json, .csv, .html and pictures (default out/dose-factor)",
     )  # fmt: skip
+    examples(parser, "torchpcct dose-factor --task plaque --method mbir --method fbp:soft --n 40")
     parser.set_defaults(tasks=_STUDY_TASKS, methods=_STUDY_METHODS, scans=None, export=None)
     _add_common(parser, n=200)
 
@@ -229,7 +231,9 @@ def _add_common(parser: argparse.ArgumentParser, n: int) -> None:
     parser.add_argument(
         "--denoiser", action="append", metavar="FUNCTION@BASE", help="a function of (volume) or (volume, sigma) in HU"
     )
-    parser.add_argument("--exposure", type=float, nargs="+", metavar="S", help="in s (default: those of each task)")
+    parser.add_argument(
+        "--exposure", dest="exposures_s", type=float, nargs="+", metavar="S", help="in s (default: those of each task)"
+    )
     parser.add_argument("--n", type=int, default=n, help=f"noise realisations, at least 8 (default {n})")
 
 
@@ -238,5 +242,6 @@ def add_show_task(commands: Commands) -> None:
         "show-task", help="print a ready task as YAML; without a name list them",
         description="Print a ready task as YAML, to copy and change. Without a name: all of them.",
     )  # fmt: skip
+    examples(parser, "torchpcct show-task nodule > mine.yaml")
     parser.set_defaults(run=_show_task, device="cpu", no_progress=True, verbose=False)
     parser.add_argument("name", nargs="?", metavar="NAME")

@@ -14,6 +14,7 @@ from recon.cli.parsing import (
     as_json,
     check_ending,
     check_output,
+    examples,
     is_picture,
     length_of,
     without_ending,
@@ -23,6 +24,7 @@ from torchpcct.validate import number
 
 if TYPE_CHECKING:
     from recon.study.study import ProgressBars
+    from torchpcct.volume import Volume
 
 __all__ = ["add_info", "add_view"]
 
@@ -94,49 +96,77 @@ def _info(arguments: argparse.Namespace, progress: ProgressBars) -> None:
 def add_info(commands: Commands) -> None:
     parser = commands.add_parser("info", help="what a scan or volume file holds", description="What a file holds.")
     parser.set_defaults(run=_info, device="cpu", no_progress=True, verbose=False)
-    parser.add_argument("file", type=Path, help="scan or volume")
+    examples(parser, "torchpcct info scan.h5", "torchpcct info volume.nii.gz --json")
+    parser.add_argument("file", type=Path, metavar="FILE", help="scan or volume")
     parser.add_argument("--json", action="store_true", help="everything, as JSON")
 
 
 def _view(arguments: argparse.Namespace, progress: ProgressBars) -> None:
-    if arguments.out is None:
-        arguments.out = Path(f"{without_ending(arguments.file)}.png")
-    check_ending(arguments.out, _PICTURE_ENDINGS)
-    check_output(arguments, is_picture, arguments.file)
+    files, page = arguments.files, arguments.html is not None
+    if not page and len(files) > 1:
+        raise ValueError("several volumes are shown in a page for the browser: add --html FILE")
+    if page and (arguments.slice is not None or arguments.plane != "z"):
+        raise ValueError("--slice and --plane belong to a picture (--out); a page of --html shows all of them")
+    arguments.out = arguments.html or arguments.out or Path(f"{without_ending(files[0])}.png")
+    check_ending(arguments.out, (".html", ".htm") if page else _PICTURE_ENDINGS)
+    check_output(arguments, _is_page if page else is_picture, *files)
     if arguments.window is not None:
         number("--window", arguments.window, positive=True)
-    if arguments.file.exists() and not _is_volume(arguments.file):
-        raise ValueError(
-            f"{arguments.file} is a scan, no volume: torchpcct reconstruct it first, info says what it holds"
-        )
+    for file in files:
+        if file.exists() and not _is_volume(file):
+            raise ValueError(f"{file} is a scan, no volume: torchpcct reconstruct it first, info says what it holds")
+    from torchpcct.volume import Volume
+
+    volumes = [Volume.load(file) for file in files]
+    scales = [_grey_scale(v.data, arguments.level, arguments.window) for v in volumes]
+    if page:
+        from torchpcct.viz import viewer_page
+
+        names = [without_ending(file) for file in files]
+        labels = [n if names.count(n) == 1 else str(f) for n, f in zip(names, files, strict=True)]
+        shown = [(label, v, *scale) for label, v, scale in zip(labels, volumes, scales, strict=True)]
+        with written_whole(arguments.out) as part:
+            part.write_text(viewer_page(shown, ", ".join(labels)), encoding="utf-8")
+        size = arguments.out.stat().st_size / 1e6
+        print(f"{arguments.out}: {', '.join(labels)}, {size:.1f} MB; open it in a browser (no network is needed)")
+        return
+    level, width = scales[0]
+    figure, index = _draw_slice(volumes[0], arguments.plane, arguments.slice, level, width)
+    with written_whole(arguments.out) as part:
+        figure.savefig(part)
+    print(f"{arguments.out}: slice {index} along {arguments.plane}, level {level:.4g}, window {width:.4g}")
+
+
+def _is_page(path: Path) -> bool:
+    """Whether a file is a page of ``view --html``."""
+    with path.open("rb") as file:
+        return b'content="torchpcct view"' in file.read(512)
+
+
+def _draw_slice(volume: Volume, plane: str, index: int | None, level: float, width: float) -> tuple[Any, int]:
+    """Figure of a slice across the axis ``plane``, and its index (the middle, if None is given)."""
     import numpy as np
     from matplotlib.figure import Figure
 
-    from torchpcct.volume import Volume
-
-    volume = Volume.load(arguments.file)
     data = volume.data if volume.data.ndim == 3 else volume.data[None]
-    axis = "zyx".index(arguments.plane)
-    index = data.shape[axis] // 2 if arguments.slice is None else arguments.slice
+    axis = "zyx".index(plane)
+    index = data.shape[axis] // 2 if index is None else index
     if not 0 <= index < data.shape[axis]:
-        raise ValueError(f"--slice must lie in 0 … {data.shape[axis] - 1} along {arguments.plane}, got {index}")
-    image = data.select(axis, index).numpy()
+        raise ValueError(f"--slice must lie in 0 … {data.shape[axis] - 1} along {plane}, got {index}")
     axes = volume.grid.axes if volume.grid.ndim == 3 else (np.zeros(1), *volume.grid.axes)
     names = [n for n in (0, 1, 2) if n != axis]
     across, up = axes[names[1]], axes[names[0]]
     figure = Figure(figsize=(6.4, 6.0), dpi=120, layout="constrained")
     panel = figure.subplots()
-    level, width = _grey_scale(volume.data, arguments.level, arguments.window)
     low, high = level - width / 2, level + width / 2
     step = [float(a[1] - a[0]) if a.size > 1 else 1.0 for a in (across, up)]
     extent = (across[0] - step[0] / 2, across[-1] + step[0] / 2, up[0] - step[1] / 2, up[-1] + step[1] / 2)
+    image = data.select(axis, index).numpy()
     shown = panel.imshow(image, cmap="gray", vmin=low, vmax=high, origin="lower", extent=extent)
     panel.set(xlabel=f"{'zyx'[names[1]]} / mm", ylabel=f"{'zyx'[names[0]]} / mm",
-              title=f"{arguments.plane} = {axes[axis][index]:.2f} mm")  # fmt: skip
+              title=f"{plane} = {axes[axis][index]:.2f} mm")  # fmt: skip
     figure.colorbar(shown, ax=panel, label=volume.unit)
-    with written_whole(arguments.out) as part:
-        figure.savefig(part)
-    print(f"{arguments.out}: slice {index} along {arguments.plane}, level {level:.4g}, window {width:.4g}")
+    return figure, index
 
 
 def _grey_scale(values: Any, level: float | None, window: float | None) -> tuple[float, float]:
@@ -151,12 +181,26 @@ def _grey_scale(values: Any, level: float | None, window: float | None) -> tuple
 
 
 def add_view(commands: Commands) -> None:
-    parser = commands.add_parser("view", help="a slice of a volume as a picture", description="Draw a slice.")
+    parser = commands.add_parser(
+        "view", help="volumes in a page for the browser, or a slice as a picture",
+        description="Draw a slice of a volume, or, with --html, make a page that shows volumes side by side in any "
+        "browser: three planes, wheel through the slices, window by dragging, one cursor in all volumes, values and "
+        "ROIs. The page is one file and needs no network.",
+    )  # fmt: skip
     parser.set_defaults(run=_view, device="cpu", no_progress=True, verbose=False)
-    parser.add_argument("file", type=Path, help="volume: .nii, .nii.gz, .mha, .h5, .dcm or a DICOM folder")
-    parser.add_argument("--out", type=Path, metavar="PATH", help="picture: .png, .pdf or .svg (default VOLUME.png)")
+    examples(
+        parser, "torchpcct view fbp.nii.gz mbir.nii.gz --level 150 --window 600 --html view.html",
+        "torchpcct view mbir.nii.gz --plane x --slice 18 --out sagittal.png",
+    )  # fmt: skip
+    parser.add_argument(
+        "files", type=Path, nargs="+", metavar="VOLUME", help=".nii, .nii.gz, .mha, .h5, .dcm or a DICOM folder"
+    )
+    to = parser.add_mutually_exclusive_group()
+    to.add_argument("--html", type=Path, metavar="FILE", help="page to write (.html), of one volume or several")
+    to.add_argument("--out", type=Path, metavar="PATH", help="picture: .png, .pdf or .svg (default VOLUME.png)")
     add_force(parser)
-    parser.add_argument("--plane", choices=("z", "y", "x"), default="z", help="axis across the slice (default z)")
-    parser.add_argument("--slice", type=int, metavar="K", help="index along it (default: the middle)")
     parser.add_argument("--level", type=float, help="centre of the grey scale (default 40 HU, mm⁻¹: of the values)")
     parser.add_argument("--window", type=float, help="its width (default 400 HU, mm⁻¹: of the values)")
+    picture = parser.add_argument_group("the picture")
+    picture.add_argument("--plane", choices=("z", "y", "x"), default="z", help="axis across the slice (default z)")
+    picture.add_argument("--slice", type=int, metavar="K", help="index along it (default: the middle)")

@@ -11,13 +11,15 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from torchpcct.files import WriteError, require_folder, require_writable, written_whole
+from torchpcct.validate import meant
 
 __all__ = [
     "SCAN_ENDINGS",
     "Commands",
+    "Parser",
     "add_force",
     "as_json",
     "as_options",
@@ -25,6 +27,7 @@ __all__ = [
     "check_output",
     "check_results",
     "command",
+    "examples",
     "is_picture",
     "length_of",
     "saying",
@@ -38,6 +41,65 @@ _BESIDE = (".json", ".yaml")
 
 Commands = Any
 """What ``add_subparsers`` gives; argparse does not publish its type."""
+
+
+_COMMON = "common options"
+
+
+class _Help(argparse.HelpFormatter):
+    """Wraps descriptions, and leaves texts that have lines of their own (examples, lists) as they are."""
+
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, max_help_position=28)
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        return text if "\n" in text else super()._fill_text(text, width, indent)
+
+
+class Parser(argparse.ArgumentParser):
+    """Its errors say what may have been meant; its help ends with the options that all commands have.
+
+    Attributes:
+        listing: what stands in the help in place of argparse's list of commands.
+    """
+
+    listing = ""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(formatter_class=_Help, **options)
+
+    def error(self, message: str) -> NoReturn:
+        """Say it with the nearest command, option or value, and exit with status 2."""
+        flags = [flag for action in self._actions for flag in action.option_strings]
+        if found := re.match(r"argument (\S+): invalid choice: '(.*?)' \(choose from (.*)\)", message):
+            name, given, rest = found.groups()
+            choices = re.findall(r"[\w-]+", rest)
+            if name == "COMMAND":
+                message = f"unknown command {given!r}"
+            message += meant(given, choices)
+        elif found := re.match("unrecognized arguments: (-[^ =]+)", message):
+            message += meant(found[1], flags)
+        self.exit(2, f"{self.prog}: {message}; {self.prog} --help says more\n")
+
+    def format_help(self) -> str:
+        """The help, the common options last."""
+        self._action_groups.sort(key=lambda group: group.title == _COMMON)
+        if not self.listing:
+            return super().format_help()
+        formatter = self._get_formatter()
+        formatter.add_text(self.description)
+        formatter.add_text(self.listing)
+        formatter.start_section("options")
+        formatter.add_arguments(self._get_optional_actions())
+        formatter.end_section()
+        formatter.add_text(self.epilog)
+        return self.format_usage() + "\n" + formatter.format_help()
+
+
+def examples(parser: argparse.ArgumentParser, *lines: str, before: str = "") -> None:
+    """Example commands, and what stands before them, at the end of a command's help."""
+    word = "example" if len(lines) == 1 else "examples"
+    parser.epilog = before + f"{word}:\n" + "".join(f"  {line}\n" for line in lines)
 
 
 def command(
@@ -60,12 +122,13 @@ def command(
     parser: argparse.ArgumentParser = commands.add_parser(name, help=help, description=description)
     parser.set_defaults(run=run)
     default = "the configuration's, or 0" if seed is None else f"{seed}"
-    parser.add_argument("--seed", type=int, default=seed, help=f"first seed of the noise, ≥ 0 (default {default})")
-    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where volumes are kept (default cpu)")
     parser.add_argument("--out", type=Path, metavar="PATH", help=out, required=required)
-    add_force(parser)
-    parser.add_argument("--no-progress", action="store_true", help="no progress bars")
-    parser.add_argument("-v", "--verbose", action="store_true", help="log what the library does")
+    common = parser.add_argument_group(_COMMON)
+    common.add_argument("--seed", type=int, default=seed, help=f"first seed of the noise, ≥ 0 (default {default})")
+    common.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where volumes are kept (default cpu)")
+    add_force(common)
+    common.add_argument("--no-progress", action="store_true", help="no progress bars")
+    common.add_argument("-v", "--verbose", action="store_true", help="log what the library does")
     return parser
 
 
@@ -159,7 +222,7 @@ def tell(arguments: argparse.Namespace, short: str, config: dict[str, Any], **su
     print(text if arguments.json else f"{file}: {short}")
 
 
-def add_force(parser: argparse.ArgumentParser) -> None:
+def add_force(parser: argparse._ActionsContainer) -> None:
     """The option ``--force`` of a command that writes."""
     parser.add_argument("--force", action="store_true", help="replace a file that another command or software has made")
 

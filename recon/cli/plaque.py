@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 # What loads torch or numba is imported by the command: help and refusals come at once.
-from recon.cli.parsing import Commands, check_results, command
+from recon.cli.parsing import Commands, check_results, command, examples
 from torchpcct import VolumeGrid
 from torchpcct.validate import number, numbers, whole
 
@@ -79,7 +79,8 @@ def add_plaque(commands: Commands) -> None:
         "bodies with the probability that they are there; beside each figure what FBP reads over the same regions.",
         "folder for report.md, report.json, tissues.nii.gz, image.nii.gz and plaque.png (default out/plaque)",
     )  # fmt: skip
-    parser.add_argument("scan", type=Path, help="scan file written by simulate")
+    examples(parser, "torchpcct plaque plaque.h5 --beside mbir --out reading")
+    parser.add_argument("scan", type=Path, metavar="SCAN", help="scan file written by simulate")
     axes = ("Z", "Y", "X")
     parser.add_argument("--point", type=float, nargs=3, metavar=axes, help="where a reader sees the plaque, mm")
     parser.add_argument("--point-sd", type=float, default=0.4, metavar="MM", help="its error (default 0.4)")

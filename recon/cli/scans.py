@@ -17,6 +17,7 @@ from recon.cli.parsing import (
     check_ending,
     check_output,
     command,
+    examples,
     length_of,
     tell,
     without_ending,
@@ -77,7 +78,7 @@ def _simulate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     if arguments.views is not None:
         whole("--views", arguments.views)
     if arguments.exposure is not None:
-        number("--exposure (exposure_s)", arguments.exposure, positive=True, unit="s")
+        number("--exposure", arguments.exposure, positive=True, unit="s")
     if arguments.config is not None and not arguments.config.exists():
         raise FileNotFoundError(f"{arguments.config} does not exist: torchpcct show-config prints an example")
     from torchpcct.acquisition.acquire import acquire, plan
@@ -140,6 +141,10 @@ def add_simulate(commands: Commands) -> None:
         "deep-silicon PCCT, and write it to HDF5, with what was done beside (.json, .yaml).",
         "HDF5 file to write", required=True, seed=None,
     )  # fmt: skip
+    examples(
+        parser, "torchpcct simulate --exposure 2 --out plaque.h5",
+        "torchpcct show-config > scene.yaml; torchpcct simulate --config scene.yaml --out scan.h5",
+    )  # fmt: skip
     parser.add_argument("--config", type=Path, metavar="YAML", help="scene, scanner and exposure")
     parser.add_argument("--exposure", type=float, metavar="S", help="exposure in s (default: noise free)")
     parser.add_argument("--views", type=int, help=f"views per rotation of the plaque scan (default {_PAPER_VIEWS})")
@@ -166,6 +171,7 @@ def add_show_config(commands: Commands) -> None:
         "show-config", help="print a full example for simulate --config, or of a .yaml stack",
         description="Print a full YAML example: for simulate --config, or, with --stack, of a stack of projections.",
     )  # fmt: skip
+    examples(parser, "torchpcct show-config > scene.yaml", "torchpcct show-config --stack > projections.yaml")
     parser.add_argument("--stack", action="store_true", help="the file beside TIFF or NumPy projections")
     parser.set_defaults(run=_show_config, device="cpu", no_progress=True, verbose=False)
 
@@ -173,9 +179,12 @@ def add_show_config(commands: Commands) -> None:
 # --- reconstruct --------------------------------------------------------------------------------------------------
 
 
-def _add_reader_options(parser: argparse.ArgumentParser) -> None:
+def _add_reader_options(parser: argparse._ActionsContainer) -> None:
     """What a file may not know of its scan, see :func:`_reader_options`."""
-    parser.add_argument("scan", type=Path, help=".h5 (ours or Data Exchange), .yaml stack, CatSim, DICOM-CT-PD folder")
+    parser.add_argument(
+        "scan", type=Path, metavar="SCAN", help=".h5 (ours or Data Exchange), .yaml stack, CatSim, DICOM-CT-PD folder"
+    )
+    parser = parser.add_argument_group("what the file does not know of its scan")
     parser.add_argument(
         "--geometry",
         type=Path,
@@ -410,28 +419,35 @@ def add_reconstruct(commands: Commands) -> None:
         "Reconstruct a scan, ours or a foreign one, and write the volume, with what was done beside (.json, .yaml).",
         "volume to write: .nii, .nii.gz, .mha, .h5, or no ending for a DICOM series (default SCAN_METHOD.nii.gz)",
     )  # fmt: skip
+    examples(
+        parser, "torchpcct reconstruct tooth.h5 --find-axis --out tooth.nii.gz",
+        "torchpcct reconstruct scan.h5 --method mbir --look 1 --out mbir.nii.gz",
+    )  # fmt: skip
     axes = ("Z", "Y", "X")
-    parser.add_argument("--method", default="fbp", help="fbp, pwls or mbir (default fbp)")
-    parser.add_argument("--kernel", help="FBP kernel: soft, standard, detail, bone, ram-lak")
-    parser.add_argument("--look", type=float, help="of MBIR: 0, quiet … 1, more contrast and noise (default 0.5)")
-    parser.add_argument("--tissues", action="store_true", help="MBIR with the tissues of the vessel in the inset")
-    parser.add_argument("--weights", type=Path, metavar="FILE", help="of MBIR: your own (default: those that ship)")
-    parser.add_argument("--point", type=float, nargs=3, metavar=axes, help="where a reader sees its plaque, mm")
-    parser.add_argument("--voxel", type=float, metavar="MM", help="voxel size (default: the detector's; inset: 0.25)")
+    how = parser.add_argument_group("method")
+    how.add_argument("--method", default="fbp", help="fbp, pwls or mbir (default fbp)")
+    how.add_argument("--kernel", help="FBP kernel: soft, standard, detail, bone, ram-lak")
+    how.add_argument("--look", type=float, help="of MBIR: 0, quiet … 1, more contrast and noise (default 0.5)")
+    how.add_argument("--tissues", action="store_true", help="MBIR with the tissues of the vessel in the inset")
+    how.add_argument("--weights", type=Path, metavar="FILE", help="of MBIR: your own (default: those that ship)")
+    how.add_argument("--point", type=float, nargs=3, metavar=axes, help="where a reader sees its plaque, mm")
+    where = parser.add_argument_group("voxels")
+    where.add_argument("--voxel", type=float, metavar="MM", help="voxel size (default: the detector's; inset: 0.25)")
     own = "of a scan of slices Y X alone"
-    parser.add_argument(
+    where.add_argument(
         "--center", type=_length, nargs="+", metavar="MM", help=f"centre, Z Y X (default: axis or plaque); {own}"
     )
-    parser.add_argument(
+    where.add_argument(
         "--extent", type=_length, nargs="+", metavar="MM", help=f"edge lengths, Z Y X (default: what is seen); {own}"
     )
     _add_reader_options(parser)
-    parser.add_argument(
+    mended = parser.add_argument_group("corrections of the scan")
+    mended.add_argument(
         "--find-axis",
         action="store_true",
         help="find the rotation axis: of a full turn, or half a turn of parallel rays",
     )
-    parser.add_argument("--clean", action="store_true", help="take out stripes and outliers (parallel and fan beams)")
+    mended.add_argument("--clean", action="store_true", help="take out stripes and outliers (parallel and fan beams)")
     _add_output(parser)
 
 
@@ -465,6 +481,7 @@ def add_lower_dose(commands: Commands) -> None:
         "of photons is not known.",
         "HDF5 file to write (default SCAN_FRACTION.h5)",
     )  # fmt: skip
+    examples(parser, "torchpcct lower-dose scan.h5 --fraction 0.25 --out quarter.h5")
     _add_reader_options(parser)
     parser.add_argument("--fraction", type=float, required=True, metavar="F", help="of the dose, 0 < F ≤ 1")
     parser.add_argument("--json", action="store_true", help="print the whole summary as JSON")

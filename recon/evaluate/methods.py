@@ -33,7 +33,7 @@ from recon.mbir.network import bilateral_prior
 from recon.mbir.tissues import TissueMbir
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
-from torchpcct.validate import checked, choice, number
+from torchpcct.validate import checked, choice, meant, number
 from torchpcct.volume import Volume
 
 __all__ = ["Draw", "Method", "deepinv_denoiser", "denoiser", "method_of"]
@@ -130,7 +130,7 @@ def method_of(spec: Any) -> Method:
     if rest:
         return _of_function(spec, _loaded(spec))
     known = "fbp:KERNEL, pwls, mbir, FILTER@BASE, package.module:function, files:FOLDER"
-    raise ValueError(f"unknown method {spec!r}: one of {known}")
+    raise ValueError(f"unknown method {spec!r}: one of {known}{_meant(spec)}")
 
 
 def denoiser(function: Callable[..., Any], base: Any, name: str = "") -> Method:
@@ -235,15 +235,19 @@ def _of_files(spec: str, folder: Path) -> Method:
     return Method(spec, run, key=str(folder.resolve()))
 
 
+def _meant(head: str) -> str:
+    return meant(head, ("fbp", "pwls", "mbir", "files", *FILTERS))
+
+
 def _loaded(spec: str) -> Callable[..., Any]:
     module, _, name = spec.partition(":")
     if not name:
         raise ValueError(f"unknown method {spec!r}: a function is package.module:function, a filter one of "
-                         f"{', '.join(FILTERS)}")  # fmt: skip
+                         f"{', '.join(FILTERS)}{_meant(module)}")  # fmt: skip
     try:
         found = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError) as error:
-        raise ValueError(f"cannot load {spec!r}: {error} (is its folder on PYTHONPATH?)") from error
+        raise ValueError(f"cannot load {spec!r}: {error} (is its folder on PYTHONPATH?){_meant(module)}") from error
     if not callable(found):
         raise TypeError(f"{spec} is no function")
     return found

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import base64
 import csv
 import html
 import io
 import json
 import math
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +17,20 @@ import numpy as np
 from recon.evaluate.estimates import Record, pivot
 from recon.evaluate.experiment import Evaluation, Seen
 from torchpcct.files import written_whole
+from torchpcct.viz import base64_text
 
-__all__ = ["plain", "save", "task_sections", "text_of"]
+__all__ = ["page", "plain", "save", "task_sections", "text_of"]
 
 COLUMNS = ("task", "method", "exposure_s", "figure", "where", "value", "low", "high", "unit", "n")
 _WINDOW_HU = (-160.0, 240.0)
+_STYLE = (
+    "body{font:15px/1.5 system-ui,sans-serif;color:#222;max-width:75rem;margin:2rem auto;padding:0 1rem}"
+    "td{white-space:nowrap}p{max-width:55rem}"
+    "table{border-collapse:collapse;margin:1rem 0;font-size:13px;display:block;overflow-x:auto;"
+    "font-variant-numeric:tabular-nums}td,th{border:1px solid #ccc;padding:.2rem .5rem;text-align:right}"
+    "th{background:#f2f4f6}tr:hover td{background:#f7f9fb}td:first-child,th:first-child{text-align:left}"
+    "img{max-width:100%}code{background:#f2f4f6;overflow-wrap:anywhere}"
+)
 _INTRO = """\
 Dose factor: how many times the dose {reference} needs for the same figure. Brackets: 95 % intervals over {n} noise
 realisations, the same for all methods; figures without are exact. Noise: of a voxel, over realisations. Error: root
@@ -126,6 +135,9 @@ def save(evaluation: Evaluation, folder: str | os.PathLike[str], command: str = 
     out = Path(folder)
     out.mkdir(parents=True, exist_ok=True)
     text = text_of(evaluation) + (f"\nCommand: `{command}`.\n" if command else "")
+    for seen in evaluation.seen:
+        name = seen.task.name
+        text = text.replace(f"## {name}\n", f"## {name}\n\n![{name}]({name}.png)\n")
     table = io.StringIO()
     writer = csv.DictWriter(table, COLUMNS, lineterminator="\n")
     writer.writeheader()
@@ -137,7 +149,7 @@ def save(evaluation: Evaluation, folder: str | os.PathLike[str], command: str = 
         "report.md": text.encode(), "report.csv": table.getvalue().encode(),
         "report.json": (json.dumps(data, indent=1) + "\n").encode(),
         **pictures,
-        "report.html": _html(text, pictures).encode(),
+        "report.html": page("Evaluation", text, pictures).encode(),
     }  # fmt: skip
     for name, content in files.items():
         with written_whole(out / name) as part:
@@ -169,38 +181,22 @@ def _picture(seen: Seen) -> bytes:
     return buffer.getvalue()
 
 
-def _html(text: str, pictures: dict[str, bytes]) -> str:
-    """One page without network: the Markdown's headings, paragraphs and tables, and the pictures in it."""
-    body: list[str] = []
-    rows: list[str] = []
-    for line in [*text.splitlines(), ""]:
-        if line.startswith("|"):
-            if not line.startswith("|---"):
-                tag = "td" if rows else "th"
-                cells = [html.escape(c.strip()) for c in line.strip("|").split("|")]
-                rows.append("<tr>" + "".join(f"<{tag}>{c}</{tag}>" for c in cells) + "</tr>")
-            continue
-        if rows:
-            body.append("<table>" + "".join(rows) + "</table>")
-            rows = []
-        if line.startswith("#"):
-            level = len(line) - len(line.lstrip("#"))
-            title = line.lstrip("# ")
-            body.append(f"<h{level}>{html.escape(title)}</h{level}>")
-            picture = pictures.get(f"{title}.png")
-            if picture is not None:
-                coded = base64.b64encode(picture).decode()
-                body.append(f'<img alt="{html.escape(title)}" src="data:image/png;base64,{coded}">')
-        elif line.strip():
-            body.append(html.escape(line))
-        elif body and not body[-1].startswith("<"):
-            body.append("<p>")
-    style = (
-        "body{font:15px/1.5 sans-serif;max-width:75rem;margin:2rem auto;padding:0 1rem}table{border-collapse:collapse;"
-        "margin:1rem 0;font-size:13px}td,th{border:1px solid #ccc;padding:.2rem .5rem;text-align:right}"
-        "td:first-child,th:first-child{text-align:left}img{max-width:100%}"
-    )
+def page(title: str, text: str, pictures: Mapping[str, bytes]) -> str:
+    """A report as one HTML page, without network.
+
+    Args:
+        title: of the page.
+        text: Markdown; a picture that it names stands there, the others at its end.
+        pictures: file name → its content, PNG or SVG.
+    """
+    from markdown_it import MarkdownIt
+
+    rest = "".join(f"\n\n![{name}]({name})" for name in pictures if f"]({name})" not in text)
+    body = MarkdownIt("commonmark", {"html": False}).enable("table").render(text + rest)
+    for name, content in pictures.items():
+        kind = "svg+xml" if name.endswith(".svg") else "png"
+        body = body.replace(f'src="{name}"', f'src="data:image/{kind};base64,{base64_text(content)}"')
     return (
-        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>Evaluation</title><style>{style}</style>'
-        f"<body>{''.join(body)}</body></html>\n"
+        f'<!doctype html>\n<html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
+        f"<title>{html.escape(title)}</title><style>{_STYLE}</style>\n<body>{body}</body></html>\n"
     )

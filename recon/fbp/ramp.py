@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.fft import next_fast_len
 
-from torchpcct.validate import checked
+from torchpcct.validate import checked, choice
 
 __all__ = ["KERNELS", "apodization", "fast_length", "ramp_kernel"]
 
@@ -37,9 +37,7 @@ KERNELS: tuple[str, ...] = tuple(_POINTS)
 def _points(kernel: Any) -> tuple[float, ...]:
     if not isinstance(kernel, str):
         raise TypeError(f"kernel must be one of {', '.join(map(repr, KERNELS))}, got {type(kernel).__name__}")
-    if kernel not in _POINTS:
-        raise ValueError(f"unknown kernel {kernel!r}: choose one of {', '.join(map(repr, KERNELS))}")
-    return _POINTS[kernel]
+    return _POINTS[choice("kernel", kernel, KERNELS)]
 
 
 @cache

@@ -88,7 +88,7 @@ class Mbir:
         """
         source = Path(path) if path is not None else Path(str(resources.files("recon") / "mbir" / "weights" / SHIPPED))
         if not source.is_file():
-            raise FileNotFoundError(f"no weights at {source}: train them (python -m train) or name a file")
+            raise FileNotFoundError(f"no weights at {source}: train them (torchpcct train) or name a file")
         try:
             tensors, config = read_tensors(source, WEIGHTS_FORMAT)
             model = Unrolled(NetworkConfig(**config["network"]), steps=config["unroll"])

@@ -12,7 +12,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torchpcct.validate import choice
+from torchpcct.validate import choice, meant
 
 if TYPE_CHECKING:
     from recon.study.report import Report
@@ -85,7 +85,8 @@ def build_settings(name: str, *, quick: bool = False, seed: int | None = None, c
     for change in changes:
         key, equals, text = change.partition("=")
         if not equals or key not in known:
-            raise ValueError(f"--set {change}: give field=value with one of the fields {', '.join(sorted(known))}")
+            fields_known = f"with one of the fields {', '.join(sorted(known))}{meant(key, known)}"
+            raise ValueError(f"--set {change}: give field=value {fields_known}")
         try:
             values[key] = ast.literal_eval(text)
         except (SyntaxError, ValueError):

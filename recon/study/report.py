@@ -1,7 +1,8 @@
-"""What every study leaves behind: ``report.json``, ``report.md`` and figures, each written whole."""
+"""What every study leaves behind: ``report.json``, ``report.md``, ``report.html`` and figures, each written whole."""
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import os
@@ -12,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from recon.evaluate.report import page
 from torchpcct.files import written_whole
 
 __all__ = ["Report", "by_sign", "markdown_table", "or_dash", "records_table"]
@@ -84,23 +86,24 @@ class Report:
         return json.dumps(self.data, indent=1, default=_plain)
 
     def save(self, folder: str | os.PathLike[str]) -> list[Path]:
-        """Write ``report.json``, ``report.md`` and the figures into ``folder`` (made if need be).
+        """Write ``report.json``, ``report.md``, the figures and ``report.html`` into ``folder`` (made if need be).
 
         Returns:
             The files written.
         """
         out = Path(folder)
         out.mkdir(parents=True, exist_ok=True)
-        files = []
-        for name, content in (
-            ("report.json", self.json),
-            ("report.md", self.text),
-        ):
+        contents = {"report.json": f"{self.json}\n".encode(), "report.md": f"{self.text}\n".encode()}
+        pictures = {name: _drawn(figure, name) for name, figure in self.figures.items()}
+        title = f"torchpcct: {self.name}"
+        contents |= {**pictures, "report.html": page(title, self.text, pictures).encode()}
+        for name, content in contents.items():
             with written_whole(out / name) as part:
-                part.write_text(content + "\n", encoding="utf-8")
-            files.append(out / name)
-        for name, figure in self.figures.items():
-            with written_whole(out / name) as part:
-                figure.savefig(part)
-            files.append(out / name)
-        return files
+                part.write_bytes(content)
+        return [out / name for name in contents]
+
+
+def _drawn(figure: Any, name: str) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format=Path(name).suffix[1:])
+    return buffer.getvalue()

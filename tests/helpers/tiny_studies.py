@@ -1,6 +1,7 @@
 """Every study of the registry at its smallest scale, and what all of their reports must be."""
 
 import json
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -82,7 +83,7 @@ def assert_report_is_whole(tiny: TinyStudy, folder: Path, figures: set[str], sec
     Each study's own test file calls it once: so each study is measured once a session, by the process of that file.
     """
     files = tiny.report.save(folder / "new")
-    assert {f.name for f in files} == {"report.json", "report.md", *figures}
+    assert {f.name for f in files} == {"report.json", "report.md", "report.html", *figures}
     assert {f.name for f in (folder / "new").iterdir()} == {f.name for f in files}  # nothing half written is left
     assert all((folder / "new" / name).read_bytes().startswith(b"\x89PNG") for name in figures)
     data = json.loads((folder / "new" / "report.json").read_text(encoding="utf-8"))
@@ -92,6 +93,10 @@ def assert_report_is_whole(tiny: TinyStudy, folder: Path, figures: set[str], sec
     text = (folder / "new" / "report.md").read_text(encoding="utf-8")
     for section in sections:
         assert section in text
+    page = (folder / "new" / "report.html").read_text(encoding="utf-8")
+    assert page.count('src="data:image/png;base64,') == len(figures)
+    assert page.count("<table>") == len(re.findall(r"^\|:?--", text, re.MULTILINE))
+    assert "http" not in page
     assert tiny.steps
     assert all(0.0 <= fraction <= 1.0 for _, fraction in tiny.steps)
     return data

@@ -274,7 +274,7 @@ def test_names_and_grey_scale_of_their_own(tmp_path, capsys, monkeypatch):
         (["reconstruct", "{tmp}", "--method", "art", "--out", "{tmp}/a.h5"], "unknown method 'art'"),
         (["view", "{tmp}/none.h5", "--out", "{tmp}/a.bmp"], "unknown ending of 'a.bmp'"),
         (["info", "{tmp}/none.h5"], "none.h5"),
-        (["simulate", "--exposure", "0", "--out", "{tmp}/a.h5"], "exposure_s"),
+        (["simulate", "--exposure", "0", "--out", "{tmp}/a.h5"], "--exposure must be greater than 0 s"),
         (["simulate", "--seed", "-1", "--exposure", "1", "--out", "{tmp}/a.h5"], "seed"),
         (["simulate", "--out", "{tmp}/none/a.h5"], "does not exist"),
         (["reconstruct", "{tmp}/none.h5", "--out", "{tmp}/a.h5"], "none.h5"),

@@ -1,4 +1,4 @@
-"""The command line, ``python -m train``, on a tiny model."""
+"""The command line, ``torchpcct train``, on a tiny model."""
 
 import json
 import signal
@@ -29,7 +29,7 @@ def test_command_line(tmp_path, objective, capsys):
     objective.at = {6: send(signal.SIGTERM)}
     assert command_line.main([*start, *common]) == 128 + signal.SIGTERM
     message = capsys.readouterr().out
-    assert f"python -m train --out {out} --resume" in message
+    assert f"torchpcct train --out {out} --resume" in message
     assert "stopped at step 8 of 12" in message
     assert command_line.main([*start, *common]) == 1
     assert "--resume" in capsys.readouterr().err

@@ -7,7 +7,7 @@ from typing import Any
 
 from recon.study.paper.facts import ASSUMED_FACTOR, DOSES
 
-__all__ = ["answer", "claim"]
+__all__ = ["answer", "claim", "interval"]
 
 _LOW_S, _HIGH_S = DOSES["1x"], DOSES["5.7x"]
 _METHOD = "mbir"
@@ -20,7 +20,8 @@ def _found(records: list[dict[str, Any]], method: str, exposure_s: float, figure
     return next((r for r in records if wanted.items() <= r.items()), None)
 
 
-def _interval(record: dict[str, Any]) -> str:
+def interval(record: dict[str, Any]) -> str:
+    """A value with its interval, where it has one."""
     low, high = record["low"], record["high"]
     if low is None or not math.isfinite(low):
         return f"{record['value']:.2f}"
@@ -58,9 +59,9 @@ def answer(data: dict[str, Any]) -> str:
         }[tested["met"]]  # fmt: skip
         against = "not" if tested["met"] == "no" else "against"
         text = (
-            f"{verdict}: at {tested['mbir_s']:.2f} s MBIR's CNR of {_interval(tested['mbir'])} {reaches} the "
+            f"{verdict}: at {tested['mbir_s']:.2f} s MBIR's CNR of {interval(tested['mbir'])} {reaches} the "
             f"{tested['fbp']['value']:.2f} of FBP (soft kernel) at {tested['fbp_s']:.2f} s: FBP needs "
-            f"{_interval(tested['factor'])} times its dose for that CNR, {against} the {ASSUMED_FACTOR:g} times "
+            f"{interval(tested['factor'])} times its dose for that CNR, {against} the {ASSUMED_FACTOR:g} times "
             "that the paper assumes"
         )
     exposures = sorted({r["exposure_s"] for r in records if r["method"] == _METHOD}, reverse=True)
@@ -76,7 +77,7 @@ def answer(data: dict[str, Any]) -> str:
             ("noise", "patient", "for the noise of a voxel in fat"),
         )
     ]  # fmt: skip
-    said = ", ".join(f"{_interval(r)} {what}" for r, what in parts if r is not None)
+    said = ", ".join(f"{interval(r)} {what}" for r, what in parts if r is not None)
     text += f"{'; at' if text else 'At'} {best:.2f} s FBP needs, in doses of MBIR, {said}"
     s = data["settings"]
     if s["views"] < FULL_VIEWS or s["n"] < FEW_DRAWS:

@@ -150,7 +150,9 @@ def test_report_and_tidy_table(found, tmp_path):
     assert len(lines) == 1 + len(found.records)
     data = json.loads(files["report.json"].read_text(encoding="utf-8"))
     assert len(data["records"]) == len(found.records)
-    assert "http" not in files["report.html"].read_text(encoding="utf-8").replace("http-equiv", "")
+    page = files["report.html"].read_text(encoding="utf-8")
+    assert page.count('src="data:image/png;base64,') == 1
+    assert "http" not in page
     text = text_of(found)
     assert "Least dose" in text
     assert "nan" not in text

@@ -331,7 +331,7 @@ def test_bad_input_is_named():
     geometry = FanBeam(full_turn(9), 50, 90, 19, 1.3)
     grid = VolumeGrid((3, 3), 1.0)
     data = torch.zeros(geometry.shape)
-    with pytest.raises(ValueError, match=r"unknown kernel 'hann': choose one of 'soft', 'standard'"):
+    with pytest.raises(ValueError, match=r"unknown kernel 'hann': use one of soft, standard"):
         fbp(data, geometry, grid, "hann")
     with pytest.raises(TypeError, match="non-empty sequence of names"):
         fbp(data, geometry, grid, [])

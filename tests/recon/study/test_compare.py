@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from tiny_studies import TINY, assert_report_is_whole
 
+from recon.evaluate.report import page
 from recon.study.compare.answer import answer, claim
 from recon.study.compare.measure import measure
 from recon.study.compare.settings import Settings
@@ -20,6 +21,10 @@ def test_report(tiny, tmp_path):
     assert {r["method"] for r in data["records"]} == {"fbp:soft", "gaussian@fbp:soft"}
     assert data["claim"] is None  # without MBIR
     assert data["answer"] == ""
+    screen = study.report.screen.splitlines()
+    assert len(screen) <= 40
+    assert max(map(len, screen)) <= 110
+    assert re.search(r"^\| gaussian@fbp:soft, \S+ s +\| +\d", study.report.screen, re.MULTILINE)
 
 
 def test_the_same_seed_gives_the_same_figures(tiny):
@@ -27,6 +32,18 @@ def test_the_same_seed_gives_the_same_figures(tiny):
     for one, other in zip(again, tiny("compare").measured.evaluation.records, strict=True):
         if one["figure"] != "seconds":
             np.testing.assert_equal(one, other)
+
+
+def test_a_page_has_its_tables_and_pictures_in_it():
+    text = f"# T\n\n<script>x</script> a | b\n\n![s](second.svg)\n\n{markdown_table(['a', 'b'], [['1 < 2', 'c`d`']])}\n"
+    whole = page("a & b", text, {"first.png": b"\x89PNG", "second.svg": b"<svg/>"})
+    assert "<title>a &amp; b</title>" in whole
+    assert "<script>" not in whole
+    assert "<td>1 &lt; 2</td>" in whole.replace(' style="text-align:left"', "")
+    assert "c<code>d</code></td>" in whole
+    first, second = (whole.index(f"data:image/{kind};base64,") for kind in ("png", "svg+xml"))
+    assert second < whole.index("<table>") < first  # where the text names it, or at the end
+    assert "http" not in whole
 
 
 def test_markdown_table_is_aligned():

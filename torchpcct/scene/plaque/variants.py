@@ -16,7 +16,7 @@ from torchpcct.scene.bodies import Ellipsoid, EllipticCylinder
 from torchpcct.scene.materials import calcification
 from torchpcct.scene.plaque.plaque import PAPER_POSITION, Plaque, interpolate_material, plaque_scene
 from torchpcct.scene.scene import Body, Scene
-from torchpcct.validate import checked, number, whole
+from torchpcct.validate import checked, choice, number, whole
 
 __all__ = ["VARIANTS", "calcification_bodies", "plaque_variant", "stent_bodies", "textured"]
 
@@ -223,6 +223,4 @@ def plaque_variant(name: str, **options: Any) -> tuple[Scene, Plaque]:
     Raises:
         ValueError: an unknown name, options that make bodies overlap.
     """
-    if name not in VARIANTS:
-        raise ValueError(f"unknown variant {name!r}: choose one of {', '.join(VARIANTS)}")
-    return VARIANTS[name](**options)
+    return VARIANTS[choice("variant", name, VARIANTS)](**options)

@@ -1,0 +1,179 @@
+"""What ``doctor`` looks at: the installation, the machine, and whether both compute what they should."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import platform
+import re
+from collections.abc import Callable, Iterator
+from importlib import metadata, resources
+from pathlib import Path
+
+from torchpcct import VolumeGrid, __version__
+from torchpcct.files import require_writable
+
+__all__ = ["outcomes"]
+
+_MODULES = {"scikit-image": "skimage", "pyyaml": "yaml"}
+"""Modules of packages with another name."""
+_EXTRAS = ("io", "train", "completion", "rivals", "interop")
+_AGAIN = "install torchpcct again, in its folder: pip install --force-reinstall --no-deps ."
+
+
+def _versions() -> str:
+    found, wrong, wanted = [], [], []
+    for requirement in metadata.requires("torchpcct") or []:
+        name, _, floor = re.split(r"\s*;", requirement)[0].partition(">=")
+        if "extra ==" in requirement:
+            continue
+        try:
+            version = metadata.version(name)
+            importlib.import_module(_MODULES.get(name, name))
+        except Exception as error:  # missing, or a binary of another machine: both are what is looked for
+            wrong.append(f"{name} does not load ({error})")
+        else:
+            found.append(f"{name} {version}")
+            if _numbers(version) >= _numbers(floor):
+                continue
+            wrong.append(f"{name} {version} is older than {floor}")
+        wanted.append(f"'{name}>={floor}'")
+    if wrong:
+        raise ValueError(f"{'; '.join(wrong)}: pip install --force-reinstall {' '.join(wanted)}")
+    return ", ".join(found)
+
+
+def _numbers(version: str) -> list[int]:
+    return [int(n) for n in re.findall(r"\d+", version)[:3]]
+
+
+def _extras() -> str:
+    parts = []
+    requirements = metadata.requires("torchpcct") or []
+    for extra in _EXTRAS:
+        names = [re.split(r"[>;=<\[ ]", r)[0] for r in requirements if re.search(f"extra == .{extra}.", r)]
+        missing = [n for n in names if not _installed(n)]
+        parts.append(f"{extra} lacks {', '.join(missing)} (pip install 'torchpcct[{extra}]')" if missing else extra)
+    return "; ".join(parts)
+
+
+def _installed(name: str) -> bool:
+    try:
+        return bool(metadata.version(name))
+    except metadata.PackageNotFoundError:
+        return False
+
+
+def _threads() -> str:
+    import torch
+
+    from torchpcct.threads import get_num_threads
+
+    names = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OMP_WAIT_POLICY")
+    said = ", ".join(f"{n}={os.environ[n]}" for n in names if n in os.environ)
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    used = f"torch {torch.get_num_threads()}, kernels {get_num_threads()}; {said}"
+    return f"{usable} of {os.cpu_count()} cores usable, {used}"
+
+
+def _processor() -> str:
+    import torch
+    from llvmlite import binding
+
+    return f"{platform.machine()}, {binding.get_host_cpu_name()}, {torch.backends.cpu.get_cpu_capability()}"
+
+
+def _gpu() -> str:
+    import torch
+
+    if not torch.cuda.is_available():
+        return f"none that torch can use (torch {torch.__version__}); everything runs on the processor"
+    if not _installed("triton"):
+        raise ValueError("torch finds one, but the GPU kernels need triton: pip install triton")
+    about = torch.cuda.get_device_properties(0)
+    versions = f"CUDA {torch.version.cuda}, triton {metadata.version('triton')}"
+    return f"{about.name}, {about.total_memory / 2**30:.0f} GiB, {versions}"
+
+
+def _cache() -> str:
+    from torchpcct.kernel_cache import folders
+    from torchpcct.projector.cpu import cone_kernels
+
+    folder = Path(min(folders(cone_kernels.__name__)))
+    try:
+        require_writable(folder)
+    except OSError as error:
+        raise ValueError(f"{error.__cause__ or error}: set NUMBA_CACHE_DIR to a folder that you can write") from None
+    return f"{folder}, writable, {len(list(folder.glob('*.nbc')))} compiled kernels"
+
+
+def _weights() -> str:
+    from recon.mbir.mbir import Mbir
+
+    card = json.loads((resources.files("recon") / "mbir" / "weights" / "card.json").read_text(encoding="utf-8"))
+    found = Mbir.load().weights_sha256
+    if found != card["sha256_of_tensors"]:
+        raise ValueError(f"sha256 {found}, their card says {card['sha256_of_tensors']}: {_AGAIN}")
+    return f"sha256 {found}, as their card says"
+
+
+def _adjoint() -> str:
+    import torch
+
+    from torchpcct import ConeBeam, Projector, full_turn
+
+    projector = Projector(ConeBeam(full_turn(12), 626.0, 1098.0, 24, 8, 2.0), VolumeGrid((8, 20, 20), 1.2))
+    draw = torch.Generator().manual_seed(0)
+    x = torch.rand(8, 20, 20, generator=draw)
+    forward = projector(x)
+    y = torch.rand(forward.shape, generator=draw)
+    both = [float((forward.double() * y).sum()), float((x * projector.T(y).double()).sum())]
+    error = abs(both[0] - both[1]) / abs(both[0])
+    if not error < 1e-5:
+        raise ValueError(f"⟨Ax, y⟩ and ⟨x, Aᵀy⟩ differ by {error:.1e} of their value: {_AGAIN}")
+    return f"⟨Ax, y⟩ = ⟨x, Aᵀy⟩ to {error:.0e} of their value"
+
+
+def _disc() -> str:
+    import numpy as np
+
+    from recon.api import reconstruct
+    from torchpcct import ParallelBeam, Scan
+
+    radius, water = 20.0, 0.02
+    geometry = ParallelBeam(np.arange(180) * np.pi / 180, 128, 0.5)
+    chords = 2.0 * np.sqrt(np.clip(radius**2 - geometry.column_positions**2, 0.0, None))
+    scan = Scan.from_line_integrals(np.tile(water * chords, (180, 1)), geometry, mu_water=water)
+    hu = reconstruct(scan, VolumeGrid((40, 40), 0.5), "fbp").data
+    error = float(hu.abs().max())
+    if not error < 5.0:
+        raise ValueError(f"a disc of water reads up to {error:.1f} HU off, 5 are allowed: {_AGAIN}")
+    return f"a disc of water reads 0 HU to {error:.1f} HU"
+
+
+_CHECKS: dict[str, Callable[[], str]] = {
+    "torchpcct": lambda: f"{__version__} in {Path(__file__).parents[2]}",
+    "python": lambda: f"{platform.python_version()}, {platform.platform()}",
+    "packages": _versions,
+    "extras": _extras,
+    "processor": _processor,
+    "threads": _threads,
+    "gpu": _gpu,
+    "kernel cache": _cache,
+    "weights": _weights,
+    "adjoint": _adjoint,
+    "FBP": _disc,
+}
+
+
+def outcomes() -> Iterator[tuple[str, bool, str]]:
+    """Name, whether it is well, and what is said, check by check."""
+    for name, check in _CHECKS.items():
+        try:
+            yield name, True, check()
+        except metadata.PackageNotFoundError:
+            yield name, False, "runs from sources that are not installed: pip install -e . in their folder"
+        except Exception as error:
+            known = isinstance(error, ValueError)
+            yield name, False, str(error) if known else f"{type(error).__name__}: {error}: {_AGAIN}"

@@ -1,0 +1,156 @@
+"""The first ten minutes with the command line: what it says unasked, what it guesses, what it finds broken."""
+
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import recon.api
+from recon.cli import _parser as make_parser
+from recon.cli import doctor, main, starting
+from torchpcct import Volume
+
+ROOT = Path(__file__).parent.parent.parent
+
+
+def _commands():
+    return make_parser()[1].choices
+
+
+def test_without_a_command_it_says_where_to_begin(capsys):
+    assert main([]) == 0
+    said = capsys.readouterr().out
+    assert len(said.splitlines()) <= 24
+    assert max(map(len, said.splitlines())) <= 120
+    examples = re.findall(r" {2}(torchpcct .*)", said)
+    assert len(examples) >= 6
+    for line in examples:  # they are commands that the parser takes
+        make_parser()[0].parse_args(shlex.split(line)[1:])
+    for name in _commands():
+        assert re.search(rf"\b{name}\b", said)
+
+
+def test_every_command_stands_in_the_help_once_and_has_examples_that_it_takes(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "120")
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    said = capsys.readouterr().out
+    for name in _commands():
+        assert len(re.findall(rf"^  {name} ", said, re.MULTILINE)) == 1
+        with pytest.raises(SystemExit) as stop:
+            main([name, "--help"])
+        assert stop.value.code == 0
+        text = capsys.readouterr().out
+        assert text.startswith(f"usage: torchpcct {name} ")
+        examples = re.findall(rf"^  torchpcct ({name}.*)$", text, re.MULTILINE)
+        assert examples
+        for line in examples:
+            if name != "train":
+                make_parser()[0].parse_args(shlex.split(line.split(" >")[0]))
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("recontruct scan.h5", "unknown command 'recontruct' (did you mean 'reconstruct'?)"),
+        ("reconstruct scan.h5 --kernal soft", "unrecognized arguments: --kernal soft (did you mean '--kernel'?)"),
+        ("simulate --out a.h5 --device cdua", "(did you mean 'cuda'?)"),
+        ("evaluate --task nodul --out {out}", "(did you mean 'nodule'?)"),
+        ("evaluate --method pwsl --out {out}", "(did you mean 'pwls'?)"),
+        ("evaluate --method mbri:look=1 --out {out}", "(did you mean 'mbir'?)"),
+        ("evaluate --method fbp:sotf --out {out}", "(did you mean 'soft'?)"),
+        ("evaluate --exposure -1 --out {out}", "--exposure[0] must be greater than 0 s"),
+        ("study nosie --out {out}", "(did you mean 'noise'?)"),
+        ("study noise --set view=3 --out {out}", "(did you mean 'views'?)"),
+        ("view a.h5 b.h5", "add --html FILE"),
+        ("view a.h5 --html a.html --slice 3", "--slice and --plane belong to a picture"),
+    ],
+)
+def test_a_slip_is_answered_with_what_was_meant(words, said, capsys, tmp_path):
+    try:
+        status = main(shlex.split(words.format(out=tmp_path / "out")))
+    except SystemExit as stop:
+        status = stop.code
+    assert status == 2
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("quick", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_the_demo_does_what_its_lines_do(quick, tmp_path, capsys, monkeypatch):
+    if quick:  # FBP in place of MBIR
+        real = recon.api.reconstruct
+        monkeypatch.setattr(starting, "_DEMO_VIEWS", 24)
+        monkeypatch.setattr("recon.api.reconstruct", lambda scan, grid, method, **_: real(scan, grid, "fbp"))
+    first, second = tmp_path / "first", tmp_path / "second"
+    second.mkdir()
+    assert main(["demo", "--out", str(first)]) == 0
+    lines = re.findall(r"^\$ (torchpcct .*)$", capsys.readouterr().out, re.MULTILINE)
+    assert [shlex.split(line)[1] for line in lines] == ["simulate", "reconstruct", "reconstruct", "view"]
+    for line in lines:
+        assert main(shlex.split(line.replace(str(first), str(second)))[1:]) == 0
+    for name in ("fbp.nii.gz", "mbir.nii.gz"):
+        assert torch.equal(Volume.load(first / name).data, Volume.load(second / name).data)
+    assert (first / "view.html").read_bytes() == (second / "view.html").read_bytes()
+    # What is there of others stays, and is named.
+    shutil.copy(first / "view.html", second / "scan.h5")
+    (second / "view.html").write_text("mine", encoding="utf-8")
+    assert main(["demo", "--out", str(second)]) == 2
+    assert "not made by torchpcct simulate" in capsys.readouterr().err
+    assert (second / "view.html").read_text(encoding="utf-8") == "mine"
+    assert main(["demo", "--out", str(second / "view.html")]) == 2
+
+
+def test_doctor_names_what_is_broken_and_what_to_do(capsys, monkeypatch):
+    assert main(["doctor"]) == 0
+    said = capsys.readouterr().out
+    assert len(re.findall("^ok ", said, re.MULTILINE)) == len(doctor._CHECKS)
+    assert re.search("weights +sha256 [0-9a-f]{64}, as their card says", said)
+    monkeypatch.setattr("torchpcct.projector.Projector.T", lambda self, y: 1.001 * torch.ones(8, 20, 20))
+    monkeypatch.setattr("recon.mbir.mbir.Mbir.weights_sha256", "0" * 64)
+    monkeypatch.setattr("recon.api.reconstruct", lambda *_, **__: Volume(torch.full((40, 40), 9.0), _[1]))
+    monkeypatch.setattr(doctor, "require_writable", lambda folder: (_ for _ in ()).throw(PermissionError("no")))
+    monkeypatch.setattr("importlib.metadata.requires", lambda name: ["numpy>=99", "nonesuch>=1", "x>=1; extra == 'io'"])
+    assert main(["doctor"]) == 1
+    lines = dict(re.findall(r"^BROKEN +(\S+(?: \S+)?)  +(.*)$", capsys.readouterr().out, re.MULTILINE))
+    assert set(lines) == {"packages", "kernel cache", "weights", "adjoint", "FBP"}
+    assert "is older than 99" in lines["packages"]
+    assert lines["packages"].endswith("pip install --force-reinstall 'numpy>=99' 'nonesuch>=1'")
+    assert "sha256 0000" in lines["weights"]
+    assert "reads up to 9.0 HU off" in lines["FBP"]
+    assert "differ by" in lines["adjoint"]
+    assert all("pip install" in text or "set NUMBA_CACHE_DIR" in text for text in lines.values())
+
+
+def test_train_is_ours_whatever_lies_in_the_folder(tmp_path):
+    (tmp_path / "train").mkdir()
+    for name in ("__init__", "__main__"):
+        (tmp_path / "train" / f"{name}.py").write_text("print('MINE')", encoding="utf-8")
+    code = "import train, sys; from recon.cli import main; sys.exit(main(['train', '--help']))"  # theirs is loaded, too
+    for words in (["-m", "recon.cli", "train", "--help"], ["-c", code]):
+        run = subprocess.run(
+            [sys.executable, *words], capture_output=True, text=True, cwd=tmp_path, env={"PYTHONPATH": str(ROOT)}
+        )
+        assert run.returncode == 0, run.stderr
+        assert "usage: torchpcct train" in run.stdout
+        assert run.stdout.count("MINE") == (words[0] == "-c")
+
+
+def test_the_completion_knows_commands_and_options(capsys, monkeypatch):
+    pytest.importorskip("shtab")
+    with pytest.raises(SystemExit) as stop:
+        main(["--print-completion", "bash"])
+    assert stop.value.code == 0
+    script = capsys.readouterr().out
+    subprocess.run(["bash", "-n"], input=script, text=True, check=True)
+    assert "--find-axis" in script
+    assert all(name in script for name in _commands())
+    monkeypatch.setitem(sys.modules, "shtab", None)
+    with pytest.raises(SystemExit) as stop:
+        main(["--print-completion", "bash"])
+    assert stop.value.code == 2
+    assert "pip install 'torchpcct[completion]'" in capsys.readouterr().err
