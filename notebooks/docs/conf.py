@@ -1,0 +1,232 @@
+"""The site of torchpcct: ``sphinx-build -W -n -b html notebooks/docs out/site``; ``-D plot_gallery=1`` runs the gallery.
+
+Nothing is downloaded: formulas become MathML (docutils), which browsers draw themselves. The pages of the API and of
+the command line are written from the package each time, into ``reference/generated``.
+"""
+
+import argparse
+import ast
+import importlib.util
+import os
+import re
+import sys
+from pathlib import Path
+from types import ModuleType
+
+from docutils.utils.math.latex2mathml import tex2mathml
+from sphinx.ext.napoleon import GoogleDocstring
+
+HERE = Path(__file__).parent
+ROOT = HERE.parents[1]
+sys.path.insert(0, str(ROOT))
+os.environ["MPLBACKEND"] = "agg"
+os.environ["COLUMNS"] = "100"  # argparse breaks the lines of --help there
+
+project, author = "torchpcct", "the authors of torchpcct"
+extensions = [
+    "sphinx.ext.autodoc", "sphinx.ext.napoleon", "myst_parser", "sphinx_design", "sphinx_copybutton",
+    "sphinxcontrib.bibtex", "sphinx_gallery.gen_gallery",
+]  # fmt: skip
+html_theme = "pydata_sphinx_theme"
+html_title = "torchpcct"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_show_sourcelink = False
+html_copy_source = False
+html_theme_options = {
+    "navbar_end": ["theme-switcher"], "show_prev_next": False, "header_links_before_dropdown": 7,
+    "secondary_sidebar_items": ["page-toc"], "footer_start": [], "footer_end": [],
+}  # fmt: skip
+html_sidebars = {"index": [], "results": [], "limits": [], "glossary": []}
+html_math_renderer = "mathml"
+myst_enable_extensions = ["dollarmath", "deflist", "colon_fence"]
+myst_heading_anchors = 3
+bibtex_bibfiles = ["references.bib"]
+exclude_patterns = ["gallery/*.ipynb", "gallery/*.py", "gallery/*.zip"]
+copybutton_prompt_text = r">>> |\.\.\. |\$ "
+copybutton_prompt_is_regexp = True
+
+nitpick_ignore_regex = [  # what other packages and private bases are; no inventory of theirs is downloaded
+    ("py:.*", r"(numpy|torch|collections|typing|matplotlib|argparse|pathlib|enum|np|nn)\..*"), ("py:.*", r"(.*\.)?_\w+"),
+    ("py:(class|exc)", r"(optional|Module|Exception|Tensor|ndarray|\w+Error|(nbclient|scipy)\..*)"),
+]  # fmt: skip
+autodoc_typehints = "none"  # the docstrings say shapes, units and kinds, in words
+autodoc_class_signature = "mixed"
+autodoc_member_order = "bysource"
+napoleon_use_rtype = False
+napoleon_custom_sections = [("Attributes", "params_style")]
+
+sphinx_gallery_conf = {
+    "examples_dirs": "../gallery", "gallery_dirs": "gallery", "filename_pattern": r"\d\d_", "plot_gallery": False,
+    "download_all_examples": False, "remove_config_comments": True, "show_memory": False, "copyfile_regex": r"$^",
+    "within_subsection_order": "FileNameSortKey", "min_reported_time": 1e9, "image_scrapers": ("matplotlib",),
+    "reset_modules": ("matplotlib",), "notebook_images": False, "show_signature": False,
+}  # fmt: skip
+
+
+# --- the API, from what the modules call public -------------------------------------------------------------------
+
+
+def public_modules():
+    """Modules without an underscore in their names, by package: ``{package: [(module, docstring, own, others), …]}``.
+
+    ``own`` are the names of ``__all__`` that the module defines; ``others`` those it hands on from elsewhere.
+    """
+    packages = {}
+    for top in ("torchpcct", "recon", "train"):
+        for path in sorted((ROOT / top).rglob("*.py")):
+            parts = path.relative_to(ROOT).with_suffix("").parts
+            if path.stem.startswith("_") and path.stem != "__init__":
+                continue
+            module = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+            tree = ast.parse(path.read_text(encoding="utf-8"))
+            public, own = [], set()
+            for node in tree.body:
+                targets = getattr(node, "targets", [getattr(node, "target", None)])
+                names = [n.id for t in targets if t for n in ast.walk(t) if isinstance(n, ast.Name)]
+                names += [getattr(node, "name", "")]
+                if "__all__" in names:
+                    public = ast.literal_eval(node.value)
+                own.update(names)
+            if public or ast.get_docstring(tree):
+                entry = (module, [n for n in public if n in own], [n for n in public if n not in own])
+                package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+                packages.setdefault(package, []).append(entry)
+    return packages
+
+
+def canonical(module, name):
+    """Where a name that is handed on is defined, ``(module, name)``."""
+    value = getattr(importlib.import_module(module), name)
+    if isinstance(value, ModuleType):
+        return value.__name__.rpartition(".")[::2]
+    home = getattr(value, "__module__", None)
+    if home and getattr(value, "__qualname__", None):
+        return home, value.__qualname__
+    tree = ast.parse(Path(importlib.import_module(module).__file__).read_text(encoding="utf-8"))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and any((a.asname or a.name) == name for a in node.names):
+            return node.module, name
+    raise LookupError(f"{module}.{name}: nobody defines it")
+
+
+def write_api(folder):
+    """A page a package: each module's text, its names, and those it hands on."""
+    packages, bare = public_modules(), {}
+    for module in (m for modules in packages.values() for m, *_ in modules):
+        body = ast.parse(Path(importlib.util.find_spec(module).origin).read_text(encoding="utf-8")).body
+        after = zip(body, [*body[1:], None], strict=True)  # a constant's text stands below it
+        bare[module] = {
+            n.id
+            for node, below in after
+            if isinstance(node, ast.Assign | ast.AnnAssign) and not isinstance(below, ast.Expr)
+            for n in ast.walk(node)
+            if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)
+        }
+    for package, modules in packages.items():
+        lines = [package, "=" * len(package), ""]
+        for module, own, others in sorted(modules, key=lambda m: m[0] != package):
+            if module != package:
+                lines += [module, "-" * len(module), ""]
+            # A function may stand in the place of its package (recon.fbp): the module is then no entry of the index.
+            lines += [f".. automodule:: {module}"]
+            lines += ["   :no-index:"] if module in ("recon.fbp", "recon.pwls") else []
+            told = [name for name in own if name not in bare[module]]
+            lines += [f"   :members: {', '.join(told)}", "   :undoc-members:", "   :show-inheritance:"] if told else []
+            lines += ["", *(_constant(module, name) for name in own if name in bare[module])]
+            for name in others:
+                home, qualname = canonical(module, name)
+                lines += [f"* ``{name}``: :py:obj:`~{home}.{qualname}`"]
+            lines += [""]
+        _write(folder / f"{package}.rst", "\n".join(lines))
+    top = [p for p in packages if not p.startswith(("recon.study", "recon.cli"))]
+    listed = [f"   generated/{p}" for p in (*top, *(p for p in packages if p not in top))]
+    _write(folder / "toctree.txt", "\n".join([".. toctree::", "   :maxdepth: 1", "", *listed, ""]))
+
+
+def _constant(module, name):
+    """Of a constant without a text autodoc would show the text of its type."""
+    value = " ".join(repr(getattr(importlib.import_module(module), name)).split())
+    return f".. py:data:: {name}\n   :module: {module}\n   :value: {value if len(value) < 72 else value[:70] + ' …'}\n"
+
+
+def write_cli(path):
+    """The command line, from the parsers themselves."""
+    from recon.cli import _parser
+    from train.__main__ import _parser as training
+
+    parser, commands = _parser()
+    shown = {c.dest: c.help for c in commands._choices_actions}
+    lines = ["# Command line", "", "Written from the parsers: what `--help` prints.", "", _help(parser)]
+    for name, command in commands.choices.items():
+        lines += [f"## torchpcct {name}", "", f"{shown.get(name) or ''}", "", _help(command)]
+    _write(path, "\n".join([*lines, "## python -m train", "", _help(training())]))
+
+
+def _help(parser):
+    assert isinstance(parser, argparse.ArgumentParser)
+    return f"```text\n{parser.format_help()}```\n"
+
+
+def _write(path, text):
+    """Only what has changed: Sphinx reads a page again when it is newer."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if not path.exists() or path.read_text(encoding="utf-8") != text:
+        path.write_text(text, encoding="utf-8")
+
+
+# --- formulas -----------------------------------------------------------------------------------------------------
+
+
+def _formula(self, node, block=False):
+    mathml = re.sub(r"^<math\b(?! xmlns)", "<math xmlns='http://www.w3.org/1998/Math/MathML'",
+                    str(tex2mathml(node.astext(), as_block=block)))  # fmt: skip
+    self.body.append(f'<div class="formula">{mathml}</div>' if block else mathml)
+    from docutils import nodes
+
+    raise nodes.SkipNode
+
+
+# --- references ---------------------------------------------------------------------------------------------------
+
+
+def as_python_does(app, env, node, contnode):
+    """A name that a docstring uses is what Python finds there: in the module, or handed on by a package."""
+    if node.get("refdomain") != "py":
+        return None
+    target, inside = node["reftarget"], [node.get("py:module"), None]
+    if node.get("py:class"):
+        inside.insert(0, f"{node['py:module']}.{node['py:class']}")
+    for where in inside:
+        parts = [*(where.split(".") if where else []), *target.split(".")]
+        for cut in range(len(parts) - 1, 0, -1):
+            try:
+                value, rest = importlib.import_module(".".join(parts[:cut])), parts[cut:]
+                owner, name = value, rest[-1]
+                for part in rest[:-1]:
+                    owner = getattr(owner, part)
+                if isinstance(owner, ModuleType):
+                    full = ".".join(canonical(owner.__name__, name))
+                else:
+                    full = f"{owner.__module__}.{owner.__qualname__}.{name}"
+            except (ImportError, AttributeError, LookupError, TypeError):
+                continue
+            domain = env.domains["py"]
+            found = domain.resolve_xref(env, node["refdoc"], app.builder, "obj", full, node, contnode)
+            if found is not None:
+                return found
+    return None
+
+
+def setup(app):
+    """Called by Sphinx."""
+    # Napoleon takes "Shape of one sinogram: …" of a property for a type and a text; what is returned, likewise.
+    GoogleDocstring._consume_returns_section = lambda self, preprocess_types=False: [
+        ("", "", self._dedent(self._consume_to_next_section()))
+    ]
+    GoogleDocstring._consume_inline_attribute = lambda self: ("", self._consume_to_end())
+    app.connect("missing-reference", as_python_does)
+    app.add_html_math_renderer("mathml", (_formula, None), (lambda self, node: _formula(self, node, True), None))
+    write_api(HERE / "reference" / "generated")
+    write_cli(HERE / "reference" / "generated" / "commands.md")
+    return {"parallel_read_safe": True}

@@ -1,0 +1,5 @@
+"""
+First
+=====
+"""
+import numpy as np
