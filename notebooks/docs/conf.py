@@ -18,7 +18,7 @@ from sphinx.ext.napoleon import GoogleDocstring
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
-sys.path.insert(0, str(ROOT))
+sys.path[:0] = [str(ROOT), str(HERE)]
 os.environ["MPLBACKEND"] = "agg"
 os.environ["COLUMNS"] = "100"  # argparse breaks the lines of --help there
 
@@ -168,6 +168,27 @@ def _help(parser):
     return f"```text\n{parser.format_help()}```\n"
 
 
+def write_results(folder):
+    """The committed results as pages, each with its pictures; links lead to these pages, or are plain text."""
+    notebooks, names = HERE.parent, []
+    for report in sorted(notebooks.glob("*/report.md")):
+        names.append(name := report.parent.name)
+        title, _, text = report.read_text(encoding="utf-8").partition("\n")
+        shown = sorted(p.name for p in report.parent.glob("*.png") if f"({p.name})" not in text)
+        pictures = [f"![{p}](../../{name}/{p})\n" for p in shown]
+        text = text.replace("(phantom.png)", "(../../phantom/phantom.png)")
+        _write(folder / f"{name}.md", _linked("\n".join([f"# {name}: {title[2:]}", *pictures, text]), ""))
+    toctree = "\n".join(["", "```{toctree}", ":hidden:", *(f"reports/{name}" for name in names), "```", ""])
+    _write(folder.parent / "results.md", _linked((notebooks / "RESULTS.md").read_text(encoding="utf-8"), "reports/") + toctree)
+    for name, path in (("card", "recon/mbir/weights/card.md"), ("size", "train/size.md")):
+        _write(folder / f"{name}.txt", _linked((ROOT / path).read_text(encoding="utf-8"), ""))
+
+
+def _linked(text, to):
+    text = re.sub(r"\]\((\w+)/report\.md\)", rf"]({to}\1.md)", text)
+    return re.sub(r"\[([^\]]*)\]\([^)]*(?:causes|size)\.md\)", r"`\1`", text)
+
+
 def _write(path, text):
     """Only what has changed: Sphinx reads a page again when it is newer."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -229,4 +250,8 @@ def setup(app):
     app.add_html_math_renderer("mathml", (_formula, None), (lambda self, node: _formula(self, node, True), None))
     write_api(HERE / "reference" / "generated")
     write_cli(HERE / "reference" / "generated" / "commands.md")
+    write_results(HERE / "reports")
+    from drawing import draw
+
+    draw(HERE / "reference" / "generated" / "conventions.svg")
     return {"parallel_read_safe": True}

@@ -1,5 +1,0 @@
-"""
-First
-=====
-"""
-import numpy as np
