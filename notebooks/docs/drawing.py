@@ -12,7 +12,7 @@ from torchpcct.vector_geometry import to_vectors
 def draw(path: Path) -> None:
     """The plane z = 0 seen from +z, and the side view of the same ray fan; an SVG file."""
     g = ConeBeam([np.deg2rad(35.0)], 60.0, 100.0, 9, 5, (8.0, 8.0), offset=(4.0, 6.0))
-    source, middle, u, v = to_vectors(g)[0].reshape(4, 3)
+    source, middle, u, _ = to_vectors(g)[0].reshape(4, 3)
     foot = source * (1 - g.sdd / g.sod)  # where the central ray meets the detector
     columns = middle + (np.arange(9)[:, None] - 4) * u
     figure = Figure(figsize=(10.5, 5.6), layout="constrained")
@@ -34,14 +34,14 @@ def draw(path: Path) -> None:
     ax.plot(*np.stack([source, foot])[:, :2].T, color="tab:orange", lw=0.8, ls="--")
     ax.plot(*columns[:, :2].T, "s", color="tab:blue", ms=5)
     ax.plot(*source[:2], "o", color="tab:orange", ms=9)
-    ax.text(*(source[:2] + (-3, 6)), "source, at sod · e_r(β)", color="tab:orange", ha="center")
+    ax.text(*np.add(source[:2], (-3, 6)), "source, at sod · e_r(β)", color="tab:orange", ha="center")
     for j, name in ((0, "column 0"), (8, "column n − 1")):
-        ax.text(*(columns[j, :2] + (-4, -7 if j == 0 else 3)), name, color="tab:blue", ha="right", fontsize=9)
+        ax.text(*np.add(columns[j, :2], (-4, -7 if j == 0 else 3)), name, color="tab:blue", ha="right", fontsize=9)
     arrow(ax, foot[:2], middle[:2], "", "tab:red")
-    ax.text(*(middle[:2] + (-6, 2)), "offset\n(column)", color="tab:red", fontsize=9, ha="right", va="center")
+    ax.text(*np.add(middle[:2], (-6, 2)), "offset\n(column)", color="tab:red", fontsize=9, ha="right", va="center")
     start = columns[1, :2] - 10 * source[:2] / g.sod
     arrow(ax, start, start + 22 * u[:2] / 8, "", "tab:blue")
-    ax.text(*(start + (-11, 0)), "columns grow\nalong e_t(β)", color="tab:blue", fontsize=9, ha="right")
+    ax.text(*np.add(start, (-11, 0)), "columns grow\nalong e_t(β)", color="tab:blue", fontsize=9, ha="right")
     arrow(ax, (0, 0), (28, 0), "x", shift=(1, -5))
     arrow(ax, (0, 0), (0, 28), "y")
     arc = np.linspace(0, g.angles[0], 30)

@@ -16,15 +16,15 @@ from torchpcct.scene import Body, Ellipsoid, EllipticCylinder, Scene
 water = Body("water", EllipticCylinder(100.0), "water")
 sphere = Body("sphere", Ellipsoid((1.5, 1.5, 1.5), position=(0.0, 40.0, 0.0)), "necrotic_core", "water")
 grid = VolumeGrid((1, 40, 40), 0.25, (0.0, 40.0, 0.0))
-clean = [acquire(Scene(b), presets.pcct(246), region=grid, duty=1 / 8) for b in ([water, sphere], [water])]
-exposures, found, images = (0.1, 0.3, 1.0, 3.0), [], {}
+clean = [acquire(Scene(b), presets.pcct(123), region=grid, duty=1 / 16) for b in ([water, sphere], [water])]
+exposures, found, images = (0.1, 0.3, 1.0), [], {}
 for s in exposures:
-    scans = [[c.with_noise(s, seed=k) for k in range(40)] for c in clean]
+    scans = [[c.with_noise(s, seed=k) for k in range(16)] for c in clean]
     present, absent = (torch.stack([v.data[0] for v in recon.reconstruct(x, grid, "fbp")]) for x in scans)
     found.append(observe(present, absent, dog_channels(grid.slice, (40.0, 0.0))).d_prime)
     images[s] = present[0]
 fig, axes = plt.subplots(1, 3, figsize=(10, 3.2), layout="constrained")
-for ax, s in zip(axes, (0.1, 3.0), strict=False):
+for ax, s in zip(axes, (0.1, 1.0), strict=False):
     shown = ax.imshow(images[s], cmap="gray", vmin=-200, vmax=280, extent=(-5, 5, 35, 45), origin="lower")
     ax.set(title=f"{s:g} s", xlabel="x, mm", ylabel="y, mm")
 fig.colorbar(shown, ax=axes[:2], label="HU", shrink=0.8)

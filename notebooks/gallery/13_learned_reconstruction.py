@@ -26,7 +26,7 @@ for step in range(150):
     error.square().mean().backward()
     optimiser.step()
     if step in (0, 149):
-        print(f"step {step}: error {float(error.square().mean().sqrt()):.0f} HU")
+        print(f"step {step}: error {float(error.detach().square().mean().sqrt()):.0f} HU")
 fig, axes = plt.subplots(1, 2, figsize=(8, 3.2), layout="constrained")
 axes[0].plot(f, (f * window).detach())
 axes[0].set(xlabel="frequency, cycles per column", ylabel="learned filter")
