@@ -62,7 +62,7 @@ napoleon_custom_sections = [("Attributes", "params_style")]
 sphinx_gallery_conf = {
     "examples_dirs": "../gallery", "gallery_dirs": "gallery", "filename_pattern": r"\d\d_", "plot_gallery": False,
     "download_all_examples": False, "remove_config_comments": True, "show_memory": False, "copyfile_regex": r"$^",
-    "within_subsection_order": "FileNameSortKey", "min_reported_time": 1e9, "image_scrapers": ("matplotlib",),
+    "within_subsection_order": "FileNameSortKey", "write_computation_times": False, "image_scrapers": ("matplotlib",),
     "reset_modules": ("matplotlib",), "notebook_images": False, "show_signature": False,
 }  # fmt: skip
 

@@ -29,6 +29,7 @@ found = evaluate(task, [denoiser(mine, "fbp:standard", "mine")], exposures_s=[1.
 rows = [r for r in found.records if r["method"] == "mine" and r["figure"].startswith("dose factor")]
 rows = [r for r in rows if r["where"] in ("patient", "lesion")]
 plt.figure(figsize=(7, 2.6), layout="constrained")
-plt.barh([r["figure"].removeprefix("dose factor: ") for r in rows], [r["value"] for r in rows])
+spread = [[abs(r["value"] - r[end]) for r in rows] for end in ("low", "high")]  # 95 %; the limit is exact
+plt.barh([r["figure"].removeprefix("dose factor: ") for r in rows], [r["value"] for r in rows], xerr=spread)
 plt.gca().set(xlabel="dose factor: how many times the dose soft FBP needs for the same figure")
 print({r["figure"]: (round(r["value"], 1), round(r["low"], 1), round(r["high"], 1)) for r in rows})
