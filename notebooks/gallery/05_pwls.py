@@ -16,7 +16,7 @@ scene, plaque = plaque_scene()
 inset = VolumeGrid((51, 45, 45), 0.2, plaque.position[::-1])
 scan = acquire(scene, presets.pcct(views=492), exposure_s=2.0, seed=0, region=inset, duty=1 / 4)
 volumes = {"FBP, soft": recon.reconstruct(scan, inset, "fbp", kernel="soft")}
-for strength in (0.1, 1.0):
+for strength in (0.5, 2.0):
     prior = QGGMRF(strength=strength, threshold=300.0)  # HU/mm: steeper slopes count as edges and are smoothed less
     volumes[f"PWLS, strength {strength:g}"] = recon.reconstruct(scan, inset, "pwls", prior=prior)
 fig, axes = plt.subplots(1, 3, figsize=(10, 3.2), layout="constrained")

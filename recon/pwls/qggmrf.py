@@ -15,8 +15,8 @@ The energy is a Riemann sum over the volume, so it does not depend on the voxel 
 with ω_d ∝ d (the usual weight 1/d on squared differences) and Σ_d ω_d = the number of dimensions: a linear ramp of
 g HU/mm costs ½ λ g² per mm³ when g ≪ T. λ is in 1/(HU² mm) and comes from the noise level, see :meth:`QGGMRF.bind`.
 
-For several channels at once t is the Euclidean length of their common gradient, ``|x_j − x_k| / (hu d)``: one edge in one
-channel relaxes the penalty of all channels there, as basis images share the edges of the tissues (vectorial
+For several channels at once t is the Euclidean length of their common gradient, ``|x_j − x_k| / (hu d)``: an edge in
+one channel relaxes the penalty of all channels there, as basis images share the edges of the tissues (vectorial
 regularisation, Sapiro and Ringach 1996; for spectral CT Rigie and La Rivière 2015). The length treats all directions in
 the space of channels alike, so the channels must be of equal, uncorrelated noise
 (:class:`recon.pwls.whitening.Whitening`).

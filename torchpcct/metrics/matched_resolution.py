@@ -149,7 +149,7 @@ def matched_noise_ratio(
     """SD of a method over that of FBP filtered to the method's f50 in plane and along z.
 
     Args:
-        log_variance: of the method's voxels (:attr:`torchpcct.metrics.image_noise.RegionNoise.log_variance`), in the reference's region.
+        log_variance: of the method's voxels (``RegionNoise.log_variance``), in the reference's region.
         f50, f50_z: of the method at the task's contrast, cycles per mm; of the same realisations, or exact.
         reference: exact, or of the same realisations.
         level: coverage of the interval, over all that is measured.

@@ -1,4 +1,4 @@
-"""Autocovariance of stationary noise, and the variance that it has after a Gaussian filter, without filtering anything::
+"""Autocovariance of stationary noise, and the variance that it has after a Gaussian filter, without filtering it::
 
     ∫ NPS(f) G²(f) df = Σ_τ C(τ) w_z(τ_z) w(τ_y) w(τ_x),    w(τ) = h ∫ G²(f) cos(2πfτ) df,  |f| ≤ 1/2h,
 
