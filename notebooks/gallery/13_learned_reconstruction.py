@@ -15,9 +15,7 @@ middle = torch.rand(40, 2, 1, 1, generator=torch.manual_seed(0)) * 40 - 20
 truth = 0.02 * (torch.hypot(x - middle[:, 0], y[:, None] - middle[:, 1]) < 20).float()  # a disc in each of 40 images
 data = A(truth) + 0.05 * torch.randn(40, *A.range_shape)
 f = torch.fft.rfftfreq(256)
-points = torch.full(
-    (1, 1, 10), 0.3
-).requires_grad_()  # what is learned: a window on the ramp filter, at ten frequencies
+points = torch.full((1, 1, 10), 0.3).requires_grad_()  # what is learned: a window on the ramp, at ten frequencies
 optimiser, errors = torch.optim.Adam([points], 0.02), []
 
 
@@ -27,15 +25,14 @@ def reconstruct(sinograms):
 
 
 for _ in range(150):
-    error = (
-        (reconstruct(data[(k := torch.randint(39, (4,)))])[0] - truth[k]) / 0.02 * 1000
-    )  # HU; autograd goes through Aᵀ
+    k = torch.randint(39, (4,))
+    error = (reconstruct(data[k])[0] - truth[k]) * 50000  # HU; autograd goes through Aᵀ
     optimiser.zero_grad()
     error.square().mean().backward()
     optimiser.step()
     errors.append(float(error.detach().square().mean().sqrt()))
 fig, axes = plt.subplots(1, 2, figsize=(8, 3.2), layout="constrained")
-volume, window = (t.detach() for t in reconstruct(data[-1]))  # a disc that was not trained on
+volume, window = (t.detach() for t in reconstruct(data[-1]))
 axes[0].plot(f, f * window)
 axes[0].set(xlabel="frequency, cycles per column", ylabel="learned filter")
 shown = axes[1].imshow(volume * 50000 - 1000, cmap="gray", extent=(-64, 64) * 2, vmin=-1000, vmax=300)
