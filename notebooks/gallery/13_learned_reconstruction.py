@@ -13,8 +13,7 @@ A = Projector(FanBeam(full_turn(120), 400.0, 800.0, 129, 2.0), VolumeGrid((64, 6
 y, x = (torch.as_tensor(a, dtype=torch.float32) for a in A.grid.axes)
 middle = torch.rand(40, 2, 1, 1, generator=torch.manual_seed(0)) * 40 - 20
 truth = 0.02 * (torch.hypot(x - middle[:, 0], y[:, None] - middle[:, 1]) < 20).float()  # a disc in each of 40 images
-data = A(truth) + 0.05 * torch.randn(40, *A.range_shape)
-f = torch.fft.rfftfreq(256)
+data, f = A(truth) + 0.05 * torch.randn(40, *A.range_shape), torch.fft.rfftfreq(256)
 points = torch.full((1, 1, 10), 0.3).requires_grad_()  # what is learned: a window on the ramp, at ten frequencies
 optimiser, errors = torch.optim.Adam([points], 0.02), []
 
