@@ -342,11 +342,11 @@ def _log_bias() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 def log_bias(mean: Tensor) -> Tensor:
     """Mean of ln(n + ½) less the logarithm of the mean, of Poisson counts n.
 
-    0.03 at two counts, 0.17 at one, 0.8 at :data:`FEWEST`: it takes the darkest rays for brighter than they are.
+    0.03 at two counts, 0.17 at one, 0.8 at ``FEWEST``: it takes the darkest rays for brighter than they are.
 
     Args:
-        mean: expected counts, estimated from some ten readings (:func:`smoothed`). Above :data:`MANY` the bias is 0;
-            below :data:`FEWEST` it is that of so many, for the estimate itself says no more.
+        mean: expected counts, estimated from some ten readings (:func:`smoothed`). Above ``MANY`` the bias is 0;
+            below ``FEWEST`` it is that of so many, for the estimate itself says no more.
     """
     known, bias = _log_bias()
     # The logarithm of the estimate is biased, too: ½ a count in those that it was made of.

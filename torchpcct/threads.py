@@ -127,7 +127,7 @@ def run(kernel: Any, count: int, *args: Any, operations: int = _LEAST) -> None:
         operations: about how many sums and products an index takes; too little work for two stays on this thread.
 
     Raises:
-        what a kernel raises, once no other thread computes any more.
+        Exception: what a kernel raises, once no other thread computes any more.
     """
     threads = get_num_threads()
     number = min(count, _PIECES * threads, count * operations // _LEAST)

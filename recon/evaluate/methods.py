@@ -85,7 +85,7 @@ class Method:
 
     Args:
         name: for tables.
-        run: from a :class:`recon.evaluate.draws.Draw` to HU ``(z, y, x)``.
+        run: from a :class:`Draw` to HU ``(z, y, x)``.
         key: what its results depend on beside its name (weights, source), so that kept ones are not mixed up.
         kernels: of FBP that it asks a draw for.
         is_fbp: its volume is FBP with the first of them: means and variances of its ROIs are exact.

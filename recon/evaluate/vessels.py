@@ -151,7 +151,7 @@ class Vessel:
         return labels
 
     def painted(self, grid: VolumeGrid, values: Mapping[str, float], samples: int = 2) -> Floats:
-        """``grid.shape``: mean over each voxel of ``values`` of the tissues, from ``samples``³ points; others 0."""
+        """``grid.shape``: mean over each voxel of ``values`` of the tissues, from ``samples ** 3`` points; others 0."""
         table = np.array([values.get(name, 0.0) for name in self.straight.names])
         result = np.empty(grid.shape)
         for first in range(0, grid.shape[0], _SLAB):

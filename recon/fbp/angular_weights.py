@@ -147,7 +147,7 @@ def parker_share(beta: Floats, gamma: Floats, half_fan: float) -> Floats:
 
 @checked
 def is_offset(geometry: Any) -> bool:
-    """Whether the detector reaches farther to one side by more than :data:`OFFSET_SHARE` of its width and two columns.
+    """Whether the detector reaches farther to one side by more than ``OFFSET_SHARE`` of its width and two columns.
 
     Quarter-column offsets are not meant: there nearly every line is measured twice.
     """

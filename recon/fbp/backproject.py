@@ -252,7 +252,7 @@ def backproject(
     detector's rows reads the outermost row. It is not the adjoint of a projector; that is the projector's ``T``.
 
     Args:
-        filtered: result of :func:`filter_sinogram`, ``(..., views, [rows,] columns)``, float32 or float64.
+        filtered: result of ``filter_sinogram``, ``(..., views, [rows,] columns)``, float32 or float64.
         geometry: parallel or fan beam (2-D grid), or cone beam (3-D grid).
         grid: voxels to reconstruct. A grid about the isocentre may be larger than the field of view: voxels outside
             are 0. A grid beside the isocentre must lie inside.

@@ -15,7 +15,7 @@ Four things differ from an inset (:mod:`recon.mbir.mbir`):
 
 Voxels: what the network knows is measured in voxels of about a detector cell at the axis. A scan with cells half as
 large is the same scan of an object half as large; lengths are counted in voxels, and grids whose voxels are not within
-:data:`VOXELS_PER_CELL` of a cell are reconstructed on voxels that are, and averaged. Parallel and fan beams: the slices
+``VOXELS_PER_CELL`` of a cell are reconstructed on voxels that are, and averaged. Parallel and fan beams: the slices
 of a stack are one volume.
 """
 

@@ -67,7 +67,7 @@ def reconstruct_mbir(
 
     Raises:
         ValueError, TypeError: see :class:`recon.pwls.inset_problem.InsetProblem`; a problem that was made for another
-        grid; a look outside of 0 … 1.
+            grid; a look outside of 0 … 1.
         FileNotFoundError: the package has no weights.
     """
     start = time.perf_counter()

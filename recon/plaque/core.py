@@ -142,7 +142,7 @@ class CoreSpace:
         return np.where(inside, self.vessel.lookup[tuple(index.T)], -1)
 
     def log_prior(self, shapes: Floats) -> Floats:
-        """``(m,)``, up to the constant that :attr:`log_places` holds; −inf where there is no layer."""
+        """``(m,)``, up to the constant that ``log_places`` holds; −inf where there is no layer."""
         p = self.prior
         at = self.locate(shapes[:, CENTRE])
         allowed = (at >= 0) & self.deep[at]

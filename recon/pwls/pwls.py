@@ -66,8 +66,8 @@ class PwlsResult:
             outer iteration), ``gradient`` (norm of the exact gradient of Φ over that of the zero volume, worst volume
             of the batch, one entry per outer iteration), ``rmsd_hu`` (root mean square distance to the minimum in HU,
             worst volume, one entry per outer iteration: as the FFT model sees it from the exact gradient and its
-            steps shrink (:func:`ahead`); for a whole field extrapolated from the latest steps, over the voxels that
-            the data determine: :attr:`recon.pwls.field_model.FieldModel.determined`), ``undetermined`` (share of the
+            steps shrink (``ahead``); for a whole field extrapolated from the latest steps, over the voxels that
+            the data determine: ``recon.pwls.field_model.FieldModel.determined``), ``undetermined`` (share of the
             other voxels), ``undetermined_rmsd_hu`` (the same estimate over them), ``converged``, ``tolerance_hu``,
             ``model`` ("gram" or "gradient": who proposed the last step), ``model_misfit`` (of the FFT model on the
             first step, None without one), ``misfit`` (weighted squared residual per reading of positive weight, one

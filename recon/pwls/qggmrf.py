@@ -1,22 +1,22 @@
 """The q-generalised Gaussian Markov random field: the edge-preserving prior of model-based reconstruction.
 
 Potential of a gradient t (HU/mm) between two neighbours (Thibault, Sauer, Bouman, Hsieh 2007, Med. Phys. 34:4526,
-eq. 18, normalised to curvature 1 at t = 0 for p = 2):
+eq. 18, normalised to curvature 1 at t = 0 for p = 2)::
 
     ρ(t) = |t|ᵖ T²⁻ᵖ / (p (1 + |t / T|ᵖ⁻ᵠ)),        1 ≤ q ≤ p ≤ 2
 
-Below the threshold T it acts like |t|ᵖ (smooths noise), above like |t|ᵠ (lets edges pass); it is convex.
+Below the threshold T it acts like ``|t|ᵖ`` (smooths noise), above like ``|t|ᵠ`` (lets edges pass); it is convex.
 p = q = 2 is the quadratic prior (with half the curvature, see :func:`quadratic`).
 
-The energy is a Riemann sum over the volume, so it does not depend on the voxel size, to first order:
+The energy is a Riemann sum over the volume, so it does not depend on the voxel size, to first order::
 
     R(x) = λ V Σ_{pairs} ω_d ρ((x_j − x_k) / (hu d)),      V voxel volume, d distance in mm,
 
 with ω_d ∝ d (the usual weight 1/d on squared differences) and Σ_d ω_d = the number of dimensions: a linear ramp of
 g HU/mm costs ½ λ g² per mm³ when g ≪ T. λ is in 1/(HU² mm) and comes from the noise level, see :meth:`QGGMRF.bind`.
 
-For several channels at once t is the Euclidean length of their common gradient, |x_j − x_k| / (hu d): one edge in one
-channel relaxes the penalty of all channels there, as basis images share the edges of the tissues (vectorial
+For several channels at once t is the Euclidean length of their common gradient, ``|x_j − x_k| / (hu d)``: an edge in
+one channel relaxes the penalty of all channels there, as basis images share the edges of the tissues (vectorial
 regularisation, Sapiro and Ringach 1996; for spectral CT Rigie and La Rivière 2015). The length treats all directions in
 the space of channels alike, so the channels must be of equal, uncorrelated noise
 (:class:`recon.pwls.whitening.Whitening`).

@@ -207,7 +207,7 @@ def _majorize_channels(begin, end, x, v, steps, scales, factors, kind, form, out
 
 @njit(nogil=True, cache=True, fastmath=_FLAGS, error_model="numpy")
 def majorize_channels(begin, end, x, v, steps, scales, factors, kind, form, out):
-    """:func:`majorize` for x, v and out ``(batch, channels, nz, ny, nx)``, with |x_j − x_k| over the channels in t."""
+    """:func:`majorize` for x, v and out ``(batch, channels, nz, ny, nx)``; ``|x_j − x_k|`` in t, over the channels."""
     _majorize_channels(begin, end, x, v, steps, scales, factors, kind, form, out, np.empty(x.shape[-1], x.dtype))
 
 

@@ -1,33 +1,39 @@
 """Scan geometries as YAML: what a geometry needs, in mm and degrees.
 
-kind: cone                 # parallel, fan, cone
-angles_deg: {start: 0, step: 0.5, count: 720}      # or a list, or the name of a text file with one angle a line
-sod: 626                   # not parallel
-sdd: 1098
-columns: 888
-rows: 64                   # cone only
-pitch: [1.1, 1.0]          # [row, column], or one number
-offset: [0, 0.25]          # optional
-detector: curved           # flat (default) or curved
-pose:                      # optional, flat detectors: numbers, lists or text files with one number a view
-  {roll_deg: 0.3, tilt_deg: 0, slant_deg: 0, columns: jitter.txt, rows: 0.5, feed: 20, start: -30}
+A circular scan::
+
+    kind: cone                 # parallel, fan, cone
+    angles_deg: {start: 0, step: 0.5, count: 720}      # or a list, or the name of a text file with one angle a line
+    sod: 626                   # not parallel
+    sdd: 1098
+    columns: 888
+    rows: 64                   # cone only
+    pitch: [1.1, 1.0]          # [row, column], or one number
+    offset: [0, 0.25]          # optional
+    detector: curved           # flat (default) or curved
+    pose:                      # optional, flat detectors: numbers, lists or text files with one number a view
+      {roll_deg: 0.3, tilt_deg: 0, slant_deg: 0, columns: jitter.txt, rows: 0.5, feed: 20, start: -30}
 
 ``pose`` makes a :class:`~torchpcct.vector_geometry.VectorGeometry`: ``columns`` and ``rows`` displace the detector by
 parts of a cell, along its own axes as they are turned; ``feed`` (mm of the source along z in a turn) and ``start`` (its
 first height, mm) make a helix.
 
-kind: vectors              # every view by itself, ASTRA's vectors
-vectors: poses.npy         # or .txt, or a list: (views, 6) or (views, 12) mm
-columns: 888
-rows: 64                   # with 12 numbers a view
-parallel: false            # optional
+Every view by itself, ASTRA's vectors::
 
-kind: rtk                  # ThreeDCircularProjectionGeometry
-file: geometry.xml
-columns: 888
-rows: 64
-pitch: 1.0                 # [row, column], or one number
-origin: [0, 0]             # optional: of the first pixel, mm
+    kind: vectors
+    vectors: poses.npy         # or .txt, or a list: (views, 6) or (views, 12) mm
+    columns: 888
+    rows: 64                   # with 12 numbers a view
+    parallel: false            # optional
+
+RTK's ``ThreeDCircularProjectionGeometry``::
+
+    kind: rtk
+    file: geometry.xml
+    columns: 888
+    rows: 64
+    pitch: 1.0                 # [row, column], or one number
+    origin: [0, 0]             # optional: of the first pixel, mm
 """
 
 from __future__ import annotations

@@ -49,7 +49,7 @@ class RotationAxis:
 
     Attributes:
         column: onto which the rotation axis projects, fractional, counted from 0.
-        error: three standard errors, at least :data:`LEAST` or :data:`LEAST_HALF`.
+        error: three standard errors, at least ``LEAST`` or ``LEAST_HALF``.
         how: what it was found from.
     """
 

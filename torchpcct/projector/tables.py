@@ -63,7 +63,7 @@ class Tables:
 
     @cached_property
     def pose(self) -> NDArray[np.float64]:
-        """``(views, 8)``, see :attr:`Rays.pose`."""
+        """``(views, 8)``, see :attr:`torchpcct.projector.rays.Rays.pose`."""
         return self.rays.pose
 
     @cached_property

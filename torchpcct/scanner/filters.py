@@ -108,7 +108,7 @@ def roi_bowtie(
         diameter_mm: diameter of the region of interest.
         thickness_mm: thickness of the blocking part (published: 39 mm).
         distance_mm: distance of the filter from the isocentre (published: 263 mm).
-        ramp_mm: width of the ramp. Not published, see :data:`ROI_RAMP_MM`.
+        ramp_mm: width of the ramp. Not published, see ``ROI_RAMP_MM``.
         material: aluminium unless given (not published; graphite and PMMA of this thickness are too weak).
 
     Raises:

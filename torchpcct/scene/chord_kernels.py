@@ -14,6 +14,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+__all__ = ["BOX", "BULGED", "CYLINDER", "ELLIPSOID", "NARROWED", "chords", "interval"]
+
 # Kinds of packed shapes.
 ELLIPSOID, CYLINDER, BOX, BULGED, NARROWED = range(5)
 # Contraction to FMA is safe; reassociation would undo the cancellation-free order of the operations below. Functions

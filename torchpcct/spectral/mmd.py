@@ -223,7 +223,7 @@ def clean(fractions: Tensor, window: int = 3, iterations: int = 50) -> Tensor:
 
 @checked
 def dice(labels: ArrayLike, truth: ArrayLike, names: Sequence[str] = MMD_TISSUES) -> Mapping[str, float]:
-    """Dice coefficient 2 |A ∩ B| / (|A| + |B|) of each tissue.
+    """Dice coefficient ``2 |A ∩ B| / (|A| + |B|)`` of each tissue.
 
     Args:
         labels, truth: whole numbers of one shape, indices into ``names``. Voxels whose truth is negative are left out

@@ -8,7 +8,7 @@ the same patient, is large enough for the plateau of its FBP image to be read di
 Measured with the paper's scanner, standard kernel: core 41.1, wall 63.5, fibrous 103.2, blood 480.0, fat −92.7 HU.
 246 views differ from 1968 by 0.01 HU at most, voxels of 0.1 mm from those of 0.25 mm too. Rods of 3, 4 and 6 mm agree
 within 0.03 HU but for blood with iodine, which hardens its own beam and reads 1.2 HU less per mm of diameter: rods
-should be about as thick as the vessel. All read 3–6 HU more than :meth:`Material.hu` of the spectrum behind the patient
+should be about as thick as the vessel. All read 3–6 HU more than ``Material.hu`` of the spectrum behind the patient
 says: that refers to water behind fat, the scanner's correction to water alone. The soft kernel is 2 % lower in rods of
 this size.
 """

@@ -28,7 +28,7 @@ from torchpcct.scene.scene import Body, Scene
 from torchpcct.scene.tubes import BulgedTube, NarrowedTube
 from torchpcct.validate import checked, number, numbers
 
-__all__ = ["Plaque", "interpolate_material", "plaque_scene"]
+__all__ = ["PAPER_POSITION", "PATIENT_DIAMETER", "Plaque", "interpolate_material", "plaque_scene"]
 
 # Default of ``Plaque.position``: the centre in the authors' published phantom description, 42.44 mm off the isocentre.
 PAPER_POSITION = (-29.63, -30.38, 0.0)

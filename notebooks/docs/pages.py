@@ -1,0 +1,143 @@
+"""Pages that are written from the package itself: its public names, its commands, its committed results."""
+
+import argparse
+import ast
+import importlib.util
+import re
+from pathlib import Path
+from types import ModuleType
+
+HERE = Path(__file__).parent
+ROOT = HERE.parents[1]
+
+
+def public_modules():
+    """Modules without an underscore in their names, by package: ``{package: [(module, own, others), …]}``.
+
+    ``own`` are the names of ``__all__`` that the module defines; ``others`` those it hands on from elsewhere.
+    """
+    packages = {}
+    for top in ("torchpcct", "recon", "train"):
+        for path in sorted((ROOT / top).rglob("*.py")):
+            parts = path.relative_to(ROOT).with_suffix("").parts
+            if path.stem.startswith("_") and path.stem != "__init__":
+                continue
+            module = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+            tree = ast.parse(path.read_text(encoding="utf-8"))
+            public, own = [], set()
+            for node in tree.body:
+                targets = getattr(node, "targets", [getattr(node, "target", None)])
+                names = [n.id for t in targets if t for n in ast.walk(t) if isinstance(n, ast.Name)]
+                names += [getattr(node, "name", "")]
+                if "__all__" in names:
+                    public = ast.literal_eval(node.value)
+                own.update(names)
+            if public or ast.get_docstring(tree):
+                entry = (module, [n for n in public if n in own], [n for n in public if n not in own])
+                package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+                packages.setdefault(package, []).append(entry)
+    return packages
+
+
+def canonical(module, name):
+    """Where a name that is handed on is defined, ``(module, name)``."""
+    value = getattr(importlib.import_module(module), name)
+    if isinstance(value, ModuleType):
+        return value.__name__.rpartition(".")[::2]
+    home = getattr(value, "__module__", None)
+    if home and getattr(value, "__qualname__", None):
+        return home, value.__qualname__
+    tree = ast.parse(Path(importlib.import_module(module).__file__).read_text(encoding="utf-8"))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and any((a.asname or a.name) == name for a in node.names):
+            return node.module, name
+    raise LookupError(f"{module}.{name}: nobody defines it")
+
+
+def write_api(folder):
+    """A page a package: each module's text, its names, and those it hands on."""
+    packages, bare = public_modules(), {}
+    for module in (m for modules in packages.values() for m, *_ in modules):
+        body = ast.parse(Path(importlib.util.find_spec(module).origin).read_text(encoding="utf-8")).body
+        after = zip(body, [*body[1:], None], strict=True)  # a constant's text stands below it
+        bare[module] = {
+            n.id
+            for node, below in after
+            if isinstance(node, ast.Assign | ast.AnnAssign) and not isinstance(below, ast.Expr)
+            for n in ast.walk(node)
+            if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)
+        }
+    for package, modules in packages.items():
+        lines = [package, "=" * len(package), ""]
+        for module, own, others in sorted(modules, key=lambda m: m[0] != package):
+            if module != package:
+                lines += [module, "-" * len(module), ""]
+            # A function may stand in the place of its package (recon.fbp): the module is then no entry of the index.
+            lines += [f".. automodule:: {module}"]
+            lines += ["   :no-index:"] if module in ("recon.fbp", "recon.pwls") else []
+            told = [name for name in own if name not in bare[module]]
+            lines += [f"   :members: {', '.join(told)}", "   :undoc-members:", "   :show-inheritance:"] if told else []
+            lines += ["", *(_constant(module, name) for name in own if name in bare[module])]
+            for name in others:
+                home, qualname = canonical(module, name)
+                lines += [f"* ``{name}``: :py:obj:`~{home}.{qualname}`"]
+            lines += [""]
+        _write(folder / f"{package}.rst", "\n".join(lines))
+    top = [p for p in packages if not p.startswith(("recon.study", "recon.cli"))]
+    listed = [f"   generated/{p}" for p in (*top, *(p for p in packages if p not in top))]
+    _write(folder / "toctree.txt", "\n".join([".. toctree::", "   :maxdepth: 1", "", *listed, ""]))
+
+
+def _constant(module, name):
+    """Of a constant without a text autodoc would show the text of its type."""
+    value = " ".join(repr(getattr(importlib.import_module(module), name)).split())
+    return f".. py:data:: {name}\n   :module: {module}\n   :value: {value if len(value) < 72 else value[:70] + ' …'}\n"
+
+
+def write_cli(path):
+    """The command line, from the parsers themselves."""
+    from recon.cli import _parser
+    from train.__main__ import _parser as training
+
+    parser, commands = _parser()
+    shown = {c.dest: c.help for c in commands._choices_actions}
+    lines = ["# Command line", "", "Written from the parsers: what `--help` prints.", "", _help(parser)]
+    for name, command in commands.choices.items():
+        lines += [f"## torchpcct {name}", "", f"{shown.get(name) or ''}", "", _help(command)]
+    _write(path, "\n".join([*lines, "## python -m train", "", _help(training())]))
+
+
+def _help(parser):
+    assert isinstance(parser, argparse.ArgumentParser)
+    return f"```text\n{parser.format_help()}```\n"
+
+
+def write_results(folder):
+    """The committed results as pages, each with its pictures; links lead to these pages, or are plain text."""
+    notebooks, names = HERE.parent, []
+    for report in sorted(notebooks.glob("*/report.md")):
+        names.append(name := report.parent.name)
+        title, _, text = report.read_text(encoding="utf-8").partition("\n")
+        shown = sorted(p.name for p in report.parent.glob("*.png") if f"({p.name})" not in text)
+        pictures = [f"![{p}](../../{name}/{p})\n" for p in shown]
+        text = text.replace("(phantom.png)", "(../../phantom/phantom.png)")
+        _write(folder / f"{name}.md", _linked("\n".join([f"# {name}: {title[2:]}", *pictures, text]), ""))
+    toctree = "\n".join(["", "```{toctree}", ":hidden:", *(f"reports/{name}" for name in names), "```", ""])
+    _write(
+        folder.parent / "results.md",
+        _linked((notebooks / "RESULTS.md").read_text(encoding="utf-8"), "reports/") + toctree,
+    )
+    for name, path in (("card", "recon/mbir/weights/card.md"), ("size", "train/size.md")):
+        _write(folder / f"{name}.txt", _linked((ROOT / path).read_text(encoding="utf-8"), ""))
+
+
+def _linked(text, to):
+    text = re.sub(r"\]\((\w+)/report\.md\)", rf"]({to}\1.md)", text)
+    return re.sub(r"\[([^\]]*)\]\([^)]*(?:causes|size)\.md\)", r"`\1`", text)
+
+
+def _write(path, text):
+    """Only what has changed: Sphinx reads a page again when it is newer."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if not path.exists() or path.read_text(encoding="utf-8") != text:
+        path.write_text(text, encoding="utf-8")
