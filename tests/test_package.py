@@ -1,10 +1,9 @@
 """The package as a whole: what it exports, and what it loads for that (its shape: test_layout.py)."""
 
 import ast
-import importlib
+import importlib.util
 import json
 import re
-import shutil
 import subprocess
 import sys
 import tomllib
@@ -86,18 +85,14 @@ def test_the_cards_are_those_of_the_weights():
 @pytest.mark.slow
 def test_the_wheel_holds_what_is_needed_and_no_more(tmp_path):
     """What it does once installed: tests/bench/wheel.py."""
-    source = tmp_path / "source"
-    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True)
-    files = [name for name in listed.stdout.splitlines() if (ROOT / name).is_file()]
-    for name in files:
-        (source / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(ROOT / name, source / name)
-    command = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(tmp_path), str(source)]
-    subprocess.run(command, check=True)
-    (wheel,) = tmp_path.glob("*.whl")
-    with zipfile.ZipFile(wheel) as archive:
+    spec = importlib.util.spec_from_file_location("wheel", ROOT / "tests/bench/wheel.py")
+    bench = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(bench)
+    with zipfile.ZipFile(bench.build(tmp_path)) as archive:
         found = {name for name in archive.namelist() if ".dist-info/" not in name}
         (metadata,) = (archive.read(n).decode() for n in archive.namelist() if n.endswith("/METADATA"))
+    source = tmp_path / "source"
+    files = {path.relative_to(source).as_posix() for path in source.rglob("*") if path.is_file()}
     packages = ("torchpcct/", "recon/", "train/")
     assert found == {name for name in files if name.startswith(packages) and name != "train/size.md"}
     import torchpcct
