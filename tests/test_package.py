@@ -1,12 +1,17 @@
 """The package as a whole: what it exports, and what it loads for that (its shape: test_layout.py)."""
 
 import ast
+import importlib.util
+import json
+import re
 import subprocess
 import sys
 import tomllib
+import zipfile
 from pathlib import Path
 
 import pytest
+import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
@@ -50,11 +55,49 @@ def test_importing_loads_nothing_that_is_used_later(package, more):
     assert not {m for m in loaded if m.startswith(("torchpcct.", "recon.", "train.")) and "kernel" in m}
 
 
-def test_the_version_is_the_projects():
+def test_one_version():
+    """It stands in torchpcct/files.py; pyproject.toml reads it there, citation and changelog follow."""
     import torchpcct
 
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    assert torchpcct.__version__ == project["version"]
+    pyproject = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    assert "version" not in pyproject["project"]
+    module, _, name = pyproject["tool"]["setuptools"]["dynamic"]["version"]["attr"].rpartition(".")
+    assert getattr(importlib.import_module(module), name) == torchpcct.__version__
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert citation["version"] == torchpcct.__version__
+    headings = re.findall(r"^## (.*)", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert headings[:2] == ["Unreleased", torchpcct.__version__]
+
+
+def test_the_cards_are_those_of_the_weights():
+    """card.md is written by hand, training.md and card.json by the training: new weights need all three."""
+    from recon.mbir.mbir import Mbir
+
+    shipped, folder = Mbir.load(), ROOT / "recon" / "mbir" / "weights"
+    assert json.loads((folder / "card.json").read_text())["sha256_of_tensors"] == shipped.weights_sha256
+    low, high = shipped.model.seen_scale_hu.tolist()
+    for name, said in (("training.md", ""), ("card.md", f"Noise scales of {low:.0f} to {high:.0f} HU")):
+        text = (folder / name).read_text(encoding="utf-8")
+        assert f"`{shipped.weights_sha256[:16]}…`" in text, name
+        assert said in text
+
+
+@pytest.mark.slow
+def test_the_wheel_holds_what_is_needed_and_no_more(tmp_path):
+    """What it does once installed: tests/bench/wheel.py."""
+    spec = importlib.util.spec_from_file_location("wheel", ROOT / "tests/bench/wheel.py")
+    bench = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(bench)
+    with zipfile.ZipFile(bench.build(tmp_path)) as archive:
+        found = {name for name in archive.namelist() if ".dist-info/" not in name}
+        (metadata,) = (archive.read(n).decode() for n in archive.namelist() if n.endswith("/METADATA"))
+    source = tmp_path / "source"
+    files = {path.relative_to(source).as_posix() for path in source.rglob("*") if path.is_file()}
+    packages = ("torchpcct/", "recon/", "train/")
+    assert found == {name for name in files if name.startswith(packages) and name != "train/size.md"}
+    import torchpcct
+
+    assert f"\nVersion: {torchpcct.__version__}\n" in metadata
 
 
 MODULES = {

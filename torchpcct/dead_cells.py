@@ -1,4 +1,4 @@
-"""Readings that say nothing: bridged by their neighbours, so that they do not spread over the image."""
+"""Readings of dead cells are interpolated from their neighbours, so that they do not spread over the image."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Readings that cannot be: dead and hot cells, dead columns and views, lost readings; found, masked, bridged.
+"""Impossible readings (dead and hot cells, dead columns and views, lost readings): found, masked, interpolated.
 
 A reading of 0 where hundreds are expected has the logarithm of a ray through lead, and FBP draws it as a streak or a
 ring of thousands of HU. It cannot be noise: the Poisson probability of 0 at an expectation of 30 is 1e-13. Metal can

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, say what wrote them, and are refused when they are damaged or foreign."""
+"""Atomic writes, and HDF5 files that name the software that wrote them and are refused when damaged or foreign."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _MAGIC = b"torchpcct, HDF5 from byte 512, SHA-256 of it: "
 _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
 VERSION = "0.1.0"
-"""Of this software, as in pyproject.toml; files carry it."""
+"""Version of this software. pyproject.toml reads it from here; files carry it."""
 
 
 def require_folder(path: str | os.PathLike[str]) -> None:
@@ -204,7 +204,7 @@ class _Unfailing(io.FileIO):
 @contextmanager
 def _signals_wait() -> Iterator[None]:
     """Put off what Python does at signals (Ctrl-C) to the end of a block: an exception in the middle of what HDF5 asks
-    of a file would be a write that is lost without a word."""
+    of a file would lose a write silently."""
     if threading.current_thread() is not threading.main_thread():
         yield  # Python serves signals in the main thread only
         return

@@ -22,7 +22,7 @@ def sources(name: str, *constants: str) -> set[Path]:
 
     Args:
         name: of an imported module.
-        constants: names of modules whose constants its kernels hold, which nothing tells of.
+        constants: names of modules whose constants its kernels hold, of which numba keeps no record.
     """
     found: set[str] = set()
     _follow(sys.modules[name], found)

@@ -1,4 +1,4 @@
-"""What readings say about themselves: too bright, clipped, over an offset, next to nothing left, or no counts at all.
+"""Checks of readings by themselves: too bright, clipped, above an offset, almost no signal, or no counts at all.
 
 The description of a scan can be wrong in ways that no shape or sign shows, and FBP reconstructs it all the same: water
 of -750 HU from transmissions given as counts. What speaks against a description is in the readings: air beside the

@@ -1,4 +1,4 @@
-"""What a scan must be: checked whenever one is made, so that nothing after it has to."""
+"""Consistency checks of a scan, made once when it is constructed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A reconstructed volume in HU, with its grid and its report; files are written whole or not at all."""
+"""A reconstructed volume in HU, with its grid and its report; files are written atomically."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Shipped weights and their training card: how they were made, on what, and how good they were."""
+"""The record of a training: how the weights were made, with which settings, and how good they were.
+
+What the weights are for and what they may not be trusted with is written by hand, in ``recon/mbir/weights/card.md``.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +48,7 @@ def finite(value: Any) -> Any:
 
 
 def export(folder: Path, weights: Mapping[str, Tensor], config: TrainConfig, state: Mapping[str, Any]) -> None:
-    """Write ``weights.safetensors`` (float16), ``card.json`` and ``card.md``.
+    """Write ``weights.safetensors`` (float16), ``card.json`` and the same as text, ``training.md``.
 
     Args:
         folder: existing.
@@ -84,7 +87,7 @@ def export(folder: Path, weights: Mapping[str, Tensor], config: TrainConfig, sta
         "score": best["score"],
     }
     write_tensors(folder / "weights.safetensors", WEIGHTS_FORMAT, stored, header)
-    texts = {"card.json": json.dumps(card, indent=2, ensure_ascii=False) + "\n", "card.md": _markdown(card, config)}
+    texts = {"card.json": json.dumps(card, indent=2, ensure_ascii=False) + "\n", "training.md": _markdown(card, config)}
     for name, text in texts.items():
         with written_whole(folder / name) as part:
             part.write_text(text, encoding="utf-8")
@@ -105,7 +108,7 @@ def _markdown(card: Mapping[str, Any], config: TrainConfig) -> str:
         "Seed": str(card["seed"]),
         "Written": card["written"],
     }
-    lines = ["# Training card", "", "| | |", "|---|---|", *(f"| {k} | {v} |" for k, v in rows.items())]
+    lines = ["# Training record", "", "| | |", "|---|---|", *(f"| {k} | {v} |" for k, v in rows.items())]
     lines += ["", "## Validation", "", "| figure | value |", "|---|---|"]
     lines += [f"| {k} | {v:.6g} |" if isinstance(v, float) else f"| {k} | {v} |" for k, v in card["validation"].items()]
     lines += ["", "## Command", "", "```"]

@@ -1,4 +1,4 @@
-"""What a run leaves to look at: CSV tables, TensorBoard events, validation pictures, a progress line."""
+"""Records of a run: CSV tables, TensorBoard events, validation pictures, a progress line."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ def train(
         objective: what is minimised, and what the weights are chosen by.
         out: folder of the run, made if missing. It gets ``checkpoint*.safetensors``, ``config.yaml``, ``log.csv``,
             ``validation.csv``, ``pictures``, ``tensorboard``, and the best weights with their card as
-            ``weights.safetensors``, ``card.json``, ``card.md``.
+            ``weights.safetensors``, ``card.json``, ``training.md``.
         resume: continue from the checkpoint.
         command: command line, for the card.
         progress: show a progress line.

@@ -4,5 +4,6 @@ Read :mod:`~recon.mbir.reconstruct` (from a scan to HU; whole fields of any scan
 :mod:`~recon.mbir.mbir` (from AᵀW y to HU, with the shipped weights), :mod:`~recon.mbir.problem` (the data in noise
 units), :mod:`~recon.mbir.unrolled` (data steps and network in turn) and :mod:`~recon.mbir.network` (the learned prior).
 :mod:`~recon.mbir.tissues` adds the outlines and tissue values of a vessel to it.
-Weights and their training card lie in ``weights``; :mod:`~recon.mbir.weights_io` reads them.
+Weights, their model card and the record of their training lie in ``weights``; :mod:`~recon.mbir.weights_io` reads
+them.
 """

@@ -1,7 +1,7 @@
 """Model-based reconstruction with the learned prior: from the scan's statistic AᵀW y to a volume in HU.
 
 The network works on cubic voxels of one size (the one it was trained at); other grids are reconstructed on such voxels
-over the same extent and averaged onto the grid that was asked for. Weights and their training card ship in
+over the same extent and averaged onto the grid that was asked for. Weights and their model card ship in
 ``recon/mbir/weights``.
 """
 
@@ -102,7 +102,7 @@ class Mbir:
 
     @property
     def weights_sha256(self) -> str:
-        """SHA-256 of the weights' names, types, shapes and values, as in their training card."""
+        """SHA-256 of the weights' names, types, shapes and values, as in the record of their training."""
         return digest(self.model.state_dict())
 
     def problem(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> NormalisedProblem:

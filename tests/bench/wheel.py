@@ -7,6 +7,7 @@ dependency) fails here. Options go to ``pip install``, e.g. ``--extra-index-url 
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -18,23 +19,39 @@ ROOT = Path(__file__).resolve().parent.parent.parent
 SMOKE = """
 import recon, torchpcct, train
 from pathlib import Path
+from recon.evaluate.rivals import tuned
+from recon.evaluate.tasks import read_task
 from recon.mbir.mbir import Mbir
 from torchpcct import VolumeGrid, acquire
 from torchpcct.scanner import presets
 from torchpcct.scene.plaque import plaque_scene
 for package in (recon, torchpcct, train):
     assert "site-packages" in package.__file__, package.__file__
-assert (Path(torchpcct.__file__).parent / "py.typed").exists()
-assert (Path(recon.__file__).parent / "py.typed").exists()
+for name in ("py.typed", "configs/default.yaml"):
+    assert (Path(train.__file__).parent / name).exists(), name
 Mbir.load()
+assert read_task("nodule").title and tuned("bilateral", "detail", 2.0)
 scene, plaque = plaque_scene(vessel_length=2.0)
 grid = VolumeGrid((3, 12, 12), 0.5, plaque.position[::-1])
 region = VolumeGrid((1, 1, 1), (2.2, 8.0, 8.0), plaque.position[::-1])
 scan = acquire(scene, presets.pcct(views=60, rows=12), exposure_s=2.0, region=region, sub_rays=16)
 volume = recon.reconstruct(scan, grid, "fbp")
 volume.save("plaque.nii.gz")
+scan.save("scan.h5")
 print("reconstructed", tuple(volume.data.shape), f"{float(volume.data.mean()):.0f} HU on average")
 """
+
+
+def build(folder: Path) -> Path:
+    """The wheel, in ``folder``, of what git knows: an old ``build`` folder would add modules that are gone."""
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    for name in (name for name in listed.splitlines() if (ROOT / name).is_file()):
+        (folder / "source" / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, folder / "source" / name)
+    command = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(folder), str(folder / "source")]
+    subprocess.run(command, cwd=folder, check=True)
+    (wheel,) = folder.glob("*.whl")
+    return wheel
 
 
 def main(options: list[str]) -> int:
@@ -46,8 +63,7 @@ def main(options: list[str]) -> int:
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        run(sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", folder, ROOT, folder=folder)
-        (wheel,) = folder.glob("*.whl")
+        wheel = build(folder)
         venv.create(folder / "empty", with_pip=True)
         scripts = folder / "empty" / ("Scripts" if os.name == "nt" else "bin")
         python = scripts / "python"
@@ -55,6 +71,7 @@ def main(options: list[str]) -> int:
         run(scripts / "torchpcct", "--version", folder=folder)
         run(scripts / "torchpcct", "study", "phantom", "--quick", "--no-progress", "--out", "out", folder=folder)
         run(python, "-c", SMOKE, folder=folder)
+        run(scripts / "torchpcct", "info", "scan.h5", folder=folder)
     print("the wheel works in an empty environment")
     return 0
 

@@ -85,6 +85,6 @@ def test_card(uninterrupted):
     assert card["validation"]["bias"] == "nan"
     assert card["parameters"] == 65 + 33
     assert 0 <= card["seconds_to_these_weights"] <= card["seconds"] + 0.1
-    text = (uninterrupted / "card.md").read_text()
+    text = (uninterrupted / "training.md").read_text()
     assert "python -m train --out whole" in text
     assert yaml.safe_load(text.split("```yaml\n")[1].split("```")[0])["validate_every"] == 5

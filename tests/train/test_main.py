@@ -42,8 +42,8 @@ def test_command_line(tmp_path, objective, capsys):
     weights = out / "weights.safetensors"
     plain = ["--no-progress", "--no-tensorboard"]
     assert command_line.main([*start, "--out", str(tmp_path / "y"), "--weights", str(weights), *plain]) == 0
-    assert command_line.main([*start, "--out", str(tmp_path / "z"), "--weights", str(out / "card.md")]) == 1
-    assert "card.md is damaged or not a safetensors file" in capsys.readouterr().err
+    assert command_line.main([*start, "--out", str(tmp_path / "z"), "--weights", str(out / "training.md")]) == 1
+    assert "training.md is damaged or not a safetensors file" in capsys.readouterr().err
 
 
 def test_second_interrupt_stops_at_once(tmp_path, objective, capsys):

@@ -133,10 +133,10 @@ def test_crash_at_any_write(tmp_path, uninterrupted, crash_before):
         ("weights.safetensors", 1),
         ("log.csv", 1),
         ("card.json", 1),
-        ("card.md", 1),
+        ("training.md", 1),
     ):
         # As a killed process leaves them.
-        for leftover in ("checkpoint.next.safetensors", ".123-0a1b2c-00000000.part.card.md"):
+        for leftover in ("checkpoint.next.safetensors", ".123-0a1b2c-00000000.part.training.md"):
             (out / leftover).write_bytes(b"half")
         crash_before(out, name, n, resume=True)
     run(out, resume=True)

@@ -1,4 +1,4 @@
-"""Open a scan, whatever wrote it."""
+"""Open a scan file of any supported format."""
 
 from __future__ import annotations
 

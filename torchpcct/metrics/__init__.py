@@ -4,7 +4,7 @@ Reading order: ``placement`` and ``roi`` say where is measured, ``cnr`` is the p
 ``data_limit`` the best that any unbiased method can reach. ``bootstrap`` and ``jackknife`` give figures their
 intervals, ``control`` narrows them. (What they are for, the dose factor, is :mod:`recon.evaluate`.) ``observer`` asks
 whether the core is seen, ``resolution`` and ``noise_power`` how sharp and how noisy an image is, and
-``plaque_measures`` what a reader takes from it: lumen, core and cap. ``residual_test`` asks whether a volume explains
+``plaque_measures`` measures lumen, core and cap. ``residual_test`` asks whether a volume explains
 its data at all, ``half_split`` what noise and resolution a real scan has, without a truth.
 """
 

@@ -1,4 +1,4 @@
-"""A word while kernels compile."""
+"""A log message before the first call that compiles kernels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every projector can do: ``A @ x``, ``A.H``, ``A.norm()``, and its form in other libraries."""
+"""Base class of operators: ``A @ x``, ``A.H``, ``A.norm()``, and conversion to SciPy, PyLops and deepinv."""
 
 from __future__ import annotations
 

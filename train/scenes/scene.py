@@ -271,8 +271,8 @@ def is_paper_family(scene: TrainingScene) -> bool:
 
     True if some vessel has an outer diameter within 20 % of 3.36 mm and holds, maybe among others, a core of any shape
     whose semi-axes are, in order of size, all within 30 % of 0.6, 0.985, 0.985 mm, with a contrast of −90…−30 HU. That
-    is one in a hundred of the scenes that are drawn. (The weights that ship were trained with half of these widths and
-    single ellipsoids only, which is so rare a scene that the rule took nothing away.)
+    is one in a hundred of the scenes that are drawn. (The first of the trainings behind the shipped weights had half of
+    these widths and single ellipsoids only, which is so rare a scene that the rule rejected nothing.)
     """
     return any(
         -90.0 <= core.contrast <= -30.0

@@ -177,9 +177,9 @@ def test_refusals(name, noise, fake_bm4d):
         for bad_noise in (0.0, -1.0, float("nan")):
             with pytest.raises(ValueError, match="noise_hu"):
                 call(noise, bad_noise)
-    setting = {"gaussian": "sigma", "perona_malik": "rate"}.get(name, "edge" if name == "bilateral" else "strength")
+    setting, (least, *_) = GROWING.get(name, ("strength", (0.0,)))
     with pytest.raises(ValueError, match=setting):
-        call(noise, NOISE, **{setting: -1.0})
+        call(noise, NOISE, **{setting: -1 - least})
 
 
 def test_refusals_of_the_flat_region(noise):

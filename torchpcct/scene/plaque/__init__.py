@@ -1,4 +1,4 @@
-"""The coronary plaque of the paper and scenes that can expose an invention.
+"""The coronary plaque of the paper and variants of it, in which a learned prior may show structures that are not there.
 
 Read :mod:`~torchpcct.scene.plaque.plaque` (geometry and scene), then :mod:`~torchpcct.scene.plaque.variants` (without a
 core, moved, mirrored, calcified, stented, textured …).

@@ -1,4 +1,4 @@
-"""Scenes that can expose an invention: the plaque without its core, moved, mirrored, calcified, stented, textured.
+"""Variants that show whether a prior invents structures: no core, moved, mirrored, calcified, stented, textured.
 
 A reconstruction with a learned prior may draw what it expects. Each variant here differs from the paper's scene in one
 respect that such a prior does not know; run it through the same scan and look for a core that is not there.
