@@ -148,7 +148,7 @@ def trained_grid(grid: VolumeGrid, geometry: Any) -> VolumeGrid:
 
 
 def blockwise(
-    network: Prior, scales: Tensor, estimate: Tensor, towards: Tensor, condition: Tensor, guide_noise: Tensor,
+    network: Prior, scales: Tensor, estimate: Tensor, towards: Tensor, condition: Tensor, smoothed: Tensor | None,
     block: int = BLOCK, halo: int = HALO,
 ) -> Tensor:  # fmt: skip
     """The network on volumes ``(1, z, y, x)`` of any size, block by block; neighbours fade into each other.
@@ -156,7 +156,7 @@ def blockwise(
     Args:
         network: the learned prior, or what stands for it.
         scales: ``(z, y, x)`` noise scale of each voxel, HU: each block is told its own.
-        estimate, towards, condition, guide_noise: see :meth:`recon.mbir.network.Network.forward`.
+        estimate, towards, condition, smoothed: see :meth:`recon.mbir.network.Network.forward`.
         block: voxels along each axis that a block gives; with those it shares with its neighbours ``2 · halo`` more. A
             multiple of 8, as ``halo``: blocks of voxels must be those of the whole.
         halo: voxels on each side that help only, or fade.
@@ -168,11 +168,11 @@ def blockwise(
         return torch.cat([level.reshape(1, 1).to(condition), condition[:, 1:]], 1)
 
     if max(shape) <= block + 2 * halo:
-        return network(estimate, towards, told((slice(None),) * 3), guide_noise)
+        return network(estimate, towards, told((slice(None),) * 3), smoothed)
     total, weight = torch.zeros_like(estimate), torch.zeros(shape, dtype=estimate.dtype, device=estimate.device)
     for part in _parts(shape, block, halo):
         here: Any = (..., *part)
-        out = network(estimate[here], towards[here], told(part), guide_noise)
+        out = network(estimate[here], towards[here], told(part), None if smoothed is None else smoothed[here])
         fade = torch.ones((), dtype=estimate.dtype, device=estimate.device)
         for axis, (s, n) in enumerate(zip(part, shape, strict=True)):
             fade = fade * _fade(s, n, halo).to(estimate).reshape(-1, *[1] * (2 - axis))

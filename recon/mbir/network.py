@@ -30,7 +30,7 @@ from torch.nn import functional as F
 from recon.mbir.bilateral import joint_bilateral
 from torchpcct.validate import number, whole
 
-__all__ = ["GUIDE_VOXELS", "Network", "NetworkConfig", "bilateral_prior"]
+__all__ = ["GUIDE_VOXELS", "Network", "NetworkConfig", "bilateral_prior", "edge_preserved"]
 
 CONDITIONS = 3
 """Numbers that steer the gains: logarithm of the noise scale, look, step."""
@@ -103,22 +103,19 @@ class Network(nn.Module):
         # The layout that processors convolve fastest in (the overload is missing in torch's types).
         self.to(memory_format=torch.channels_last_3d)  # type: ignore[call-overload]
 
-    def forward(
-        self, estimate: Tensor, towards: Tensor, condition: Tensor, guide_noise: Tensor | None = None
-    ) -> Tensor:
+    def forward(self, estimate: Tensor, towards: Tensor, condition: Tensor, smoothed: Tensor | None = None) -> Tensor:
         """The new estimate, ``(batch, z, y, x)``.
 
         Args:
             estimate, towards: ``(batch, z, y, x)`` in noise units.
             condition: ``(batch, 3)``: ln(noise scale / 200 HU), look − ½, number of the step.
-            guide_noise: ``(batch,)`` standard deviation of ``towards`` smoothed by :data:`GUIDE_VOXELS`, for a network
-                with ``bilateral``.
+            smoothed: :func:`edge_preserved` of ``towards``, for a network with ``bilateral``.
         """
         views = [estimate, towards]
         if self.config.bilateral:
-            if guide_noise is None:
-                raise ValueError("a network with a bilateral filter needs guide_noise")
-            views.append(edge_preserved(towards, guide_noise))
+            if smoothed is None:
+                raise ValueError("a network with a bilateral filter needs the smoothed view of the data")
+            views.append(smoothed)
         if not self.config.local_mm:
             return self._symmetric(views, condition)
         level = local_mean(estimate, self.config.local_mm / self.config.voxel_mm)
@@ -157,15 +154,18 @@ def edge_preserved(towards: Tensor, guide_noise: Tensor) -> Tensor:
     """Two passes of the joint bilateral filter over a step towards the data, ``(batch, z, y, x)``.
 
     Args:
-        towards, guide_noise: see :meth:`Network.forward`.
+        towards: ``(batch, z, y, x)`` in noise units.
+        guide_noise: ``(batch,)`` standard deviation of ``towards`` smoothed by :data:`GUIDE_VOXELS`.
     """
     once = joint_bilateral(towards, local_mean(towards, GUIDE_VOXELS), _FIRST[0] * guide_noise, *_FIRST[1:])
     return joint_bilateral(once, once, _SECOND[0] * guide_noise, *_SECOND[1:])
 
 
-def bilateral_prior(estimate: Tensor, towards: Tensor, condition: Tensor, guide_noise: Tensor) -> Tensor:
-    """Called as a :class:`Network`, and nothing learned: :func:`edge_preserved` alone."""
-    return edge_preserved(towards, guide_noise)
+def bilateral_prior(estimate: Tensor, towards: Tensor, condition: Tensor, smoothed: Tensor | None) -> Tensor:
+    """Called as a :class:`Network` with ``bilateral``, and nothing learned: :func:`edge_preserved` alone."""
+    if smoothed is None:
+        raise ValueError("these weights are of a network without the bilateral filter: take those that ship")
+    return smoothed
 
 
 def local_mean(v: Tensor, sigma: float) -> Tensor:

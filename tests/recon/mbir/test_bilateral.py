@@ -4,10 +4,12 @@ from dataclasses import replace
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from recon.mbir.bilateral import joint_bilateral
-from recon.mbir.network import GUIDE_VOXELS, Network, NetworkConfig, local_mean
-from recon.mbir.unrolled import Unrolled, guide_noise
+from recon.mbir.network import GUIDE_VOXELS, Network, NetworkConfig, edge_preserved, local_mean
+from recon.mbir.unrolled import Unrolled, guide_noise, limited
 
 T = torch.tensor([0.6, 1.1])
 
@@ -87,17 +89,37 @@ def test_the_network_starts_from_half_of_it():
     network = Network(CONFIG).eval().requires_grad_(False)
     u, towards = volumes((1, 8, 8, 8))
     condition, noise = torch.zeros(1, 3), torch.tensor([0.3])
-    found = network(u, towards, condition, noise)
-    torch.testing.assert_close(network(u + 5, towards + 5, condition, noise), found + 5, rtol=1e-4, atol=1e-4)
-    turned = network(*(torch.rot90(v, 1, (-2, -1)) for v in (u, towards)), condition, noise)
+
+    def run(u, towards):
+        return network(u, towards, condition, edge_preserved(towards, noise))
+
+    found = run(u, towards)
+    torch.testing.assert_close(run(u + 5, towards + 5), found + 5, rtol=1e-4, atol=1e-4)
+    turned = run(*(torch.rot90(v, 1, (-2, -1)) for v in (u, towards)))
     torch.testing.assert_close(turned, torch.rot90(found, 1, (-2, -1)), rtol=1e-4, atol=1e-4)
     network.leave.weight.zero_()
     level = local_mean(u, 4.0)
     smooth = joint_bilateral(towards, local_mean(towards, GUIDE_VOXELS), 2.8 * noise, 2.5)
     smooth = joint_bilateral(smooth, smooth, 1.4 * noise, 4.0, 2)
-    torch.testing.assert_close(network(u, towards, condition, noise), 0.5 * (level + smooth), rtol=1e-4, atol=1e-4)
-    with pytest.raises(ValueError, match="guide_noise"):
+    torch.testing.assert_close(run(u, towards), 0.5 * (level + smooth), rtol=1e-4, atol=1e-4)
+    with pytest.raises(ValueError, match="smoothed view"):
         network(u, towards, condition)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.floats(-50, 50), st.floats(0.1, 3.0), st.floats(0.0, 4.0), st.integers(0, 1000))
+def test_overshoot_of_strong_edges_is_cut_off_and_weak_structures_stay(level, noise, ripple, seed):
+    """Within 5 voxels of a step of 30 guide noises nothing leaves the range of the filter's values."""
+    sd = torch.tensor([noise])
+    smoothed = torch.full((1, 6, 6, 40), level)
+    smoothed[..., :10] += 30 * noise
+    u = smoothed + ripple * noise * torch.randn(smoothed.shape, generator=torch.Generator().manual_seed(seed))
+    found = limited(u, smoothed, sd)
+    assert float(found[..., 5:15].max()) <= float(smoothed.max()) + 1e-4
+    assert float(found[..., 5:15].min()) >= float(smoothed.min()) - 1e-4
+    torch.testing.assert_close(found[..., 15:], u[..., 15:].clamp(level - 10 * noise, level + 10 * noise))
+    inner = (u > level + 1e-3 * noise) & (u < level + 29.999 * noise)
+    torch.testing.assert_close(found[inner], u[inner])
 
 
 def test_noise_of_the_guide_is_that_of_draws(normalised):

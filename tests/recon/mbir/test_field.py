@@ -60,9 +60,9 @@ def test_blocks_with_all_that_the_network_sees_are_the_whole():
     a, b = torch.randn(2, 1, 8, 8, 160)
     scales, condition = torch.full((8, 8, 160), 270.0), torch.tensor([[math.log(1.35), 0.0, 1.0]])
     whole = network(a, b, condition)
-    parts = blockwise(network, scales, a, b, condition, torch.ones(1), block=24, halo=56)
+    parts = blockwise(network, scales, a, b, condition, None, block=24, halo=56)
     torch.testing.assert_close(parts, whole, atol=1e-4 * float(whole.std()), rtol=1e-4)
-    near = blockwise(network, scales, a, b, condition, torch.ones(1), block=24, halo=16)
+    near = blockwise(network, scales, a, b, condition, None, block=24, halo=16)
     assert 0 < float((near - whole).square().mean().sqrt()) < 0.1 * float(whole.std())
 
 

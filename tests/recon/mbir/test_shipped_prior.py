@@ -103,7 +103,7 @@ class Listener(nn.Module):
         super().__init__()
         self.seen = []
 
-    def forward(self, u, towards, condition, guide_noise):
+    def forward(self, u, towards, condition, smoothed):
         self.seen.append((u, towards, condition))
         return 0.9 * u
 

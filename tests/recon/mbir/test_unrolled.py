@@ -1,6 +1,7 @@
 """The unrolled reconstruction: its linear parts against dense solutions, its look, hard cases."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -24,10 +25,10 @@ def scan():
     return gram, x, gram.apply(x)
 
 
-def model(seed=0, steps=2):
+def model(seed=0, steps=2, bilateral=False):
     """With a network that does something."""
     torch.manual_seed(seed)
-    made = Unrolled(SMALL, steps)
+    made = Unrolled(replace(SMALL, bilateral=bilateral), steps)
     torch.nn.init.normal_(made.network.leave.weight, std=0.02)
     return made.eval().requires_grad_(False)
 
@@ -90,9 +91,12 @@ def test_the_data_have_the_last_word(scan):
 def test_another_prior_takes_the_place_of_the_network(scan):
     """The filter alone asks nothing of the weights, and what it gives is made consistent with the data."""
     p = normal(scan, noise=1.0)
-    first, second = (model(seed)(p, 0.5, prior=bilateral_prior) for seed in (0, 1))
-    torch.testing.assert_close(first, second, rtol=0, atol=0)
-    assert not torch.equal(first, model(0)(p, 0.5))
+    first, second = (model(seed, bilateral=True) for seed in (0, 1))
+    found = first(p, 0.5, prior=bilateral_prior)
+    torch.testing.assert_close(found, second(p, 0.5, prior=bilateral_prior), rtol=0, atol=0)
+    assert not torch.equal(found, first(p, 0.5))
+    with pytest.raises(ValueError, match="without the bilateral filter"):
+        model()(p, 0.5, prior=bilateral_prior)
 
 
 def test_noise_grows_with_the_look(scan):
