@@ -38,12 +38,14 @@ class TissueData:
             (:class:`recon.gram.gram.Gram`).
         scale: G in HU⁻² is ``scale`` times ``gram``.
         source: what the data are, for the report.
+        boxes: whether G takes each value for that of a whole voxel, as a projector does, or for one at its centre.
     """
 
     b: Tensor
     gram: Any
     scale: float
     source: str = "scan"
+    boxes: bool = True
 
     def __post_init__(self) -> None:
         if self.gram.grid.ndim != 3 or tuple(self.b.shape) != tuple(self.gram.grid.shape):
@@ -103,7 +105,7 @@ class TissueData:
         if tuple(volume.shape) != tuple(grid.shape):
             raise ValueError(f"volume has shape {tuple(volume.shape)}, its grid {tuple(grid.shape)}")
         gram = StationaryGram(grid, noise_power, transfer)
-        return cls(gram.statistic(volume), gram, 1.0, "volume with a stationary noise model")
+        return cls(gram.statistic(volume), gram, 1.0, "volume with a stationary noise model", boxes=False)
 
     def apply(self, x: Tensor) -> Tensor:
         """G x, HU⁻¹, of volumes in HU ``(..., z, y, x)``."""

@@ -376,11 +376,11 @@ def _on_grid(vessel: Vessel, values: Floats, outside: float = 0.0) -> NDArray[np
 def _regions(
     vessel: Vessel, fit: Fit, space: CoreSpace, shares: NDArray[np.float32], calcifications: int
 ) -> dict[str, NDArray[np.float32]]:
-    outer, inner, lumen = fit.drawing.shares
-    layer = np.clip(inner - lumen, 0.0, 1.0)
     core = np.zeros(len(vessel.index))
     core[space.chosen] = shares.mean(0)
-    hard = fit.bodies[:calcifications].sum(0) * layer
+    hard = fit.bodies[:calcifications].sum(0) * np.clip(fit.drawing.shares[1] - fit.drawing.shares[2], 0.0, 1.0)
+    outer, inner, lumen, core, hard = vessel.voxel_means(np.stack([*fit.drawing.shares, core, hard], 1)).T
+    layer = np.clip(inner - lumen, 0.0, 1.0)
     parts = {"wall": outer - inner, "fibrous": layer - np.minimum(core, layer) - hard, "lumen": lumen, "core": core}
     if calcifications:
         parts["calcification"] = hard
@@ -398,4 +398,4 @@ def _layer(fit: Fit) -> Floats:
 
 def _image(vessel: Vessel, fit: Fit) -> NDArray[np.float32]:
     fat = fit.parameters[FAT]
-    return _on_grid(vessel, fat + fit.drawing.image, fat)
+    return _on_grid(vessel, fat + vessel.voxel_means(fit.drawing.soft), fat)
