@@ -50,7 +50,7 @@ be taken for a bulge of it, and leave no trace."""
 _WALL_MM, _WALL_LOG_SD = 0.2, 0.2
 _BLUR, _BLUR_SD, BLUR_UNIT = 0.2, 1.0, 0.01
 """Variance by which edges are softer than the operator's: focal spot, turning gantry, tissue; in units of 0.01 mm²."""
-SOFT = 0.425
+SOFT = 0.5
 """Standard deviation of an outline as drawn, in voxels: narrower aliases, wider needs more of what noise hides."""
 _BOX = 1 / 12
 """Variance of a voxel's box, in squared voxels."""
