@@ -9,6 +9,7 @@ from numba import njit
 
 __all__ = ["core_fractions", "gather_block", "outline_radius", "outline_spread", "sharpened", "symmetric_step"]
 
+
 @njit(cache=True)
 def sharpened(values, neighbours, excess, out):
     """Take an averaging of variance ``excess`` (along each axis, in squared voxels) off values on voxels.
