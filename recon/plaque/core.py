@@ -85,7 +85,8 @@ class CoreSpace:
         self.vessel, self.fit, self.prior = vessel, fit, prior
         drawing = fit.drawing
         layer = drawing.shares[1] - drawing.shares[2]
-        inside = (drawing.inner_distance < 0.4) & (drawing.lumen_distance > -0.4) & (drawing.shares[0] > 0)
+        reach = 4.0 * float(vessel.sd.max())  # of soft edges, and of the voxels beside them
+        inside = (drawing.inner_distance < reach) & (drawing.lumen_distance > -reach) & (drawing.shares[0] > 0)
         if prior.point is not None:
             inside &= np.linalg.norm(vessel.points - np.array(prior.point), axis=1) < 3.0
         self.chosen = np.flatnonzero(inside)
@@ -97,6 +98,7 @@ class CoreSpace:
         self.points = np.ascontiguousarray(vessel.points[self.chosen])
         self.inner = np.ascontiguousarray(drawing.shares[1][self.chosen])
         self.lumen = np.ascontiguousarray(drawing.lumen_distance[self.chosen])
+        self.lumen_normal = np.ascontiguousarray(drawing.lumen_normal[self.chosen])
         self.lumen_sd = np.ascontiguousarray(drawing.lumen_sd[self.chosen])
         self.blur = BLUR_UNIT * float(fit.parameters[BLUR])
         self.frames = vessel.lumen_at.frame
@@ -194,7 +196,8 @@ class CoreSpace:
         run(
             core_fractions, len(shapes), np.ascontiguousarray(shapes[:, CENTRE]),
             np.ascontiguousarray(self.axes(shapes)), np.exp(shapes[:, AXES]), np.exp(shapes[:, CAP]), self.points,
-            self.vessel.sd, self.inner, self.lumen, self.lumen_sd, self.blur, out, operations=50 * len(self.points),
+            self.vessel.sd, self.inner, self.lumen, self.lumen_sd, self.lumen_normal, self.blur, out,
+            operations=50 * len(self.points),
         )  # fmt: skip
         return out
 

@@ -35,18 +35,19 @@ def sharpened(values, neighbours, excess, out):
 
 
 @njit(nogil=True, cache=True)
-def core_fractions(begin, end, centres, axes, semi, caps, points, sd, inner, lumen, lumen_sd, blur, out):
+def core_fractions(begin, end, centres, axes, semi, caps, points, sd, inner, lumen, lumen_sd, lumen_normal, blur, out):
     """Each ellipsoid inside the fibrous layer and farther than a cap from the lumen, drawn with soft edges.
 
-    Nested outlines that face each other within a voxel are parallel planes there: the part inside of several is the
-    smallest of the shares.
+    Where a body meets the cap the part inside of both is that of two Gaussians whose correlation is the cosine of the
+    angle between the outlines, exact where both halve the voxel; the wall's inner surface is taken for parallel.
 
     Args:
         centres: ``(bodies, 3)`` mm; axes: ``(bodies, 3, 3)`` rows are the unit axes; semi: ``(bodies, 3)`` mm.
         caps: ``(bodies,)`` mm.
         points: ``(n, 3)`` voxel centres, ordered by z; sd: ``(3,)`` of the edges along each axis, mm.
         inner: ``(n,)`` share of each voxel inside the wall's inner surface.
-        lumen: ``(n,)`` distance from the lumen, mm; lumen_sd: ``(n,)`` of its edge, mm.
+        lumen: ``(n,)`` distance from the lumen, mm; lumen_sd: ``(n,)`` of its edge, mm;
+            lumen_normal: ``(n, 3)``.
         blur: variance of the edges' blur in the plane, mm².
         out: ``(bodies, n)``, filled.
     """
@@ -74,7 +75,7 @@ def core_fractions(begin, end, centres, axes, semi, caps, points, sd, inner, lum
             r, g = math.sqrt(f), math.sqrt(q)
             if r < 0.2:
                 # The normal turns within a voxel: the distance is that along the shortest axis.
-                d, variance = (r - 1.0) * short, sd[0] ** 2
+                d, variance, nz, ny, nx = (r - 1.0) * short, sd[0] ** 2, 0.0, 0.0, 0.0
             else:
                 nz, ny, nx = gz / g, gy / g, gx / g
                 variance = (sd[0] * nz) ** 2 + (sd[1] * ny) ** 2 + (sd[2] * nx) ** 2
@@ -84,7 +85,10 @@ def core_fractions(begin, end, centres, axes, semi, caps, points, sd, inner, lum
             share = 0.5 * math.erfc(d / math.sqrt(2.0 * variance))
             if share > 1e-4:
                 far = 0.5 * math.erfc((caps[p] - lumen[i]) / (math.sqrt(2.0) * lumen_sd[i]))
-                out[p, i] = min(share, inner[i], far)
+                along = -(nz * lumen_normal[i, 0] + ny * lumen_normal[i, 1] + nx * lumen_normal[i, 2])
+                weight = math.asin(min(abs(along), 1.0)) * 2.0 / math.pi
+                both = min(share, far) if along > 0.0 else max(share + far - 1.0, 0.0)
+                out[p, i] = min(weight * both + (1.0 - weight) * share * far, inner[i])
 
 
 @njit(nogil=True, cache=True, fastmath={"contract", "reassoc", "nsz"})

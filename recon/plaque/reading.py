@@ -56,9 +56,9 @@ class PlaqueReading:
     Attributes:
         grid: of the data.
         presence: probability that there is a plaque body of another value than the fibrous tissue.
-        second_core: probability of one more core, apart from the first; 0 where the first is not certain. Where it is at
-            least :data:`CERTAIN` both are read, the one with more evidence (or at the point) as the core, and
-            ``info["second_core"]`` tells place, mm³ and HU of the other; it has no figures beside its contrast.
+        second_core: probability of one more core, apart from the first; 0 where the first is not certain. From
+            :data:`CERTAIN` on both are read: one (that at the point) as the core, the other's shape is held where it
+            was found, its figure is the ``second contrast``, ``info["second_core"]`` tells its place and mm³.
         third_core: what is said of one more that the data show after that: ``at_mm``, ``volume_mm3``, ``contrast_hu``.
         calcifications: number of calcified bodies.
         figures: name → :class:`recon.plaque.figures.Estimate`; the core's are missing where presence is below
@@ -338,7 +338,9 @@ def _read(
         given[f"calcification {k + 1}"] = Estimate(value, value - 1.96 * sd, value + 1.96 * sd, sd, "HU")
     if other_core is not None:
         i = vessel.size + calcifications
-        sd, value = math.hypot(math.sqrt(fit.covariance[i, i]), tau.sd_of("contrast")), -fit.parameters[i]
+        # The fit holds the other core's shape; its uncertainty is that of the shapes which were found.
+        sd = math.hypot(math.sqrt(fit.covariance[i, i]), tau.sd_of("contrast"), other_core["contrast_sd_hu"])
+        value = -float(fit.parameters[i])
         given["second contrast"] = Estimate(value, value - 1.96 * sd, value + 1.96 * sd, sd, "HU")
     more, found = (0.0, None) if presence < CERTAIN else _one_more(vessel, fit, shares.mean(0), space, particles, rng)
     if found is not None and other_core is None:
@@ -408,9 +410,11 @@ def _one_more(
 
 
 def _core_told(space: CoreSpace, cloud: Cloud, contrast: float, probability: float) -> dict[str, Any]:
-    """Place, size and value of a core that has no figures."""
+    """Place, size and value of a core beside the first."""
+    seen = space.evidence(space.shares(cloud.points))
     return {"probability": probability, "at_mm": cloud.points[:, :3].mean(0).tolist(), "contrast_hu": -contrast,
-            "volume_mm3": float(space.evidence(space.shares(cloud.points)).volume.mean())}  # fmt: skip
+            "contrast_sd_hu": math.sqrt(float(seen.mean.var() + seen.variance.mean())),
+            "volume_mm3": float(seen.volume.mean())}  # fmt: skip
 
 
 def _on_grid(vessel: Vessel, values: Floats, outside: float = 0.0) -> NDArray[np.float32]:
@@ -427,7 +431,8 @@ def _regions(
     soft = fit.bodies[:-1] * np.clip(fit.drawing.shares[1] - fit.drawing.shares[2], 0.0, 1.0)
     outer, inner, lumen, core, *bodies = vessel.voxel_means(np.stack([*fit.drawing.shares, core, *soft], 1)).T
     layer, hard = np.clip(inner - lumen, 0.0, 1.0), sum(bodies[:calcifications], np.zeros(len(core)))
-    rest = layer - np.minimum(core, layer) - sum(bodies, np.zeros(len(core)))
+    core = np.clip(core, 0.0, layer)
+    rest = layer - core - sum(bodies, np.zeros(len(core)))
     parts = {"wall": outer - inner, "fibrous": rest, "lumen": lumen, "core": core}
     if calcifications:
         parts["calcification"] = hard

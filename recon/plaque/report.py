@@ -125,8 +125,8 @@ def save(
 ) -> list[Path]:
     """Write ``report.md``, ``report.json``, ``tissues.nii.gz`` (labels), ``image.nii.gz`` and ``plaque.png``.
 
-    Labels: 0 fat, 1 wall, 2 fibrous, 3 lumen, 4 core, 5 calcification, 6 second core; cores only where they are certain,
-    and no plaque body where none can be told.
+    Labels: 0 fat, 1 wall, 2 fibrous, 3 lumen, 4 core, 5 calcification, 6 second core; cores only where they are
+    certain, and no plaque body where none can be told.
 
     Args:
         reading: to write.

@@ -6,8 +6,8 @@ O, I and L are the shares at each voxel inside the vessel, inside its wall and i
 in the fibrous layer. The wall is of one thickness; a lumen may cross it in the model, so that a layer of no thickness
 is estimated without bias.
 
-A voxel's mean, projected as a box, is averaged twice: a lumen of 2 mm on voxels of 0.2 mm then reads 1 % too much, 5 HU.
-So an outline is drawn as an error function, soft enough for the voxels to hold it without aliasing, and what it and the
+A voxel's mean, projected as a box, is averaged twice: a lumen of 2 mm on voxels of 0.2 mm then reads 5 HU too much. So
+an outline is drawn as an error function, soft enough for the voxels to hold it without aliasing, and what it and the
 operator's box average is taken off again (:func:`recon.plaque.kernels.sharpened`): x is what the operator takes.
 """
 
@@ -25,7 +25,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.special import ndtr
 
 from recon.plaque.centreline import Centreline, Coordinates
-from recon.plaque.data import TissueData
+from recon.plaque.data import BOX, TissueData
 from recon.plaque.kernels import sharpened
 from recon.plaque.local_gram import LocalGram
 from recon.plaque.outline import Outline, OutlineAt
@@ -52,8 +52,6 @@ _BLUR, _BLUR_SD, BLUR_UNIT = 0.2, 1.0, 0.01
 """Variance by which edges are softer than the operator's: focal spot, turning gantry, tissue; in units of 0.01 mm²."""
 SOFT = 0.5
 """Standard deviation of an outline as drawn, in voxels: narrower aliases, wider needs more of what noise hides."""
-_BOX = 1 / 12
-"""Variance of a voxel's box, in squared voxels."""
 _END_SD_MM = (1.0, 0.1, 0.1)
 _FAR = 15.0
 """A step that gains more of the log posterior than this makes the curvature worth computing again."""
@@ -94,7 +92,7 @@ class Drawing:
         image: ``(n,)`` HU above fat, as the operator takes it.
         jacobian: ``(n, parameters)`` float32, of ``image``, HU per unit; None where it was not asked for.
         lumen_distance, inner_distance: ``(n,)`` mm, negative inside.
-        lumen_sd: ``(n,)`` mm, softness of the lumen's outline.
+        lumen_sd: ``(n,)`` mm, softness of the lumen's outline; lumen_normal: ``(n, 3)``.
     """
 
     soft: Floats
@@ -104,6 +102,7 @@ class Drawing:
     lumen_distance: Floats
     inner_distance: Floats
     lumen_sd: Floats
+    lumen_normal: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,7 +177,7 @@ class Vessel:
         self.lookup.ravel()[flat] = np.arange(len(flat))
         self.points = points[flat]
         self.sd = SOFT * np.array(grid.spacing)
-        self.excess = SOFT**2 + (_BOX if data.boxes else 0.0)  # squared voxels, of outline and operator together
+        self.excess = SOFT**2 + data.averaged  # squared voxels, of outline and operator together
         self.outer_at = Coordinates(near.s[flat], near.rho[flat], near.theta[flat], near.frame[flat])
         self.lumen_at = start.lumen.coordinates(self.points)
         low, high = min(low, float(self.lumen_at.s.min())), max(high, float(self.lumen_at.s.max()))
@@ -260,7 +259,7 @@ class Vessel:
 
     def voxel_means(self, soft: Floats) -> Floats:
         """Means over the voxels of ``(n,)`` values that are drawn as softly as outlines."""
-        return np.asarray(self._less(soft, SOFT**2 - _BOX))
+        return np.asarray(self._less(soft, SOFT**2 - BOX))
 
     def _less(self, soft: Any, excess: float) -> Any:
         columns = np.ascontiguousarray(soft).reshape(len(soft), -1)
@@ -330,7 +329,7 @@ class Vessel:
             for k, body in enumerate(bodies):
                 single[:, self.size + k] = body * (shares[1] - shares[2])
             single = self.as_projected(single)
-        return Drawing(soft, shares, self.as_projected(soft), single, lumen_d, outer_d + thickness, lumen_sd)
+        return Drawing(soft, shares, self.as_projected(soft), single, lumen_d, outer_d + thickness, lumen_sd, lumen_n)
 
     # -- fitting -------------------------------------------------------------------------------------------------
 

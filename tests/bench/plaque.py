@@ -75,8 +75,8 @@ CASES = {
 SCANNED = ("paper", "absent_core", "calcification", "half_contrast", "two cores", "one core")
 POINT_SD_MM = 0.4
 TISSUES_HU = {**ROD_HU, "contrast": ROD_HU["fibrous"] - ROD_HU["core"]}
-"""By rods of 4 mm. Least squares over the plaque's true outlines gives the lumen 478.8 HU on voxels of 0.05 mm, 479.9 on
-0.1 mm and 484.9 on 0.2 mm, where each voxel's mean is averaged once more by the projector."""
+"""By rods of 4 mm. Least squares over the plaque's true outlines gives the lumen 478.8 HU on voxels of 0.05 mm, 479.9
+on 0.1 mm and 484.9 on 0.2 mm, where each voxel's mean is averaged once more by the projector."""
 TEXTURE_HU, TEXTURE_MM, SOFT_MM = 10.0, 0.3, 0.12
 _FINER, _POINTS = 2, 3
 """Voxels of a painting along each edge of one of the reader's, and points along each edge of one of those."""
@@ -405,7 +405,8 @@ def text(result: dict[str, Any]) -> str:
             f"[{share['low']:.2f}, {share['high']:.2f}]; "
             f"median P {entry['median_presence']:.3f}, least {entry['least_presence']:.3f}; "
             f"not read {entry['failed']}; "
-            f"calcified {entry['calcified']}; a second core {entry['second_core']}; warned {entry['warned']}; residual {entry['chi2']:.3f}; texture "
+            f"calcified {entry['calcified']}; a second core {entry['second_core']}; "
+            f"warned {entry['warned']}; residual {entry['chi2']:.3f}; texture "
             f"{entry['texture_hu']:.1f} HU; {entry['cpu_seconds']:.1f} CPU s a reading (loaded machine). "
             f"{_contrast(entry)}",
             "",
