@@ -109,13 +109,8 @@ class TissueData:
         if tuple(volume.shape) != tuple(grid.shape):
             raise ValueError(f"volume has shape {tuple(volume.shape)}, its grid {tuple(grid.shape)}")
         gram = StationaryGram(grid, noise_power, transfer)
-        return cls(
-            gram.statistic(volume),
-            gram,
-            1.0,
-            "volume with a stationary noise model",
-            averaged=0.0 if transfer else -BOX,
-        )
+        averaged = -BOX if transfer is None else 0.0
+        return cls(gram.statistic(volume), gram, 1.0, "volume with a stationary noise model", averaged)
 
     def apply(self, x: Tensor) -> Tensor:
         """G x, HU⁻¹, of volumes in HU ``(..., z, y, x)``."""

@@ -176,8 +176,10 @@ class Vessel:
         self.lookup = np.full(grid.shape, -1, np.int64)  # position of each of the grid's voxels in the index
         self.lookup.ravel()[flat] = np.arange(len(flat))
         self.points = points[flat]
-        self.sd = SOFT * np.array(grid.spacing)
-        self.excess = SOFT**2 + data.averaged  # squared voxels, of outline and operator together
+        # Of means over voxels nothing has to be taken off.
+        self._soft = SOFT if data.averaged >= 0.0 else math.sqrt(-data.averaged)
+        self.sd = self._soft * np.array(grid.spacing)
+        self.excess = self._soft**2 + data.averaged  # squared voxels, of outline and operator together
         self.outer_at = Coordinates(near.s[flat], near.rho[flat], near.theta[flat], near.frame[flat])
         self.lumen_at = start.lumen.coordinates(self.points)
         low, high = min(low, float(self.lumen_at.s.min())), max(high, float(self.lumen_at.s.max()))
@@ -259,7 +261,7 @@ class Vessel:
 
     def voxel_means(self, soft: Floats) -> Floats:
         """Means over the voxels of ``(n,)`` values that are drawn as softly as outlines."""
-        return np.asarray(self._less(soft, SOFT**2 - BOX))
+        return np.asarray(self._less(soft, self._soft**2 - BOX))
 
     def _less(self, soft: Any, excess: float) -> Any:
         columns = np.ascontiguousarray(soft).reshape(len(soft), -1)
