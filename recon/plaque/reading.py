@@ -111,7 +111,11 @@ class PlaqueReading:
 
     @property
     def mean_contrast(self) -> float:
-        """Posterior mean of the contrast fibrous − core over a core that is there and one that is not, HU."""
+        """Posterior mean of the contrast fibrous − core over a core that is there and one that is not, HU.
+
+        A contrast among the figures is given where the data prove a core, so rather where noise has enlarged it: on
+        average those are too large. This mean is of every reading.
+        """
         return self.presence * self.given_core["contrast"].value
 
     @property

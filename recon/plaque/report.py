@@ -62,14 +62,14 @@ def table(reading: PlaqueReading, others: Mapping[str, Any] | None = None, devia
         lines.append(" | ".join([f"| {name}", *cells]) + " |")
     for name, why in reading.refused.items():
         lines.append(" | ".join([f"| {name}", f"refused: {why}", *("–" for _ in read)]) + " |")
-    other = reading.info.get("second_core")
-    if other and reading.explained and not reading.taken_off_hu:
-        z, y, x = other["at_mm"]
+    second = reading.info.get("second_core")
+    if second and reading.explained and not reading.taken_off_hu:
+        z, y, x = second["at_mm"]
         lines += [
             "",
-            f"A second core is there with a probability of {other['probability']:.3f}, at ({z:.1f}, {y:.1f}, {x:.1f}) "
-            f"mm (z, y, x), of about {other['volume_mm3']:.1f} mm³. Both were read together; the figures are those of "
-            "the other one, but for the second contrast.",
+            f"A second core is there with a probability of {second['probability']:.3f}, at ({z:.1f}, {y:.1f}, {x:.1f}) "
+            f"mm (z, y, x), of about {second['volume_mm3']:.1f} mm³. Both were read together; the figures are those of "
+            "the first, but for the second contrast.",
         ]
     if reading.explained and not reading.taken_off_hu:
         lines += [

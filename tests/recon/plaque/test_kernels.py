@@ -15,7 +15,7 @@ from recon.plaque.vessel import SOFT, _behind
 
 @pytest.mark.parametrize("radius", [0.9, 1.1, 2.3])
 def test_what_is_taken_off_is_what_drawing_and_projecting_have_averaged(radius):
-    """Chords of a disc by its soft drawing, each value projected as a box; means over voxels are 1 % too narrow."""
+    """Chords of a disc by its soft drawing, each value projected as a box; means over voxels take a higher value."""
     step, count, off = 0.2, 40, 0.03
     at = (np.arange(count) - 19.5) * step
     y, x = np.meshgrid(at, at, indexing="ij")
