@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from recon.plaque.kernels import core_fractions
+from recon.plaque.kernels import core_fractions, sharpened
 from recon.plaque.local_gram import LocalGram
 from recon.plaque.vessel import BLUR, BLUR_UNIT, Fit, Vessel
 from torchpcct.threads import run
@@ -85,16 +85,21 @@ class CoreSpace:
         self.vessel, self.fit, self.prior = vessel, fit, prior
         drawing = fit.drawing
         layer = drawing.shares[1] - drawing.shares[2]
-        inside = (drawing.inner_distance < 0.15) & (drawing.lumen_distance > -0.25) & (drawing.shares[0] > 0)
+        reach = 4.0 * float(vessel.sd.max())  # of soft edges, and of the voxels beside them
+        inside = (drawing.inner_distance < reach) & (drawing.lumen_distance > -reach) & (drawing.shares[0] > 0)
         if prior.point is not None:
             inside &= np.linalg.norm(vessel.points - np.array(prior.point), axis=1) < 3.0
         self.chosen = np.flatnonzero(inside)
         # Where a centre may lie: in the layer, with some of it on both sides.
         deep = (drawing.inner_distance < -0.1) & (drawing.lumen_distance > 0.1) & (layer > 0.3)
+        place = np.full(len(vessel.index) + 1, -1)  # the last one is that of neighbours which are no voxels
+        place[self.chosen] = np.arange(len(self.chosen))
+        self.neighbours = place[vessel.neighbours[self.chosen]]
         self.points = np.ascontiguousarray(vessel.points[self.chosen])
         self.inner = np.ascontiguousarray(drawing.shares[1][self.chosen])
         self.lumen = np.ascontiguousarray(drawing.lumen_distance[self.chosen])
-        self.normals = np.ascontiguousarray(drawing.lumen_normals[self.chosen])
+        self.lumen_normal = np.ascontiguousarray(drawing.lumen_normal[self.chosen])
+        self.lumen_sd = np.ascontiguousarray(drawing.lumen_sd[self.chosen])
         self.blur = BLUR_UNIT * float(fit.parameters[BLUR])
         self.frames = vessel.lumen_at.frame
         self.deep = deep
@@ -191,7 +196,8 @@ class CoreSpace:
         run(
             core_fractions, len(shapes), np.ascontiguousarray(shapes[:, CENTRE]),
             np.ascontiguousarray(self.axes(shapes)), np.exp(shapes[:, AXES]), np.exp(shapes[:, CAP]), self.points,
-            self.vessel.half, self.inner, self.lumen, self.normals, self.blur, out, operations=50 * len(self.points),
+            self.vessel.sd, self.inner, self.lumen, self.lumen_sd, self.lumen_normal, self.blur, out,
+            operations=50 * len(self.points),
         )  # fmt: skip
         return out
 
@@ -199,9 +205,11 @@ class CoreSpace:
 
     def evidence(self, shares: NDArray[np.float32]) -> Evidence:
         """Of bodies ``(m, n)``."""
-        own = self.gram.energies(shares)
-        touched = np.flatnonzero(shares.any(0))
-        near = shares[:, touched]
+        image = np.empty(shares.shape[::-1], np.float32)
+        sharpened(np.ascontiguousarray(shares.T), self.neighbours, self.vessel.excess, image)
+        own = self.gram.energies(image.T)
+        touched = np.flatnonzero(image.any(1))
+        near = image[touched].T
         mixed = (near @ self.curved[touched]).astype(np.float64)
         white = solve_triangular(self.lower, mixed.T, lower=True)
         precision = np.maximum(own - (white**2).sum(0), 1e-3 * own) + self.prior.contrast_sd**-2.0

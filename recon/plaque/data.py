@@ -19,10 +19,12 @@ from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
 from torchpcct.validate import number
 
-__all__ = ["TissueData"]
+__all__ = ["BOX", "TissueData"]
 
 Floats = NDArray[np.float64]
 
+BOX = 1 / 12
+"""Variance of a voxel's box, in squared voxels."""
 _PILOT_SD_MM = 0.25
 _PILOT_STEPS = 4
 _PILOT_FLOOR = 0.02
@@ -38,12 +40,15 @@ class TissueData:
             (:class:`recon.gram.gram.Gram`).
         scale: G in HU⁻² is ``scale`` times ``gram``.
         source: what the data are, for the report.
+        averaged: variance that G averages a value with, in squared voxels: :data:`BOX` where it takes it for that of a
+            whole voxel, as a projector does; 0 of values at centres; −:data:`BOX` where it takes means over voxels.
     """
 
     b: Tensor
     gram: Any
     scale: float
     source: str = "scan"
+    averaged: float = BOX
 
     def __post_init__(self) -> None:
         if self.gram.grid.ndim != 3 or tuple(self.b.shape) != tuple(self.gram.grid.shape):
@@ -95,7 +100,8 @@ class TissueData:
             grid: of the volume.
             noise_power: HU² mm³ at (in-plane, axial) frequencies in line pairs per mm, e.g. from
                 :mod:`torchpcct.metrics.noise_power`.
-            transfer: the method's transfer function at the same; None: 1, then edges read softer than they are.
+            transfer: the method's transfer function at the same; None: the values are means over
+                voxels, no softer; an edge that is softer reads so.
 
         Raises:
             ValueError: another shape than the grid's, noise power that is not finite or nowhere positive.
@@ -103,7 +109,8 @@ class TissueData:
         if tuple(volume.shape) != tuple(grid.shape):
             raise ValueError(f"volume has shape {tuple(volume.shape)}, its grid {tuple(grid.shape)}")
         gram = StationaryGram(grid, noise_power, transfer)
-        return cls(gram.statistic(volume), gram, 1.0, "volume with a stationary noise model")
+        averaged = -BOX if transfer is None else 0.0
+        return cls(gram.statistic(volume), gram, 1.0, "volume with a stationary noise model", averaged)
 
     def apply(self, x: Tensor) -> Tensor:
         """G x, HU⁻¹, of volumes in HU ``(..., z, y, x)``."""

@@ -1,4 +1,4 @@
-"""CPU kernels: the part of a voxel behind an outline, and the Gram operator between chosen voxels."""
+"""CPU kernels: bodies drawn on voxels, an averaging undone, and the Gram operator between chosen voxels."""
 
 from __future__ import annotations
 
@@ -7,96 +7,54 @@ import math
 import numpy as np
 from numba import njit
 
-__all__ = ["core_fractions", "gather_block", "outline_radius", "outline_spread", "plane_fractions", "symmetric_step"]
-
-_LEAST = 0.04
-"""Smallest share of a voxel's edge that an outline's normal sees; the exact formula divides by it."""
+__all__ = ["core_fractions", "gather_block", "outline_radius", "outline_spread", "sharpened", "symmetric_step"]
 
 
 @njit(cache=True)
-def _behind(d, a, b, c):
-    """Share of a box behind a plane at the signed distance d (negative: the centre lies behind), and −d(share)/dd.
+def sharpened(values, neighbours, excess, out):
+    """Take an averaging of variance ``excess`` (along each axis, in squared voxels) off values on voxels.
 
-    The box's half widths along the plane's normal are a, b, c: the share is the distribution function of a sum of three
-    uniform variables.
-    """
-    reach = a + b + c
-    if d >= reach:
-        return 0.0, 0.0
-    if d <= -reach:
-        return 1.0, 0.0
-    t = -d
-    share, slope = 0.0, 0.0
-    for i in range(8):
-        sign, at = 1.0, t
-        if i & 1:
-            at += a
-        else:
-            at -= a
-            sign = -sign
-        if i & 2:
-            at += b
-        else:
-            at -= b
-            sign = -sign
-        if i & 4:
-            at += c
-        else:
-            at -= c
-            sign = -sign
-        if at > 0.0:
-            share += sign * at * at * at
-            slope += sign * at * at
-    volume = 48.0 * a * b * c
-    return min(max(share / volume, 0.0), 1.0), max(3.0 * slope / volume, 0.0)
-
-
-@njit(cache=True)
-def _widened(a, b, c, blur):
-    """Half widths of a box whose variance along the normal, (a² + b² + c²) / 3, has grown by a blur."""
-    own = a * a + b * b + c * c
-    scale = math.sqrt(max(1.0 + 3.0 * blur / own, 0.2))
-    return scale * a, scale * b, scale * c
-
-
-@njit(cache=True)
-def plane_fractions(distance, widths, blur, share, slope):
-    """Share of every voxel behind its plane, and its derivative by −distance.
-
-    A blurred edge is taken for that of a larger voxel, of the variance of voxel and blur along the normal.
+    ``out = values − ½ excess Σ (second difference along each axis)``: the inverse of the averaging to second order in
+    the frequency, and no steeper where the voxels hold nothing any more.
 
     Args:
-        distance: ``(n,)`` mm from the plane to the voxel's centre.
-        widths: ``(n, 3)`` half edges of the voxel times the components of the plane's unit normal, mm, any sign.
-        blur: ``(n,)`` variance of the edge's blur, mm² (negative: sharper than the voxel).
-        share, slope: ``(n,)``, filled.
+        values: ``(n, k)``.
+        neighbours: ``(n, 6)`` positions of the voxels beside each; −1: there the value is 0.
+        out: ``(n, k)``, filled.
     """
-    for i in range(distance.size):
-        a, b, c = _widened(abs(widths[i, 0]), abs(widths[i, 1]), abs(widths[i, 2]), blur[i])
-        least = _LEAST * max(a, b, c)
-        share[i], slope[i] = _behind(distance[i], max(a, least), max(b, least), max(c, least))
+    side, own = out.dtype.type(0.5 * excess), out.dtype.type(1.0 + 3.0 * excess)
+    for i in range(values.shape[0]):
+        row = out[i]
+        for k in range(row.size):
+            row[k] = own * values[i, k]
+        for j in neighbours[i]:
+            if j >= 0:
+                other = values[j]
+                for k in range(row.size):
+                    row[k] -= side * other[k]
 
 
 @njit(nogil=True, cache=True)
-def core_fractions(begin, end, centres, axes, semi, caps, points, half, inner, lumen, normals, blur, out):
-    """Share of every voxel inside each ellipsoid, inside the fibrous layer and farther than a cap from the lumen.
+def core_fractions(begin, end, centres, axes, semi, caps, points, sd, inner, lumen, lumen_sd, lumen_normal, blur, out):
+    """Each ellipsoid inside the fibrous layer and farther than a cap from the lumen, drawn with soft edges.
 
-    Nested outlines that face each other within a voxel are parallel planes there: the part inside of several is the
-    smallest of the shares.
+    Where a body meets the cap the part inside of both is that of two Gaussians whose correlation is the cosine of the
+    angle between the outlines, exact where both halve the voxel; the wall's inner surface is taken for parallel.
 
     Args:
         centres: ``(bodies, 3)`` mm; axes: ``(bodies, 3, 3)`` rows are the unit axes; semi: ``(bodies, 3)`` mm.
         caps: ``(bodies,)`` mm.
-        points: ``(n, 3)`` voxel centres, ordered by z; half: ``(3,)`` half edges of a voxel.
+        points: ``(n, 3)`` voxel centres, ordered by z; sd: ``(3,)`` of the edges along each axis, mm.
         inner: ``(n,)`` share of each voxel inside the wall's inner surface.
-        lumen: ``(n,)`` distance from the lumen, mm; normals: ``(n, 3)`` half edges times the lumen's unit normal.
+        lumen: ``(n,)`` distance from the lumen, mm; lumen_sd: ``(n,)`` of its edge, mm;
+            lumen_normal: ``(n, 3)``.
         blur: variance of the edges' blur in the plane, mm².
         out: ``(bodies, n)``, filled.
     """
     for p in range(begin, end):
         cz, cy, cx = centres[p]
-        largest = max(semi[p, 0], semi[p, 1], semi[p, 2]) + half[0] + half[1] + half[2]
-        flattest = 0.0
+        largest = max(semi[p, 0], semi[p, 1], semi[p, 2]) + 3.0 * max(sd[0], sd[1], sd[2])
+        flattest, short = 0.0, min(semi[p, 0], semi[p, 1], semi[p, 2])
         for k in range(3):
             flattest += 1.0 / semi[p, k] ** 2
         out[p] = 0.0
@@ -116,26 +74,21 @@ def core_fractions(begin, end, centres, axes, semi, caps, points, half, inner, l
                 gx += w * axes[p, k, 2]
             r, g = math.sqrt(f), math.sqrt(q)
             if r < 0.2:
-                share = 1.0
-                if r * g < 1e-9 or (1.0 - r) * r / g < half[0] + half[1] + half[2]:
-                    # Inside a body of a voxel's size: the distance is that along the shortest axis.
-                    short = min(semi[p, 0], semi[p, 1], semi[p, 2])
-                    share = _behind((r - 1.0) * short, half[0], 0.1 * half[1], 0.1 * half[2])[0]
+                # The normal turns within a voxel: the distance is that along the shortest axis.
+                d, variance, nz, ny, nx = (r - 1.0) * short, sd[0] ** 2, 0.0, 0.0, 0.0
             else:
-                # Mean curvature's share of the distance's own average over the voxel.
-                bend = (flattest - q / f) * r / g
-                d = (r - 1.0) * r / g + bend * half[1] * half[1] / 6.0
-                a, b, c = _widened(
-                    abs(gz / g) * half[0], abs(gy / g) * half[1], abs(gx / g) * half[2], blur * (1 - (gz / g) ** 2)
-                )
-                least = _LEAST * max(a, b, c)
-                share = _behind(d, max(a, least), max(b, least), max(c, least))[0]
-            if share > 0.0:
-                flat = blur * (1.0 - (normals[i, 0] / half[0]) ** 2)
-                a, b, c = _widened(abs(normals[i, 0]), abs(normals[i, 1]), abs(normals[i, 2]), flat)
-                least = _LEAST * max(a, b, c)
-                blood = _behind(lumen[i] - caps[p], max(a, least), max(b, least), max(c, least))[0]
-                out[p, i] = max(min(share, inner[i], 1.0 - blood), 0.0)
+                nz, ny, nx = gz / g, gy / g, gx / g
+                variance = (sd[0] * nz) ** 2 + (sd[1] * ny) ** 2 + (sd[2] * nx) ** 2
+                variance = max(variance + blur * (1.0 - nz * nz), 0.2 * variance)
+                # The distance's own average under the blur: half the sum of the curvatures times its variance.
+                d = (r - 1.0) * r / g + 0.5 * (flattest - q / f) * r / g * variance
+            share = 0.5 * math.erfc(d / math.sqrt(2.0 * variance))
+            if share > 1e-4:
+                far = 0.5 * math.erfc((caps[p] - lumen[i]) / (math.sqrt(2.0) * lumen_sd[i]))
+                along = -(nz * lumen_normal[i, 0] + ny * lumen_normal[i, 1] + nx * lumen_normal[i, 2])
+                weight = math.asin(min(abs(along), 1.0)) * 2.0 / math.pi
+                both = min(share, far) if along > 0.0 else max(share + far - 1.0, 0.0)
+                out[p, i] = min(weight * both + (1.0 - weight) * share * far, inner[i])
 
 
 @njit(nogil=True, cache=True, fastmath={"contract", "reassoc", "nsz"})

@@ -42,8 +42,9 @@ _MOST_BODIES = 3
 _BESIDE, _INSIDE = "a second vessel, a branch, muscle", "more plaque bodies, a stent, another shape"
 _ROUNDS = 2
 """Times that what stands beside the vessel is estimated and taken off the data."""
-_APART = 0.2
-"""A second core shares at most so much of its volume with the first."""
+_APART, _WORTH = 0.2, 0.7
+"""A second core shares at most so much of its volume with the first; from this probability on, by a few hundred trials,
+it is looked for with care."""
 _PURE, _FEW, _LESS_PURE = 0.95, 8, 0.8
 """Share of a tissue in voxels that are read in other volumes; where there are too few, the second."""
 
@@ -55,7 +56,10 @@ class PlaqueReading:
     Attributes:
         grid: of the data.
         presence: probability that there is a plaque body of another value than the fibrous tissue.
-        second_core: probability of one more core, apart from the first; 0 where the first is not certain.
+        second_core: probability of one more core, apart from the first; 0 where the first is not certain. From
+            :data:`CERTAIN` on both are read: one (that at the point) as the core, the other's shape is held where it
+            was found, its figure is the ``second contrast``, ``info["second_core"]`` tells its place and mm³.
+        third_core: what is said of one more that the data show after that: ``at_mm``, ``volume_mm3``, ``contrast_hu``.
         calcifications: number of calcified bodies.
         figures: name → :class:`recon.plaque.figures.Estimate`; the core's are missing where presence is below
             :data:`CERTAIN`, those of all plaque bodies where the tissues do not explain the data.
@@ -93,6 +97,7 @@ class PlaqueReading:
     texture_high_hu: float
     info: Mapping[str, Any] = field(default_factory=dict)
     taken_off_hu: float = 0.0
+    third_core: Mapping[str, Any] | None = None
 
     @property
     def explained(self) -> bool:
@@ -106,7 +111,11 @@ class PlaqueReading:
 
     @property
     def mean_contrast(self) -> float:
-        """Posterior mean of the contrast fibrous − core over a core that is there and one that is not, HU."""
+        """Posterior mean of the contrast fibrous − core over a core that is there and one that is not, HU.
+
+        A contrast among the figures is given where the data prove a core, so rather where noise has enlarged it: on
+        average those are too large. This mean is of every reading.
+        """
         return self.presence * self.given_core["contrast"].value
 
     @property
@@ -126,10 +135,13 @@ class PlaqueReading:
                 f"the residual is {self.chi2:.2f} of what noise leaves ({self.chi2_sd:.2f} standard deviation): "
                 "there is something here that the model does not have; do not trust the intervals"
             )
-        if self.second_core >= CERTAIN:
+        if self.third_core is not None:
+            z, y, x = self.third_core["at_mm"]
             found.append(
-                f"a second core is there with a probability of {self.second_core:.2f}: the figures are those of one, "
-                "and the fitted tissues show fibrous tissue in place of the other"
+                f"one more core is there with a probability of {self.third_core['probability']:.2f}, at ({z:.1f}, "
+                f"{y:.1f}, {x:.1f}) mm (z, y, x), of about {self.third_core['volume_mm3']:.1f} mm³ and "
+                f"{self.third_core['contrast_hu']:.0f} HU of contrast: the fitted tissues show fibrous tissue in its "
+                "place; do not trust the intervals"
             )
         return found
 
@@ -291,15 +303,16 @@ def _doubt(presence: float, contrast: Estimate) -> str:
 
 def _read(
     vessel: Vessel, fit: Fit, prior_of_core: CorePrior, particles: int, prior: float, rng: np.random.Generator,
-    seed: int,
+    seed: int, other_core: Mapping[str, Any] | None = None,
 ) -> PlaqueReading:  # fmt: skip
-    calcifications = len(fit.bodies)
+    others = len(fit.bodies)
+    calcifications = others - (other_core is not None)  # the other core is the last of the fit's bodies
     plain = fit
     space = CoreSpace(vessel, fit, prior_of_core)
     cloud = lead(space.draw_prior(particles, rng), space.nothing, space.target, rng)
     first = cloud.log_evidence
     seen = space.evidence(space.shares(cloud.points))
-    if seen.mean.mean() > 0.5 * CALCIFIED_HU and calcifications < _MOST_BODIES:
+    if seen.mean.mean() > 0.5 * CALCIFIED_HU and others < _MOST_BODIES and not other_core:
         # The search with few trial bodies had missed it.
         other = _with_body(vessel, fit, space, cloud, float(seen.mean.mean()), expected=True)
         if other.parameters[-1] > CALCIFIED_HU:
@@ -308,7 +321,7 @@ def _read(
     # with the one that was found; and then the core again.
     without = CoreSpace(vessel, vessel.fit(fit.parameters, fit.bodies), prior_of_core)
     fit = _with_body(vessel, fit, space, cloud, float(seen.mean.mean()))
-    again = CoreSpace(vessel, fit, prior_of_core, replaces=calcifications, against=without.none)
+    again = CoreSpace(vessel, fit, prior_of_core, replaces=others, against=without.none)
     cloud = lead(cloud.points, space.target, again.target, rng, log_evidence=first)
     space = again
     odds = math.log(prior / (1 - prior)) if 0 < prior < 1 else math.copysign(math.inf, prior - 0.5)
@@ -327,15 +340,31 @@ def _read(
         i = vessel.size + k
         sd, value = math.sqrt(fit.covariance[i, i]), fit.parameters[i] + fit.parameters[FIBROUS]
         given[f"calcification {k + 1}"] = Estimate(value, value - 1.96 * sd, value + 1.96 * sd, sd, "HU")
-    second = _second_core(vessel, fit, shares.mean(0), space, rng) if presence >= CERTAIN else 0.0
+    if other_core is not None:
+        i = vessel.size + calcifications
+        # The fit holds the other core's shape; its uncertainty is that of the shapes which were found.
+        sd = math.hypot(math.sqrt(fit.covariance[i, i]), tau.sd_of("contrast"), other_core["contrast_sd_hu"])
+        value = -float(fit.parameters[i])
+        given["second contrast"] = Estimate(value, value - 1.96 * sd, value + 1.96 * sd, sd, "HU")
+    more, found = (0.0, None) if presence < CERTAIN else _one_more(vessel, fit, shares.mean(0), space, particles, rng)
+    if found is not None and other_core is None:
+        where, cloud_there, contrast_there = found
+        told = _core_told(where, cloud_there, contrast_there, more)
+        both = _read(
+            vessel, _with_body(vessel, plain, where, cloud_there, contrast_there, expected=True), prior_of_core,
+            particles, prior, rng, seed, told,
+        )  # fmt: skip
+        if both.presence >= CERTAIN:
+            return both
     reading = PlaqueReading(
-        vessel.grid, presence, second, calcifications, figures, {}, given,
-        _regions(vessel, fit, space, shares, calcifications), _image(vessel, fit), _image(vessel, plain),
+        vessel.grid, presence, more if other_core is None else other_core["probability"], calcifications, figures, {},
+        given, _regions(vessel, fit, space, shares, calcifications), _image(vessel, fit), _image(vessel, plain),
         _on_grid(vessel, _layer(plain)), square, spread, left, tau.sd_hu, tau.high_hu,
         {"particles": particles, "seed": seed, "log_evidence": cloud.log_evidence, "log_evidence_first": first,
          "point": prior_of_core.point, "vessel_prior": asdict(vessel.prior),
          "source": vessel.data.source, "voxels": len(vessel.index),
-         "core_center_mm": cloud.points[:, :3].mean(0).tolist(), "prior": prior},
+         "core_center_mm": cloud.points[:, :3].mean(0).tolist(), "prior": prior, "second_core": other_core},
+        third_core=None if found is None else _core_told(*found, more),
     )  # fmt: skip
     why = "" if reading.explained else "the tissues do not explain the data, see the warning"
     doubt = why or _doubt(presence, given["contrast"])
@@ -348,23 +377,48 @@ def _probability(log_odds: float) -> float:
     return 1.0 / (1.0 + math.exp(-min(max(log_odds, -700.0), 700.0)))
 
 
-def _second_core(
-    vessel: Vessel, fit: Fit, core: NDArray[np.float32], space: CoreSpace, rng: np.random.Generator
-) -> float:
-    """Probability of one more core than the fit has, as likely as none before the data: trials all over the layer.
+def _one_more(
+    vessel: Vessel, fit: Fit, core: NDArray[np.float32], space: CoreSpace, particles: int, rng: np.random.Generator
+) -> tuple[float, tuple[CoreSpace, Cloud, float] | None]:
+    """Probability of one more core than the fit has, as likely as none before the data, anywhere in the layer.
 
-    Trials that overlap the first core count as none: they would mend its shape.
+    Bodies that overlap the first core count as none: they would mend its shape.
+
+    Returns:
+        The probability, and of a certain one its space, its shapes and its contrast δ, HU.
     """
     more = CoreSpace(vessel, fit, CorePrior())
-    shares = more.shares(more.draw_prior(_LOOK, rng))
     first = np.zeros(len(vessel.index), np.float32)
     first[space.chosen] = core
-    volume = shares.sum(1)
-    apart = (volume > 0.0) & (shares @ first[more.chosen] < _APART * volume)
-    log = np.zeros(len(shares))
-    if apart.any():
-        log[apart] = more.evidence(shares[apart]).log
-    return _probability(float(logsumexp(log)) - math.log(len(log)))
+
+    def target(shapes: Floats) -> tuple[Floats, Floats]:
+        prior, log = more.log_prior(shapes), np.zeros(len(shapes))
+        allowed = np.flatnonzero(np.isfinite(prior))
+        shares = more.shares(shapes[allowed])
+        volume = shares.sum(1)
+        apart = (volume > 0.0) & (shares @ first[more.chosen] < _APART * volume)
+        if apart.any():
+            log[allowed[apart]] = more.evidence(shares[apart]).log
+        return prior, log
+
+    tries = more.draw_prior(_LOOK, rng)
+    log = target(tries)[1]
+    probability = _probability(float(logsumexp(log)) - math.log(len(log)))
+    if probability < _WORTH:
+        return probability, None
+    cloud = lead(tries[:particles], more.nothing, target, rng)
+    probability = _probability(cloud.log_evidence)
+    if probability < CERTAIN:
+        return probability, None
+    return probability, (more, cloud, float(more.evidence(more.shares(cloud.points)).mean.mean()))
+
+
+def _core_told(space: CoreSpace, cloud: Cloud, contrast: float, probability: float) -> dict[str, Any]:
+    """Place, size and value of a core beside the first."""
+    seen = space.evidence(space.shares(cloud.points))
+    return {"probability": probability, "at_mm": cloud.points[:, :3].mean(0).tolist(), "contrast_hu": -contrast,
+            "contrast_sd_hu": math.sqrt(float(seen.mean.var() + seen.variance.mean())),
+            "volume_mm3": float(seen.volume.mean())}  # fmt: skip
 
 
 def _on_grid(vessel: Vessel, values: Floats, outside: float = 0.0) -> NDArray[np.float32]:
@@ -376,14 +430,18 @@ def _on_grid(vessel: Vessel, values: Floats, outside: float = 0.0) -> NDArray[np
 def _regions(
     vessel: Vessel, fit: Fit, space: CoreSpace, shares: NDArray[np.float32], calcifications: int
 ) -> dict[str, NDArray[np.float32]]:
-    outer, inner, lumen = fit.drawing.shares
-    layer = np.clip(inner - lumen, 0.0, 1.0)
     core = np.zeros(len(vessel.index))
     core[space.chosen] = shares.mean(0)
-    hard = fit.bodies[:calcifications].sum(0) * layer
-    parts = {"wall": outer - inner, "fibrous": layer - np.minimum(core, layer) - hard, "lumen": lumen, "core": core}
+    soft = fit.bodies[:-1] * np.clip(fit.drawing.shares[1] - fit.drawing.shares[2], 0.0, 1.0)
+    outer, inner, lumen, core, *bodies = vessel.voxel_means(np.stack([*fit.drawing.shares, core, *soft], 1)).T
+    layer, hard = np.clip(inner - lumen, 0.0, 1.0), sum(bodies[:calcifications], np.zeros(len(core)))
+    core = np.clip(core, 0.0, layer)
+    rest = layer - core - sum(bodies, np.zeros(len(core)))
+    parts = {"wall": outer - inner, "fibrous": rest, "lumen": lumen, "core": core}
     if calcifications:
         parts["calcification"] = hard
+    if len(bodies) > calcifications:
+        parts["second core"] = bodies[-1]
     found = {"fat": _on_grid(vessel, 1.0 - outer, 1.0)}
     found |= {name: _on_grid(vessel, np.clip(part, 0.0, 1.0)) for name, part in parts.items()}
     return found
@@ -398,4 +456,4 @@ def _layer(fit: Fit) -> Floats:
 
 def _image(vessel: Vessel, fit: Fit) -> NDArray[np.float32]:
     fat = fit.parameters[FAT]
-    return _on_grid(vessel, fat + fit.drawing.image, fat)
+    return _on_grid(vessel, fat + vessel.voxel_means(fit.drawing.soft), fat)

@@ -18,7 +18,8 @@ from torchpcct.volume import Volume
 
 __all__ = ["picture", "save", "table"]
 
-_COLOURS = {"lumen": "tab:red", "fibrous": "tab:orange", "wall": "tab:blue", "core": "lime", "calcification": "white"}
+_COLOURS = {"lumen": "tab:red", "fibrous": "tab:orange", "wall": "tab:blue", "core": "lime", "calcification": "white",
+            "second core": "lime"}  # fmt: skip
 
 
 Deviations = Mapping[str, Mapping[str, float]]
@@ -61,6 +62,15 @@ def table(reading: PlaqueReading, others: Mapping[str, Any] | None = None, devia
         lines.append(" | ".join([f"| {name}", *cells]) + " |")
     for name, why in reading.refused.items():
         lines.append(" | ".join([f"| {name}", f"refused: {why}", *("–" for _ in read)]) + " |")
+    second = reading.info.get("second_core")
+    if second and reading.explained and not reading.taken_off_hu:
+        z, y, x = second["at_mm"]
+        lines += [
+            "",
+            f"A second core is there with a probability of {second['probability']:.3f}, at ({z:.1f}, {y:.1f}, {x:.1f}) "
+            f"mm (z, y, x), of about {second['volume_mm3']:.1f} mm³. Both were read together; the figures are those of "
+            "the first, but for the second contrast.",
+        ]
     if reading.explained and not reading.taken_off_hu:
         lines += [
             "",
@@ -83,7 +93,7 @@ def table(reading: PlaqueReading, others: Mapping[str, Any] | None = None, devia
 def _hidden(reading: PlaqueReading) -> set[str]:
     """Plaque bodies that a reading must not show: fibrous tissue in their place."""
     told = reading.explained and not reading.taken_off_hu
-    return (set() if told else {"calcification"}) | (set() if reading.certain else {"core"})
+    return (set() if told else {"calcification"}) | (set() if reading.certain else {"core", "second core"})
 
 
 def picture(reading: PlaqueReading, others: Mapping[str, Any] | None = None) -> Any:
@@ -115,8 +125,8 @@ def save(
 ) -> list[Path]:
     """Write ``report.md``, ``report.json``, ``tissues.nii.gz`` (labels), ``image.nii.gz`` and ``plaque.png``.
 
-    Labels: 0 fat, 1 wall, 2 fibrous, 3 lumen, 4 core, 5 calcification; the core only where it is certain, and no
-    plaque body where none can be told.
+    Labels: 0 fat, 1 wall, 2 fibrous, 3 lumen, 4 core, 5 calcification, 6 second core; cores only where they are
+    certain, and no plaque body where none can be told.
 
     Args:
         reading: to write.
@@ -124,7 +134,7 @@ def save(
         others, deviations: as for :func:`table`.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    names = ["fat", "wall", "fibrous", "lumen", "core", "calcification"]
+    names = ["fat", "wall", "fibrous", "lumen", "core", "calcification", "second core"]
     shares = [reading.regions.get(n, np.zeros(reading.grid.shape, np.float32)) for n in names]
     for k in (names.index(name) for name in _hidden(reading)):
         shares[2], shares[k] = shares[2] + shares[k], 0 * shares[k]
@@ -132,6 +142,7 @@ def save(
     data = {
         "presence": reading.presence,
         "second_core": reading.second_core,
+        "third_core": reading.third_core,
         "explained": reading.explained,
         "mean_contrast_hu": reading.mean_contrast,
         "calcifications": reading.calcifications,

@@ -2,9 +2,13 @@
 
     x = fat + (wall − fat) O + (fibrous − wall) I + (lumen − fibrous) L + Σ δ_k B_k
 
-O, I and L are the shares of each voxel inside the vessel, inside its wall and in the lumen, B_k those of plaque bodies
-in the fibrous layer. An outline is a plane within a voxel, whose share is exact (:mod:`recon.plaque.kernels`). The wall
-is of one thickness; a lumen may cross it in the model, so that a layer of no thickness is estimated without bias.
+O, I and L are the shares at each voxel inside the vessel, inside its wall and in the lumen, B_k those of plaque bodies
+in the fibrous layer. The wall is of one thickness; a lumen may cross it in the model, so that a layer of no thickness
+is estimated without bias.
+
+A voxel's mean, projected as a box, is averaged twice: a lumen of 2 mm on voxels of 0.2 mm then reads 5 HU too much. So
+an outline is drawn as an error function, soft enough for the voxels to hold it without aliasing, and what it and the
+operator's box average is taken off again (:func:`recon.plaque.kernels.sharpened`): x is what the operator takes.
 """
 
 from __future__ import annotations
@@ -18,10 +22,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
+from scipy.special import ndtr
 
 from recon.plaque.centreline import Centreline, Coordinates
-from recon.plaque.data import TissueData
-from recon.plaque.kernels import plane_fractions
+from recon.plaque.data import BOX, TissueData
+from recon.plaque.kernels import sharpened
 from recon.plaque.local_gram import LocalGram
 from recon.plaque.outline import Outline, OutlineAt
 from recon.plaque.vessel_prior import VesselPrior
@@ -45,8 +50,8 @@ be taken for a bulge of it, and leave no trace."""
 _WALL_MM, _WALL_LOG_SD = 0.2, 0.2
 _BLUR, _BLUR_SD, BLUR_UNIT = 0.2, 1.0, 0.01
 """Variance by which edges are softer than the operator's: focal spot, turning gantry, tissue; in units of 0.01 mm²."""
-_DIFFERENCE = 0.02
-"""Of the blur, for its derivative."""
+SOFT = 0.5
+"""Standard deviation of an outline as drawn, in voxels: narrower aliases, wider needs more of what noise hides."""
 _END_SD_MM = (1.0, 0.1, 0.1)
 _FAR = 15.0
 """A step that gains more of the log posterior than this makes the curvature worth computing again."""
@@ -83,19 +88,21 @@ class Drawing:
     """A vessel drawn on its voxels.
 
     Attributes:
-        image: ``(n,)`` HU above fat.
-        shares: ``(3, n)`` outer, inner, lumen.
-        jacobian: ``(n, parameters)`` float32, HU per unit; None where it was not asked for.
+        soft: ``(n,)`` HU above fat, outlines of :data:`SOFT`; shares: ``(3, n)`` outer, inner, lumen, likewise.
+        image: ``(n,)`` HU above fat, as the operator takes it.
+        jacobian: ``(n, parameters)`` float32, of ``image``, HU per unit; None where it was not asked for.
         lumen_distance, inner_distance: ``(n,)`` mm, negative inside.
-        lumen_normals: ``(n, 3)`` half edges of a voxel times the lumen's normal, mm.
+        lumen_sd: ``(n,)`` mm, softness of the lumen's outline; lumen_normal: ``(n, 3)``.
     """
 
-    image: Floats
+    soft: Floats
     shares: Floats
+    image: Floats
     jacobian: NDArray[np.float32] | None
     lumen_distance: Floats
     inner_distance: Floats
-    lumen_normals: Floats
+    lumen_sd: Floats
+    lumen_normal: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,6 +144,13 @@ class Fit:
         return np.asarray(cho_solve(self.factor, np.eye(len(self.parameters))))
 
 
+def _behind(distance: Floats, variance: Floats) -> tuple[Floats, Floats]:
+    """Share behind a soft edge at a signed distance (negative: behind), and its derivative by −distance."""
+    sd = np.sqrt(variance)
+    t = distance / sd
+    return np.asarray(ndtr(-t)), np.exp(-0.5 * t * t) / (math.sqrt(2.0 * math.pi) * sd)
+
+
 class Vessel:
     """The model of one vessel and its data.
 
@@ -162,7 +176,10 @@ class Vessel:
         self.lookup = np.full(grid.shape, -1, np.int64)  # position of each of the grid's voxels in the index
         self.lookup.ravel()[flat] = np.arange(len(flat))
         self.points = points[flat]
-        self.half = np.array(grid.spacing) / 2
+        # Of means over voxels nothing has to be taken off.
+        self._soft = SOFT if data.averaged >= 0.0 else math.sqrt(-data.averaged)
+        self.sd = self._soft * np.array(grid.spacing)
+        self.excess = self._soft**2 + data.averaged  # squared voxels, of outline and operator together
         self.outer_at = Coordinates(near.s[flat], near.rho[flat], near.theta[flat], near.frame[flat])
         self.lumen_at = start.lumen.coordinates(self.points)
         low, high = min(low, float(self.lumen_at.s.min())), max(high, float(self.lumen_at.s.max()))
@@ -178,6 +195,10 @@ class Vessel:
         self.b = data.b.double().numpy()[tuple(self.index.T)]
         self.b_sum = float(data.b.double().sum())
         self._prior_mean, self._prior = self._prior_of()
+        # Beyond the rim of the volume it goes on as it ends, elsewhere there is fat beside the vessel's voxels.
+        beside = np.pad(self.lookup, 1, mode="edge")
+        steps = np.concatenate([np.eye(3, dtype=int), -np.eye(3, dtype=int)])
+        self.neighbours = np.stack([beside[tuple((self.index + 1 + step).T)] for step in steps], 1)
 
     body_precision = _BODY_SD**-2.0
 
@@ -234,15 +255,27 @@ class Vessel:
 
     # -- drawing -------------------------------------------------------------------------------------------------
 
-    def _distance(self, at: OutlineAt, c: Coordinates, shape: Floats) -> tuple[Floats, Floats, Floats]:
-        """Signed distance, half edges times the normal, and the change of the distance per change of the radius."""
+    def as_projected(self, soft: Any) -> Any:
+        """What the operator must be given of ``(n,)`` or ``(n, k)`` values that are drawn as softly as outlines."""
+        return self._less(soft, self.excess)
+
+    def voxel_means(self, soft: Floats) -> Floats:
+        """Means over the voxels of ``(n,)`` values that are drawn as softly as outlines."""
+        return np.asarray(self._less(soft, self._soft**2 - BOX))
+
+    def _less(self, soft: Any, excess: float) -> Any:
+        columns = np.ascontiguousarray(soft).reshape(len(soft), -1)
+        out = np.empty_like(columns)
+        sharpened(columns, self.neighbours, excess, out)
+        return out.reshape(soft.shape)
+
+    def _distance(self, at: OutlineAt, c: Coordinates, shape: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+        """Signed distance, unit normal, change of the distance per change of the radius, and half the curvature."""
         r, turn, slope = at.radius(shape)
         around = turn / np.maximum(c.rho, 0.3 * np.abs(r) + 0.05)
         length = np.sqrt(1 + around**2 + slope**2)
         normal = (c.frame[:, 0] - around[:, None] * c.frame[:, 1] - slope[:, None] * c.frame[:, 2]) / length[:, None]
-        # The distance's own mean over a voxel: its Laplacian is about one over the radius.
-        bend = np.mean(self.half**2) / 6.0 / np.maximum(np.abs(r), 0.2)
-        return (c.rho - r) / length + bend, normal * self.half, 1.0 / length
+        return (c.rho - r) / length, normal, 1.0 / length, 0.5 / np.maximum(np.abs(r), 0.2)
 
     def draw(self, parameters: Floats, bodies: Floats, *, jacobian: bool = True) -> Drawing:
         """The vessel with parameters ``(p,)`` and bodies ``(k, n)``, shares of the fibrous layer."""
@@ -250,28 +283,36 @@ class Vessel:
         thickness = math.exp(parameters[THICKNESS])
         contrasts = parameters[self.size :]
         n = len(self.index)
-        lumen_d, lumen_w, lumen_rate = self._distance(self._lumen, self.lumen_at, self.lumen_shape(parameters))
-        outer_d, outer_w, outer_rate = self._distance(self._outer, self.outer_at, self.outer_shape(parameters))
-        share, slope = np.empty((3, n)), np.empty((3, n))
-        blur, softer = BLUR_UNIT * parameters[BLUR], np.empty((3, n))
-        spare = np.empty(n)
-        for k, (d, w) in enumerate(((outer_d, outer_w), (outer_d + thickness, outer_w), (lumen_d, lumen_w))):
+        lumen_d, lumen_n, lumen_rate, lumen_bend = self._distance(
+            self._lumen, self.lumen_at, self.lumen_shape(parameters)
+        )
+        outer_d, outer_n, outer_rate, outer_bend = self._distance(
+            self._outer, self.outer_at, self.outer_shape(parameters)
+        )
+        share, slope, softer = np.empty((3, n)), np.empty((3, n)), np.empty((3, n))
+        outlines = (
+            (outer_d, outer_n, outer_bend), (outer_d + thickness, outer_n, outer_bend), (lumen_d, lumen_n, lumen_bend),
+        )  # fmt: skip
+        for k, (d, normal, bend) in enumerate(outlines):
             # Focal spot and gantry blur in the plane, not along z.
-            flat = 1.0 - (w[:, 0] / self.half[0]) ** 2
-            plane_fractions(d, w, blur * flat, share[k], slope[k])
-            if jacobian:
-                plane_fractions(d, w, (blur + BLUR_UNIT * _DIFFERENCE) * flat, softer[k], spare)
+            own, flat = (normal**2) @ self.sd**2, 1.0 - normal[:, 0] ** 2
+            variance = np.maximum(own + BLUR_UNIT * parameters[BLUR] * flat, 0.2 * own)
+            # A bent outline's mean distance grows with the blur.
+            mean = d + bend * variance
+            share[k], slope[k] = _behind(mean, variance)
+            softer[k] = slope[k] * (0.5 * mean / variance - bend) * flat * BLUR_UNIT * (variance > 0.2 * own)
+        lumen_d, lumen_sd = mean, np.sqrt(variance)
         end_share, end_slope = np.ones((2, n)), np.zeros((2, n))
-        along = self.lumen_at.frame[:, 2] * self.half
+        along = (self.lumen_at.frame[:, 2] ** 2) @ self.sd**2
         for k, sign in enumerate((1.0, -1.0)):
             if math.isfinite(self.start.ends[k]):
                 plane = self._planes @ parameters[ENDS + 3 * k : ENDS + 3 * k + 3]
-                plane_fractions(sign * (plane - self.lumen_at.s), along, np.zeros(n), end_share[k], end_slope[k])
+                end_share[k], end_slope[k] = _behind(sign * (plane - self.lumen_at.s), along)
         inside = end_share.prod(0)
         mixed = contrasts @ bodies if len(contrasts) else np.zeros(n)
         steps = np.stack([np.full(n, wall - fat), fibrous - wall + mixed, blood - fibrous - mixed])
         whole = (steps * share).sum(0)
-        image = inside * whole
+        soft = inside * whole
         shares = share * inside
         single = None
         if jacobian:
@@ -281,7 +322,7 @@ class Vessel:
             single[:, FIBROUS] = shares[1] - shares[2]
             single[:, LUMEN] = shares[2]
             single[:, THICKNESS] = -inside * steps[1] * slope[1] * thickness
-            single[:, BLUR] = inside * (steps * (softer - share)).sum(0) / _DIFFERENCE
+            single[:, BLUR] = inside * (steps * softer).sum(0)
             single[:, ENDS : ENDS + 3] = (-whole * end_slope[0] * end_share[1])[:, None] * self._planes
             single[:, ENDS + 3 : ENDS + 6] = (whole * end_slope[1] * end_share[0])[:, None] * self._planes
             self._lumen.spread(inside * steps[2] * slope[2] * lumen_rate, single[:, self.lumen_part])
@@ -289,7 +330,8 @@ class Vessel:
             self._outer.spread(outward, single[:, self.outer_part])
             for k, body in enumerate(bodies):
                 single[:, self.size + k] = body * (shares[1] - shares[2])
-        return Drawing(image, shares, single, lumen_d, outer_d + thickness, lumen_w)
+            single = self.as_projected(single)
+        return Drawing(soft, shares, self.as_projected(soft), single, lumen_d, outer_d + thickness, lumen_sd, lumen_n)
 
     # -- fitting -------------------------------------------------------------------------------------------------
 

@@ -315,8 +315,10 @@ FAULTS = (
           _PQ + "test_a_second_vessel_apart_is_taken_off_the_data"),
     Fault("lumens without contrast agent are read", "recon/plaque/start.py", "_LEAST_LUMEN_HU = 180.0",
           "_LEAST_LUMEN_HU = 0.0", _PQ + "test_what_is_no_enhanced_vessel_is_refused_in_words"),
-    Fault("a second core is painted over", _READ, "if self.second_core >= CERTAIN:", "if False:",
-          _PQ + "test_a_second_core_is_said"),
+    Fault("a second core is painted over", _READ, "if found is not None and other_core is None:", "if False:",
+          _PQ + "test_a_second_core_is_read_beside_the_first"),
+    Fault("what projecting averages stays in a lumen", "recon/plaque/kernels.py", "0.5 * excess", "0.25 * excess",
+          "tests/recon/plaque/test_kernels.py::test_what_is_taken_off_is_what_drawing_and_projecting_have_averaged"),
     Fault("noise of a residual by the wrong power", "recon/plaque/data.py", "(pairs * passed**2 * spectrum)",
           "(pairs * passed * spectrum)", _PQ + "test_noise_alone_is_not_striking_anywhere_in_the_volume"),
 )  # fmt: skip

@@ -4,8 +4,9 @@
 
 Every draw is a noisy scan of the paper's scene (1968 views, drawn readings), read blind or from a point that misses the
 core's centre by 0.4 mm (standard deviation, each axis); the scene without its core is read blind. FBP is that of the
-same readings. What the model does not have (texture, soft edges, a calcification) and the held-out plaques of training
-(``train.scenes.held_out``) are drawn through the operator, without readings. Finished draws in the work folder are
+same readings. A calcification, half the contrast and two cores are scans of analytic bodies, too. Texture, soft edges
+and the held-out plaques of training (``train.scenes.held_out``) are painted on voxels of half the reader's size and
+projected exactly; their noise is drawn by the operator. Finished draws in the work folder are
 kept: after an interruption the same command goes on; ``--summary`` tells what there is, ``--mbir`` reads MBIR of the
 package's weights over the regions of the finished draws. True values are those of rods of each tissue at the plaque's
 place (least squares on noise-free readings), areas and volumes those of the scene.
@@ -37,9 +38,12 @@ from torchpcct.acquisition.acquire import acquire
 from torchpcct.files import written_whole
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.plaque_measures import cap_on_line, lumen_area
+from torchpcct.projector import Projector
 from torchpcct.scan import Scan
 from torchpcct.scanner import presets
-from torchpcct.scene.plaque import plaque_scene, plaque_variant
+from torchpcct.scene import Body, Scene
+from torchpcct.scene.bodies import Ellipsoid
+from torchpcct.scene.plaque import Plaque, plaque_scene, plaque_variant
 from train.scenes.held_out import validation_scenes
 
 
@@ -61,30 +65,46 @@ CASES = {
     "0.35 s, with a point": Case("paper", 0.35, True),
     "0.35 s, blind": Case("paper", 0.35, False),
     "2.0 s, held-out plaques, with a point": Case("held out", 2.0, True),
-    "2.0 s, texture of 10 HU, with a point": Case("texture", 2.0, True, 4),
-    "2.0 s, soft edges, with a point": Case("soft edges", 2.0, True, 4),
-    "2.0 s, calcification, with a point": Case("calcification", 2.0, True, 4),
-    "2.0 s, half contrast, with a point": Case("half contrast", 2.0, True, 4),
+    "2.0 s, texture of 10 HU, with a point": Case("texture", 2.0, True, 2),
+    "2.0 s, soft edges, with a point": Case("soft edges", 2.0, True, 2),
+    "2.0 s, calcification, with a point": Case("calcification", 2.0, True, 2),
+    "2.0 s, half contrast, with a point": Case("half_contrast", 2.0, True, 2),
+    "2.0 s, two cores, blind": Case("two cores", 2.0, False, 2),
+    "2.0 s, one of the two cores, with a point": Case("one core", 2.0, True, 2),
 }
+SCANNED = ("paper", "absent_core", "calcification", "half_contrast", "two cores", "one core")
 POINT_SD_MM = 0.4
 TISSUES_HU = {**ROD_HU, "contrast": ROD_HU["fibrous"] - ROD_HU["core"]}
-"""By rods of 4 mm. Blood with iodine hardens its own beam: least squares with exact path
-lengths gives the narrower lumen 484.7 HU in the plaque (``notebooks/fbp_vs_mbir.ipynb``), where readings of scans
-find 485.0; of what is drawn through the operator they find the 480.0 that were drawn."""
-TEXTURE_HU, TEXTURE_MM, SOFT_MM, CALCIFICATION_HU = 10.0, 0.3, 0.12, 1500.0
-_FINE = 5
-"""Points along each edge of a voxel, where a scene is drawn through the operator."""
+"""By rods of 4 mm. Least squares over the plaque's true outlines gives the lumen 478.8 HU on voxels of 0.05 mm, 479.9
+on 0.1 mm and 484.9 on 0.2 mm, where each voxel's mean is averaged once more by the projector."""
+TEXTURE_HU, TEXTURE_MM, SOFT_MM = 10.0, 0.3, 0.12
+_FINER, _POINTS = 2, 3
+"""Voxels of a painting along each edge of one of the reader's, and points along each edge of one of those."""
 PLAQUE_ONLY = ("core", "contrast", "core volume", "cap thickness")
 FBP_PAPER_SD_HU = 28.2
 """Of soft FBP's contrast in the paper's ROIs at 2.0 s, exact."""
 
 
-def truth(**changed: float) -> dict[str, float]:
+def truth(plaque: Plaque, **changed: float) -> dict[str, float]:
     """Of every figure, in its unit."""
-    _, plaque = plaque_scene()
     volume = 4 / 3 * np.pi * float(np.prod(plaque.core.semi_axes))
-    return {**TISSUES_HU, "wall thickness": plaque.wall_thickness, "lumen area": float(plaque.area("lumen", 0.0)),
-            "core volume": volume, "cap thickness": plaque.cap_thickness, **changed}  # fmt: skip
+    return {**TISSUES_HU, "wall thickness": plaque.wall_thickness,
+            "lumen area": float(plaque.area("lumen", plaque.core_center[2])), "core volume": volume,
+            "cap thickness": plaque.minimum_cap, **changed}  # fmt: skip
+
+
+def scene_of(name: str) -> tuple[Scene, Plaque]:
+    """What is scanned; two cores lie 3.2 mm apart along the vessel, 1.9 mm³ each."""
+    if name not in ("two cores", "one core"):
+        return plaque_variant(name)
+    long = Plaque(bulge_length=12.0, core_semi_axes=(0.5, 0.95, 0.95))
+    middle, _, radius, _ = (float(v) for v in long.section("lumen", 1.6))
+    x = middle + radius + 0.2 + 0.5
+    scene, plaque = plaque_scene(long, core_shift=(x - long.core_center[0], 0.0, -1.6))
+    if name == "two cores":
+        other = Ellipsoid(long.core_semi_axes, position=tuple(plaque.to_scanner((x, 0.0, 1.6))))
+        scene = scene.add(Body("core2", other, "necrotic_core", "fibrous"))
+    return scene, plaque
 
 
 class Draws:
@@ -96,6 +116,7 @@ class Draws:
         self._clean: dict[str, Scan] = {}
         self._problem: InsetProblem | None = None
         self._fbp: InsetFbp | None = None
+        self._exact: Projector | None = None
         self._tissues: dict[str, Any] = {}
 
     @property
@@ -108,12 +129,18 @@ class Draws:
     def clean(self, name: str) -> Scan:
         """The noise-free scan, from a folder or simulated."""
         if name not in self._clean:
-            path = None if self.scans is None else self.scans / f"{name}_1968.h5"
+            path = None if self.scans is None else self.scans / f"{_stem(name)}_1968.h5"
             known = path is not None and path.exists()
             self._clean[name] = Scan.load(path) if known else acquire(
-                plaque_variant(name)[0], presets.pcct(), region=self.grid
+                scene_of(name)[0], presets.pcct(), region=self.grid
             )  # fmt: skip
         return self._clean[name]
+
+    @property
+    def fine(self) -> VolumeGrid:
+        """Of what is painted."""
+        return VolumeGrid(tuple(_FINER * n for n in self.grid.shape), tuple(s / _FINER for s in self.grid.spacing),
+                          self.grid.center)  # fmt: skip
 
     def drawn(self, name: str, exposure_s: float, k: int) -> tuple[torch.Tensor, torch.Tensor | None]:
         """Statistic AᵀW y and soft FBP of a noisy scan; of what is drawn through the operator, no FBP."""
@@ -121,17 +148,21 @@ class Draws:
         if path.exists():
             with np.load(path) as kept:
                 return torch.from_numpy(kept["b"]), torch.from_numpy(kept["fbp"]) if "fbp" in kept else None
-        if name in ("paper", "absent_core"):
+        if name in SCANNED:
             scan = self.clean(name).with_noise(exposure_s, k)
-            if self._fbp is None:
-                self._fbp = InsetFbp(self.clean("paper"), [self.grid], ["soft"])
-            b = self.problem.statistic(scan).b
-            found = {"b": b.numpy(), "fbp": self._fbp(scan)[0][0].numpy()}
+            found = {"b": self.problem.statistic(scan).b.numpy()}
+            if name in ("paper", "absent_core"):
+                if self._fbp is None:
+                    self._fbp = InsetFbp(self.clean("paper"), [self.grid], ["soft"])
+                found["fbp"] = self._fbp(scan)[0][0].numpy()
         else:
             image = self._held_out(k)[0] if name == "held out" else self._image(name, k)
             gram, hu = self.problem.gram.scaled(exposure_s), self.problem.mu_ref / 1000.0
             above = image * hu + self.problem.mu_ref - self.problem.level
-            b = gram.apply(above) + gram.noise(generator=torch.Generator().manual_seed(k))
+            if self._exact is None:
+                self._exact = Projector(self.problem.geometry, self.fine, self.problem.window)
+            seen = self.problem.projector.T(self.problem.weights * exposure_s * self._exact(above))
+            b = seen + gram.noise(generator=torch.Generator().manual_seed(k))
             found = {"b": b.numpy()}
         with written_whole(path) as part, part.open("wb") as file:
             np.savez(file, **found)
@@ -145,13 +176,13 @@ class Draws:
             return
         b, fbp = self.drawn(what.scene, what.exposure_s, k)
         data = TissueData.of_statistic(b, self.problem, what.exposure_s)
-        plaque = plaque_scene()[1]
+        plaque = scene_of(what.scene)[1] if what.scene in SCANNED else plaque_scene()[1]
         seeds = np.array(plaque.to_scanner([plaque.section("lumen", 0.0)[0], 0.0, 0.0]))[::-1]
-        centre, true = np.array(plaque.to_scanner(plaque.core_center))[::-1], truth()
+        centre, true = np.array(plaque.to_scanner(plaque.core_center))[::-1], truth(plaque)
         if what.scene == "held out":
             _, centre, true = self._held_out(k)
-        elif what.scene == "half contrast":
-            true = truth(contrast=31.08, core=72.14)
+        elif what.scene == "half_contrast":
+            true = truth(plaque, contrast=31.08, core=72.14)
         point = centre + POINT_SD_MM * np.random.default_rng(k).standard_normal(3) if what.pointed else None
         start, cpu = time.perf_counter(), time.process_time()
         try:
@@ -164,6 +195,9 @@ class Draws:
                 "figures": {n: e.as_dict() for n, e in {**reading.figures, **reading.given_core}.items()},
                 "truth": true,
                 "calcifications": reading.calcifications,
+                "mean_contrast": reading.mean_contrast,
+                "second_core": reading.second_core,
+                "third_core": reading.third_core is not None,
                 "warnings": len(reading.warnings),
                 "left": reading.left.score,
                 "chi2": reading.chi2,
@@ -200,46 +234,36 @@ class Draws:
 
     def _held_out(self, k: int) -> tuple[torch.Tensor, Any, dict[str, float]]:
         """The k-th plaque of the family, its core's centre and true values."""
-        scenes = validation_scenes(self.grid.shape, self.grid.spacing, seed=k // 8, contrasts=(-60.0,))
+        scenes = validation_scenes(self.fine.shape, self.fine.spacing, seed=k // 8, contrasts=(-60.0,))
         image, core, vessel = scenes.image[k % 8, 0], scenes.core[k % 8].double(), scenes.scenes[k % 8].vessels[0]
-        axes = [torch.from_numpy(a) for a in self.grid.axes]
+        axes = [torch.from_numpy(a) for a in self.fine.axes]
         total = float(core.sum())
         centre = [float((core.sum([i for i in range(3) if i != d]) * axes[d]).sum()) / total for d in range(3)]
         true = {"fat": scenes.scenes[k % 8].background, "wall": vessel.wall_hu, "fibrous": vessel.fibrous_hu,
                 "lumen": vessel.lumen_hu, "core": vessel.fibrous_hu - 60.0, "contrast": 60.0,
                 "wall thickness": vessel.wall, "lumen area": np.pi * vessel.lumen_radius**2 * vessel.lumen_aspect,
-                "core volume": total * float(np.prod(self.grid.spacing))}  # fmt: skip
+                "core volume": total * float(np.prod(self.fine.spacing))}  # fmt: skip
         return image, np.array(centre), true
 
     def _image(self, name: str, k: int) -> torch.Tensor:
-        """The paper's plaque with what the model does not have, HU averaged over voxels."""
+        """The paper's plaque with what the model does not have, HU on the fine grid."""
         if not self._tissues:
-            scene, plaque = plaque_scene()
-            fine = VolumeGrid(tuple(_FINE * n for n in self.grid.shape),
-                              tuple(s / _FINE for s in self.grid.spacing), self.grid.center)  # fmt: skip
-            labels = np.asarray(scene.labels(fine))
+            scene, _ = plaque_scene()
+            points = VolumeGrid(tuple(_POINTS * n for n in self.fine.shape),
+                                tuple(s / _POINTS for s in self.fine.spacing), self.fine.center)  # fmt: skip
+            labels = np.asarray(scene.labels(points))
             values = np.full(labels.shape, TISSUES_HU["fat"], np.float32)
             for tissue in ("wall", "fibrous", "lumen", "core"):
                 values[labels == scene.index(tissue)] = TISSUES_HU[tissue]
-            hard = values.copy()
-            z, y, x = np.meshgrid(*(a for a in fine.axes), indexing="ij", sparse=True)
-            at = np.array(plaque.to_scanner((0.75, 1.1, 0.0)))[::-1]
-            body = sum(((v - c) / s) ** 2 for v, c, s in zip((z, y, x), at, (0.6, 0.2, 0.25), strict=True)) < 1
-            hard[body & (labels == scene.index("fibrous"))] = CALCIFICATION_HU
-            half = values.copy()
-            half[labels == scene.index("core")] += TISSUES_HU["contrast"] / 2
-            sd = [SOFT_MM / s for s in fine.spacing]
-            soft = ndimage.gaussian_filter(values, sd, mode="nearest")
-            shape = [n for size in self.grid.shape for n in (size, _FINE)]
-            tissue = (labels == scene.index("wall")) | (labels == scene.index("fibrous"))
-            tissue |= labels == scene.index("core")
-            named = {"calcification": hard, "half contrast": half, "soft edges": soft, "texture": values,
-                     "tissue": tissue.astype(np.float32)}  # fmt: skip
-            self._tissues = {n: torch.from_numpy(v.reshape(shape).mean((1, 3, 5))) for n, v in named.items()}
+            soft = ndimage.gaussian_filter(values, [SOFT_MM / s for s in points.spacing], mode="nearest")
+            tissue = np.isin(labels, [scene.index(name) for name in ("wall", "fibrous", "core")]).astype(np.float32)
+            shape = [n for size in self.fine.shape for n in (size, _POINTS)]
+            self._tissues = {n: torch.from_numpy(v.reshape(shape).mean((1, 3, 5))).float() for n, v in
+                             {"soft edges": soft, "texture": values, "tissue": tissue}.items()}  # fmt: skip
         if name != "texture":
-            return self._tissues[name].float()
-        sd = [TEXTURE_MM / np.sqrt(2) / s for s in self.grid.spacing]
-        rough = ndimage.gaussian_filter(np.random.default_rng(k).standard_normal(self.grid.shape), sd, mode="wrap")
+            return self._tissues[name]
+        sd = [TEXTURE_MM / np.sqrt(2) / s for s in self.fine.spacing]
+        rough = ndimage.gaussian_filter(np.random.default_rng(k).standard_normal(self.fine.shape), sd, mode="wrap")
         rough *= TEXTURE_HU / rough.std()
         return (self._tissues["texture"] + torch.from_numpy(rough) * self._tissues["tissue"]).float()
 
@@ -274,6 +298,8 @@ def summary(work: Path) -> dict[str, Any]:
             "median_presence": float(np.median(presence)),
             "least_presence": float(presence.min()),
             "warned": sum(bool(d.get("warnings")) for d in read),
+            "second_core": sum(d["second_core"] >= CERTAIN for d in read),
+            "mean_contrast": float(np.mean([d["mean_contrast"] for d in read])),
             "calcified": sum(d.get("calcifications", 0) > 0 for d in read),
             "chi2": float(np.mean([d["chi2"] for d in read])),
             "texture_hu": float(np.mean([d["texture_hu"] for d in read])),
@@ -346,7 +372,8 @@ def _spread(values: Any, true: Any) -> dict[str, Any]:
 def _contrast(entry: dict[str, Any]) -> str:
     """What a user is given of the contrast, and how much of a true one is read."""
     if "given" not in entry:
-        return f"Contrast if there were one: {entry['contrast_if_there']:+.1f} HU."
+        return (f"Contrast if there were one: {entry['contrast_if_there']:+.1f} HU; over a core that is there and one "
+                f"that is not: {entry['mean_contrast']:+.1f} HU.")  # fmt: skip
     told = "No contrast given."
     if entry["given"]["n"]:
         told = (
@@ -355,6 +382,9 @@ def _contrast(entry: dict[str, Any]) -> str:
             )
         )
     contrast = entry["figures"]["contrast"]
+    told += " Of all draws, over a core that is there and one that is not: bias {:+.1f} HU.".format(
+        entry["mean_contrast"] - contrast["true"]
+    )
     if "slope" in contrast:
         told += " From no core to all of it: slope {slope:.2f}, SD at slope 1 {corrected_sd:.1f} HU.".format(**contrast)
     return told
@@ -375,7 +405,8 @@ def text(result: dict[str, Any]) -> str:
             f"[{share['low']:.2f}, {share['high']:.2f}]; "
             f"median P {entry['median_presence']:.3f}, least {entry['least_presence']:.3f}; "
             f"not read {entry['failed']}; "
-            f"calcified {entry['calcified']}; warned {entry['warned']}; residual {entry['chi2']:.3f}; texture "
+            f"calcified {entry['calcified']}; a second core {entry['second_core']}; "
+            f"warned {entry['warned']}; residual {entry['chi2']:.3f}; texture "
             f"{entry['texture_hu']:.1f} HU; {entry['cpu_seconds']:.1f} CPU s a reading (loaded machine). "
             f"{_contrast(entry)}",
             "",

@@ -1,4 +1,6 @@
-"""A tilted vessel with a fibrous layer and a core, averaged over voxels by brute force, and its noise-free data."""
+"""A tilted vessel with a fibrous layer and a core, averaged over voxels by brute force, and its noise-free data.
+
+Data are projected from voxels of half the size: what is fitted must not share its painting."""
 
 import numpy as np
 import torch
@@ -6,6 +8,7 @@ from inset_operators import HU, problem
 
 from recon.gram.gram import Gram
 from recon.plaque.data import TissueData
+from torchpcct import Projector, VolumeGrid
 
 VALUES = {"fat": -90.0, "wall": 50.0, "fibrous": 100.0, "lumen": 400.0}
 TILT = 0.15
@@ -50,15 +53,18 @@ def image(grid, contrast, samples=5, hard=0.0, cores=(0.0,), **values):
 
 
 def operator(shape=(26, 24, 24), voxel=0.3):
-    """Gram operator of a scan in which a core stands out of the noise."""
+    """Gram operator of a scan in which a core stands out of the noise; its ``statistic`` takes ``finer`` voxels."""
     A, w = problem(views=120, shape=shape, voxel=voxel, rows=32)
-    return Gram(A, w, 5).scaled(200.0)
+    gram = Gram(A, w, 5).scaled(200.0)
+    gram.finer = VolumeGrid(tuple(2 * n for n in shape), voxel / 2, A.grid.center)
+    fine = Projector(A.geometry, gram.finer, A.window)
+    gram.statistic = lambda volume: A.T(200.0 * w * fine(volume))
+    return gram
 
 
 def data(gram, volume, seed=None):
-    """Statistic of a volume; noise of the operator for a seed."""
-    shown = TissueData(torch.zeros(gram.grid.shape), gram, HU**2)
-    b = shown.apply(volume)
+    """Statistic of a volume on ``gram.finer``; noise of the operator for a seed."""
+    b = HU**2 * gram.statistic(volume)
     if seed is not None:
         b = b + gram.noise(generator=torch.Generator().manual_seed(seed)) * HU
     return TissueData(b, gram, HU**2)

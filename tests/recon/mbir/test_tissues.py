@@ -29,6 +29,14 @@ def drawn():
 
 
 @pytest.fixture(scope="module")
+def fine(drawn):
+    """What is seen, on voxels of half the size."""
+    image = drawn_vessel.image(drawn.gram.finer, 100.0, samples=3)
+    image[tuple(slice(2 * s.start, 2 * s.stop) for s in BALL)] += 300.0
+    return image
+
+
+@pytest.fixture(scope="module")
 def network():
     """Untrained: the linear start, and the data's low frequencies."""
     with torch.random.fork_rng():
@@ -47,13 +55,13 @@ def truth(drawn):
 
 def statistic(drawn, image, seed):
     noise = drawn.gram.noise(generator=torch.Generator().manual_seed(seed))
-    return (drawn.gram.apply((image / 1000.0 + 1.0) * drawn.mu_ref - drawn.level) + noise)[None]
+    return (drawn.gram.statistic((image / 1000.0 + 1.0) * drawn.mu_ref - drawn.level) + noise)[None]
 
 
 @pytest.fixture(scope="module")
-def solved(drawn, network, truth):
+def solved(drawn, network, fine):
     """Without and with tissues, HU, and the notes."""
-    b = statistic(drawn, truth, 1)
+    b = statistic(drawn, fine, 1)
     method = TissueMbir(network)
     found = method.solved(drawn, b, 1.0)
     with torch.no_grad():
@@ -70,7 +78,8 @@ def test_the_vessel_is_sharper_and_its_core_at_full_contrast(drawn, solved, trut
     assert error[1] < 0.5 * error[0]
     inside = drawn_vessel.image(drawn.grid, 1000.0) < -880  # voxels wholly in the core
     assert inside.sum() > 5
-    assert float(found[inside].mean()) == pytest.approx(0.0, abs=30)
+    # The reading of these data says 136 ± 42 HU of contrast.
+    assert float(found[inside].mean()) == pytest.approx(0.0, abs=50)
 
 
 def test_what_no_tissue_is_comes_from_the_data(solved):
@@ -79,9 +88,9 @@ def test_what_no_tissue_is_comes_from_the_data(solved):
     assert float(plain[BALL].mean()) > drawn_vessel.VALUES["fat"] + 60
 
 
-def test_the_data_are_kept(drawn, network, solved, truth):
+def test_the_data_are_kept(drawn, network, solved, fine):
     """The low frequencies of the residual are as small as without tissues, the fit to the data is better."""
-    b = statistic(drawn, truth, 1)
+    b = statistic(drawn, fine, 1)
     normal = network.problem(drawn, b, 1.0)
     rest = []
     for volume in solved[:2]:
@@ -92,23 +101,23 @@ def test_the_data_are_kept(drawn, network, solved, truth):
 
 
 def test_without_a_vessel_it_is_the_plain_reconstruction(drawn, network):
-    b = statistic(drawn, torch.full(drawn.grid.shape, -90.0), 2)
+    b = statistic(drawn, torch.full(drawn.gram.finer.shape, -90.0), 2)
     found = TissueMbir(network).solved(drawn, b, 1.0)
     assert torch.equal(found.u, network.solved(drawn, b, 1.0).u.detach())
     assert not found.notes[0]["tissues"]["used"]
     assert "no tissues were fitted" in found.notes[0]["warnings"][0]
 
 
-def test_tissues_that_do_not_explain_the_data_are_not_used(drawn, network, truth, monkeypatch):
+def test_tissues_that_do_not_explain_the_data_are_not_used(drawn, network, fine, monkeypatch):
     reading = tissues.read_plaque
     monkeypatch.setattr(tissues, "read_plaque", lambda *a, **k: replace(reading(*a, **k), chi2=2.0))
-    b = statistic(drawn, truth, 1)
+    b = statistic(drawn, fine, 1)
     found = TissueMbir(network).solved(drawn, b, 1.0)
     assert torch.equal(found.u, network.solved(drawn, b, 1.0).u.detach())
     assert "residual is 2.00" in found.notes[0]["warnings"][0]
 
 
-def test_what_is_believed_of_the_vessel_reaches_the_reading(drawn, network, truth, monkeypatch):
+def test_what_is_believed_of_the_vessel_reaches_the_reading(drawn, network, fine, monkeypatch):
     seen = []
 
     def reading(*arguments, vessel_prior, seed):
@@ -116,7 +125,7 @@ def test_what_is_believed_of_the_vessel_reaches_the_reading(drawn, network, trut
         raise ValueError("seen")
 
     monkeypatch.setattr(tissues, "read_plaque", reading)
-    b = statistic(drawn, truth, 1)
+    b = statistic(drawn, fine, 1)
     for believed in (None, VesselPrior(wall=(20.0, 5.0))):
         TissueMbir(network, vessel_prior=believed).looking(1.0).solved(drawn, b, 1.0)
     assert seen == [None, VesselPrior(wall=(20.0, 5.0))]
@@ -134,8 +143,8 @@ def test_what_is_not_proven_is_left_as_the_plain_reconstruction_has_it(solved):
     assert torch.allclose(found[10], 10.0 + 0.75 * (50.0 + 0.5 * plain[10]), atol=1e-3)
 
 
-def test_a_core_is_drawn_as_far_as_it_is_probable(drawn, network, truth, monkeypatch):
-    b = statistic(drawn, truth, 1)
+def test_a_core_is_drawn_as_far_as_it_is_probable(drawn, network, fine, monkeypatch):
+    b = statistic(drawn, fine, 1)
     reading = read_plaque(TissueData.of_statistic(b[0], drawn, 1.0))
     seen = []
     monkeypatch.setattr(tissues, "read_plaque", lambda *arguments, **settings: replace(reading, presence=0.25))
@@ -157,12 +166,12 @@ def test_from_a_scan(clean, problem, caplog):
     assert "no tissues were fitted" in caplog.text
 
 
-def test_another_look_keeps_the_tissues_and_noise_units_are_the_inverse_of_hu(drawn, network, truth):
+def test_another_look_keeps_the_tissues_and_noise_units_are_the_inverse_of_hu(drawn, network, truth, fine):
     method = TissueMbir(network, (0.0, 0.0, 1.0)).looking(1.0)
     assert isinstance(method, TissueMbir)
     assert (method.look, method.point) == (1.0, (0.0, 0.0, 1.0))
     assert network.look != 1.0
-    normal = network.problem(drawn, statistic(drawn, truth, 1), 1.0)
+    normal = network.problem(drawn, statistic(drawn, fine, 1), 1.0)
     back = method.in_hu(drawn, method.in_noise_units(drawn, truth[None], normal), normal)
     assert torch.allclose(back[0], truth, atol=1e-3)
 

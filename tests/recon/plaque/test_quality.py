@@ -30,9 +30,9 @@ def fitted(gram, volume, seed):
 
 
 def test_texture_is_told_from_none(gram):
-    plain = drawn_vessel.image(gram.grid, 0.0, samples=3)
-    rough = np.random.default_rng(0).standard_normal(gram.grid.shape)
-    rough = ndimage.gaussian_filter(rough, LENGTH_MM / np.sqrt(2) / 0.3, mode="constant")
+    plain = drawn_vessel.image(gram.finer, 0.0, samples=3)
+    rough = np.random.default_rng(0).standard_normal(gram.finer.shape)
+    rough = ndimage.gaussian_filter(rough, LENGTH_MM / np.sqrt(2) / 0.15, mode="constant")
     rough *= 60.0 / rough.std()
     soft = (plain > -20) & (plain < 250)
     rng = np.random.default_rng(0)
@@ -46,7 +46,7 @@ def test_texture_is_told_from_none(gram):
 
 
 def test_a_calcification_becomes_a_body_and_not_a_core(gram, tmp_path):
-    found = read_plaque(drawn_vessel.data(gram, drawn_vessel.image(gram.grid, 0.0, 3, 1200.0), 5), particles=150)
+    found = read_plaque(drawn_vessel.data(gram, drawn_vessel.image(gram.finer, 0.0, 3, 1200.0), 5), particles=150)
     assert found.calcifications >= 1  # a coarse grid may make two bodies of it
     assert abs(found.chi2 - 1) < 4 * found.chi2_sd
     assert found.presence < 0.95
@@ -64,9 +64,9 @@ def test_a_calcification_becomes_a_body_and_not_a_core(gram, tmp_path):
 
 
 def test_what_the_model_does_not_have_is_warned_of(gram):
-    volume = drawn_vessel.image(gram.grid, 0.0, samples=3)
+    volume = drawn_vessel.image(gram.finer, 0.0, samples=3)
     right = misfit(*fitted(gram, volume, 6))
-    volume[12:15, 16:19, 11:14] += 600.0  # metal at the outer wall
+    volume[24:30, 32:38, 22:28] += 600.0  # metal at the outer wall
     wrong = misfit(*fitted(gram, volume, 6))
     assert abs(right[0] - 1) < 4 * right[1]
     assert wrong[0] - 1 > 4 * wrong[1]
@@ -81,9 +81,9 @@ def tube(grid, at, radius):
 
 def with_tube(gram, at):
     """A vessel without a core, and a second one along z."""
-    volume = drawn_vessel.image(gram.grid, 0.0, samples=3)
+    volume = drawn_vessel.image(gram.finer, 0.0, samples=3)
     for radius, hu in ((0.9, 140.0), (0.7, 350.0)):
-        volume = volume + hu * tube(gram.grid, at, radius)
+        volume = volume + hu * tube(gram.finer, at, radius)
     return volume
 
 
@@ -120,7 +120,7 @@ def test_beside_a_second_vessel_that_is_not_known_nothing_of_a_plaque_is_claimed
 
 
 def test_noise_alone_is_not_striking_anywhere_in_the_volume(gram):
-    data = drawn_vessel.data(gram, torch.zeros(gram.grid.shape))
+    data = drawn_vessel.data(gram, torch.zeros(gram.finer.shape))
     scores = np.array([data.scores(gram.noise(generator=torch.Generator().manual_seed(k)) * drawn_vessel.HU, (0.4, 1.2))
                        for k in range(20)])  # fmt: skip
     assert np.abs(scores).max() < STRIKING
@@ -136,30 +136,44 @@ def test_noise_alone_is_not_striking_anywhere_in_the_volume(gram):
 )  # fmt: skip
 def test_what_is_no_enhanced_vessel_is_refused_in_words(gram, change, why):
     """A stent was refused by SciPy's own words, a short bright piece by a division by zero."""
-    volume = drawn_vessel.image(gram.grid, 0.0, samples=2, **(change if isinstance(change, dict) else {}))
-    off = torch.arange(len(volume))[:, None, None] - (len(volume) - 1) / 2
-    inside = tube(gram.grid, (0.0, drawn_vessel.LUMEN_OFF), 1.1)
-    shell = inside - tube(gram.grid, (0.0, drawn_vessel.LUMEN_OFF), 0.9)
+    volume = drawn_vessel.image(gram.finer, 0.0, samples=2, **(change if isinstance(change, dict) else {}))
+    off = torch.arange(len(volume))[:, None, None] / 2 - (len(volume) - 1) / 4
+    inside = tube(gram.finer, (0.0, drawn_vessel.LUMEN_OFF), 1.1)
+    shell = inside - tube(gram.finer, (0.0, drawn_vessel.LUMEN_OFF), 0.9)
     if change == "stent":
         volume = volume + 9000.0 * shell * (off.abs() < 10)
     elif change == "rings":
-        volume = volume + 25000.0 * shell * (off.abs() % 5 == 2.5)
+        volume = volume + 25000.0 * shell * ((off.abs() % 5 - 2.5).abs() < 0.5)
     elif change == "short":
         volume = torch.where((off.abs() > 4) & (volume > 100.0), 100.0, volume)
     with pytest.raises(ValueError, match=why):
         read_plaque(drawn_vessel.data(gram, volume, 8), particles=60)
 
 
-def test_a_second_core_is_said(gram):
-    found = [
-        read_plaque(drawn_vessel.data(gram, drawn_vessel.image(gram.grid, 200.0, 3, cores=cores), 9), particles=60)
+def test_a_second_core_is_read_beside_the_first(gram, tmp_path):
+    point = (gram.grid.center[0] - 1.5, gram.grid.center[1] - 1.5 * drawn_vessel.TILT, gram.grid.center[2] + 1.15)
+    two, one = (
+        read_plaque(drawn_vessel.data(gram, drawn_vessel.image(gram.finer, 200.0, 3, cores=cores), 9), point,
+                    particles=60)
         for cores in ((-1.5, 1.5), (-1.5,))
-    ]
-    assert [r.presence > 0.95 for r in found] == [True, True]
-    assert found[0].second_core > 0.95 > 0.6 > found[1].second_core
-    assert any("a second core" in text for text in found[0].warnings)
-    assert found[1].warnings == []
-    two = found[0]
+    )  # fmt: skip
+    assert [r.presence > 0.95 for r in (two, one)] == [True, True]
+    assert two.second_core > 0.95 > 0.7 > one.second_core
+    assert two.warnings == one.warnings == []
+    assert one.info["second_core"] is None
+    other = two.info["second_core"]
+    assert np.linalg.norm(np.array(other["at_mm"]) - point - (3.0, 3.0 * drawn_vessel.TILT, 0.0)) < 0.6
+    assert other["volume_mm3"] == pytest.approx(1.05, rel=0.6)
+    for name in ("contrast", "second contrast"):
+        assert abs(two.figures[name].value - 200.0) < 3.5 * two.figures[name].sd
+        assert two.figures[name].value > 120.0
+    assert "Both were read together" in table(two)
+    save(two, tmp_path)
+    labels = Volume.load(tmp_path / "tissues.nii.gz").data
+    assert (labels == 4).any()
+    assert (labels == 6).any()
+    more = replace(two, third_core={**other, "probability": 0.97})
+    assert "one more core is there with a probability of 0.97, at (1." in more.warnings[0]
     assert two.mean_contrast == pytest.approx(two.presence * two.given_core["contrast"].value)
     foreign = replace(two, left=Leftover(9.0, 50.0, (0.0, 1.0, 2.0), False))
     assert not foreign.certain

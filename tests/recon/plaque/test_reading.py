@@ -24,12 +24,12 @@ def gram():
 @pytest.fixture(scope="module")
 def strong(gram):
     """A core 100 HU below the fibrous tissue, with noise."""
-    return read_plaque(drawn_vessel.data(gram, drawn_vessel.image(gram.grid, 100.0), seed=1), particles=150)
+    return read_plaque(drawn_vessel.data(gram, drawn_vessel.image(gram.finer, 100.0), seed=1), particles=150)
 
 
 @pytest.fixture(scope="module")
 def absent(gram):
-    return read_plaque(drawn_vessel.data(gram, drawn_vessel.image(gram.grid, 0.0), seed=1), particles=150)
+    return read_plaque(drawn_vessel.data(gram, drawn_vessel.image(gram.finer, 0.0), seed=1), particles=150)
 
 
 def test_a_core_is_found_and_its_figures_hold_the_truth(strong):
@@ -63,7 +63,7 @@ def test_regions_share_every_voxel_and_read_other_volumes(strong, gram):
 
 
 def test_the_same_twice(gram):
-    data = drawn_vessel.data(gram, drawn_vessel.image(gram.grid, 100.0, samples=2), seed=2)
+    data = drawn_vessel.data(gram, drawn_vessel.image(gram.finer, 100.0, samples=2), seed=2)
     point = tuple(c + d for c, d in zip(gram.grid.center, POINT_OFF, strict=True))
     first, second = (read_plaque(data, point, particles=50, seed=3) for _ in range(2))
     assert first.figures == second.figures
@@ -82,7 +82,7 @@ def test_files(strong, absent, tmp_path, gram):
 
 
 def test_refusals(gram):
-    data = drawn_vessel.data(gram, drawn_vessel.image(gram.grid, 0.0, samples=1))
+    data = drawn_vessel.data(gram, drawn_vessel.image(gram.finer, 0.0, samples=1))
     with pytest.raises(ValueError, match="point_sd"):
         read_plaque(data, point_sd=0.0)
     with pytest.raises(ValueError, match="particles"):
@@ -120,5 +120,5 @@ def test_one_blas_thread_reads_the_tissues(gram, monkeypatch):
     seen: list[int] = []
     monkeypatch.setattr(reading, "find_vessel", look)
     with threadpool_limits(4, user_api="blas"), pytest.raises(Seen):
-        read_plaque(drawn_vessel.data(gram, drawn_vessel.image(gram.grid, 0.0)))
+        read_plaque(drawn_vessel.data(gram, drawn_vessel.image(gram.finer, 0.0)))
     assert set(seen) == {1}
