@@ -310,7 +310,8 @@ def _dispersion(readings: Tensor) -> float:
     second = n[:, 2:] - 2.0 * n[:, 1:-1] + n[:, :-2]
     level = (n[:, 2:] + n[:, 1:-1] + n[:, :-2]) / 3.0
     live = (n[:, 2:] > 0) & (n[:, 1:-1] > 0) & (n[:, :-2] > 0)
-    level, ratio = level[live], (second.square() / (6.0 * level))[live]
+    del n
+    level, ratio = level[live], second.square_().div_(6.0 * level)[live]
     for _ in range(2):  # a first guess from all, then without the dim ones, whose noise is not normal
         if ratio.numel() < 8:
             return math.nan

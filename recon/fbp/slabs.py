@@ -7,6 +7,8 @@ pass over the scan; every slab then gets the same bits as in one piece.
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import hashlib
 import logging
 import math
@@ -16,7 +18,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -30,9 +32,9 @@ from recon.fbp.detector_edges import Rows, continued, ends_cut_off, mirrored, ro
 from recon.fbp.fbp import filter_windowed
 from recon.metal import metal_warnings
 from recon.pwls.memory import available_bytes, memory_bytes, pwls_bytes, resident_bytes
-from torchpcct.defects import mended
+from torchpcct.defects import Cells, cell_sums, dark_views, is_mended, mended, photon_and_light, wrong_cells
 from torchpcct.detector_window import DetectorWindow, shadow
-from torchpcct.formats.scans import adapted, open_scan, reads_slices
+from torchpcct.formats.scans import adapted, open_scan, own_options
 from torchpcct.formats.volume_slabs import CHUNK, SlabFile, check_slab_name
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
 from torchpcct.projector import Projector
@@ -58,6 +60,23 @@ _RATE, _READ_RATE = 4e8, 1e8
 """Voxel updates of the backprojection, and readings that are read and prepared, a second on one core."""
 
 
+class Part(NamedTuple):
+    """Some slices or rows of a scan.
+
+    Attributes:
+        scan: of a cone beam with :data:`HALO` rows more on either side.
+        own: where they stand in it.
+        zeros, replaced, dead: how many of their readings registered nothing, are such as no object can cause, and are
+            bridged by their neighbours.
+    """
+
+    scan: Scan
+    own: slice
+    zeros: int
+    replaced: int
+    dead: int
+
+
 class ScanSlices:
     """A scan of which no more than some slices (of a cone beam: rows of the detector) are in memory at a time.
 
@@ -79,18 +98,21 @@ class ScanSlices:
     window = None
 
     def __init__(self, scan: Scan | str | os.PathLike[str], **options: Any) -> None:
-        if not isinstance(scan, Scan) and not reads_slices(scan):
+        takes = {"slices"} if isinstance(scan, Scan) else own_options(scan)
+        if "slices" not in takes:
             raise ValueError(f"{scan} is no file that is read slice by slice: open_scan(…).save(…) makes an .h5 of it")
         self.source, self.options = scan, options
+        self.cells: Cells | None = None
+        self.photon: float | None = None
         self.first = self._open(0, 4)
         # What the readers estimate from the readings must not differ from slab to slab.
         info = self.first.info
-        if not isinstance(scan, Scan) and "signal_of_one_photon" in info:
-            self.options |= {"gain": info["signal_of_one_photon"]}
+        if "gain" in takes and "signal_of_one_photon" in info:
+            self.options["gain"] = info["signal_of_one_photon"]
             if not self.first.counting:
-                self.options |= {"electronic_noise": self.first.electronic_noise}
-        elif not isinstance(scan, Scan) and str(info.get("photons")).startswith("estimated"):
-            self.options |= {"photons": float(self.first.air.flatten()[0])}
+                self.options["electronic_noise"] = self.first.electronic_noise
+        elif "photons" in takes and str(info.get("photons")).startswith("estimated"):
+            self.options["photons"] = float(self.first.air.flatten()[0])
         self.unit, self.water = self.first.unit, self.first.linearisation.mu_ref
         start, stop, self.count = info["slices"]
         g = self.first.geometry
@@ -104,16 +126,46 @@ class ScanSlices:
             return adapted(self.source, slices=part, **self.options)
         return open_scan(self.source, slices=part, **self.options)
 
-    def read(self, first: int, stop: int) -> tuple[Scan, slice]:
-        """The slices ``first`` … ``stop - 1``, readings that cannot be bridged, and where they stand in the scan that
-        is returned: of a cone beam it holds :data:`HALO` rows more on either side."""
-        halo = HALO if self.geometry.has_rows else 0
+    def read(self, first: int, stop: int) -> Part:
+        """The slices ``first`` … ``stop - 1``, impossible readings replaced."""
+        axis, halo = (1, HALO) if self.geometry.has_rows else (0, 0)
         low = max(first - halo, 0)
-        scan = mended(self._open(low, min(stop + halo, self.count)))[0]
-        own = slice(first - low, stop - low)
+        raw = self._open(low, min(stop + halo, self.count))
+        cells = None if self.cells is None else Cells(
+            self.cells.views, *(c[low : low + raw.geometry.rows] for c in self.cells[1:])
+        )
+        scan, own = mended(raw, cells, self.photon)[0], slice(first - low, stop - low)
+        _give_back()
         if halo and scan.dead is not None:
             self._check_bridged(scan.dead, own, low)
-        return scan, own
+        counts, now, dead = (
+            v if v is None else v.narrow(axis, own.start, stop - first) for v in (raw.counts, scan.counts, raw.dead)
+        )
+        replaced = 0 if scan is raw else int((counts != now).sum())
+        return Part(scan, own, int((counts <= 0).sum()), replaced, replaced + (0 if dead is None else int(dead.sum())))
+
+    def find_cells(self, step: int) -> None:
+        """Find the cells of a cone beam that are dead or of a wrong gain, by all rows, ``step`` rows at a time."""
+        g = self.geometry
+        if not g.has_rows or not is_mended(self.first):
+            return
+        start = max((self.count - step) // 2, 0)
+        self.photon, light = photon_and_light(self._open(start, start + step))
+        lost, zeros = np.zeros(g.views, bool), np.zeros(g.views)
+        for _ in range(2):  # again, without the views that turn out to have no signal
+            parts, zeros[:] = [], 0.0
+            for first in range(0, self.count, step):
+                low = max(first - HALO, 0)
+                raw = self._open(low, min(first + step + HALO, self.count))
+                n = raw.counts.numpy()
+                sums = cell_sums(n, raw.air, np.zeros(g.views, np.int64), lost, light)
+                parts.append(sums[:, first - low : first - low + step])
+                zeros += (n[:, first - low : first - low + step] <= 0).sum((1, 2))
+                del raw, n
+            before, lost = lost, dark_views(zeros / (self.count * g.columns))
+            if (before == lost).all():
+                break
+        self.cells = wrong_cells(np.concatenate(parts, 1), lost, self.photon, light)
 
     def _check_bridged(self, dead: Tensor, own: slice, low: int) -> None:
         """Whether the neighbours that bridge dead cells were read."""
@@ -164,6 +216,12 @@ class SlabPlan:
         )
 
 
+def _give_back() -> None:
+    """Let the system have the memory that was freed: the C library keeps it, up to several times what is in use."""
+    with contextlib.suppress(OSError, AttributeError, TypeError):  # another C library than GNU's
+        ctypes.CDLL(None).malloc_trim(0)
+
+
 class _Fbp:
     """The FBP of a volume, of which slabs are made: the steps of :func:`recon.fbp.fbp.fbp`, with its results."""
 
@@ -209,11 +267,12 @@ class _Fbp:
     def __call__(self, source: ScanSlices, first: int, stop: int) -> Tensor:
         """The slices ``first`` … ``stop - 1``, in the scan's unit."""
         low, high = self.band(first, stop)
-        scan, own = source.read(low, high)
+        scan, own, *_ = source.read(low, high)
         lines, geometry = scan.line_integrals(), scan.geometry
         del scan
         rows = self.complete(lines, geometry)
         del lines
+        _give_back()
         whole = DetectorWindow.full(self.wide)
         if self.cone:
             held, wanted = whole.with_rows(low - own.start, rows.lines.shape[-2]), self.window.with_rows(low, high - low)
@@ -225,6 +284,7 @@ class _Fbp:
             del rows
             mu = self.plan.forward(filtered)
         del filtered
+        _give_back()
         return to_hu(mu, self.water).to(torch.float32)
 
 
@@ -365,6 +425,7 @@ def reconstruct_to(
     thick = plan.slabs[0][1] - plan.slabs[0][0]
     file = SlabFile(path, grid, source.unit, key, min(thick, CHUNK))
     _LOG.info("%s", plan)
+    source.find_cells(max(high - low for low, high in plan.bands))
     if "sides" not in file.notes:
         file.notes |= _survey(source, plan)
     notes = file.notes
@@ -383,7 +444,7 @@ def reconstruct_to(
             if source.unit != "HU":
                 values = from_hu(values, source.water)
         else:
-            part = replace_slices(grid, first, stop)
+            part = _slices_of(grid, first, stop)
             volume = reconstruct(source._open(first, stop), part, method, **options)
             values, texts, peak = volume.data, volume.report["warnings"], 0.0
         for text in texts:
@@ -408,7 +469,7 @@ def reconstruct_to(
     return report
 
 
-def replace_slices(grid: VolumeGrid, first: int, stop: int) -> VolumeGrid:
+def _slices_of(grid: VolumeGrid, first: int, stop: int) -> VolumeGrid:
     """The slices ``first`` … ``stop - 1`` of a ``(z, y, x)`` grid, at their places."""
     z = grid.center[0] + (first + stop - grid.shape[0]) / 2 * grid.spacing[0]
     return VolumeGrid((stop - first, *grid.shape[1:]), grid.spacing, (z, *grid.center[1:]))
@@ -418,20 +479,18 @@ def _survey(source: ScanSlices, plan: SlabPlan) -> dict[str, Any]:
     """What has to be known of all readings before the first slab, and what the middle ones say of the scan."""
     g, cone = source.geometry, source.geometry.has_rows
     step = max(high - low for low, high in plan.bands)
-    zeros, dead, highest, means, ends = 0, 0, -math.inf, 0.0, []
+    tally, highest, means, ends = np.zeros(3, np.int64), -math.inf, 0.0, []
     for first in range(0, source.count, step):
-        scan, own = source.read(first, min(first + step, source.count))
-        at = (slice(None), own) if cone else (own,)
-        zeros += int((scan.counts[at] <= 0).sum())
-        dead += 0 if scan.dead is None else int(scan.dead[at].sum())
-        lines = scan.line_integrals()[at]
+        scan, own, *numbers = source.read(first, min(first + step, source.count))
+        tally += numbers
+        lines = scan.line_integrals()[(slice(None), own) if cone else own]
         del scan
         if cone:
             means = means + lines.sum(1, dtype=torch.float64)
         else:
             top, *end = row_ends(lines)
             highest, ends = max(highest, top), [*ends, end]
-    readings = source.counts.numel()
+    readings, (zeros, replaced, dead) = source.counts.numel(), map(int, tally)
     if zeros > _STARVED * readings:
         raise ValueError(
             f"{100 * zeros / readings:.0f} % of the readings are zero: too few photons for a line-integral method; "
@@ -441,10 +500,10 @@ def _survey(source: ScanSlices, plan: SlabPlan) -> dict[str, Any]:
         highest, *end = row_ends((means / source.count).float())  # type: ignore[attr-defined]
         ends = [end]
     sides = ends_cut_off(highest, *(torch.cat(e) if not cone else e[0] for e in zip(*ends, strict=True)), g, angular_weights(g))
-    return {"sides": sides, "dead_readings": dead, **_looked_at(source, plan, dead, sides)}
+    return {"sides": sides, "dead_readings": dead, **_looked_at(source, plan, replaced, sides)}
 
 
-def _looked_at(source: ScanSlices, plan: SlabPlan, dead: int, sides: tuple[bool, bool]) -> dict[str, Any]:
+def _looked_at(source: ScanSlices, plan: SlabPlan, replaced: int, sides: tuple[bool, bool]) -> dict[str, Any]:
     g, cone = source.geometry, source.geometry.has_rows
     most = min(_LOOKED_AT, max(high - low for low, high in plan.bands), source.count)
     if cone:  # about the plane of the orbit
@@ -452,13 +511,13 @@ def _looked_at(source: ScanSlices, plan: SlabPlan, dead: int, sides: tuple[bool,
     else:
         most -= 1 - most % 2
         first = source.count // 2 - most // 2
-    scan = source.read(first, first + most)[0]
+    scan = source.read(first, first + most).scan
     flat = VolumeGrid((scan.counts.shape[0], 1, 1), 1.0)
     texts = [*reading_warnings(scan), *consistency_warnings(scan, flat)]
-    if dead:
-        share = 100 * dead / source.counts.numel()
-        texts.insert(0, f"{dead} readings are dead, or such as no object can cause: {share:.2g} % were interpolated from "
-                        "their neighbours")  # fmt: skip
+    if replaced:
+        share = 100 * replaced / source.counts.numel()
+        texts.insert(0, f"{replaced} readings are such as no object can cause (dead cells, wrong gains, lost readings): "
+                        f"{share:.2g} % of the readings were interpolated from their neighbours")  # fmt: skip
     if any(sides) and not any("inside the object" in text for text in texts):
         texts.append("the rows end inside the object above or below the middle: what lies beyond is continued as water")
     what = f"{'rows' if cone else 'slices'} {first} … {first + most - 1} of {source.count}"

@@ -22,7 +22,7 @@ from torchpcct.scan_file import slice_axis, sliced
 from torchpcct.validate import number
 from torchpcct.vector_geometry import VectorGeometry
 
-__all__ = ["adapted", "check_scan_name", "open_scan", "reads_slices"]
+__all__ = ["adapted", "check_scan_name", "open_scan", "own_options"]
 
 _HDF5, _YAML, _CATSIM = (".h5", ".hdf5", ".hdf"), (".yaml", ".yml"), (".prep", ".scan")
 
@@ -80,9 +80,10 @@ def open_scan(path: str | os.PathLike[str], geometry: Geometry | None = None, **
     return adapted(_read(name, what, geometry, own), **{k: v for k, v in options.items() if k not in own and k in _ANY})
 
 
-def reads_slices(path: str | os.PathLike[str]) -> bool:
-    """Whether ``open_scan(path, slices=…)`` reads no more of the file than these slices, or rows of a cone beam."""
-    return "slices" in _OPTIONS.get(_format(Path(path)), ())
+def own_options(path: str | os.PathLike[str]) -> set[str]:
+    """Options that the reader of a file takes itself; with "slices" it reads no more of the file than those."""
+    check_scan_name(path)
+    return _OPTIONS.get(_format(Path(path)), set())
 
 
 def _format(name: Path) -> str:
