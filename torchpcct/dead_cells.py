@@ -9,7 +9,7 @@ from torch import Tensor
 
 __all__ = ["MOST_DEAD", "bridge"]
 
-_BLOCK = 2**22
+_BLOCK = 2**20
 """Readings that are bridged at a time, about."""
 MOST_DEAD = 0.25
 """Largest share of a view's readings that may be dead: beyond it the neighbours say too little."""

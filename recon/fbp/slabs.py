@@ -49,7 +49,7 @@ _LOG = logging.getLogger(__name__)
 
 HALO = 8
 """Rows read beside those that a slab needs: dead cells are found and bridged with their neighbours' help."""
-_RESERVE = 120 * 10**6
+_RESERVE = 150 * 10**6
 """Compiled kernels, and what filters work on (:data:`recon.fbp.filter_plan.CHUNK_BYTES`)."""
 _READINGS, _VOLUMES = 7, 4
 """Arrays of the size of the readings and of a slab that live at once while either is prepared."""
@@ -449,7 +449,7 @@ def reconstruct_to(
             values, texts, peak = volume.data, volume.report["warnings"], 0.0
         for text in texts:
             found[text] = peak
-        low, high, total = min(low, float(values.min())), max(high, float(values.max())), total + float(values.double().sum())
+        low, high, total = min(low, float(values.min())), max(high, float(values.max())), total + float(values.sum(dtype=torch.float64))
         file.write(values.numpy())
         del values
         if progress is not None:
