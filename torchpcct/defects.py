@@ -145,16 +145,16 @@ def find_defects(
     # Without the dead views, which nobody is the neighbour of.
     at = at[~view_dead[at[:, 0]]]
     at[:, 0] = np.searchsorted(alive, at[:, 0])
-    single, lasting, cells = _unshadowed(n[alive], at, first[alive], air.shape[1], light)
+    single, lasting, resting = _unshadowed(n[alive], at, first[alive], air.shape[1], light)
     single[:, 0] = alive[single[:, 0]]
     mask[tuple(single.T)] = True
     return Defects(
-        torch.from_numpy(mask), int(dead.sum()), int(hot.sum()), int(view_dead.sum()), len(single) - lasting, cells
+        torch.from_numpy(mask), int(dead.sum()), int(hot.sum()), int(view_dead.sum()), len(single) - lasting, resting
     )
 
 
 class Cells(NamedTuple):
-    """Views without signal ``(views,)``, and dead cells and cells of a wrong gain ``(rows, detector columns)``, bool."""
+    """Views without signal ``(views,)``, dead cells and cells of a wrong gain ``(rows, detector columns)``, bool."""
 
     views: NDArray[np.bool_]
     dead: NDArray[np.bool_]
@@ -421,9 +421,9 @@ def mended(scan: Scan, cells: Cells | None = None, photon: float | None = None) 
         mask = found.mask
     else:
         # Slices of a stack need not be neighbours.
-        counts, cells = scan.counts.reshape(-1, g.views, 1, g.columns), air.reshape(-1, 1, g.columns)
+        counts, beam = scan.counts.reshape(-1, g.views, 1, g.columns), air.reshape(-1, 1, g.columns)
         known = [None] * len(counts) if dead is None else list(dead.reshape(counts.shape))
-        slices = [find_defects(n, a, known=k, **options) for n, a, k in zip(counts, cells, known, strict=True)]
+        slices = [find_defects(n, a, known=k, **options) for n, a, k in zip(counts, beam, known, strict=True)]
         mask = torch.stack([f.mask for f in slices]).reshape(scan.counts.shape)
         found = Defects(
             mask, sum(f.dead_cells for f in slices), sum(f.hot_cells for f in slices),

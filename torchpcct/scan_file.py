@@ -20,7 +20,8 @@ _VERSION = 5
 """2: energy-integrating scans with their noise model. 3: with a checksum (:func:`torchpcct.files.write_hdf5`). 4:
 parallel and fan beams, flux, dead readings, units. 5: geometries given view by view. Each scan is written as the lowest
 version that holds it."""
-# Compress in blocks of whole views: fast to write, and a window of views can be read without the rest.
+# Compress in blocks of one view: fast to write, and a window of views, or of rows, can be read without the rest.
+_CHUNK_ROWS = 64
 _HDF5_COMPRESSION = {"compression": "lzf", "shuffle": True}
 
 
@@ -38,7 +39,9 @@ def write_scan(scan: Any, path: str | os.PathLike[str]) -> None:
             file.attrs["exposure_s"] = scan.exposure_s
         if scan.seed is not None:
             file.attrs["seed"] = scan.seed
-        chunk = (*(1,) * (scan.counts.ndim - 2), *scan.counts.shape[-2:])
+        rows, columns = scan.counts.shape[-2:]
+        rows = min(rows, _CHUNK_ROWS) if scan.geometry.has_rows else rows
+        chunk = (*(1,) * (scan.counts.ndim - 2), rows, columns)
         # Counts are whole numbers: as integers they compress, and they stay exact.
         whole = scan.counting and not (scan.noise_free or scan.logged) and float(scan.counts.max()) < 2**31
         whole = whole and (not foreign or bool((scan.counts == scan.counts.round()).all()))
@@ -118,12 +121,16 @@ def scan_fields(file: Any, path: str | os.PathLike[str], slices: slice | None = 
 
 
 def slice_axis(geometry: Geometry, shape: tuple[int, ...], window: Any = None) -> int:
-    """Axis of the slices of a stack, or of the rows of a cone beam, in counts of a shape (ValueError: there is none)."""
+    """Axis of the slices of a stack, or of the rows of a cone beam, in counts of a shape.
+
+    Raises:
+        ValueError: there is none.
+    """
     if len(shape) != 3 or window is not None or (geometry.has_rows and not isinstance(geometry, ConeBeam)):
         kind = "part of a detector" if window is not None else type(geometry).__name__
         raise ValueError(
-            f"slices= picks slices of parallel and fan beams or rows of a cone beam, this is one {kind} of {len(shape)} "
-            "axes"
+            f"slices= picks slices of parallel and fan beams or rows of a cone beam, this is one {kind} of "
+            f"{len(shape)} axes"
         )
     return 1 if geometry.has_rows else 0
 

@@ -138,7 +138,9 @@ class Volume:
         """
         form = format_of(path)
         if form != "HDF5":
-            read = {"NIfTI": read_nifti, "MetaImage": read_meta_image, "DICOM": read_dicom, "OME-Zarr": read_ome_zarr}[form]
+            read = {"NIfTI": read_nifti, "MetaImage": read_meta_image, "DICOM": read_dicom, "OME-Zarr": read_ome_zarr}[
+                form
+            ]
             values, grid, unit = read(path)
             return cls(torch.from_numpy(values), grid, {"file": str(path)}, unit)
         with read_hdf5(path, "volume") as file:

@@ -29,7 +29,6 @@ from torchpcct.validate import choice, number, numbers, whole
 if TYPE_CHECKING:
     from recon.study.study import ProgressBars
     from torchpcct.acquisition.config import SimulationConfig
-    from torchpcct.scan import Scan
     from torchpcct.scene.voxels import VoxelScene
 
 __all__ = ["add_lower_dose", "add_reconstruct", "add_show_config", "add_simulate", "grid_of_scan"]
@@ -423,7 +422,9 @@ def _reconstruct_slabs(arguments: argparse.Namespace, options: dict[str, Any], p
             raise ValueError(f"--{name.replace('_', '-')} is not done slab by slab: {remedy} or leave out --memory")
     reader = _reader_options(arguments)
     if reader.pop("slices", None) is not None:
-        raise ValueError("--memory takes all slices of the scan: leave out --slices, or reconstruct those without --memory")
+        raise ValueError(
+            "--memory takes all slices of the scan: leave out --slices, or reconstruct those without --memory"
+        )
     source = ScanSlices(arguments.scan, **reader)
     grid = grid_of_scan(source, arguments)
     check_target(arguments.out, grid.voxels, source.unit)
@@ -463,7 +464,7 @@ def add_reconstruct(commands: Commands) -> None:
     parser = command(
         commands, "reconstruct", _reconstruct, "reconstruct a scan file to a volume",
         "Reconstruct a scan, ours or a foreign one, and write the volume, with what was done beside (.json, .yaml).",
-        "volume to write: .nii, .nii.gz, .mha, .h5, .zarr, or no ending for a DICOM series (default SCAN_METHOD.nii.gz)",
+        "volume to write: .nii, .nii.gz, .mha, .h5, .zarr, or no ending for DICOM (default SCAN_METHOD.nii.gz)",
     )  # fmt: skip
     axes = ("Z", "Y", "X")
     parser.add_argument("--method", default="fbp", help="fbp, pwls or mbir (default fbp)")
@@ -489,8 +490,8 @@ def add_reconstruct(commands: Commands) -> None:
     parser.add_argument(
         "--memory",
         metavar="SIZE",
-        help="limit, e.g. 4GB, for volumes larger than memory: slab by slab to .nii or .zarr (default SCAN_METHOD.nii); "
-        "what was interrupted goes on",
+        help="limit, e.g. 4GB, for volumes larger than memory: slab by slab to .nii or .zarr (default "
+        "SCAN_METHOD.nii); what was interrupted goes on",
     )
     parser.add_argument("--clean", action="store_true", help="take out stripes and outliers (parallel and fan beams)")
     _add_output(parser)

@@ -16,7 +16,6 @@ import os
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,6 +31,7 @@ from recon.fbp.detector_edges import Rows, continued, ends_cut_off, mirrored, ro
 from recon.fbp.fbp import filter_windowed
 from recon.metal import metal_warnings
 from recon.pwls.memory import available_bytes, memory_bytes, pwls_bytes, resident_bytes
+from torchpcct.dead_cells import MOST_DEAD
 from torchpcct.defects import Cells, cell_sums, dark_views, is_mended, mended, photon_and_light, wrong_cells
 from torchpcct.detector_window import DetectorWindow, shadow
 from torchpcct.formats.scans import adapted, open_scan, own_options
@@ -114,7 +114,7 @@ class ScanSlices:
         elif "photons" in takes and str(info.get("photons")).startswith("estimated"):
             self.options["photons"] = float(self.first.air.flatten()[0])
         self.unit, self.water = self.first.unit, self.first.linearisation.mu_ref
-        start, stop, self.count = info["slices"]
+        start, _, self.count = info["slices"]
         g = self.first.geometry
         self.geometry: Any = g.with_rows(-start, self.count) if isinstance(g, ConeBeam) else g
         lead = () if g.has_rows else (self.count,)
@@ -131,18 +131,22 @@ class ScanSlices:
         axis, halo = (1, HALO) if self.geometry.has_rows else (0, 0)
         low = max(first - halo, 0)
         raw = self._open(low, min(stop + halo, self.count))
-        cells = None if self.cells is None else Cells(
-            self.cells.views, *(c[low : low + raw.geometry.rows] for c in self.cells[1:])
+        cells = (
+            None
+            if self.cells is None
+            else Cells(self.cells.views, *(c[low : low + raw.geometry.rows] for c in self.cells[1:]))
         )
         scan, own = mended(raw, cells, self.photon)[0], slice(first - low, stop - low)
         _give_back()
         if halo and scan.dead is not None:
             self._check_bridged(scan.dead, own, low)
-        counts, now, dead = (
-            v if v is None else v.narrow(axis, own.start, stop - first) for v in (raw.counts, scan.counts, raw.dead)
-        )
-        replaced = 0 if scan is raw else int((counts != now).sum())
-        return Part(scan, own, int((counts <= 0).sum()), replaced, replaced + (0 if dead is None else int(dead.sum())))
+
+        def mine(values: Tensor) -> Tensor:
+            return values.narrow(axis, own.start, stop - first)
+
+        replaced = 0 if scan is raw else int(torch.ne(mine(scan.counts), mine(raw.counts)).sum())
+        dead = replaced + (0 if raw.dead is None else int(mine(raw.dead).sum()))
+        return Part(scan, own, int((mine(raw.counts) <= 0).sum()), replaced, dead)
 
     def find_cells(self, step: int) -> None:
         """Find the cells of a cone beam that are dead or of a wrong gain, by all rows, ``step`` rows at a time."""
@@ -169,20 +173,28 @@ class ScanSlices:
 
     def _check_bridged(self, dead: Tensor, own: slice, low: int) -> None:
         """Whether the neighbours that bridge dead cells were read."""
-        for side, rows in ((low > 0, dead[:, : own.start + 1]), (low + dead.shape[1] < self.count, dead[:, own.stop - 1 :])):
-            across = rows.all(1)
-            live = ~across
-            beside = (live.cumsum(-1) > 0) & (live.flip(-1).cumsum(-1).flip(-1) > 0)
-            if side and bool((across & ~beside).any()):
-                raise ValueError(
-                    f"more than {HALO} rows side by side are dead near row {low + own.start}: slabs do not reach the "
-                    "readings that bridge them; reconstruct the whole volume at once"
-                )
+        outer = float(dead.float().mean((1, 2)).max()) > MOST_DEAD
+        for side, rows in (
+            (low > 0, dead[:, : own.start + 1]),
+            (low + dead.shape[1] < self.count, dead[:, own.stop - 1 :]),
+        ):
+            lost = rows.all(1)  # and no live reading on one side, from which the row itself would be bridged
+            ends = (lost.cummin(-1).values | lost.flip(-1).cummin(-1).values.flip(-1)) if side else lost & False
+            outer = outer or bool(ends.any())
+        if outer:
+            raise ValueError(
+                f"too many readings are dead near row {low + own.start}: slabs read {HALO} rows beside their own, "
+                "which do not bridge them; reconstruct the whole volume at once"
+            )
 
     def identity(self) -> str:
         """A text that changes with the readings, as far as the file's size and date and the first rows tell."""
         text = hashlib.sha256(self.first.counts.numpy().tobytes())
-        text.update(repr((self.geometry._key(), self.count, self.unit, self.water, sorted(self.options.items(), key=str))).encode())
+        text.update(
+            repr(
+                (self.geometry._key(), self.count, self.unit, self.water, sorted(self.options.items(), key=str))
+            ).encode()
+        )
         if not isinstance(self.source, Scan):
             stat = Path(self.source).stat()
             text.update(repr((stat.st_size, stat.st_mtime_ns)).encode())
@@ -225,7 +237,9 @@ def _give_back() -> None:
 class _Fbp:
     """The FBP of a volume, of which slabs are made: the steps of :func:`recon.fbp.fbp.fbp`, with its results."""
 
-    def __init__(self, geometry: Geometry, grid: VolumeGrid, kernel: str, sides: tuple[bool, bool], water: float) -> None:
+    def __init__(
+        self, geometry: Geometry, grid: VolumeGrid, kernel: str, sides: tuple[bool, bool], water: float
+    ) -> None:
         self.geometry, self.grid, self.kernel, self.sides, self.water = geometry, grid, kernel, sides, water
         self.cone = isinstance(geometry, ConeBeam)
         self.plane = grid if self.cone else grid.slice
@@ -275,7 +289,10 @@ class _Fbp:
         _give_back()
         whole = DetectorWindow.full(self.wide)
         if self.cone:
-            held, wanted = whole.with_rows(low - own.start, rows.lines.shape[-2]), self.window.with_rows(low, high - low)
+            held, wanted = (
+                whole.with_rows(low - own.start, rows.lines.shape[-2]),
+                self.window.with_rows(low, high - low),
+            )
             filtered = filter_windowed(rows.lines, self.wide, held, self.kernel, wanted, weights=rows.weights)
             del rows
             mu = self.plan.forward(filtered, (first, stop), low - self.window.first_row)
@@ -358,13 +375,15 @@ def plan_slabs(
 def _check(geometry: Geometry, grid: VolumeGrid, method: str) -> None:
     choice("method", method, ("fbp", "pwls"))
     if not isinstance(geometry, ParallelBeam | FanBeam | ConeBeam):
-        raise ValueError("slabs are of parallel, fan or cone beams on a circle: reconstruct a geometry view by view whole")
+        raise ValueError(
+            "slabs are of parallel, fan or cone beams on a circle: reconstruct a geometry view by view whole"
+        )
     if grid.ndim != 3:
         raise ValueError(f"grid must be a (z, y, x) VolumeGrid, got {grid!r}")
     if method == "pwls" and geometry.has_rows:
         raise ValueError(
-            'method "pwls" of a cone beam couples all slices: it needs the whole volume in memory; slabs are for "fbp", '
-            "and for stacks of parallel or fan-beam slices"
+            'method "pwls" of a cone beam couples all slices: it needs the whole volume in memory; slabs are for '
+            '"fbp", and for stacks of parallel or fan-beam slices'
         )
 
 
@@ -423,11 +442,15 @@ def reconstruct_to(
     fixed = [*check_rows(g, grid), *sampling_warnings(g)] if method == "fbp" else []
     key = hashlib.sha256(repr((source.identity(), grid, method, kernel, sorted(options.items()))).encode()).hexdigest()
     thick = plan.slabs[0][1] - plan.slabs[0][0]
+    source.find_cells(max(high - low for low, high in plan.bands))
     file = SlabFile(path, grid, source.unit, key, min(thick, CHUNK))
     _LOG.info("%s", plan)
-    source.find_cells(max(high - low for low, high in plan.bands))
     if "sides" not in file.notes:
-        file.notes |= _survey(source, plan)
+        try:
+            file.notes |= _survey(source, plan)
+        except BaseException:
+            file.discard()
+            raise
     notes = file.notes
     sides: Any = tuple(notes["sides"])
     begun = file.done
@@ -449,7 +472,11 @@ def reconstruct_to(
             values, texts, peak = volume.data, volume.report["warnings"], 0.0
         for text in texts:
             found[text] = peak
-        low, high, total = min(low, float(values.min())), max(high, float(values.max())), total + float(values.sum(dtype=torch.float64))
+        low, high, total = (
+            min(low, float(values.min())),
+            max(high, float(values.max())),
+            total + float(values.sum(dtype=torch.float64)),
+        )
         file.write(values.numpy())
         del values
         if progress is not None:
@@ -461,7 +488,8 @@ def reconstruct_to(
     report = {
         "method": method, **({"kernel": kernel} if run is not None else {}),
         "seconds": round(time.perf_counter() - start, 3), "warnings": warnings,
-        "notes": [*notes["notes"], *(view_notes(g) if run is not None else [])], "dead_readings": notes["dead_readings"],
+        "notes": [*notes["notes"], *(view_notes(g) if run is not None else [])],
+        "dead_readings": notes["dead_readings"],
         "slabs": len(plan.slabs), "memory_bytes": plan.memory, "resumed_at": begun,
         "minimum": low, "maximum": high, "mean": total / max((grid.shape[0] - begun) * math.prod(grid.shape[1:]), 1),
     }  # fmt: skip
@@ -479,17 +507,17 @@ def _survey(source: ScanSlices, plan: SlabPlan) -> dict[str, Any]:
     """What has to be known of all readings before the first slab, and what the middle ones say of the scan."""
     g, cone = source.geometry, source.geometry.has_rows
     step = max(high - low for low, high in plan.bands)
-    tally, highest, means, ends = np.zeros(3, np.int64), -math.inf, 0.0, []
+    tally, rows = np.zeros(3, np.int64), torch.zeros(g.views, g.columns, dtype=torch.float64)
+    ends: list[tuple[float, Tensor, Tensor]] = []
     for first in range(0, source.count, step):
         scan, own, *numbers = source.read(first, min(first + step, source.count))
         tally += numbers
         lines = scan.line_integrals()[(slice(None), own) if cone else own]
         del scan
         if cone:
-            means = means + lines.sum(1, dtype=torch.float64)
+            rows += lines.sum(1, dtype=torch.float64)
         else:
-            top, *end = row_ends(lines)
-            highest, ends = max(highest, top), [*ends, end]
+            ends.append(row_ends(lines))
     readings, (zeros, replaced, dead) = source.counts.numel(), map(int, tally)
     if zeros > _STARVED * readings:
         raise ValueError(
@@ -497,9 +525,9 @@ def _survey(source: ScanSlices, plan: SlabPlan) -> dict[str, Any]:
             "raise the exposure or bin the readings"
         )
     if cone:
-        highest, *end = row_ends((means / source.count).float())  # type: ignore[attr-defined]
-        ends = [end]
-    sides = ends_cut_off(highest, *(torch.cat(e) if not cone else e[0] for e in zip(*ends, strict=True)), g, angular_weights(g))
+        ends = [row_ends((rows / source.count).float()[None])]
+    highest, first_column, last_column = zip(*ends, strict=True)
+    sides = ends_cut_off(max(highest), torch.cat(first_column), torch.cat(last_column), g, angular_weights(g))
     return {"sides": sides, "dead_readings": dead, **_looked_at(source, plan, replaced, sides)}
 
 
@@ -516,8 +544,11 @@ def _looked_at(source: ScanSlices, plan: SlabPlan, replaced: int, sides: tuple[b
     texts = [*reading_warnings(scan), *consistency_warnings(scan, flat)]
     if replaced:
         share = 100 * replaced / source.counts.numel()
-        texts.insert(0, f"{replaced} readings are such as no object can cause (dead cells, wrong gains, lost readings): "
-                        f"{share:.2g} % of the readings were interpolated from their neighbours")  # fmt: skip
+        texts.insert(
+            0,
+            f"{replaced} readings are such as no object can cause (dead cells, wrong gains, lost readings): {share:.2g} "
+            "% of the readings were interpolated from their neighbours",
+        )
     if any(sides) and not any("inside the object" in text for text in texts):
         texts.append("the rows end inside the object above or below the middle: what lies beyond is continued as water")
     what = f"{'rows' if cone else 'slices'} {first} … {first + most - 1} of {source.count}"

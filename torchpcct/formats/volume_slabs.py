@@ -76,7 +76,7 @@ class SlabFile:
         self.notes: dict[str, Any] = kept["notes"] if resumed else {}
         if not resumed:
             with self._writing():
-                self._clear()
+                self.discard()
                 if self.path.suffix == ".zarr":
                     _create(self.part, grid, unit, chunk)
                 else:
@@ -117,7 +117,8 @@ class SlabFile:
         with written_whole(self.journal) as part:
             part.write_text(json.dumps({"key": self.key, "done": self.done, "notes": self.notes}))
 
-    def _clear(self) -> None:
+    def discard(self) -> None:
+        """Take back what has been begun."""
         self.journal.unlink(missing_ok=True)
         if self.part.is_dir():
             shutil.rmtree(self.part)
@@ -129,7 +130,11 @@ class SlabFile:
             yield
         except OSError as error:
             why = os.strerror(error.errno) if error.errno else str(error)
-            kept = f"; its slabs up to now are kept in {self.part.name}, the same call goes on with them" if self.done else ""
+            kept = (
+                f"; its slabs up to now are kept in {self.part.name}, the same call goes on with them"
+                if self.done
+                else ""
+            )
             raise WriteError(f"cannot write {self.path}: {why}{kept}") from error
 
 
