@@ -546,8 +546,8 @@ def _looked_at(source: ScanSlices, plan: SlabPlan, replaced: int, sides: tuple[b
         share = 100 * replaced / source.counts.numel()
         texts.insert(
             0,
-            f"{replaced} readings are such as no object can cause (dead cells, wrong gains, lost readings): {share:.2g} "
-            "% of the readings were interpolated from their neighbours",
+            f"{replaced} readings are such as no object can cause (dead cells, wrong gains, lost readings): "
+            f"{share:.2g} % of the readings were interpolated from their neighbours",
         )
     if any(sides) and not any("inside the object" in text for text in texts):
         texts.append("the rows end inside the object above or below the middle: what lies beyond is continued as water")
