@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
 __all__ = ["MOST_DEAD", "bridge"]
 
+_BLOCK = 2**20
+"""Readings that are bridged at a time, about."""
 MOST_DEAD = 0.25
 """Largest share of a view's readings that may be dead: beyond it the neighbours say too little."""
 
@@ -42,15 +46,26 @@ def bridge(lines: Tensor, dead: Tensor, rows: bool, most: float = MOST_DEAD) -> 
         )
     if bool(dead.all()):
         raise ValueError("no live reading is left: the scan cannot be used")
-    # What a dead cell holds must not reach anything, not as 0 × NaN either.
-    values = torch.where(dead, 0.0, lines)
     across = ((-1, True), (-2, True), (-1, False), (-2, False)) if rows else ((-1, True), (-1, False))
     view = -3 if rows else -2
-    for axis, between in (*across, (view, True), (view, False)):
+    # What a dead cell holds must not reach anything, not as 0 × NaN either. Block by block: indices need memory.
+    split = max(view, -lines.ndim)
+    step = lines.shape[split] if split != view else max(1, _BLOCK * lines.shape[view] // max(lines.numel(), 1))
+    blocks = [
+        _bridged_along(torch.where(d, 0.0, v), d, across)
+        for v, d in zip(lines.split(step, split), dead.split(step, split), strict=True)
+    ]
+    values, left = (torch.cat(parts, split) for parts in zip(*blocks, strict=True))
+    return _bridged_along(values, left, ((view, True), (view, False)))[0]
+
+
+def _bridged_along(values: Tensor, dead: Tensor, axes: Sequence[tuple[int, bool]]) -> tuple[Tensor, Tensor]:
+    """:func:`_bridged` along one axis after the other, until nothing is dead."""
+    for axis, between in axes:
         if not bool(dead.any()):
             break
         values, dead = _bridged(values, dead, axis, between)
-    return values
+    return values, dead
 
 
 def _bridged(values: Tensor, dead: Tensor, axis: int, between: bool) -> tuple[Tensor, Tensor]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -23,7 +23,8 @@ from torchpcct.robust import MEDIAN_TO_SD
 from torchpcct.scan import Scan
 from torchpcct.threads import run
 
-__all__ = ["Defects", "dead_readings", "find_defects", "mended"]
+__all__ = ["Cells", "Defects", "cell_sums", "dark_views", "dead_readings", "find_defects", "is_mended", "mended",
+           "photon_and_light", "wrong_cells"]  # fmt: skip
 
 BRIGHT = 30.0
 """Expected readings from which 0 cannot be noise (probability 1e-13)."""
@@ -87,6 +88,7 @@ def find_defects(
     known: Tensor | None = None,
     photon: float = 1.0,
     electronic_noise: float = 0.0,
+    cells: Cells | None = None,
 ) -> Defects:
     """Find readings that no object can cause.
 
@@ -106,6 +108,7 @@ def find_defects(
         known: bool, the shape of ``counts``: readings that are known to be dead, which are not found again.
         photon: reading of one photon.
         electronic_noise: standard deviation that the electronics add to a reading.
+        cells: of some rows of a detector, what all of them say of these cells and of the views; None: found here.
 
     Raises:
         ValueError: shapes that do not fit.
@@ -116,48 +119,18 @@ def find_defects(
             f"{tuple(air.shape)}"
         )
     n = counts.detach().cpu().numpy()
-    reference = np.log(air.detach().cpu().to(torch.float64).numpy())
-    views, rows, columns = n.shape
+    views, _, columns = n.shape
     first: Any = np.zeros(views, np.int64) if first_column is None else np.asarray(first_column, np.int64)
     if first.shape != (views,) or first.min() < 0 or first.max() + columns > air.shape[1]:
         raise ValueError(f"first_column must hold {views} columns of a detector with {air.shape[1]}")
     light = BRIGHT * photon + _SIGMAS * electronic_noise
     zero = n <= 0
-    view_dead = zero.mean((1, 2)) > 0.99
-    if view_dead.all():
-        view_dead[:] = False
     parts = [np.s_[:, c : c + columns] for c in first]
-    from torchpcct.defects_kernels import bends, levels  # numba loads with its first use
-
+    if cells is None:
+        lost = dark_views(zero.mean((1, 2)))
+        cells = wrong_cells(cell_sums(n, air, first, lost, light), lost, photon, light)
+    view_dead, dead, hot = cells
     alive = np.flatnonzero(~view_dead)
-    seen, dark, bright = (np.zeros((rows, air.shape[1])) for _ in range(3))
-    run(levels, rows, n, first, alive, seen, dark, bright, operations=3 * alive.size * columns)
-    used = seen > 0
-    level = bright / np.maximum(seen, 1)
-    dead = used & (dark > 0.98 * seen)
-    good_level = np.where(dead | ~used, np.nan, level)
-    # Of a dead row the neighbours are in other rows.
-    dead &= np.fmax(_beside(good_level), _beside(good_level.T).T) > light
-    along = _dimmed(good_level, dead)
-    dead &= ~np.where(np.isnan(along), np.nan_to_num(_dimmed(good_level.T, dead.T).T), along).astype(bool)
-    hot = np.zeros_like(dead)
-    if rows >= 3:
-        # How far a cell's log signal lies above the mean of its neighbours', over the views in which both are good.
-        above, times = np.zeros_like(seen), np.zeros_like(seen)
-        run(bends, rows, n, first, alive, dead, above, times, operations=20 * alive.size * columns)
-        # The air's own share, which no view changes.
-        expected = reference[:, 1:-1] - (reference[:, :-2] + reference[:, 2:]) / 2
-        above[:, 1:-1] -= np.where(times[:, 1:-1] > 0, times[:, 1:-1] * expected, 0.0)
-        mean = above / np.maximum(times, 1)
-        # The object's edges are seen by all rows alike, the gain of a cell by one.
-        deviation = mean - np.median(mean, axis=0)
-        some = times > 0.25 * seen.max()
-        usual = MEDIAN_TO_SD * np.median(np.abs(deviation[some])) if some.any() else 0.0
-        error = np.hypot(np.sqrt(1.5 * photon / np.maximum(level * times, photon)), usual)
-        hot = some & (np.abs(deviation) > np.maximum(GAIN_ERROR, _SIGMAS * error)) & (level > light)
-        # The neighbours of a hot cell deviate by half as much, the other way.
-        strength = np.pad(np.where(hot, np.abs(deviation), 0.0), ((0, 0), (1, 1)))
-        hot &= np.abs(deviation) >= np.maximum(strength[:, :-2], strength[:, 2:])
     if known is None:
         new = np.ones(n.shape, bool)
     else:
@@ -172,12 +145,88 @@ def find_defects(
     # Without the dead views, which nobody is the neighbour of.
     at = at[~view_dead[at[:, 0]]]
     at[:, 0] = np.searchsorted(alive, at[:, 0])
-    single, lasting, cells = _unshadowed(n[alive], at, first[alive], air.shape[1], light)
+    single, lasting, resting = _unshadowed(n[alive], at, first[alive], air.shape[1], light)
     single[:, 0] = alive[single[:, 0]]
     mask[tuple(single.T)] = True
     return Defects(
-        torch.from_numpy(mask), int(dead.sum()), int(hot.sum()), int(view_dead.sum()), len(single) - lasting, cells
+        torch.from_numpy(mask), int(dead.sum()), int(hot.sum()), int(view_dead.sum()), len(single) - lasting, resting
     )
+
+
+class Cells(NamedTuple):
+    """Views without signal ``(views,)``, dead cells and cells of a wrong gain ``(rows, detector columns)``, bool."""
+
+    views: NDArray[np.bool_]
+    dead: NDArray[np.bool_]
+    hot: NDArray[np.bool_]
+
+
+def dark_views(share: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Views without signal, by the share of their readings that is 0."""
+    dark: NDArray[np.bool_] = share > 0.99
+    return dark & ~dark.all()
+
+
+def cell_sums(n: Any, air: Tensor, first: Any, lost: NDArray[np.bool_], light: float) -> NDArray[np.float64]:
+    """What the readings of every cell add up to over the views that have a signal, row by row for itself.
+
+    Args:
+        n: readings ``(views, rows, columns)``.
+        air: ``(rows, detector columns)``.
+        first: detector column of the first reading of each view.
+        lost: views without signal.
+        light: readings from which 0 cannot be noise.
+
+    Returns:
+        ``(5, rows, detector columns)``: how often each was read, and 0; the sum of its readings; how far its log signal
+        lies above the mean of its neighbours', summed over the views in which both are good, and how many those are.
+    """
+    from torchpcct.defects_kernels import bends, levels  # numba loads with its first use
+
+    rows, alive = n.shape[1], np.flatnonzero(~lost)
+    sums = np.zeros((5, *air.shape))
+    seen, dark, bright, above, times = sums
+    run(levels, rows, n, first, alive, seen, dark, bright, operations=3 * alive.size * n.shape[2])
+    if rows >= 3:
+        dead = _dead_cells(sums, light)
+        run(bends, rows, n, first, alive, dead, above, times, operations=20 * alive.size * n.shape[2])
+        # The air's own share, which no view changes.
+        reference = np.log(air.detach().cpu().to(torch.float64).numpy())
+        expected = reference[:, 1:-1] - (reference[:, :-2] + reference[:, 2:]) / 2
+        above[:, 1:-1] -= np.where(times[:, 1:-1] > 0, times[:, 1:-1] * expected, 0.0)
+    return sums
+
+
+def _dead_cells(sums: NDArray[np.float64], light: float) -> NDArray[np.bool_]:
+    """Cells that read 0 in (nearly) all views, beside bright ones that are not dimmed."""
+    seen, dark, bright = sums[:3]
+    used = seen > 0
+    dead: NDArray[np.bool_] = used & (dark > 0.98 * seen)
+    good_level = np.where(dead | ~used, np.nan, bright / np.maximum(seen, 1))
+    # Of a dead row the neighbours are in other rows.
+    dead &= np.fmax(_beside(good_level), _beside(good_level.T).T) > light
+    along = _dimmed(good_level, dead)
+    dead &= ~np.where(np.isnan(along), np.nan_to_num(_dimmed(good_level.T, dead.T).T), along).astype(bool)
+    return dead
+
+
+def wrong_cells(sums: NDArray[np.float64], lost: NDArray[np.bool_], photon: float, light: float) -> Cells:
+    """Cells that are dead or of a wrong gain, by :func:`cell_sums` of all rows; see :func:`find_defects`."""
+    dead = _dead_cells(sums, light)
+    hot = np.zeros_like(dead)
+    if sums.shape[1] >= 3:
+        seen, _, bright, above, times = sums
+        level, mean = bright / np.maximum(seen, 1), above / np.maximum(times, 1)
+        # The object's edges are seen by all rows alike, the gain of a cell by one.
+        deviation = mean - np.median(mean, axis=0)
+        some = times > 0.25 * seen.max()
+        usual = MEDIAN_TO_SD * np.median(np.abs(deviation[some])) if some.any() else 0.0
+        error = np.hypot(np.sqrt(1.5 * photon / np.maximum(level * times, photon)), usual)
+        hot = some & (np.abs(deviation) > np.maximum(GAIN_ERROR, _SIGMAS * error)) & (level > light)
+        # The neighbours of a hot cell deviate by half as much, the other way.
+        strength = np.pad(np.where(hot, np.abs(deviation), 0.0), ((0, 0), (1, 1)))
+        hot &= np.abs(deviation) >= np.maximum(strength[:, :-2], strength[:, 2:])
+    return Cells(lost, dead, hot)
 
 
 def _beside(cells: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -327,7 +376,20 @@ def _flank(n: NDArray[Any], at: NDArray[np.int64], side: int) -> tuple[NDArray[A
     return distance, near, np.where(far > 0, far, near)
 
 
-def mended(scan: Scan) -> tuple[Scan, list[str]]:
+def is_mended(scan: Scan) -> bool:
+    """Whether :func:`mended` looks at a scan: at noisy readings of a known noise, without energy bins."""
+    noisy = not (scan.noise_free or scan.logged)
+    return noisy and scan.counts.ndim <= 3 and (scan.quantum is not None or scan.counting)
+
+
+def photon_and_light(scan: Scan) -> tuple[float, float]:
+    """Reading of one photon, and readings from which 0 cannot be noise."""
+    photon = 1.0 if scan.quantum is None else float(scan.quantum.median())
+    photon = max(photon, dispersion(scan.counts, scan.geometry.has_rows)) if scan.window is None else photon
+    return photon, BRIGHT * photon + _SIGMAS * scan.electronic_noise
+
+
+def mended(scan: Scan, cells: Cells | None = None, photon: float | None = None) -> tuple[Scan, list[str]]:
     """A scan whose impossible readings are bridged by their neighbours, and what was done.
 
     Of a scan without window they are dead from then on (``scan.dead``): they weigh nothing. In views of which more is
@@ -337,6 +399,7 @@ def mended(scan: Scan) -> tuple[Scan, list[str]]:
     Args:
         scan: noisy readings of any geometry, of several slices or one; other scans (noise-free ones, line integrals,
             energy bins) are returned as they are.
+        cells, photon: of :func:`find_defects`, where they are known of more rows than these; None: found here.
 
     Returns:
         The scan (the same object if nothing was found), its ``info`` with the number of ``dead_readings``; and one
@@ -344,24 +407,23 @@ def mended(scan: Scan) -> tuple[Scan, list[str]]:
     """
     g = scan.geometry
     before = list(scan.info.get("mended", []))
-    if scan.noise_free or scan.logged or scan.counts.ndim > 3 or (scan.quantum is None and not scan.counting):
+    if not is_mended(scan):
         return scan, before
     window, dead = scan.window, scan.dead
     air = scan.air if window is None else scan.air[window.first_row : window.first_row + window.rows]
-    photon = 1.0 if scan.quantum is None else float(scan.quantum.median())
     options: dict[str, Any] = {
-        "photon": max(photon, dispersion(scan.counts, g.has_rows)) if window is None else photon,
+        "photon": photon_and_light(scan)[0] if photon is None else photon,
         "electronic_noise": scan.electronic_noise,
     }
     if g.has_rows:
         first = None if window is None else window.first_column
-        found = find_defects(scan.counts, air, first, known=dead, **options)
+        found = find_defects(scan.counts, air, first, known=dead, cells=cells, **options)
         mask = found.mask
     else:
         # Slices of a stack need not be neighbours.
-        counts, cells = scan.counts.reshape(-1, g.views, 1, g.columns), air.reshape(-1, 1, g.columns)
+        counts, beam = scan.counts.reshape(-1, g.views, 1, g.columns), air.reshape(-1, 1, g.columns)
         known = [None] * len(counts) if dead is None else list(dead.reshape(counts.shape))
-        slices = [find_defects(n, a, known=k, **options) for n, a, k in zip(counts, cells, known, strict=True)]
+        slices = [find_defects(n, a, known=k, **options) for n, a, k in zip(counts, beam, known, strict=True)]
         mask = torch.stack([f.mask for f in slices]).reshape(scan.counts.shape)
         found = Defects(
             mask, sum(f.dead_cells for f in slices), sum(f.hot_cells for f in slices),
@@ -373,8 +435,8 @@ def mended(scan: Scan) -> tuple[Scan, list[str]]:
     dead = mask if scan.dead is None else mask | scan.dead
     p = replace(scan, dead=dead)._logarithm()
     # Dead readings stand as 1 in p.
-    expected = torch.exp(p - bridge(p, dead, rows=g.has_rows, most=1.0))
-    replaced = (expected - 0.5 * (1.0 if scan.quantum is None else scan.quantum)).clamp_min(0.0)
+    replaced = p.sub_(bridge(p, dead, rows=g.has_rows, most=1.0)).exp_()
+    replaced.sub_(0.5 * (1.0 if scan.quantum is None else scan.quantum)).clamp_min_(0.0)
     changes: dict[str, Any] = {"counts": torch.where(mask, replaced, scan.counts)}
     if window is None:
         axes = (-2, -1) if g.has_rows else (-1,)

@@ -303,6 +303,11 @@ class ConeBeam(_Divergent):
         """Row centres along z on the detector, ``(rows,)`` mm."""
         return _axis(self.rows, self.pitch[0], self.offset[0])
 
+    def with_rows(self, first: int, rows: int) -> ConeBeam:
+        """The same beam on ``rows`` rows, the first of which is row ``first`` of this detector, at their places."""
+        shift = (first + 0.5 * (rows - self.rows)) * self.pitch[0]
+        return replace(self, rows=rows, offset=(self.offset[0] + shift, self.offset[1]))
+
     @property
     def central_fan(self) -> FanBeam:
         """The fan beam of the plane z = 0."""

@@ -310,7 +310,8 @@ def _dispersion(readings: Tensor) -> float:
     second = n[:, 2:] - 2.0 * n[:, 1:-1] + n[:, :-2]
     level = (n[:, 2:] + n[:, 1:-1] + n[:, :-2]) / 3.0
     live = (n[:, 2:] > 0) & (n[:, 1:-1] > 0) & (n[:, :-2] > 0)
-    level, ratio = level[live], (second.square() / (6.0 * level))[live]
+    del n
+    level, ratio = level[live], second.square_().div_(6.0 * level)[live]
     for _ in range(2):  # a first guess from all, then without the dim ones, whose noise is not normal
         if ratio.numel() < 8:
             return math.nan
@@ -350,9 +351,10 @@ def log_bias(mean: Tensor) -> Tensor:
     """
     known, bias = _log_bias()
     # The logarithm of the estimate is biased, too: ½ a count in those that it was made of.
-    m = (mean + 0.5 / _AVERAGED).double()
-    found = np.interp(np.log(m.clamp(FEWEST, MANY).numpy()), known, bias)
-    return torch.from_numpy(np.where((m < MANY).numpy(), found, 0.0)).to(mean.dtype)
+    m = mean + 0.5 / _AVERAGED
+    dim = m < MANY
+    found = np.interp(np.log(m[dim].double().clamp(FEWEST, MANY).numpy()), known, bias)
+    return torch.zeros_like(mean).masked_scatter_(dim, torch.from_numpy(found).to(mean.dtype))
 
 
 def smoothed(values: Tensor, dead: Tensor | None, rows: bool) -> Tensor:

@@ -413,8 +413,8 @@ class Scan:
         write_scan(self, path)
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Scan:
-        """Read a scan written by :meth:`save`.
+    def load(cls, path: str | os.PathLike[str], slices: slice | None = None) -> Scan:
+        """Read a scan written by :meth:`save`; with ``slices`` no more than these slices, or rows of a cone beam.
 
         Raises:
             FileNotFoundError: no such file.
@@ -422,4 +422,4 @@ class Scan:
                 newer format.
         """
         with read_hdf5(path, "scan") as file:
-            return cls(**scan_fields(file, path))
+            return cls(**scan_fields(file, path, slices))

@@ -14,13 +14,14 @@ from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam
 from torchpcct.scanner.linearisation import WaterLinearisation
 from torchpcct.vector_geometry import VectorGeometry
 
-__all__ = ["read_geometry", "scan_fields", "write_geometry", "write_scan"]
+__all__ = ["read_geometry", "scan_fields", "slice_axis", "sliced", "write_geometry", "write_scan"]
 
 _VERSION = 5
 """2: energy-integrating scans with their noise model. 3: with a checksum (:func:`torchpcct.files.write_hdf5`). 4:
 parallel and fan beams, flux, dead readings, units. 5: geometries given view by view. Each scan is written as the lowest
 version that holds it."""
-# Compress in blocks of whole views: fast to write, and a window of views can be read without the rest.
+# Compress in blocks of one view: fast to write, and a window of views, or of rows, can be read without the rest.
+_CHUNK_ROWS = 64
 _HDF5_COMPRESSION = {"compression": "lzf", "shuffle": True}
 
 
@@ -38,7 +39,9 @@ def write_scan(scan: Any, path: str | os.PathLike[str]) -> None:
             file.attrs["exposure_s"] = scan.exposure_s
         if scan.seed is not None:
             file.attrs["seed"] = scan.seed
-        chunk = (*(1,) * (scan.counts.ndim - 2), *scan.counts.shape[-2:])
+        rows, columns = scan.counts.shape[-2:]
+        rows = min(rows, _CHUNK_ROWS) if scan.geometry.has_rows else rows
+        chunk = (*(1,) * (scan.counts.ndim - 2), rows, columns)
         # Counts are whole numbers: as integers they compress, and they stay exact.
         whole = scan.counting and not (scan.noise_free or scan.logged) and float(scan.counts.max()) < 2**31
         whole = whole and (not foreign or bool((scan.counts == scan.counts.round()).all()))
@@ -63,11 +66,11 @@ def write_scan(scan: Any, path: str | os.PathLike[str]) -> None:
         file.attrs["complete"] = True
 
 
-def scan_fields(file: Any, path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Fields of the scan in an open HDF5 file.
+def scan_fields(file: Any, path: str | os.PathLike[str], slices: slice | None = None) -> dict[str, Any]:
+    """Fields of the scan in an open HDF5 file; with ``slices`` those of some slices, or rows of a cone beam.
 
     Raises:
-        ValueError: a newer format, or a file that was not written to its end.
+        ValueError: a newer format, a file that was not written to its end, or slices of a scan that has none.
         KeyError: something is missing.
     """
     if int(file.attrs["version"]) > _VERSION:
@@ -84,27 +87,63 @@ def scan_fields(file: Any, path: str | os.PathLike[str]) -> dict[str, Any]:
         )
         surround = torch.from_numpy(w["surround"][()])
 
-    def given(name: str) -> Any:
-        return torch.from_numpy(file[name][()]) if name in file else None
+    geometry, info = read_geometry(file["geometry"]), json.loads(file.attrs["info"])
+    axis = 0
+    if slices is not None:
+        shape = tuple(file["counts"].shape)
+        axis = slice_axis(geometry, shape, window)
+        geometry, info["slices"] = sliced(geometry, slices, shape[axis])
+        slices = slice(*info["slices"][:2])
+
+    def given(name: str, axis: int = axis) -> Any:
+        if name not in file:
+            return None
+        return torch.from_numpy(file[name][()] if slices is None else file[name][(slice(None),) * axis + (slices,)])
 
     return {
-        "counts": torch.from_numpy(file["counts"][()]).to(torch.float32),
-        "air": torch.from_numpy(file["air"][()]),
-        "geometry": read_geometry(file["geometry"]),
+        "counts": given("counts").to(torch.float32),
+        "air": given("air", 0),
+        "geometry": geometry,
         "linearisation": WaterLinearisation.load(file["linearisation"]),
         "exposure_s": float(file.attrs["exposure_s"]) if "exposure_s" in file.attrs else None,
         "seed": int(file.attrs["seed"]) if "seed" in file.attrs else None,
         "window": window,
         "surround": surround,
         "counting": bool(file.attrs["counting"]),
-        "info": json.loads(file.attrs["info"]),
+        "info": info,
         "quantum": given("quantum_kev"),
         "electronic_noise": float(file.attrs.get("electronic_noise_kev", 0.0)),
-        "flux": given("flux"),
+        "flux": torch.from_numpy(file["flux"][()]) if "flux" in file else None,
         "dead": given("dead"),
         "logged": bool(file.attrs.get("logged", False)),
         "unit": str(file.attrs.get("unit", "HU")),
     }
+
+
+def slice_axis(geometry: Geometry, shape: tuple[int, ...], window: Any = None) -> int:
+    """Axis of the slices of a stack, or of the rows of a cone beam, in counts of a shape.
+
+    Raises:
+        ValueError: there is none.
+    """
+    if len(shape) != 3 or window is not None or (geometry.has_rows and not isinstance(geometry, ConeBeam)):
+        kind = "part of a detector" if window is not None else type(geometry).__name__
+        raise ValueError(
+            f"slices= picks slices of parallel and fan beams or rows of a cone beam, this is one {kind} of "
+            f"{len(shape)} axes"
+        )
+    return 1 if geometry.has_rows else 0
+
+
+def sliced(geometry: Any, slices: slice, count: int) -> tuple[Any, list[int]]:
+    """Geometry of some of ``count`` slices or rows, and what a scan's ``info["slices"]`` says: first, stop, count."""
+    first, stop, step = slices.indices(count)
+    if step != 1 or stop <= first:
+        ends = ":".join("" if end is None else str(end) for end in (slices.start, slices.stop))
+        what = "rows" if geometry.has_rows else "slices"
+        raise ValueError(f"slices= must lie within the {count} {what} of the scan, got {ends}")
+    cone = isinstance(geometry, ConeBeam)
+    return geometry.with_rows(first, stop - first) if cone else geometry, [first, stop, count]
 
 
 def write_geometry(group: Any, geometry: Geometry) -> None:

@@ -23,6 +23,7 @@ from torchpcct.formats.volume_files import (
     write_meta_image,
     write_nifti,
 )
+from torchpcct.formats.volume_slabs import read_ome_zarr, write_ome_zarr
 from torchpcct.geometry import VolumeGrid
 from torchpcct.validate import UNITS, checked, choice
 
@@ -85,10 +86,10 @@ class Volume:
         return f"Volume({size}, {low:.4g} … {high:.4g} {self.unit}, {how}\n       {self.grid!r})"
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write ``.nii`` / ``.nii.gz`` (NIfTI-1), ``.mha`` (MetaImage), ``.h5`` (HDF5 with grid and report), or, if the
-        name has no ending, a folder with a DICOM series in HU.
+        """Write ``.nii`` / ``.nii.gz`` (NIfTI-1), ``.mha`` (MetaImage), ``.h5`` (HDF5 with grid and report), ``.zarr``
+        (OME-Zarr 0.5), or, if the name has no ending, a folder with a DICOM series in HU.
 
-        x, y, z of the scanner become right, anterior, superior. DICOM needs the extra ``io``. A 2-D image
+        x, y, z of the scanner become right, anterior, superior. DICOM and OME-Zarr need the extra ``io``. A 2-D image
         is written as :meth:`slices` makes it, but to HDF5, which keeps it as it is.
 
         Raises:
@@ -102,7 +103,9 @@ class Volume:
         if form == "HDF5":
             self._save_hdf5(path)
         else:
-            write = {"NIfTI": write_nifti, "MetaImage": write_meta_image, "DICOM": write_dicom}[form]
+            write = {
+                "NIfTI": write_nifti, "MetaImage": write_meta_image, "DICOM": write_dicom, "OME-Zarr": write_ome_zarr
+            }[form]  # fmt: skip
             slices = self.slices()
             write(path, slices.data.detach().cpu().numpy(), slices.grid, self.unit)
 
@@ -135,7 +138,9 @@ class Volume:
         """
         form = format_of(path)
         if form != "HDF5":
-            read = {"NIfTI": read_nifti, "MetaImage": read_meta_image, "DICOM": read_dicom}[form]
+            read = {"NIfTI": read_nifti, "MetaImage": read_meta_image, "DICOM": read_dicom, "OME-Zarr": read_ome_zarr}[
+                form
+            ]
             values, grid, unit = read(path)
             return cls(torch.from_numpy(values), grid, {"file": str(path)}, unit)
         with read_hdf5(path, "volume") as file:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import shlex
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +30,6 @@ from torchpcct.validate import choice, number, numbers, whole
 if TYPE_CHECKING:
     from recon.study.study import ProgressBars
     from torchpcct.acquisition.config import SimulationConfig
-    from torchpcct.scan import Scan
     from torchpcct.scene.voxels import VoxelScene
 
 __all__ = ["add_lower_dose", "add_reconstruct", "add_show_config", "add_simulate", "grid_of_scan"]
@@ -199,7 +198,7 @@ def _add_reader_options(parser: argparse._ActionsContainer) -> None:
     parser.add_argument(
         "--photons", type=float, metavar="N", help="of an unattenuated reading, of scans given as line integrals"
     )
-    parser.add_argument("--slices", metavar="A:B", help="slices of parallel and fan beams to read")
+    parser.add_argument("--slices", metavar="A:B", help="slices of parallel and fan beams, or rows of a cone, to read")
 
 
 def _reader_options(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -224,8 +223,12 @@ def _reader_options(arguments: argparse.Namespace) -> dict[str, Any]:
     return options
 
 
-def grid_of_scan(scan: Scan, arguments: argparse.Namespace) -> VolumeGrid:
-    """The grid that was asked for; else the plaque's inset for a windowed scan, the field of view for any other."""
+def grid_of_scan(scan: Any, arguments: argparse.Namespace) -> VolumeGrid:
+    """The grid that was asked for; else the plaque's inset for a windowed scan, the field of view for any other.
+
+    Args:
+        scan: a scan, or the :class:`recon.fbp.slabs.ScanSlices` of one.
+    """
     import numpy as np
 
     from recon.fbp.angular_weights import is_offset, view_steps
@@ -270,7 +273,7 @@ def grid_of_scan(scan: Scan, arguments: argparse.Namespace) -> VolumeGrid:
     return VolumeGrid((*slices, *plane), voxel, tuple(center[3 - len(slices) - 2 :]))
 
 
-def _of_axes(scan: Scan, arguments: argparse.Namespace) -> tuple[list[float] | None, list[float] | None]:
+def _of_axes(scan: Any, arguments: argparse.Namespace) -> tuple[list[float] | None, list[float] | None]:
     """``--extent`` and ``--center`` as z, y, x, where they are given.
 
     Raises:
@@ -326,8 +329,9 @@ def _method_options(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     options = _method_options(arguments)
+    slabs = arguments.memory is not None
     if arguments.out is None:
-        arguments.out = Path(f"{without_ending(arguments.scan)}_{arguments.method}.nii.gz")
+        arguments.out = Path(f"{without_ending(arguments.scan)}_{arguments.method}.nii{'' if slabs else '.gz'}")
     check_target(arguments.out)
     check_output(arguments, is_own_volume, arguments.scan, arguments.geometry, beside=True)
     if arguments.voxel is not None:
@@ -338,18 +342,20 @@ def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
             if len(given) not in (2, 3):
                 raise ValueError(f"--{name} takes three numbers, Z Y X, of slices two, Y X; got {len(given)}")
             numbers(f"--{name}", given, unit="mm", **limits)
-    if arguments.voxel is not None:
+    if arguments.voxel is not None and not slabs:
         _require_voxels(tuple(math.ceil(e / arguments.voxel) for e in arguments.extent or (1.0, 1.0, 1.0)))
     if not arguments.scan.exists():
         raise FileNotFoundError(f"{arguments.scan} does not exist (torchpcct simulate makes scans)")
     import yaml
 
     from recon.api import METHODS, reconstruct
-    from torchpcct.formats.geometry_yaml import geometry_values
     from torchpcct.formats.scans import check_scan_name, open_scan
 
     choice("method", arguments.method, METHODS)
     check_scan_name(arguments.scan)
+    if slabs:
+        _reconstruct_slabs(arguments, options, progress)
+        return
     scan = open_scan(arguments.scan, **_reader_options(arguments))
     if arguments.find_axis:
         from torchpcct.formats.preprocess import centred, find_axis
@@ -365,11 +371,7 @@ def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     grid = grid_of_scan(scan, arguments)
     _require_voxels(grid.shape)
     check_target(arguments.out, grid.voxels, scan.unit)
-    config = {
-        "scan": str(arguments.scan), "geometry": geometry_values(scan.geometry), "method": arguments.method,
-        "grid": {"shape": list(grid.shape), "spacing": list(grid.spacing), "center": list(grid.center)},
-        "unit": scan.unit, "clean": arguments.clean, **{k: v if k != "weights" else str(v) for k, v in options.items()},
-    }  # fmt: skip
+    config = _config(arguments, scan, grid, options)
     if arguments.dry_run:
         bytes_ = 4 * (3 * scan.counts.numel() + 2 * grid.voxels)
         seconds = grid.voxels * scan.geometry.views / _FBP_RATE
@@ -391,33 +393,87 @@ def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         scan, grid, arguments.method, progress=progress.of(arguments.method), device=arguments.device, **options
     )
     progress.close()
-    made = {
+    placed = {"axis": scan.info["axis"]} if arguments.find_axis else {}
+    volume = replace(volume, report={**volume.report, **placed, **_made(arguments)}).slices()
+    volume.save(arguments.out)
+    report = {**volume.report, "mean": float(volume.data.mean())}
+    _tell_volume(arguments, config, volume.grid, volume.unit, report)
+
+
+def _config(arguments: argparse.Namespace, scan: Any, grid: VolumeGrid, options: dict[str, Any]) -> dict[str, Any]:
+    from torchpcct.formats.geometry_yaml import geometry_values
+
+    return {
+        "scan": str(arguments.scan), "geometry": geometry_values(scan.geometry), "method": arguments.method,
+        "grid": {"shape": list(grid.shape), "spacing": list(grid.spacing), "center": list(grid.center)},
+        "unit": scan.unit, "clean": arguments.clean, **{k: v if k != "weights" else str(v) for k, v in options.items()},
+    }  # fmt: skip
+
+
+def _made(arguments: argparse.Namespace) -> dict[str, Any]:
+    return {
         "torchpcct": VERSION, "command": shlex.join(["torchpcct", *arguments.command_line]),
         "input": str(arguments.scan), "input_sha256": fingerprint(arguments.scan),
     }  # fmt: skip
-    placed = {"axis": scan.info["axis"]} if arguments.find_axis else {}
-    volume = replace(volume, report={**volume.report, **placed, **made}).slices()
-    volume.save(arguments.out)
-    grid, mean = volume.grid, float(volume.data.mean())
+
+
+def _reconstruct_slabs(arguments: argparse.Namespace, options: dict[str, Any], progress: ProgressBars) -> None:
+    """``--memory``: slab by slab (:mod:`recon.fbp.slabs`)."""
+    import yaml
+
+    from recon.fbp.slabs import ScanSlices, plan_slabs, reconstruct_to
+    from torchpcct.formats.volume_slabs import check_slab_name
+
+    check_slab_name(arguments.out)
+    for name, remedy in (("clean", "filters over all slices"), ("find_axis", "give --axis COLUMN, which "
+                         "--find-axis --slices A:B of a few slices finds,")):  # fmt: skip
+        if getattr(arguments, name):
+            raise ValueError(f"--{name.replace('_', '-')} is not done slab by slab: {remedy} or leave out --memory")
+    reader = _reader_options(arguments)
+    if reader.pop("slices", None) is not None:
+        raise ValueError(
+            "--memory takes all slices of the scan: leave out --slices, or reconstruct those without --memory"
+        )
+    source = ScanSlices(arguments.scan, **reader)
+    grid = grid_of_scan(source, arguments)
+    check_target(arguments.out, grid.voxels, source.unit)
+    config = {**_config(arguments, source, grid, options), "memory": arguments.memory}
+    plan = plan_slabs(source.geometry, grid, arguments.memory, arguments.method)
+    if arguments.dry_run:
+        print(as_json({**config, "estimate": {"file": str(arguments.out), **asdict(plan)}}) if arguments.json else
+              f"{yaml.safe_dump(config, sort_keys=False, allow_unicode=True)}\n{arguments.out}: {plan}")  # fmt: skip
+        return
+    if not arguments.json:
+        print(plan)
+    report = reconstruct_to(
+        source, grid, arguments.out, arguments.method, memory=arguments.memory,
+        progress=progress.of(arguments.method), **options,
+    )  # fmt: skip
+    progress.close()
+    _tell_volume(arguments, config, grid, source.unit, {**report, **_made(arguments)})
+
+
+def _tell_volume(
+    arguments: argparse.Namespace, config: dict[str, Any], grid: VolumeGrid, unit: str, report: dict[str, Any]
+) -> None:
     size = " × ".join(map(str, grid.shape))
     spacing = " × ".join(f"{s:.4g}" for s in grid.spacing)
-    seconds = volume.report["seconds"]
-    length = length_of(scan.unit)
+    length = length_of(unit)
     noted = _NO_SIZE if length == "pixels" else ""
     short = f"{size} voxels of {spacing} {length}{noted}, "
-    short += f"{arguments.method}, mean {mean:.4g} {volume.unit}, {seconds} s"
-    short += "".join(f"\n  {text}" for text in volume.report.get("notes", []))
-    for text in volume.report.get("warnings", []):
+    short += f"{arguments.method}, mean {report['mean']:.4g} {unit}, {report['seconds']} s"
+    short += "".join(f"\n  {text}" for text in report.get("notes", []))
+    for text in report.get("warnings", []):
         arguments.warn(text)
     place = {f"spacing_{length}": list(grid.spacing), f"center_{length}": list(grid.center)}
-    tell(arguments, short, config, shape=list(grid.shape), **place, unit=volume.unit, mean=mean, **volume.report)
+    tell(arguments, short, config, shape=list(grid.shape), **place, unit=unit, **report)
 
 
 def add_reconstruct(commands: Commands) -> None:
     parser = command(
         commands, "reconstruct", _reconstruct, "reconstruct a scan file to a volume",
         "Reconstruct a scan, ours or a foreign one, and write the volume, with what was done beside (.json, .yaml).",
-        "volume to write: .nii, .nii.gz, .mha, .h5, or no ending for a DICOM series (default SCAN_METHOD.nii.gz)",
+        "volume to write: .nii, .nii.gz, .mha, .h5, .zarr, or no ending for DICOM (default SCAN_METHOD.nii.gz)",
     )  # fmt: skip
     examples(
         parser, "torchpcct reconstruct tooth.h5 --find-axis --out tooth.nii.gz",
@@ -448,6 +504,12 @@ def add_reconstruct(commands: Commands) -> None:
         help="find the rotation axis: of a full turn, or half a turn of parallel rays",
     )
     mended.add_argument("--clean", action="store_true", help="take out stripes and outliers (parallel and fan beams)")
+    where.add_argument(
+        "--memory",
+        metavar="SIZE",
+        help="limit, e.g. 4GB, for volumes larger than memory: slab by slab to .nii or .zarr (default "
+        "SCAN_METHOD.nii); what was interrupted goes on",
+    )
     _add_output(parser)
 
 

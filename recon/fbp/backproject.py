@@ -27,6 +27,8 @@ _TILES = ((12, 24), (8, 12))
 _ATAN_TERMS = {torch.float32: (7, 20), torch.float64: (12, 20)}
 #: Errors of the fan angle, in columns, at which the longer polynomial takes over: far below rounding.
 _ATAN_TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-11}
+#: Rows of a slab at least: products of a matrix with fewer rows are summed in another order by some libraries.
+_FEWEST_ROWS = 8
 
 
 def _atan_polynomial(reach: float, columns_per_rad: float, dtype: torch.dtype) -> tuple[float, ...]:
@@ -105,6 +107,7 @@ class BackprojectionPlan:
             radius = max(min(-u[0], u[-1]) + geometry.pitch / 2.0, 0.0)
         else:
             radius = geometry.fov_radius
+        self.radius = float(radius)
         y, x = self.grid.axes[-2:]
         outside = np.hypot(y[:, None], x[None, :]) + self.travel > radius * (1.0 + 1e-9)
         if not outside.any():
@@ -180,18 +183,38 @@ class BackprojectionPlan:
                 return y, x
         return _TILES[0]
 
-    def forward(self, data: Tensor) -> Tensor:
-        """``(..., views, [rows,] columns)`` to ``(..., [z,] y, x)``."""
+    def rows(self, first: int, stop: int) -> tuple[int, int]:
+        """Of a cone beam: the first row of the window that the slices ``first`` … ``stop - 1`` read, and the one after
+        their last."""
+        seen = self.radius if self.mask is not None else self.grid.in_plane_radius
+        radius = min(seen, self.grid.in_plane_radius) + self.travel
+        z = self.grid.axes[0][[first, stop - 1]] + np.array([self.shifts[:, 2].min(), self.shifts[:, 2].max()])
+        heights = self.sdd / (self.sod + np.array([-radius, radius])) * self.row_scale
+        row = np.outer(z, heights) + self.row_start
+        # What a row needs of its neighbours, and a kink of a tile that reaches beyond the field of view.
+        low = int(np.clip(math.floor(row.min()) - 3, 0, max(self.window.rows - _FEWEST_ROWS, 0)))
+        return low, int(np.clip(math.floor(row.max()) + 4, min(low + _FEWEST_ROWS, self.window.rows), self.window.rows))
+
+    def forward(self, data: Tensor, slices: tuple[int, int] | None = None, first_row: int = 0) -> Tensor:
+        """``(..., views, [rows,] columns)`` to ``(..., [z,] y, x)``.
+
+        Of a cone beam, with ``slices`` (first, stop) only these of the volume, from the rows of the window that start
+        at ``first_row`` and hold :meth:`rows`: the same bits as in the whole.
+        """
         from recon.fbp import backproject_kernels as kernels  # numba loads with its first use
 
         n = 3 if self.cone else 2
         lead, shape = data.shape[:-n], data.shape[-n:]
-        out = data.new_empty((math.prod(lead), *self.grid.shape))
+        first, stop = (0, self.grid.shape[0]) if slices is None else slices
+        shape_out = (stop - first, *self.grid.shape[1:]) if self.cone else self.grid.shape
+        out = data.new_empty((math.prod(lead), *shape_out))
         if out.shape[0]:
             numbers = data.reshape(-1, *shape).contiguous().numpy()
             arguments = self._arguments(data.dtype)
             if self.cone:
-                tile = self._tile()
+                tile, z = self._tile(), self.grid.axes[0]
+                arguments[6] = z[first:stop]
+                arguments += [float(first_row), z[0], z[-1]]
                 tasks = len(out) * math.prod(-(-n // t) for n, t in zip(out.shape[-2:], tile, strict=True))
                 run(kernels.backproject_3d, tasks, self.kind, numbers, *arguments, *tile, out.numpy())
             else:
@@ -199,7 +222,7 @@ class BackprojectionPlan:
                 run(kernels.backproject_2d, tasks, self.kind, numbers, *arguments, out.numpy())
             if self.mask is not None:
                 out.masked_fill_(torch.from_numpy(self.mask), 0.0)
-        return out.view(*lead, *self.grid.shape)
+        return out.view(*lead, *shape_out)
 
     def transpose(self, volume: Tensor) -> Tensor:
         """``(..., [z,] y, x)`` to ``(..., views, [rows,] columns)``: the exact transpose of :meth:`forward`."""

@@ -176,7 +176,7 @@ def _add_by_kink(near, far, table, m, z, tau, step, total, p):
 
 
 @njit(inline="always", **_INLINE)
-def _add_by_index(near, far, turned, m, z, step, origin, column, lower, upper, total, p):
+def _add_by_index(near, far, turned, m, z, step, origin, below, column, lower, upper, total, p):
     """One voxel column, any magnification: interpolate the columns first, then look the rows up."""
     number, n = z.dtype.type, m + np.uint64(1)
     rows = turned.shape[1] - 2
@@ -184,7 +184,7 @@ def _add_by_index(near, far, turned, m, z, step, origin, column, lower, upper, t
         column[r] = near * turned[m, r + np.uint64(1)] + far * turned[n, r + np.uint64(1)]
     zero, last = number(0), number(rows - 1)
     for k in range(z.size):  # apart from the look-ups, so that it vectorises
-        row = min(max(z[k] * step + origin, zero), last)
+        row = min(max((z[k] * step + origin) - below, zero), last)
         lower[k] = np.int32(row)
         upper[k] = row - number(lower[k])
     for k in range(np.uint64(z.size)):
@@ -195,8 +195,8 @@ def _add_by_index(near, far, turned, m, z, step, origin, column, lower, upper, t
 
 @njit(**_BARE)
 def _add_view(
-    index, weight, height, first, last, row_scale, kink, table, tau, turned, origin, column, lower, upper, heights,
-    total,
+    index, weight, height, first, last, row_scale, kink, table, tau, turned, origin, below, column, lower, upper,
+    heights, total,
 ):  # fmt: skip
     """What one view adds to every voxel column of a tile; apart, because it needs no reference counts."""
     number = total.dtype.type
@@ -211,7 +211,7 @@ def _add_view(
         if kink:
             _add_by_kink(near, far, table, m, heights, tau, step, total, q)
         else:
-            _add_by_index(near, far, turned, m, heights, step, origin, column, lower, upper, total, q)
+            _add_by_index(near, far, turned, m, heights, step, origin, below, column, lower, upper, total, q)
 
 
 @njit(**_OPTIONS)
@@ -233,11 +233,18 @@ def backproject_3d(
     row_scale,
     row_start,
     atan,
+    first_row,
+    bottom,
+    top,
     tile_y,
     tile_x,
     out,
 ):
-    """``data (B, V, rows, columns)`` into ``out (B, Z, Y, X)``, tile by tile of ``tile_y × tile_x`` voxel columns."""
+    """``data (B, V, rows, columns)`` into ``out (B, Z, Y, X)``, tile by tile of ``tile_y × tile_x`` voxel columns.
+
+    ``z`` may be some slices of a volume that reaches from ``bottom`` to ``top``, and ``data`` the rows from
+    ``first_row`` that they read: every voxel then gets the same bits as in the whole volume.
+    """
     _, views, rows, columns = data.shape
     nz, ny, nx = out.shape[1], out.shape[2], out.shape[3]
     number = data.dtype.type
@@ -245,7 +252,7 @@ def backproject_3d(
     tiles = tiles_y * tiles_x
     padded = (nz + 7) // 8 * 8
     last = columns - 1.0
-    origin = number(row_start)
+    origin, below = number(row_start), number(first_row)
     for task in range(begin, end):
         b = task // tiles
         iy, ix = (task % tiles) // tiles_x, task % tiles_x
@@ -298,13 +305,13 @@ def backproject_3d(
                     turned[i - first, r + 1] = slab[r, min(i, columns - 1)]
             for i in range(stop - first):
                 turned[i, 0], turned[i, rows + 1] = turned[i, 1], turned[i, rows]
-            reach = max(abs(z[0] + lift), abs(z[nz - 1] + lift)) * row_scale
+            reach = max(abs(bottom + lift), abs(top + lift)) * row_scale
             kink = reach * (high - low) <= 1.0
             if kink:
                 for k in range(nz):
                     r = max((z[k] + lift) * low, (z[k] + lift) * high) * row_scale + row_start
-                    middle = min(max(math.floor(r), 0.0), rows - 1.0)
-                    tau[k] = number(row_start - middle)
+                    middle = min(max(math.floor(r) - first_row, 0.0), rows - 1.0)
+                    tau[k] = number(row_start - (middle + first_row))
                     lower[k] = np.int32(middle)
                 for i in range(stop - first):
                     source, g, d, e = turned[i], table[i, 0], table[i, 1], table[i, 2]
@@ -315,8 +322,8 @@ def backproject_3d(
                         d[k] = here - source[j]
                         e[k] = source[j + np.uint32(2)] - here
             _add_view(
-                index, weight, height, first, last, row_scale, kink, table, tau, turned, origin, column, lower, upper,
-                heights, total,
+                index, weight, height, first, last, row_scale, kink, table, tau, turned, origin, below, column, lower,
+                upper, heights, total,
             )  # fmt: skip
         for k in range(nz):
             for p in range(n):

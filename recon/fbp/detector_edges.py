@@ -21,7 +21,7 @@ from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid
 from torchpcct.robust import MEDIAN_TO_SD
 from torchpcct.validate import checked
 
-__all__ = ["Rows", "continued", "cut_off", "mirrored", "reach"]
+__all__ = ["Rows", "continued", "cut_off", "ends_cut_off", "mirrored", "reach", "row_ends"]
 
 Floats = NDArray[np.float64]
 G = TypeVar("G", bound=Geometry)
@@ -64,13 +64,20 @@ def cut_off(lines: Tensor, geometry: Any, weights: Floats) -> tuple[bool, bool]:
     A side that the weights leave out (the short one of an offset detector) does not count.
     """
     means = lines.detach()
-    if isinstance(geometry, ConeBeam):
-        means = means.mean(-2)
-    limit = _CUT * float(means.amax())
-    width = max(1, geometry.columns // 256)
-    order = torch.from_numpy(np.argsort(np.mod(geometry.angles, 2.0 * math.pi), kind="stable")).to(means.device)
-    ends = (means[..., :width].mean(-1), means[..., -width:].mean(-1))
-    found = [limit > 0 and _rises(end[..., order], limit) for end in ends]
+    return ends_cut_off(*row_ends(means.mean(-2) if isinstance(geometry, ConeBeam) else means), geometry, weights)
+
+
+def row_ends(means: Tensor) -> tuple[float, Tensor, Tensor]:
+    """The highest of line integrals ``(..., views, columns)``, means over the rows, and what the rows end at."""
+    width = max(1, means.shape[-1] // 256)
+    return float(means.amax()), means[..., :width].mean(-1), means[..., -width:].mean(-1)
+
+
+def ends_cut_off(highest: float, first: Tensor, last: Tensor, geometry: Any, weights: Floats) -> tuple[bool, bool]:
+    """:func:`cut_off` of what :func:`row_ends` says of a scan."""
+    limit = _CUT * highest
+    order = torch.from_numpy(np.argsort(np.mod(geometry.angles, 2.0 * math.pi), kind="stable")).to(first.device)
+    found = [limit > 0 and _rises(end[..., order], limit) for end in (first, last)]
     if _leaves_out_short_side(weights, geometry):
         shown = weights.sum(0)
         found = [found[0] and shown[0] > shown[-1], found[1] and shown[-1] > shown[0]]

@@ -69,6 +69,8 @@ def read_data_exchange(
         readings = data[:, rows]
         angles = _theta(file, data.shape[0])
         info: dict[str, Any] = {"file": str(path), "format": "Data Exchange"}
+        if slices is not None:
+            info["slices"] = [*slices.indices(data.shape[1])[:2], data.shape[1]]
         if pitch is None:
             pitch, info["pixel_size"] = _pixel_size(file)
         unknown = pitch is None

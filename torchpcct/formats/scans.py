@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from torchpcct.files import is_sealed
@@ -19,10 +18,11 @@ from torchpcct.formats.stack import read_stack
 from torchpcct.geometry import Geometry, ParallelBeam
 from torchpcct.metrics.rotation_axis import at_axis
 from torchpcct.scan import Scan
+from torchpcct.scan_file import slice_axis, sliced
 from torchpcct.validate import number
 from torchpcct.vector_geometry import VectorGeometry
 
-__all__ = ["adapted", "check_scan_name", "open_scan"]
+__all__ = ["adapted", "check_scan_name", "open_scan", "own_options"]
 
 _HDF5, _YAML, _CATSIM = (".h5", ".hdf5", ".hdf"), (".yaml", ".yml"), (".prep", ".scan")
 
@@ -43,6 +43,8 @@ _OPTIONS = {
     "Data Exchange": {"slices"} | _COUNTS,
     "CatSim's readings": _COUNTS,
     "CatSim's line integrals": _LINES | {"photons"},
+    "a torchpcct scan": {"slices"},
+    "a .yaml stack": {"slices", "gain", "electronic_noise", "photons"},
     "a DICOM-CT-PD folder": {"ignore_flying_spot"},
 }
 """What the readers take themselves: what has to be known while reading, or is the format's own."""
@@ -78,6 +80,12 @@ def open_scan(path: str | os.PathLike[str], geometry: Geometry | None = None, **
     return adapted(_read(name, what, geometry, own), **{k: v for k, v in options.items() if k not in own and k in _ANY})
 
 
+def own_options(path: str | os.PathLike[str]) -> set[str]:
+    """Options that the reader of a file takes itself; with "slices" it reads no more of the file than those."""
+    check_scan_name(path)
+    return _OPTIONS.get(_format(Path(path)), set())
+
+
 def _format(name: Path) -> str:
     ending = name.suffix.lower()
     if ending in _CATSIM:
@@ -95,7 +103,7 @@ def _read(name: Path, what: str, geometry: Geometry | None, options: dict[str, A
             raise ValueError(f"{name.name}: CatSim's files do not hold the geometry, give it")
         return read_catsim(name, geometry, **options)
     if what == "a .yaml stack":
-        return read_stack(name, geometry)
+        return read_stack(name, geometry, **options)
     if geometry is not None and not isinstance(geometry, VectorGeometry):
         raise ValueError(
             f"{name.name} holds its geometry: leave out geometry, or give a VectorGeometry (kind: vectors) in its place"
@@ -103,7 +111,7 @@ def _read(name: Path, what: str, geometry: Geometry | None, options: dict[str, A
     if what == "a DICOM-CT-PD folder":
         scan = read_dicom_ct_pd(name, **options).scan()
     else:
-        scan = Scan.load(name) if what == "a torchpcct scan" else read_data_exchange(name, **options)
+        scan = Scan.load(name, **options) if what == "a torchpcct scan" else read_data_exchange(name, **options)
     return scan if geometry is None else _placed(scan, geometry)
 
 
@@ -122,7 +130,7 @@ def adapted(
         scan: of any format.
         axis: column that the rotation axis projects onto (may be fractional).
         pitch: cell width in mm, of parallel beams.
-        slices: of parallel and fan beams ``(slices, views, columns)``: those to keep.
+        slices: of parallel and fan beams ``(slices, views, columns)``: those to keep; of a cone beam its rows.
         mu_water: attenuation of water in mm⁻¹: volumes in HU.
         photons: of an unattenuated reading, of scans that were given as line integrals.
 
@@ -133,9 +141,8 @@ def adapted(
     g = scan.geometry
     kind = type(g).__name__
     if slices is not None:
-        if g.has_rows or scan.counts.ndim != 3:
-            raise ValueError(f"slices= picks slices of a parallel or fan beam, this is one {kind}")
         scan = _sliced(scan, slices)
+        g = scan.geometry
     if pitch is not None:
         if not isinstance(g, ParallelBeam):
             raise ValueError(f"pitch= is the cell width of parallel beams, this is a {kind}: its geometry says it")
@@ -163,18 +170,14 @@ def adapted(
     return scan
 
 
-def _text(slices: slice) -> str:
-    return ":".join("" if end is None else str(end) for end in (slices.start, slices.stop))
-
-
 def _sliced(scan: Scan, slices: slice) -> Scan:
-    kept = np.arange(scan.counts.shape[0])[slices]
-    if not kept.size:
-        raise ValueError(f"slices= must lie within the {scan.counts.shape[0]} slices of the scan, got {_text(slices)}")
+    axis = slice_axis(scan.geometry, tuple(scan.counts.shape), scan.window)
+    geometry, kept = sliced(scan.geometry, slices, scan.counts.shape[axis])
+    at = (slice(None),) * axis + (slice(*kept[:2]),)
     changed: dict[str, Any] = {
-        n: None if getattr(scan, n) is None else getattr(scan, n)[kept] for n in ("quantum", "dead")
+        n: None if getattr(scan, n) is None else getattr(scan, n)[at] for n in ("counts", "quantum", "dead")
     }
-    return replace(scan, counts=scan.counts[kept], air=scan.air[kept], **changed)
+    return replace(scan, geometry=geometry, air=scan.air[at[-1:]], info={**scan.info, "slices": kept}, **changed)
 
 
 def _placed(scan: Scan, geometry: VectorGeometry) -> Scan:

@@ -13,6 +13,7 @@ from torchpcct.formats.damage import check_size, needed, read_yaml, reading
 from torchpcct.formats.geometry_yaml import geometry_of
 from torchpcct.geometry import Geometry
 from torchpcct.scan import Scan
+from torchpcct.scan_file import slice_axis, sliced
 from torchpcct.validate import choice
 from torchpcct.vector_geometry import VectorGeometry
 
@@ -20,7 +21,7 @@ __all__ = ["EXAMPLE", "read_array", "read_stack"]
 
 EXAMPLE = """\
 # A stack of projections: torchpcct reconstruct scan.yaml; files are looked for beside this one
-readings: proj/*.tif        # a pattern, in the order of the names; or one .npy, .tif with all views
+readings: proj/*.tif        # a pattern, in the order of the names; or one .npy, .zarr, .tif with all views
 kind: counts                # or line_integrals: -ln of the transmission
 air: flat.tif               # of counts, without the object: a file, a pattern (several frames) or a number
 dark: dark.npy              # optional, of counts without beam; as air
@@ -47,8 +48,14 @@ _LINES = {"photons", "dead", "linearisation", "mu_water", "exposure_s"}
 _FILES = {"air", "dark", "dead", "flux", "photons"}
 
 
-def read_array(name: str, folder: Path = Path()) -> Any:
-    """Numbers of ``.npy`` or TIFF files: one file, or a pattern whose files are stacked in the order of their names.
+def read_array(name: str, folder: Path = Path(), pick: Any = None) -> Any:
+    """Numbers of ``.npy``, Zarr or TIFF files: one file, or a pattern whose files are stacked in the order of their
+    names.
+
+    Args:
+        name: of the file, or a pattern.
+        folder: that the name starts from.
+        pick: function of the array's shape that returns the index, one slice an axis, of what to read; None: all.
 
     Raises:
         FileNotFoundError: no file. ValueError: damaged, an unknown ending, files of several shapes.
@@ -56,19 +63,29 @@ def read_array(name: str, folder: Path = Path()) -> Any:
     paths = sorted(folder.glob(name)) if any(c in name for c in "*?[") else [folder / name]
     if not paths:
         raise FileNotFoundError(f"no file matches {folder / name}")
-    arrays = [_one(path) for path in paths]
-    if len(arrays) == 1:
-        return arrays[0]
+    if len(paths) == 1:
+        return _one(paths[0], pick)
+    at = (slice(None),) if pick is None else pick((len(paths), *_one(paths[0]).shape))
+    arrays = [_one(path) if pick is None else _one(path, lambda shape: at[1:]) for path in paths[at[0]]]
     shapes = {a.shape for a in arrays}
     if len(shapes) > 1:
         raise ValueError(f"the files of {name} have several shapes: {sorted(shapes)}")
     return np.stack(arrays)
 
 
-def _one(path: Path) -> Any:
+def _one(path: Path, pick: Any = None) -> Any:
+    """The numbers of a file; with ``pick``, a function of the number of axes and the first length, no more of them than
+    the index that it returns."""
     if path.suffix == ".npy":
         with reading(path, "a NumPy array"):
-            return np.load(path, allow_pickle=False)
+            values = np.load(path, mmap_mode=None if pick is None else "r", allow_pickle=False)
+            return values if pick is None else np.array(values[pick(values.shape)])
+    if path.suffix == ".zarr":
+        zarr = needed("zarr")
+        with reading(path, "a Zarr array"):
+            values = zarr.open_array(path, mode="r")
+            check_size(values.shape, "the array")
+            return values[... if pick is None else pick(values.shape)]
     if path.suffix in (".tif", ".tiff"):
         tifffile = needed("tifffile")
         with reading(path, "a TIFF image"), tifffile.TiffFile(path) as file:
@@ -80,18 +97,28 @@ def _one(path: Path) -> Any:
                     raise ValueError("it ends before its last image")
                 if page.compression == 1 and sum(page.databytecounts) < page.nbytes:
                     raise ValueError(f"it holds {sum(page.databytecounts)} bytes of an image of {page.nbytes}")
-            check_size(file.series[0].shape, "the image")
-            return file.asarray()
-    raise ValueError(f"{path.name}: readings must be .npy, .tif or .tiff")
+            shape = file.series[0].shape
+            check_size(shape, "the image")
+            if pick is None:
+                return file.asarray()
+            at = pick(shape)
+            if len(shape) < 3 or len(file.pages) != shape[0]:
+                return file.asarray()[at]
+            return np.stack([file.pages[int(k)].asarray()[at[1:]] for k in np.arange(shape[0])[at[0]]])
+    raise ValueError(f"{path.name}: readings must be .npy, .zarr, .tif or .tiff")
 
 
-def read_stack(path: str | os.PathLike[str], geometry: Geometry | None = None) -> Scan:
+def read_stack(
+    path: str | os.PathLike[str], geometry: Geometry | None = None, slices: slice | None = None, **known: Any
+) -> Scan:
     """The scan that a YAML file describes; see :data:`EXAMPLE`.
 
     Args:
         path: YAML file.
         geometry: where the file has none; a :class:`~torchpcct.vector_geometry.VectorGeometry` also in place of the
             file's.
+        slices: those to read, of a cone beam its rows; None: all.
+        known: values that take the place of the file's, e.g. ``gain``.
 
     Raises:
         FileNotFoundError: a file is missing.
@@ -102,7 +129,7 @@ def read_stack(path: str | os.PathLike[str], geometry: Geometry | None = None) -
     with reading(path, "the description of a scan"):
         if not isinstance(text, Mapping):
             raise ValueError("it is no mapping with readings, kind and geometry")
-        given = dict(text)
+        given = {**text, **known}
         kind = choice("kind", given.pop("kind", None), ("counts", "line_integrals"))
         described = given.pop("geometry", None)
         if geometry is None:
@@ -123,9 +150,27 @@ def read_stack(path: str | os.PathLike[str], geometry: Geometry | None = None) -
     options = {k: read_array(v, folder) if k in _FILES and isinstance(v, str) else v for k, v in given.items()}
     if "dead" in options:
         options["dead"] = np.asarray(options["dead"]).astype(bool)
-    readings = read_array(name, folder)
+    info: dict[str, Any] = {"file": str(path), "format": "stack"}
+    views, beam = geometry.views, geometry
+
+    def pick(shape: tuple[int, ...]) -> tuple[slice, ...]:
+        axis = slice_axis(beam, shape)
+        axis = 1 if shape[0] == views else axis  # images of a camera, view by view
+        info["slices"] = sliced(beam, slices, shape[axis])[1]  # type: ignore[arg-type]
+        return tuple(slice(*info["slices"][:2]) if k == axis else slice(None) for k in range(3))
+
+    readings = read_array(name, folder, None if slices is None else pick)
     if not geometry.has_rows and readings.ndim == 3 and readings.shape[0] == geometry.views:
-        # Images of a camera, view by view: slices first.
         readings = np.moveaxis(readings, 0, 1)
+    if slices is not None:
+        first, stop, count = info["slices"]
+        geometry = sliced(geometry, slices, count)[0]
+        for key in _FILES & set(options):
+            # One value a cell, (…, slices, columns), or one a reading of a stack, (slices, views, columns).
+            shape = np.shape(options[key])
+            if len(shape) > 1 and shape[-2] == count:
+                options[key] = options[key][..., first:stop, :]
+            elif len(shape) == 3 and shape[0] == count:
+                options[key] = options[key][first:stop]
     make = Scan.from_counts if kind == "counts" else Scan.from_line_integrals
-    return make(readings, geometry, info={"file": str(path), "format": "stack"}, **options)
+    return make(readings, geometry, info=info, **options)

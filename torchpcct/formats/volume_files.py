@@ -7,6 +7,7 @@ so the same point carries the opposite sign there; every reader shows the same v
 from __future__ import annotations
 
 import gzip
+import json
 import os
 import shutil
 import zlib
@@ -26,6 +27,7 @@ __all__ = [
     "check_volume_name",
     "format_of",
     "is_own_volume",
+    "nifti_header",
     "read_dicom",
     "read_meta_image",
     "read_nifti",
@@ -34,8 +36,8 @@ __all__ = [
     "write_nifti",
 ]
 
-ENDINGS = {"NIfTI": (".nii", ".nii.gz"), "MetaImage": (".mha",), "HDF5": (".h5", ".hdf5")}
-"""Of files; a name without ending is a folder for a DICOM series."""
+ENDINGS = {"NIfTI": (".nii", ".nii.gz"), "MetaImage": (".mha",), "HDF5": (".h5", ".hdf5"), "OME-Zarr": (".zarr",)}
+"""Of files, and of the folder of an OME-Zarr; a name without ending is a folder for a DICOM series."""
 
 _DICOM = (".dcm", ".ima")
 _STRAIGHT = 1e-4
@@ -88,10 +90,12 @@ def check_target(path: str | os.PathLike[str], voxels: int = 0, unit: str = "HU"
     if form == "DICOM":
         needed("pydicom")
         _check_series(target, unit)
-    elif target.is_dir():
+    elif target.is_dir() and not (form == "OME-Zarr" and is_own_volume(target)):
         raise ValueError(f"{target} is a folder: name a file to write")
+    if form == "OME-Zarr":
+        needed("zarr")
     require_writable(target.parent)
-    compressed = form == "MetaImage" or target.suffix == ".gz"
+    compressed = form in ("MetaImage", "OME-Zarr") or target.suffix == ".gz"
     least = 0 if compressed else voxels * (2 if form == "DICOM" else 4)
     free = shutil.disk_usage(target.parent).free
     if least > free:
@@ -108,6 +112,11 @@ def is_own_volume(path: str | os.PathLike[str]) -> bool:
         return Path(path).is_dir()
     if form == "HDF5":
         return is_own_hdf5(path, "volume")
+    if form == "OME-Zarr":
+        try:
+            return "torchpcct" in json.loads((Path(path) / "zarr.json").read_text(encoding="utf-8"))["attributes"]
+        except (OSError, ValueError, KeyError, TypeError):
+            return False
     try:
         with gzip.open(path) if str(path).endswith(".gz") else open(path, "rb") as file:
             header = file.read(2**12)
@@ -141,20 +150,31 @@ def write_nifti(path: str | os.PathLike[str], data: Any, grid: VolumeGrid, unit:
     """Write NIfTI-1, float32, mm, RAS, with qform and sform (scanner coordinates); the unit stands in ``descrip``."""
     import nibabel
 
-    affine = np.diag([*grid.spacing[::-1], 1.0])
-    affine[:3, 3] = [axis[0] for axis in grid.axes[::-1]]
     # NIfTI stores (x, y, z).
-    image = nibabel.Nifti1Image(np.asarray(data, dtype=np.float32).transpose(2, 1, 0), affine)
-    image.set_qform(affine, code="scanner")
-    image.set_sform(affine, code="scanner")
-    image.header.set_xyzt_units("unknown" if unit == "pixel^-1" else "mm")
-    image.header["descrip"] = (_MADE_BY + unit).encode()
+    image = nibabel.Nifti1Image(np.asarray(data, dtype=np.float32).transpose(2, 1, 0), None, nifti_header(grid, unit))
     with written_whole(path) as part, part.open("wb") as raw:
         if not str(path).endswith(".gz"):
             image.to_stream(raw)
         else:
             with gzip.GzipFile("", "wb", compresslevel=1, fileobj=raw, mtime=0) as packed:  # the same for the same
                 image.to_stream(packed)
+
+
+def nifti_header(grid: VolumeGrid, unit: str) -> Any:
+    """The header of a NIfTI-1 file of float32 voxels, which begin at byte 352."""
+    import nibabel
+
+    affine = np.diag([*grid.spacing[::-1], 1.0])
+    affine[:3, 3] = [axis[0] for axis in grid.axes[::-1]]
+    header = nibabel.Nifti1Header()
+    header.set_data_dtype(np.float32)
+    header.set_data_shape(grid.shape[::-1])
+    header.set_qform(affine, code="scanner")
+    header.set_sform(affine, code="scanner")
+    header.set_xyzt_units("unknown" if unit == "pixel^-1" else "mm")
+    header["descrip"] = (_MADE_BY + unit).encode()
+    header["vox_offset"] = 352
+    return header
 
 
 def read_nifti(path: str | os.PathLike[str]) -> tuple[Any, VolumeGrid, str]:

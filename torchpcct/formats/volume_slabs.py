@@ -1,0 +1,203 @@
+"""Volumes that are written slab by slab along z, larger than memory: NIfTI (``.nii``) and OME-Zarr (``.zarr``).
+
+What is not complete stands beside its place, with ``.unfinished`` behind its name, and what is in it already in a
+journal (``.unfinished.json``). Nothing takes the name that was asked for before the last slab is on the disk.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchpcct.files import WriteError, require_folder, written_whole
+from torchpcct.formats.damage import check_size, needed, reading
+from torchpcct.formats.volume_files import nifti_header
+from torchpcct.geometry import VolumeGrid
+from torchpcct.validate import UNITS
+
+__all__ = ["SLAB_ENDINGS", "SlabFile", "check_slab_name", "read_ome_zarr", "write_ome_zarr"]
+
+SLAB_ENDINGS = (".nii", ".zarr")
+CHUNK = 32
+"""Most slices of a Zarr chunk: slabs hold whole chunks, so that none is written twice."""
+_CHUNK_PLANE = 256
+
+
+def check_slab_name(path: str | os.PathLike[str]) -> None:
+    """Raise ``ValueError`` unless the ending of ``path`` names a format that is written slab by slab."""
+    if not str(path).endswith(SLAB_ENDINGS):
+        raise ValueError(
+            f"{Path(path).name!r} cannot be written slab by slab: use .nii or .zarr (OME-Zarr); .nii.gz, .mha, .h5 and "
+            "DICOM hold what fits into memory"
+        )
+
+
+class SlabFile:
+    """A volume on the disk that grows slab by slab, and goes on where an earlier process was stopped.
+
+    Args:
+        path: ``.nii`` or ``.zarr``.
+        grid: ``(z, y, x)`` of the whole volume.
+        unit: of its values.
+        key: text that names all that the voxels depend on: what an earlier process wrote under another key is
+            begun anew.
+        chunk: slices of a chunk of Zarr.
+
+    Attributes:
+        done: slices, from the lowest, that are on the disk.
+        notes: JSON values that are kept with them.
+
+    Raises:
+        ValueError: another ending.
+        FileNotFoundError: the folder does not exist.
+        WriteError: the system refuses to write.
+        ImportError: ``zarr`` is not installed.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], grid: VolumeGrid, unit: str, key: str, chunk: int) -> None:
+        check_slab_name(path)
+        require_folder(path)
+        self.path, self.grid, self.unit, self.key = Path(path), grid, unit, key
+        self.part = self.path.with_name(self.path.name + ".unfinished")
+        self.journal = self.part.with_name(self.part.name + ".json")
+        try:
+            kept = json.loads(self.journal.read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            kept = {}
+        resumed = self.part.exists() and kept.get("key") == key
+        self.done: int = kept["done"] if resumed else 0
+        self.notes: dict[str, Any] = kept["notes"] if resumed else {}
+        if not resumed:
+            with self._writing():
+                self.discard()
+                if self.path.suffix == ".zarr":
+                    _create(self.part, grid, unit, chunk)
+                else:
+                    self.part.write_bytes(_nifti_header(grid, unit))
+                self._note()
+
+    def write(self, data: Any) -> None:
+        """Put the next slices on the disk, float32 ``(slices, y, x)``."""
+        values, first = np.ascontiguousarray(data, dtype="<f4"), self.done
+        with self._writing():
+            if self.path.suffix == ".zarr":
+                needed("zarr").open_group(self.part, mode="r+")["0"][first : first + len(values)] = values
+                if hasattr(os, "sync"):
+                    os.sync()
+            else:
+                # Not by a memory map, which a full disk ends with a signal instead of an error.
+                with self.part.open("r+b") as file:
+                    file.seek(len(_nifti_header(self.grid, self.unit)) + 4 * first * int(np.prod(self.grid.shape[1:])))
+                    file.write(values.data)
+                    file.flush()
+                    os.fsync(file.fileno())
+            self.done += len(values)
+            self._note()
+
+    def finish(self, report: Mapping[str, Any]) -> None:
+        """Give the volume its name; an OME-Zarr keeps the report. What had the name before is gone then."""
+        with self._writing():
+            if self.path.suffix == ".zarr":
+                group = needed("zarr").open_group(self.part, mode="r+")
+                text = json.dumps(dict(report), default=str)
+                group.attrs["torchpcct"] = {"unit": self.unit, "report": json.loads(text)}
+            if self.path.is_dir():
+                shutil.rmtree(self.path)
+            os.replace(self.part, self.path)
+            self.journal.unlink(missing_ok=True)
+
+    def _note(self) -> None:
+        with written_whole(self.journal) as part:
+            part.write_text(json.dumps({"key": self.key, "done": self.done, "notes": self.notes}))
+
+    def discard(self) -> None:
+        """Take back what has been begun."""
+        self.journal.unlink(missing_ok=True)
+        if self.part.is_dir():
+            shutil.rmtree(self.part)
+        self.part.unlink(missing_ok=True)
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            why = os.strerror(error.errno) if error.errno else str(error)
+            kept = (
+                f"; its slabs up to now are kept in {self.part.name}, the same call goes on with them"
+                if self.done
+                else ""
+            )
+            raise WriteError(f"cannot write {self.path}: {why}{kept}") from error
+
+
+def _nifti_header(grid: VolumeGrid, unit: str) -> bytes:
+    """What stands before the voxels, as :func:`torchpcct.formats.volume_files.write_nifti` writes it."""
+    return bytes(nifti_header(grid, unit).binaryblock) + bytes(4)
+
+
+def _create(path: Path, grid: VolumeGrid, unit: str, chunk: int) -> Any:
+    """An empty OME-Zarr 0.5 (https://ngff.openmicroscopy.org/0.5): one resolution, axes z, y, x."""
+    zarr = needed("zarr")
+    length = {} if unit == "pixel^-1" else {"unit": "millimeter"}
+    transforms = [
+        {"type": "scale", "scale": list(grid.spacing)},
+        {"type": "translation", "translation": [float(axis[0]) for axis in grid.axes]},
+    ]
+    image = {
+        "axes": [{"name": name, "type": "space", **length} for name in "zyx"],
+        "datasets": [{"path": "0", "coordinateTransformations": transforms}],
+    }
+    attributes = {"ome": {"version": "0.5", "multiscales": [image]}, "torchpcct": {"unit": unit}}
+    group = zarr.create_group(path, zarr_format=3, attributes=attributes)
+    chunks = (min(chunk, grid.shape[0]), *(min(n, _CHUNK_PLANE) for n in grid.shape[1:]))
+    group.create_array(
+        "0", shape=grid.shape, chunks=chunks, dtype="float32", dimension_names=("z", "y", "x"), fill_value=float("nan")
+    )
+    return group
+
+
+def write_ome_zarr(path: str | os.PathLike[str], data: Any, grid: VolumeGrid, unit: str) -> None:
+    """Write a whole volume ``(z, y, x)`` as OME-Zarr 0.5: a folder, float32, mm."""
+    with written_whole(path) as part:
+        _create(part, grid, unit, CHUNK)["0"][...] = np.asarray(data, dtype=np.float32)
+        if Path(path).is_dir():
+            shutil.rmtree(path)
+
+
+def read_ome_zarr(path: str | os.PathLike[str]) -> tuple[Any, VolumeGrid, str]:
+    """Data ``(z, y, x)`` float32, grid and unit of the first resolution of an OME-Zarr 0.4 or 0.5 with axes z, y, x.
+
+    Raises:
+        FileNotFoundError: no such folder. ValueError: damaged, other axes or lengths than mm and µm.
+        ImportError: ``zarr`` is not installed.
+    """
+    zarr = needed("zarr")
+    with reading(path, "an OME-Zarr"):
+        group = zarr.open_group(path, mode="r")
+        about = dict(group.attrs)
+        image = about.get("ome", about)["multiscales"][0]
+        if [axis["name"] for axis in image["axes"]] != ["z", "y", "x"]:
+            raise ValueError(f"its axes are {', '.join(axis['name'] for axis in image['axes'])}, expected z, y, x")
+        lengths = [_MM[axis.get("unit", "millimeter")] for axis in image["axes"]]
+        array = group[image["datasets"][0]["path"]]
+        check_size(array.shape, "the volume")
+        found = {t["type"]: t[t["type"]] for t in image["datasets"][0]["coordinateTransformations"]}
+        spacing, first = (np.array(found.get(name, [start] * 3)) * lengths
+                          for name, start in (("scale", 1.0), ("translation", 0.0)))  # fmt: skip
+        center = first + spacing * (np.array(array.shape) - 1) / 2
+        unit = about.get("torchpcct", {}).get("unit", "HU")
+        if unit not in UNITS:
+            raise ValueError(f"it gives the unit {unit!r}, expected {' or '.join(UNITS)}")
+        grid = VolumeGrid(tuple(array.shape), tuple(map(float, spacing)), tuple(map(float, center)))
+        return np.asarray(array[...], dtype=np.float32), grid, unit
+
+
+_MM = {"millimeter": 1.0, "micrometer": 1e-3}
