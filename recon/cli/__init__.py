@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from recon.cli.evaluating import add_dose_factor, add_evaluate, add_show_task
 from recon.cli.looking import add_info, add_view
-from recon.cli.parsing import Commands, as_options, check_results, command, saying
+from recon.cli.parsing import Commands, add_execution, as_options, check_results, command, executing, saying
 
 # What loads torch or numba is imported by the commands: help and refusals come at once.
 from recon.cli.plaque import add_plaque
@@ -54,8 +54,12 @@ def _run_study(name: str, settings: Any, arguments: argparse.Namespace, progress
     from recon.evaluate.store import Pieces  # loads torch
 
     start = time.perf_counter()
-    report = registry.run(name, settings, progress, folder)
+    report = None
+    with executing(arguments, folder):
+        report = registry.run(name, settings, progress, folder)
     progress.close()
+    if report is None:
+        return
     if "command" in report.data:
         report.made_by(shlex.join(["torchpcct", *arguments.command_line]))
     files = report.save(folder)
@@ -119,6 +123,7 @@ def _add_compare(commands: Commands) -> None:
     parser.add_argument("--n", type=int, metavar="N", help="realisations (default 16)")
     parser.add_argument("--methods", nargs="+", metavar="METHOD", help="as of evaluate --method")
     parser.add_argument("--quick", action="store_true", help="reduced views and methods: a first look, < 45 s")
+    add_execution(parser)
 
 
 def _add_hardcases(commands: Commands) -> None:
@@ -132,6 +137,7 @@ def _add_hardcases(commands: Commands) -> None:
     parser.add_argument("--methods", nargs="+", metavar="M", help="fbp pwls mbir (default: all)")
     parser.add_argument("--cases", nargs="+", metavar="NAME", help="only these cases")
     parser.add_argument("--views", type=int, metavar="N", help="views of the scan (default 984)")
+    add_execution(parser)
 
 
 def _add_study(commands: Commands) -> None:
@@ -144,6 +150,7 @@ def _add_study(commands: Commands) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = "studies:\n" + "".join(f"  {name:<12} {text}\n" for name, text in registry.STUDIES.items())
     parser.add_argument("name", metavar="NAME", help="of the study")
+    add_execution(parser)
     parser.add_argument("--quick", action="store_true", help="reduced settings: a first look, < 60 s")
     parser.add_argument(
         "--set",
@@ -206,6 +213,8 @@ def _run(options: argparse.Namespace, actions: Any) -> int:
         text = as_options(str(error), actions) or "out of memory: use larger voxels or a smaller grid"
         return _failed(options.command, progress, text, 2)
     except RuntimeError as error:
+        if type(error).__name__ == "LeftOut":
+            return _failed(options.command, progress, str(error), 1)
         if "no locator available" not in str(error):
             raise
         text = "numba cannot keep compiled kernels: set NUMBA_CACHE_DIR to a folder that you can write"

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 # What loads torch or numba is imported by the commands: help and refusals come at once.
-from recon.cli.parsing import Commands, check_results, command
+from recon.cli.parsing import Commands, add_execution, check_results, command, executing
 
 if TYPE_CHECKING:
     from recon.study.study import ProgressBars
@@ -82,11 +82,15 @@ def _evaluate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
             "the volumes under the same names in another folder, and evaluate --method files:FOLDER"
         )
         return
-    found = evaluate(
-        tasks, methods, exposures_s=arguments.exposure, n=arguments.n, seed=arguments.seed,
-        folder=out / "pieces", progress=progress,
-    )  # fmt: skip
+    found = None
+    with executing(arguments, out):
+        found = evaluate(
+            tasks, methods, exposures_s=arguments.exposure, n=arguments.n, seed=arguments.seed,
+            folder=out / "pieces", progress=progress,
+        )  # fmt: skip
     progress.close()
+    if found is None:
+        return
     files = save(found, out, f"torchpcct {shlex.join(arguments.command_line)}")
     print(text_of(found))
     print(f"all figures, pictures and the page: {', '.join(str(f) for f in files)}")
@@ -229,6 +233,7 @@ def _add_common(parser: argparse.ArgumentParser, n: int) -> None:
         "--denoiser", action="append", metavar="FUNCTION@BASE", help="a function of (volume) or (volume, sigma) in HU"
     )
     parser.add_argument("--exposure", type=float, nargs="+", metavar="S", help="in s (default: those of each task)")
+    add_execution(parser)
     parser.add_argument("--n", type=int, default=n, help=f"noise realisations, at least 8 (default {n})")
 
 
