@@ -26,7 +26,7 @@ import socket
 import sys
 import threading
 import time
-from collections import Counter
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, ThreadPoolExecutor
 from concurrent.futures import ProcessPoolExecutor as Pool
@@ -197,9 +197,14 @@ def _load() -> None:
 
 def _end_with_parent() -> None:
     """A process whose parent was killed would wait for its next job forever."""
-    parent = multiprocessing.parent_process()
+    parent: Any = multiprocessing.parent_process()
+
+    def end() -> None:
+        parent.join()
+        os._exit(1)
+
     if parent is not None:
-        threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()
+        threading.Thread(target=end, daemon=True).start()
 
 
 class Cluster(Executor):
@@ -393,56 +398,64 @@ def run(
     if not jobs:
         return {}
     folder.mkdir(parents=True, exist_ok=True)
-    calls = {job.name: packed_call(executor, (job.function, job.args)) for job in jobs}
     with marker(folder) as here:
         of = _Run(
             str(folder.resolve()), str(here.resolve()), (platform.node(), os.getpid()),
             getattr(executor, "threads", None), VERSION, os.getcwd(),
         )  # fmt: skip
-        return _run(jobs, calls, folder, executor, of, _Log(executor, jobs), progress, finished)
+        return _run(jobs, folder, executor, of, _Log(executor, jobs), progress, finished)
 
 
 def _run(
-    jobs: Sequence[Job], calls: dict[str, bytes], folder: Path, executor: Executor, of: _Run, book: _Log,
+    jobs: Sequence[Job], folder: Path, executor: Executor, of: _Run, book: _Log,
     progress: Progress | None, finished: Callable[[Job], Any] | None,
 ) -> dict[str, Any]:  # fmt: skip
-    waiting = {job.name: job for job in jobs}
-    open_, values, lost = set(waiting), dict[str, Any](), dict[str, str]()
-    deaths: Counter[str] = Counter()
+    names = {job.name for job in jobs}
+    needs = {job.name: names.intersection(job.after) for job in jobs}
+    next_: dict[str, list[Job]] = defaultdict(list)
+    for job in jobs:
+        for name in needs[job.name]:
+            next_[name].append(job)
+    ready = deque(job for job in jobs if not needs[job.name])
+    values, lost, deaths = dict[str, Any](), dict[str, str](), Counter[str]()
     running: dict[Future[_Done], Job] = {}
+
+    def leave_out(job: Job, why: str) -> None:
+        if lost.setdefault(job.name, why) is why:
+            for other in next_[job.name]:
+                leave_out(other, f"needs {job.name}")
+
     try:
-        while waiting or running:
+        while ready or running:
             workers = getattr(executor, "workers", 16)
-            for job in list(waiting.values()):
-                if len(running) >= _AHEAD * max(1, workers):
-                    break
-                left_out = [name for name in job.after if name in lost]
-                if left_out or (not workers and getattr(executor, "avoid", None)):
-                    lost[job.name] = f"needs {left_out[0]}" if left_out else "no worker is left"
-                elif open_.isdisjoint(job.after):
-                    module = job.module or job.function.__module__
-                    call = executor.submit(_work, calls[job.name], module, source_digest(module), job.makes, of)
-                    running[call] = job
-                else:
+            while ready and len(running) < _AHEAD * max(1, workers):
+                job = ready.popleft()
+                if not workers and getattr(executor, "avoid", None):
+                    leave_out(job, "no worker is left")
                     continue
-                del waiting[job.name]
+                module = job.module or job.function.__module__
+                call = packed_call(executor, (job.function, job.args))
+                running[executor.submit(_work, call, module, source_digest(module), job.makes, of)] = job
             for future in wait_for(running, 1.0, FIRST_COMPLETED)[0] if running else ():
                 job = running.pop(future)
                 done, why = _outcome(future, executor)
-                if done is not None:
-                    _keep(folder, done.files)
-                    open_.remove(job.name)
-                    values[job.name] = done.value
-                    book.done(job, done)
-                    if finished is not None:
-                        finished(job)
+                if done is None:
+                    deaths[job.name] += DEATHS if "KilledWorker" in why else 1
+                    book.note(f"failed   {job.name}: {why}")
+                    if deaths[job.name] < DEATHS:
+                        ready.append(job)
+                    else:
+                        leave_out(job, why)
                     continue
-                deaths[job.name] += DEATHS if "KilledWorker" in why else 1
-                book.note(f"failed   {job.name}: {why}")
-                if deaths[job.name] < DEATHS:
-                    waiting[job.name] = job
-                else:
-                    lost[job.name] = why
+                _keep(folder, done.files)
+                values[job.name] = done.value
+                book.done(job, done)
+                if finished is not None:
+                    finished(job)
+                for other in next_[job.name]:
+                    needs[other.name].discard(job.name)
+                    if not needs[other.name] and other.name not in lost:
+                        ready.append(other)
             if isinstance(executor, Cluster):
                 executor.check()
             if progress is not None:

@@ -179,35 +179,48 @@ def _jobs(
         jobs.append(Job(first, _facts, (bench,), (f"{place}facts.npz",)))
     for kernel in dict.fromkeys(m.kernels[0] for m in sent if m.is_fbp):
         if not store.has(f"exact_{kernel}", f"1 {task.fingerprint}"):
-            made = (f"{place}exact_{kernel}.npz",)
-            jobs.append(Job(f"{task.name}: exact noise, {kernel}", _exact, (bench, kernel), made, (first,)))
+            name = f"{task.name}: exact noise, {kernel}"
+            jobs.append(Job(name, _exact, (bench, kernel), (f"{place}exact_{kernel}.npz",), (first,)))
     blocks = [range(start, min(start + BLOCK, n)) for start in range(0, n, BLOCK)]
     exposures = exposures or task.exposures_s
     groups = min(len(sent), -(-2 * getattr(executor, "workers", 16) // (len(blocks) * len(exposures)))) or 1
     for exposure in exposures:
-        for names in (sent[g::groups] for g in range(groups)):
-            kept = {m.name: kept_as(m, exposure, task, seed) for m in names}
+        for group in (sent[g::groups] for g in range(groups)):
+            kept = {m.name: kept_as(m, exposure, task, seed) for m in group}
             known = f"{task.name}: {exposure:g} s, noise-free, {', '.join(kept)}"
-            for k in (None, *blocks):
-                parts = ("clean", "response") if k is None else (f"{k.start}-{k.stop}",)
-                asked = [
-                    m
-                    for m in names
-                    for part in parts
-                    if (part != "response" or m.network is not None)
-                    and not store.has(f"{kept[m.name][0]}/{part}", kept[m.name][1])
-                ]
-                asked = list(dict.fromkeys(m.name for m in asked))
+            for k in (range(0), *blocks):
+                asked = [m.name for m in group if not all(
+                    store.has(f"{kept[m.name][0]}/{part}", kept[m.name][1]) for part in _parts(m, k)
+                )]  # fmt: skip
                 if not asked:
                     continue
-                made = tuple(f"{place}{kept[name][0]}/{part}.npz" for name in asked for part in parts)
-                if k is None:
-                    call, name, after = (bench, exposure, asked, 0, 0), known, (first,)
-                else:
-                    call, after = (bench, exposure, asked, k.start, k.stop), (first, known)
-                    name = f"{task.name}: {exposure:g} s, {k.start}-{k.stop}, {', '.join(asked)}"
-                jobs.append(Job(name, _block, call, made, after))
+                made = tuple(f"{place}{kept[m.name][0]}/{part}.npz" for m in group for part in _parts(m, k))
+                name = f"{task.name}: {exposure:g} s, {k.start}-{k.stop}, {', '.join(asked)}" if k else known
+                seconds, kb = _estimate(task, [m for m in group if m.name in asked], max(len(k), 1))
+                jobs.append(
+                    Job(name, _block, (bench, exposure, asked, k), made, (first, known) if k else (first,),
+                        seconds=seconds, mib=_MIB, bytes=kb)
+                )  # fmt: skip
     return jobs
+
+
+def _parts(method: Method, k: range) -> tuple[str, ...]:
+    """Names of the pieces of a block; of none those without noise."""
+    if k:
+        return (f"{k.start}-{k.stop}",)
+    return ("clean",) if method.network is None else ("clean", "response")
+
+
+_SECONDS = {"fbp": 0.0, "pwls": 5.0, "mbir": 5.0}
+"""Of a volume of 10⁵ voxels on one core by method; a filter or a function of others in _OTHER_S; of two draws."""
+_OTHER_S, _DRAW_S, _MIB = 1.0, 1.5, 1500.0
+
+
+def _estimate(task: Task, methods: Sequence[Method], n: int) -> tuple[float, float]:
+    """Rough seconds of realisations on one core, and bytes that are kept."""
+    volumes = 2 * n * task.grid.voxels / 1e5
+    seconds = volumes * sum(_SECONDS.get(m.name.partition(":")[0], _OTHER_S) for m in methods)
+    return seconds + n * _DRAW_S, len(methods) * (2.0 * task.grid.voxels + 8e3 * n * (1 + len(task.scene.names)))
 
 
 @lru_cache(maxsize=1)
@@ -226,10 +239,9 @@ def _exact(folder: Path, bench: bytes, kernel: str) -> None:
     _bench(folder, bench)[0].exact_covariance(kernel)
 
 
-def _block(folder: Path, bench: bytes, exposure: float, names: Sequence[str], start: int, stop: int) -> None:
+def _block(folder: Path, bench: bytes, exposure: float, names: Sequence[str], k: range) -> None:
     """Pieces of methods at an exposure: of a block of realisations, or of none what is without noise."""
     draws, reader, methods = _bench(folder, bench)
-    k = range(start, stop)
     pairs = cache(partial(_pairs, draws, exposure, k))
     for name in names:
         measurement = Measurement(methods[name], draws, reader, exposure, draws.store)

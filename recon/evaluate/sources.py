@@ -26,16 +26,16 @@ def source_digest(*modules: str) -> str:
         modules: names; those of other software do not count. None at all: all of this software.
     """
     total = hashlib.sha256(VERSION.encode())
+    endings: tuple[str, ...] = _DATA
     files: set[Path] = set()
     if modules:
         seen: set[tuple[str, str]] = set()
         for name in modules:
             _follow(name, "", seen)
         files = {Path(found[0]) for found in (_source(name) for name, _ in seen) if found is not None}
-        endings = _DATA
     else:
         files = {Path(str(importlib.import_module(package).__file__)) for package in ("torchpcct", "recon")}
-        endings = ("**/*.py", *(f"**/{ending}" for ending in _DATA))
+        endings = "**/*.py", *(f"**/{ending}" for ending in _DATA)
     files |= {found for folder in {f.parent for f in files} for ending in endings for found in folder.glob(ending)}
     roots = Path(str(importlib.import_module("torchpcct").__file__)).parent.parent
     for path in sorted(files):

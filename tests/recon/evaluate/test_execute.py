@@ -3,21 +3,26 @@
 import contextlib
 import json
 import os
+import pickle
 import subprocess
 import sys
 import time
 
 import pytest
+import torch
 from some_jobs import dies, full, noted, refuses, threads
-from tiny_studies import INSERT
+from tiny_studies import INSERT, TINY
 
 from recon.cli import main
 from recon.evaluate import execute
 from recon.evaluate.execute import Cluster, Job, LeftOut, Processes, run
 from recon.evaluate.experiment import evaluate
-from recon.evaluate.methods import Method
+from recon.evaluate.methods import Method, method_of
 from recon.evaluate.sources import _follow, source_digest
 from recon.evaluate.tasks import read_task
+from recon.study import registry
+from recon.study.results import differences
+from torchpcct import ConeBeam, Scan, Volume, full_turn
 
 METHODS = ["fbp:soft", "gaussian@fbp:soft", "mbir"]
 
@@ -51,8 +56,6 @@ def figures(found):
 
 @pytest.fixture(scope="module")
 def serial(task, tmp_path_factory):
-    import torch
-
     before = torch.get_num_threads()
     torch.set_num_threads(1)  # of MBIR the last bits depend on their number
     try:
@@ -84,6 +87,49 @@ def test_a_cluster_gives_the_same_figures(task, serial, cluster, tmp_path, monke
     monkeypatch.setattr("recon.evaluate.measure.volume_of", pytest.fail)
     assert figures(evaluate(task, METHODS, n=8, folder=tmp_path, executor=cluster)) == serial
     assert bool(list(tmp_path.rglob("*.h5"))) is shared  # scans stay where they were made
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["hardcases", *(pytest.param(n, marks=pytest.mark.slow) for n in ("bowtie", "motion", "resolution", "spectral",
+                                                                      "detector", "compare"))],
+)  # fmt: skip
+def test_a_study_gives_the_same_report(name, processes, tmp_path):
+    settings = {**TINY[name], **({"cases": ("dead-column", "metal")} if name == "hardcases" else {})}
+    run_tiny_with(name, settings, tmp_path / "here")
+    processes.log = tmp_path / "run.log"
+    with execute.using(processes):
+        run_tiny_with(name, settings, tmp_path / "there")
+    assert "done     " in processes.log.read_text()
+    here, there = (json.loads((tmp_path / x / "report.json").read_text()) for x in ("here", "there"))
+    assert list(differences(here, there)) == []
+    assert not [p for p in (tmp_path / "there").rglob(".*")]
+
+
+def run_tiny_with(name, settings, folder):
+    made = registry.part(name, "settings").Settings(**settings)
+    registry.run(name, made, pieces=folder).save(folder)
+
+
+def test_many_scans_are_reconstructed_as_if_each_were_alone(processes, tmp_path, capsys):
+    g = ConeBeam(full_turn(24), 300.0, 500.0, 24, 4, 1.0)
+    for k in range(3):
+        Scan.from_counts(torch.full(g.shape, 900.0 + k), g, air=1000.0).save(tmp_path / f"s{k}.h5")
+    (tmp_path / "bad.h5").write_bytes(b"no scan")
+    scans = [str(tmp_path / f"{name}.h5") for name in ("s0", "bad", "s1", "s2")]
+    out, alone = tmp_path / "out", tmp_path / "alone"
+    assert main(["reconstruct", *scans, "--out", str(out), "--workers", "2"]) == 2
+    text = capsys.readouterr()
+    assert "1 of 4 scans are not reconstructed" in text.err
+    assert text.out.count("voxels of") == 3
+    assert main(["reconstruct", *scans, "--out", str(alone)]) == 2
+    for k in range(3):
+        a, b = (Volume.load(folder / f"s{k}_fbp.nii.gz").data for folder in (out, alone))
+        assert torch.equal(a, b)
+    assert main(["reconstruct", *scans]) == 2
+    assert "--out FOLDER says where" in capsys.readouterr().err
+    assert main(["reconstruct", *scans, "--out", str(out), "--dry-run"]) == 0
+    assert "4 jobs" in capsys.readouterr().out
 
 
 def test_a_lambda_is_computed_here(task, processes, tmp_path, caplog):
@@ -168,42 +214,47 @@ def test_a_dry_run_lists_the_jobs(task, tmp_path, capsys):
     assert not list((tmp_path / "x").rglob("*.npz"))
 
 
-LOADED = """
-import sys, os
-from tiny_studies import INSERT
+CALLED = """
+import pickle, sys
 from pathlib import Path
-from recon.evaluate.measure import Measurement, Reader
 from recon.evaluate.draws import Draws
+from recon.evaluate.measure import Measurement, Reader
+from recon.evaluate.sources import _follow
 from recon.evaluate.store import Store
-from recon.evaluate.task import Task
-from recon.evaluate.methods import method_of
-import pickle
+seen, called = set(), set()
+_follow("recon.evaluate.measure", "", seen)
+known = {name for name, _ in seen}
+def note(frame, event, what):
+    name = frame.f_globals.get("__name__", "")
+    if event == "call" and name not in known and name.startswith(("torchpcct", "recon", "train")):
+        while frame is not None and frame.f_code.co_name != "<module>" or frame.f_globals["__name__"] == "__main__":
+            frame = frame.f_back
+            if frame is None:  # not while modules load
+                called.add(name)
+                return
+sys.setprofile(note)
 task, methods = pickle.loads(Path(sys.argv[1]).read_bytes())
 draws = Draws(task, Store(Path(sys.argv[2])), 0, [k for m in methods for k in m.kernels])
 reader = Reader(task, task.truth(draws.facts))
 for m in methods:
     Measurement(m, draws, reader, 20.0, draws.store)
-print(*(m for m in sys.modules if m.startswith(("torchpcct.", "recon.")) and "." in m))
+sys.setprofile(None)
+print(*called)
 """
 
 
-def test_a_digest_covers_all_that_a_piece_imports(task, tmp_path):
-    """What a process has really loaded after measuring is among the modules that the imports name, and not much else
-    is."""
-    import pickle
-
-    from recon.evaluate.methods import method_of
-
+def test_a_digest_covers_all_that_a_piece_runs(task, tmp_path):
+    """Every function that is called while a piece is computed stands in a module that the digest has read, and the
+    digest reads neither studies nor the command line."""
     (tmp_path / "given").write_bytes(pickle.dumps((task, [method_of(m) for m in METHODS])))
     path = os.pathsep.join([p for p in sys.path if p])
-    loaded = subprocess.run(
-        [sys.executable, "-c", LOADED, tmp_path / "given", tmp_path / "store"], check=True, capture_output=True,
+    called = subprocess.run(
+        [sys.executable, "-c", CALLED, tmp_path / "given", tmp_path / "store"], check=True, capture_output=True,
         text=True, env={**os.environ, "PYTHONPATH": path},
     ).stdout.split()  # fmt: skip
+    packages = {"recon", "torchpcct"}  # where lazy names are looked up
+    assert set(called) - packages == set()
     seen = set()
-    _follow("recon.evaluate.measure", "", seen)
-    modules = {name for name, _ in seen}
-    packages = {m for m in loaded if any(other.startswith(f"{m}.") for other in loaded)}
-    assert set(loaded) - packages - modules == set()
-    assert not [m for m in modules if m.startswith(("recon.cli", "recon.study", "train"))]
+    _follow("recon.evaluate.experiment", "", seen)
+    assert not [m for m, _ in seen if m.startswith(("recon.cli", "recon.study", "train"))]
     assert source_digest("recon.evaluate.measure") != source_digest("recon.study.hardcases.measure")
