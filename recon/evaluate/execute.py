@@ -238,6 +238,7 @@ class Cluster(Executor):
         finally:
             quiet.setLevel(level)
         self.avoid: set[str] = set()
+        self._asked: tuple[float, list[str]] = -9.0, []
         from cloudpickle import dumps
 
         self.dumps = dumps
@@ -251,7 +252,10 @@ class Cluster(Executor):
 
     @property
     def _addresses(self) -> list[str]:
-        return [a for a in self.client.scheduler_info(-1)["workers"] if a not in self.avoid]
+        now = time.monotonic()
+        if now - self._asked[0] > 1.0:  # a way to the scheduler and back
+            self._asked = now, list(self.client.scheduler_info(-1)["workers"])
+        return [a for a in self._asked[1] if a not in self.avoid]
 
     @property
     def dashboard(self) -> str:
@@ -269,10 +273,6 @@ class Cluster(Executor):
         lost = any(state.status == "lost" for state in list(self.client.futures.values()))
         if lost or self.client.status in ("closing", "closed"):
             raise _gone(self)
-
-    def nodes(self) -> list[str]:
-        """One worker of each machine."""
-        return list({w["host"]: a for a, w in self.client.scheduler_info(-1)["workers"].items()}.values())
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Part from the scheduler, which goes on; what was submitted and is not done is dropped."""

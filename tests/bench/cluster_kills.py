@@ -1,4 +1,4 @@
-"""Workers, scheduler and client of a Dask cluster, killed (SIGKILL) at random: ``python tests/bench/cluster_kills.py [N]``.
+"""A Dask cluster's workers, scheduler and client, killed at random: ``python tests/bench/cluster_kills.py [N]``.
 
 ``torchpcct evaluate`` of a small task runs on two workers. N times each, at a random moment of it, a worker, the
 scheduler or the client (the command itself) is killed; whoever is dead is started again, and the same command goes on
