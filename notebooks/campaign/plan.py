@@ -92,8 +92,8 @@ def main() -> None:
         "worker. This is what the table shows, and it forbids large blocks long before anything asks for them.",
         f"2. The result store: blocks of 8 make {files:,} files, where parallel file systems allow some 10⁶ to 10⁷ "
         f"a user; to see which are there takes a repeated command {files * m['seconds_has'] / 3600:.1f} h. Hence runs "
-        f"of {TASKS // PARTS} tasks, each folder packed or cleared when its report stands; blocks of 40 where stragglers "
-        "allow.",
+        f"of {TASKS // PARTS} tasks, each folder packed or cleared when its report stands; blocks of 40 where "
+        "stragglers allow.",
         f"3. The client's memory: about {m['client_bytes_job'] / 1e3:.1f} kB a job, "
         f"{m['client_bytes_job'] * TASKS * DRAWS / 8 / 1e9:.1f} GB for all tasks at once in blocks of 8.",
         f"4. The scheduler, last: {1e3 * m['seconds_per_job']:.1f} ms of client a job, {rate:.0f} jobs a second, feed "

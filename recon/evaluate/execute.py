@@ -121,7 +121,7 @@ class _Run:
 
 @dataclass
 class _Done:
-    """What comes back: ``problem`` is what a disk said."""
+    """What comes back: ``problem`` is what a disk said, ``said`` what was logged as a warning."""
 
     where: str
     value: Any = None
@@ -129,6 +129,7 @@ class _Done:
     seconds: float = 0.0
     compiled_s: float = 0.0
     problem: str = ""
+    said: list[str] = field(default_factory=list)
 
 
 # --- where jobs are run -------------------------------------------------------------------------------------------
@@ -322,6 +323,23 @@ def _compile_time() -> Iterator[list[float]]:
         yield found
 
 
+@contextlib.contextmanager
+def _heard(own: bool) -> Iterator[list[str]]:
+    """Warnings that a worker logs, which the client says instead; of its own process it has heard them."""
+    said: list[str] = []
+
+    class Listener(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            said.append(record.getMessage())
+
+    listener = logging.NullHandler() if own else Listener(logging.WARNING)
+    logging.getLogger().addHandler(listener)
+    try:
+        yield said
+    finally:
+        logging.getLogger().removeHandler(listener)
+
+
 def _work(call: bytes, module: str, digest: str, makes: tuple[str, ...], of: _Run) -> _Done:
     """Run a job where this is called."""
     own = of.client == (platform.node(), os.getpid())
@@ -343,7 +361,7 @@ def _work(call: bytes, module: str, digest: str, makes: tuple[str, ...], of: _Ru
     start = time.perf_counter()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with _compile_time() as compiled:
+        with _compile_time() as compiled, _heard(own) as said:
             value = function(folder, *args)
     except OSError as error:
         if own or (error.errno not in _DISK and not isinstance(error, WriteError)):
@@ -352,7 +370,8 @@ def _work(call: bytes, module: str, digest: str, makes: tuple[str, ...], of: _Ru
     made = {} if shared else {
         p.relative_to(folder).as_posix(): p.read_bytes() for pattern in makes for p in folder.glob(pattern)
     }  # fmt: skip
-    return _Done(where, value, made, time.perf_counter() - start, sum(compiled))
+    seconds = time.perf_counter() - start
+    return _Done(where, value, made, seconds, sum(compiled), said=said)
 
 
 # --- the client ---------------------------------------------------------------------------------------------------
@@ -419,6 +438,7 @@ def _run(
     ready = deque(job for job in jobs if not needs[job.name])
     values, lost, deaths = dict[str, Any](), dict[str, str](), Counter[str]()
     running: dict[Future[_Done], Job] = {}
+    said: set[str] = set()
 
     def leave_out(job: Job, why: str) -> None:
         if lost.setdefault(job.name, why) is why:
@@ -450,6 +470,10 @@ def _run(
                 _keep(folder, done.files)
                 values[job.name] = done.value
                 book.done(job, done)
+                for text in dict.fromkeys(done.said):
+                    if text not in said:
+                        said.add(text)
+                        log.warning("%s", text)
                 if finished is not None:
                     finished(job)
                 for other in next_[job.name]:

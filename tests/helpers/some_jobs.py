@@ -1,6 +1,7 @@
 """Jobs for tests of recon.evaluate.execute, which other processes import."""
 
 import errno
+import logging
 import os
 import signal
 import time
@@ -8,6 +9,7 @@ import time
 
 def noted(folder, name, value):
     """Write a file, give a value and where it was computed."""
+    logging.getLogger("recon").warning("noted %s", value)
     (folder / f"{name}.txt").write_text(str(value))
     return value, os.getpid()
 

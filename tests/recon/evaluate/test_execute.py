@@ -139,7 +139,7 @@ def test_a_lambda_is_computed_here(task, processes, tmp_path, caplog):
     assert "mine is computed here, not by other processes" in caplog.text
 
 
-def test_a_job_whose_process_dies_is_repeated_and_left_out_after_three(processes, tmp_path):
+def test_a_job_whose_process_dies_is_repeated_and_left_out_after_three(processes, tmp_path, caplog, capfd):
     jobs = [Job("once", dies, ("once", 1)), Job("always", dies, ("always", 9)),
             Job("needs it", noted, ("n", 1), after=("always",)),
             *(Job(f"other {k}", noted, (f"o{k}", k)) for k in range(8))]  # fmt: skip
@@ -152,6 +152,8 @@ def test_a_job_whose_process_dies_is_repeated_and_left_out_after_three(processes
     text = processes.log.read_text()
     assert text.count("done     ") == 9
     assert text.count("failed   ") == 4
+    assert caplog.messages.count("noted 3") == 1  # what a worker says is said here
+    assert "noted" not in capfd.readouterr().err
 
 
 def test_what_a_job_itself_refuses_ends_the_run(processes, tmp_path):
