@@ -29,6 +29,7 @@ __all__ = [
     "clear_folder",
     "fingerprint",
     "is_own_hdf5",
+    "marker",
     "read_hdf5",
     "require_folder",
     "require_writable",
@@ -166,6 +167,23 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise FileNotFoundError(f"cannot write {target}: its folder has been removed") from error
     except OSError as error:
         raise _write_error(target, error) from error
+    finally:
+        _remove(part)
+
+
+@contextmanager
+def marker(folder: str | os.PathLike[str]) -> Iterator[Path]:
+    """Yield a new empty file in a folder, by which other machines see that the disk is the same; gone after the block.
+
+    What a killed process left is removed by the next one.
+    """
+    for left in Path(folder).glob(".*.part.marker"):
+        if _abandoned(left):
+            _remove(left)
+    part = _part(Path(folder) / "marker", os.getpid())
+    part.touch()
+    try:
+        yield part
     finally:
         _remove(part)
 

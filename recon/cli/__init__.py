@@ -23,7 +23,17 @@ from typing import TYPE_CHECKING, Any
 
 from recon.cli.evaluating import add_dose_factor, add_evaluate, add_show_task
 from recon.cli.looking import add_info, add_view
-from recon.cli.parsing import Commands, Parser, as_options, check_results, command, examples, saying
+from recon.cli.parsing import (
+    Commands,
+    Parser,
+    add_execution,
+    as_options,
+    check_results,
+    command,
+    examples,
+    executing,
+    saying,
+)
 
 # What loads torch or numba is imported by the commands: help and refusals come at once.
 from recon.cli.plaque import add_plaque
@@ -59,8 +69,12 @@ def _run_study(name: str, settings: Any, arguments: argparse.Namespace, progress
     from recon.evaluate.store import Pieces  # loads torch
 
     start = time.perf_counter()
-    report = registry.run(name, settings, progress, folder)
+    report = None
+    with executing(arguments, folder):
+        report = registry.run(name, settings, progress, folder)
     progress.close()
+    if report is None:
+        return
     if "command" in report.data:
         report.made_by(shlex.join(["torchpcct", *arguments.command_line]))
     files = report.save(folder)
@@ -125,6 +139,7 @@ def _add_compare(commands: Commands) -> None:
     parser.add_argument("--n", type=int, metavar="N", help="realisations (default 16)")
     parser.add_argument("--methods", nargs="+", metavar="METHOD", help="as of evaluate --method")
     parser.add_argument("--quick", action="store_true", help="reduced views and methods: a first look, < 45 s")
+    add_execution(parser)
 
 
 def _add_hardcases(commands: Commands) -> None:
@@ -139,6 +154,7 @@ def _add_hardcases(commands: Commands) -> None:
     parser.add_argument("--methods", nargs="+", metavar="M", help="fbp pwls mbir (default: all)")
     parser.add_argument("--cases", nargs="+", metavar="NAME", help="only these cases")
     parser.add_argument("--views", type=int, metavar="N", help="views of the scan (default 984)")
+    add_execution(parser)
 
 
 def _add_study(commands: Commands) -> None:
@@ -152,6 +168,7 @@ def _add_study(commands: Commands) -> None:
     before = f"studies:\n{listed}\n"
     examples(parser, "torchpcct study noise --quick", "torchpcct study motion --set views=492", before=before)
     parser.add_argument("name", metavar="NAME", help="of the study")
+    add_execution(parser)
     parser.add_argument("--quick", action="store_true", help="reduced settings: a first look, < 60 s")
     parser.add_argument(
         "--set",
@@ -279,6 +296,8 @@ def _run(options: argparse.Namespace, actions: Any) -> int:
         text = as_options(str(error), actions) or "out of memory: use larger voxels or a smaller grid"
         return _failed(options.command, progress, text, 2)
     except RuntimeError as error:
+        if type(error).__name__ == "LeftOut":
+            return _failed(options.command, progress, str(error), 1)
         if "no locator available" not in str(error):
             raise
         text = "numba cannot keep compiled kernels: set NUMBA_CACHE_DIR to a folder that you can write"

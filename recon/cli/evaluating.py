@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 # What loads torch or numba is imported by the commands: help and refusals come at once.
-from recon.cli.parsing import Commands, check_results, command, examples
+from recon.cli.parsing import Commands, add_execution, check_results, command, examples, executing
 
 if TYPE_CHECKING:
     from recon.study.study import ProgressBars
@@ -83,11 +83,15 @@ def _evaluate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
             "the volumes under the same names in another folder, and evaluate --method files:FOLDER"
         )
         return
-    found = evaluate(
-        tasks, methods, exposures_s=arguments.exposures_s, n=arguments.n, seed=arguments.seed,
-        folder=out / "pieces", progress=progress,
-    )  # fmt: skip
+    found = None
+    with executing(arguments, out):
+        found = evaluate(
+            tasks, methods, exposures_s=arguments.exposures_s, n=arguments.n, seed=arguments.seed,
+            folder=out / "pieces", progress=progress,
+        )  # fmt: skip
     progress.close()
+    if found is None:
+        return
     files = save(found, out, f"torchpcct {shlex.join(arguments.command_line)}")
     print(text_of(found))
     print(f"all figures, pictures and the page: {', '.join(str(f) for f in files)}")
@@ -234,6 +238,7 @@ def _add_common(parser: argparse.ArgumentParser, n: int) -> None:
     parser.add_argument(
         "--exposure", dest="exposures_s", type=float, nargs="+", metavar="S", help="in s (default: those of each task)"
     )
+    add_execution(parser)
     parser.add_argument("--n", type=int, default=n, help=f"noise realisations, at least 8 (default {n})")
 
 

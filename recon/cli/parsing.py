@@ -5,8 +5,10 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import os
 import re
 import sys
+import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -20,6 +22,7 @@ __all__ = [
     "SCAN_ENDINGS",
     "Commands",
     "Parser",
+    "add_execution",
     "add_force",
     "as_json",
     "as_options",
@@ -28,6 +31,7 @@ __all__ = [
     "check_results",
     "command",
     "examples",
+    "executing",
     "is_picture",
     "length_of",
     "saying",
@@ -220,6 +224,52 @@ def tell(arguments: argparse.Namespace, short: str, config: dict[str, Any], **su
         except WriteError as error:
             raise WriteError(f"{error}; {file} itself is written") from error
     print(text if arguments.json else f"{file}: {short}")
+
+
+def add_execution(parser: argparse.ArgumentParser) -> None:
+    """Where jobs are run, for :func:`executing`."""
+    group = parser.add_argument_group("several processes or machines")
+    group.add_argument("--workers", type=int, metavar="N", help="processes of this machine (default: this one alone)")
+    group.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        default=os.environ.get("DASK_SCHEDULER_ADDRESS"),
+        help="of Dask: tcp://HOST:PORT or its scheduler file (default: $DASK_SCHEDULER_ADDRESS); extra: cluster",
+    )
+    group.add_argument("--threads", type=int, metavar="K", help="of each worker (default: cores / N; of Dask 1)")
+    if not any(action.dest == "dry_run" for action in parser._actions):
+        group.add_argument("--dry-run", action="store_true", help="list the jobs, their time and memory; run none")
+
+
+@contextmanager
+def executing(arguments: argparse.Namespace, out: Path) -> Iterator[Any]:
+    """Run the jobs of a block where the options say, noted in ``OUT/jobs-DATE.log``; ``--dry-run`` lists them.
+
+    Yields:
+        The executor; None: everything is done here, one after another.
+    """
+    from recon.evaluate import execute
+
+    executor: Any = None
+    if arguments.dry_run:
+        executor = execute.Plan()
+    elif arguments.workers is not None:
+        executor = execute.Processes(arguments.workers, arguments.threads)
+    elif arguments.scheduler:
+        executor = execute.Cluster(arguments.scheduler, arguments.threads)
+        print(f"{executor.workers} workers, dashboard: {executor.dashboard}", file=sys.stderr)
+    elif arguments.threads is not None:
+        raise ValueError("--threads K is of the workers: give --workers N or --scheduler ADDRESS with it")
+    if executor is not None:
+        executor.log = out / f"jobs-{time.strftime('%Y%m%d-%H%M%S')}.log"
+    try:
+        with execute.using(executor):
+            yield executor
+    except execute.Planned as plan:
+        print(plan)
+    finally:
+        if executor is not None:
+            executor.shutdown(cancel_futures=True)
 
 
 def add_force(parser: argparse._ActionsContainer) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import io
 import math
 import shlex
 from dataclasses import asdict, replace
@@ -13,17 +15,19 @@ from typing import TYPE_CHECKING, Any
 from recon.cli.parsing import (
     SCAN_ENDINGS,
     Commands,
+    add_execution,
     as_json,
     check_ending,
     check_output,
     command,
     examples,
+    executing,
     length_of,
     tell,
     without_ending,
 )
 from torchpcct import VolumeGrid
-from torchpcct.files import VERSION, fingerprint, is_own_hdf5
+from torchpcct.files import VERSION, WriteError, fingerprint, is_own_hdf5, require_writable
 from torchpcct.formats.volume_files import check_target, is_own_volume
 from torchpcct.validate import choice, number, numbers, whole
 
@@ -178,10 +182,14 @@ def add_show_config(commands: Commands) -> None:
 # --- reconstruct --------------------------------------------------------------------------------------------------
 
 
-def _add_reader_options(parser: argparse._ActionsContainer) -> None:
-    """What a file may not know of its scan, see :func:`_reader_options`."""
+def _add_reader_options(parser: argparse._ActionsContainer, number: str | None = None) -> None:
+    """What a file may not know of its scan, see :func:`_reader_options`; ``number`` of files as of argparse."""
     parser.add_argument(
-        "scan", type=Path, metavar="SCAN", help=".h5 (ours or Data Exchange), .yaml stack, CatSim, DICOM-CT-PD folder"
+        "scan",
+        type=Path,
+        nargs=number,
+        metavar="SCAN",
+        help=".h5 (ours or Data Exchange), .yaml stack, CatSim, DICOM-CT-PD folder",
     )
     parser = parser.add_argument_group("what the file does not know of its scan")
     parser.add_argument(
@@ -328,6 +336,64 @@ def _method_options(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
+    """One scan, or many, each as if it were alone."""
+    if len(arguments.scan) == 1:
+        arguments.scan = arguments.scan[0]
+        _reconstruct_scan(arguments, progress)
+        return
+    from recon.evaluate import execute
+
+    folder: Path | None = arguments.out
+    if folder is None:
+        raise ValueError(f"{len(arguments.scan)} scans: --out FOLDER says where their volumes go")
+    require_writable(folder)
+    ending = ".nii.gz" if arguments.memory is None else ".nii"
+    outs = [f"{without_ending(scan)}_{arguments.method}{ending}" for scan in arguments.scan]
+    twice = {name for name in outs if outs.count(name) > 1}
+    if twice:
+        raise ValueError(f"several scans would become {', '.join(sorted(twice))}: give the files other names")
+    common = {k: v for k, v in vars(arguments).items() if k not in ("run", "warn", "scan", "out")}
+    jobs = [
+        execute.Job(
+            str(scan), reconstruct_one, ({**common, "scan": scan.resolve()}, out), (f"{out}*",),
+            mib=4 * scan.stat().st_size / 2**20 if scan.is_file() else 0.0,
+        )
+        for scan, out in zip(arguments.scan, outs, strict=True)
+    ]  # fmt: skip
+    refused = []
+
+    def tell_of(name: str, said: list[str], text: str, error: str) -> None:
+        for warning in said:
+            arguments.warn(f"{name}: {warning}")
+        refused.extend([f"{name}: {error}"] if error else [])
+        print(text or f"{name}: {error}")
+
+    with executing(arguments, folder) as executor:
+        found = execute.run(jobs, folder, executor, progress) if executor is not None else {}
+        for k, job in enumerate(jobs):
+            progress("scans", k / len(jobs))
+            tell_of(job.name, *(found[job.name] if found else job.function(folder, *job.args)))
+    if refused:
+        raise ValueError(f"{len(refused)} of {len(jobs)} scans are not reconstructed: {'; '.join(refused)}")
+
+
+def reconstruct_one(folder: Path, options: dict[str, Any], out: str) -> tuple[list[str], str, str]:
+    """A scan of many, anywhere: warnings, what is printed, and why it is refused."""
+    from recon.study.study import ProgressBars
+
+    said: list[str] = []
+    arguments = argparse.Namespace(**options, out=folder / out, warn=said.append)
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        try:
+            _reconstruct_scan(arguments, ProgressBars(False))
+        except WriteError:
+            raise
+        except (ValueError, TypeError, OSError, ImportError, OverflowError) as error:
+            return said, "", str(error)
+    return said, printed.getvalue().rstrip(), ""
+
+
+def _reconstruct_scan(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     options = _method_options(arguments)
     slabs = arguments.memory is not None
     if arguments.out is None:
@@ -472,12 +538,15 @@ def _tell_volume(
 def add_reconstruct(commands: Commands) -> None:
     parser = command(
         commands, "reconstruct", _reconstruct, "reconstruct a scan file to a volume",
-        "Reconstruct a scan, ours or a foreign one, and write the volume, with what was done beside (.json, .yaml).",
-        "volume to write: .nii, .nii.gz, .mha, .h5, .zarr, or no ending for DICOM (default SCAN_METHOD.nii.gz)",
+        "Reconstruct a scan, ours or a foreign one, and write the volume, with what was done beside (.json, .yaml). "
+        "Many scans go into a folder, each SCAN_METHOD.nii.gz.",
+        "folder of many scans; of one, volume to write: .nii, .nii.gz, .mha, .h5, .zarr, or no ending for DICOM "
+        "(default SCAN_METHOD.nii.gz)",
     )  # fmt: skip
     examples(
         parser, "torchpcct reconstruct tooth.h5 --find-axis --out tooth.nii.gz",
         "torchpcct reconstruct scan.h5 --method mbir --look 1 --out mbir.nii.gz",
+        "torchpcct reconstruct scans/*.h5 --out volumes --workers 4",
     )  # fmt: skip
     axes = ("Z", "Y", "X")
     how = parser.add_argument_group("method")
@@ -496,7 +565,7 @@ def add_reconstruct(commands: Commands) -> None:
     where.add_argument(
         "--extent", type=_length, nargs="+", metavar="MM", help=f"edge lengths, Z Y X (default: what is seen); {own}"
     )
-    _add_reader_options(parser)
+    _add_reader_options(parser, "+")
     mended = parser.add_argument_group("corrections of the scan")
     mended.add_argument(
         "--find-axis",
@@ -511,6 +580,7 @@ def add_reconstruct(commands: Commands) -> None:
         "SCAN_METHOD.nii); what was interrupted goes on",
     )
     _add_output(parser)
+    add_execution(parser)
 
 
 # --- lower-dose ---------------------------------------------------------------------------------------------------

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import json
+import logging
+import pickle
+import zlib
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -13,9 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.evaluate import execute
 from recon.evaluate.draws import Draws
 from recon.evaluate.estimates import Known, Record, records_of
-from recon.evaluate.measure import BLOCK, Measurement, Reader
+from recon.evaluate.execute import Job, Unportable
+from recon.evaluate.measure import BLOCK, Measurement, Reader, kept_as
 from recon.evaluate.methods import Method, method_of
 from recon.evaluate.store import Store
 from recon.evaluate.task import Facts, Task
@@ -24,6 +30,8 @@ from torchpcct.files import written_whole
 from torchpcct.validate import checked, numbers, whole
 
 __all__ = ["Evaluation", "Seen", "evaluate", "export_scans"]
+
+log = logging.getLogger(__name__)
 
 Progress = Callable[[str, float], None]
 LEAST = 8
@@ -74,6 +82,7 @@ def evaluate(
     seed: int = 0,
     folder: str | Path | None = None,
     progress: Progress | None = None,
+    executor: Executor | None = None,
 ) -> Evaluation:
     """Measure methods at tasks, all on the same noise realisations.
 
@@ -87,10 +96,14 @@ def evaluate(
         folder: where scans and finished pieces are kept; the same call goes on after an interruption, and a second one
             with more methods or realisations computes what is new. None: nothing is kept.
         progress: called with a text and the finished fraction of it.
+        executor: where volumes are computed, any of :mod:`concurrent.futures`, best one of
+            :mod:`recon.evaluate.execute`; None: that of :func:`recon.evaluate.execute.using`, else here, one after
+            another. The figures are the same, but for times.
 
     Raises:
         ValueError, TypeError: an unknown task or method, bad values; a method whose volume has another shape or unit,
             holds NaN or is shifted.
+        recon.evaluate.execute.LeftOut: jobs that failed wherever they were tried; the others are kept.
     """
     n, seed = whole("n", n, LEAST), whole("seed", seed, 0)
     todo = [read_task(t) for t in _listed(tasks)]
@@ -102,7 +115,13 @@ def evaluate(
     exposures = None if exposures_s is None else tuple(numbers("exposures_s", exposures_s, positive=True, unit="s"))
     if folder is None:
         with TemporaryDirectory() as kept:
-            return evaluate(todo, run, exposures_s=exposures, n=n, seed=seed, folder=kept, progress=progress)
+            return evaluate(
+                todo, run, exposures_s=exposures, n=n, seed=seed, folder=kept, progress=progress, executor=executor
+            )
+    executor = executor or execute.current()
+    if executor is not None:
+        jobs = [job for task in todo for job in _jobs(task, run, exposures, n, seed, Path(folder), executor)]
+        execute.run(jobs, Path(folder), executor, progress)
     records: list[Record] = []
     seen = []
     for task in todo:
@@ -122,15 +141,124 @@ def _pairs(draws: Draws, exposure_s: float, k: range) -> list[Any]:
     return [draws.draw(exposure_s, i) for i in k]
 
 
+def _everyone(task: Task, methods: Sequence[Method]) -> list[Method]:
+    """The methods after the task's reference."""
+    reference = method_of(task.reference)
+    if not reference.is_fbp:
+        raise ValueError(f"task {task.name}: factors are quoted against FBP, got {reference.name!r}")
+    return [reference, *(m for m in methods if m.name != reference.name)]
+
+
+# --- the same as jobs ---------------------------------------------------------------------------------------------
+
+
+def _jobs(
+    task: Task, methods: Sequence[Method], exposures: Sequence[float] | None, n: int, seed: int, folder: Path,
+    executor: Executor,
+) -> list[Job]:  # fmt: skip
+    """What :func:`_task` would compute and is not there yet: scan and facts, then every block of realisations.
+
+    A job draws its realisations for several methods: for all of them, if there are jobs enough for all workers.
+    """
+    everyone, sent = _everyone(task, methods), []
+    for method in everyone:
+        try:
+            execute.packed_call(executor, method)
+            sent.append(method)
+        except Unportable as error:
+            log.warning(
+                "%s is computed here, not by other processes: it is made of a function that they cannot load (%s); a "
+                "function of a module can be loaded", method.name, error,
+            )  # fmt: skip
+    kernels = tuple(k for m in everyone for k in m.kernels)
+    bench = zlib.compress(execute.packed_call(executor, (task, sent, seed, kernels)))
+    store, place = Store(folder / task.name), f"{task.name}/"
+    first = f"{task.name}: scan"
+    jobs = []
+    if not store.has("facts", f"1 {task.fingerprint}"):
+        jobs.append(Job(first, _facts, (bench,), (f"{place}facts.npz",)))
+    for kernel in dict.fromkeys(m.kernels[0] for m in sent if m.is_fbp):
+        if not store.has(f"exact_{kernel}", f"1 {task.fingerprint}"):
+            name = f"{task.name}: exact noise, {kernel}"
+            jobs.append(Job(name, _exact, (bench, kernel), (f"{place}exact_{kernel}.npz",), (first,)))
+    blocks = [range(start, min(start + BLOCK, n)) for start in range(0, n, BLOCK)]
+    exposures = exposures or task.exposures_s
+    groups = min(len(sent), -(-2 * getattr(executor, "workers", 16) // (len(blocks) * len(exposures)))) or 1
+    for exposure in exposures:
+        for group in (sent[g::groups] for g in range(groups)):
+            kept = {m.name: kept_as(m, exposure, task, seed) for m in group}
+            known = f"{task.name}: {exposure:g} s, noise-free, {', '.join(kept)}"
+            for k in (range(0), *blocks):
+                asked = [m.name for m in group if not all(
+                    store.has(f"{kept[m.name][0]}/{part}", kept[m.name][1]) for part in _parts(m, k)
+                )]  # fmt: skip
+                if not asked:
+                    continue
+                made = tuple(f"{place}{kept[m.name][0]}/{part}.npz" for m in group for part in _parts(m, k))
+                name = f"{task.name}: {exposure:g} s, {k.start}-{k.stop}, {', '.join(asked)}" if k else known
+                seconds, kb = _estimate(task, [m for m in group if m.name in asked], max(len(k), 1))
+                jobs.append(
+                    Job(name, _block, (bench, exposure, asked, k), made, (first, known) if k else (first,),
+                        seconds=seconds, mib=_MIB, bytes=kb)
+                )  # fmt: skip
+    return jobs
+
+
+def _parts(method: Method, k: range) -> tuple[str, ...]:
+    """Names of the pieces of a block; of none those without noise."""
+    if k:
+        return (f"{k.start}-{k.stop}",)
+    return ("clean",) if method.network is None else ("clean", "response")
+
+
+_SECONDS = {"fbp": 0.0, "pwls": 0.5, "mbir": 0.8}
+"""Of a volume of 10⁵ voxels on one core by method; _OTHER_S of a filter or another function, _DRAW_S of a noisy scan
+and its twin with FBP of them (1968 views), _MIB of a process."""
+_OTHER_S, _DRAW_S, _MIB = 0.2, 2.0, 2600.0
+
+
+def _estimate(task: Task, methods: Sequence[Method], n: int) -> tuple[float, float]:
+    """Rough seconds of realisations on one core, and bytes that are kept."""
+    volumes = 2 * n * task.grid.voxels / 1e5
+    seconds = volumes * sum(_SECONDS.get(m.name.partition(":")[0], _OTHER_S) for m in methods)
+    return seconds + n * _DRAW_S, len(methods) * (2.0 * task.grid.voxels + 8e3 * n * (1 + len(task.scene.names)))
+
+
+@lru_cache(maxsize=1)
+def _bench(folder: Path, packed: bytes) -> tuple[Draws, Reader, dict[str, Method]]:
+    """What the jobs of a task share in a process."""
+    task, methods, seed, kernels = pickle.loads(zlib.decompress(packed))
+    draws = Draws(task, Store(folder / task.name), seed, kernels)
+    return draws, Reader(task, task.truth(draws.facts)), {m.name: m for m in methods}
+
+
+def _facts(folder: Path, bench: bytes) -> None:
+    _bench(folder, bench)
+
+
+def _exact(folder: Path, bench: bytes, kernel: str) -> None:
+    _bench(folder, bench)[0].exact_covariance(kernel)
+
+
+def _block(folder: Path, bench: bytes, exposure: float, names: Sequence[str], k: range) -> None:
+    """Pieces of methods at an exposure: of a block of realisations, or of none what is without noise."""
+    draws, reader, methods = _bench(folder, bench)
+    pairs = cache(partial(_pairs, draws, exposure, k))
+    for name in names:
+        measurement = Measurement(methods[name], draws, reader, exposure, draws.store)
+        if k:
+            measurement.block(k, pairs)
+
+
+# --- the loop -----------------------------------------------------------------------------------------------------
+
+
 def _task(
     task: Task, methods: Sequence[Method], exposures: Sequence[float], n: int, seed: int, folder: Path,
     progress: Progress | None,
 ) -> tuple[list[Record], Seen]:  # fmt: skip
-    store = Store(folder / task.name)
-    reference = method_of(task.reference)
-    if not reference.is_fbp:
-        raise ValueError(f"task {task.name}: factors are quoted against FBP, got {reference.name!r}")
-    everyone = [reference, *(m for m in methods if m.name != reference.name)]
+    store, everyone = Store(folder / task.name), _everyone(task, methods)
+    reference = everyone[0]
     draws = Draws(task, store, seed, [k for m in everyone for k in m.kernels])
     if progress is not None:
         progress(f"{task.name}: scan", 0.0)

@@ -26,7 +26,7 @@ from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.observer import dog_channels, template_channel
 from torchpcct.volume import Volume
 
-__all__ = ["BLOCK", "Measurement", "Reader", "Readings", "volume_of"]
+__all__ = ["BLOCK", "Measurement", "Reader", "Readings", "kept_as", "volume_of"]
 
 Floats = NDArray[np.float64]
 
@@ -185,6 +185,12 @@ def check_method(method: Method, reader: Reader, draws: Draws, exposure_s: float
         )
 
 
+def kept_as(method: Method, exposure_s: float, task: Task, seed: int) -> tuple[str, str]:
+    """Where the pieces of a method at an exposure lie in the task's store, and their key."""
+    name = "".join(c if c.isalnum() or c in "-_." else "_" for c in method.name)
+    return f"{name}/{exposure_s:g}s", f"5 {method.name} {method.key} {seed} {task.fingerprint}"
+
+
 class Measurement:
     """A method at one exposure: what is read of noise-free data, then of block after block of realisations.
 
@@ -197,8 +203,7 @@ class Measurement:
 
     def __init__(self, method: Method, draws: Draws, reader: Reader, exposure_s: float, store: Store) -> None:
         self.method, self.reader, self.store = method, reader, store
-        self._place = f"{_file_name(method.name)}/{exposure_s:g}s"
-        self._key = f"5 {method.name} {method.key} {draws.seed} {draws.task.fingerprint}"
+        self._place, self._key = kept_as(method, exposure_s, draws.task, draws.seed)
         self._pieces: list[dict[str, Any]] = []
 
         def clean() -> dict[str, Any]:
@@ -275,7 +280,3 @@ def _of(
 def functionals(adjoints: Tensor, statistic: Tensor) -> Floats:
     """Of AᵀWy ``(z, y, x)``: ``(rois, 2)`` HU, of adjoints ``(2 · rois, z, y, x)``."""
     return np.asarray(torch.einsum("zyx,rzyx->r", statistic.double(), adjoints).numpy()).reshape(-1, 2)
-
-
-def _file_name(name: str) -> str:
-    return "".join(c if c.isalnum() or c in "-_." else "_" for c in name)

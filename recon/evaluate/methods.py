@@ -19,7 +19,7 @@ import hashlib
 import importlib
 import inspect
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -90,6 +90,8 @@ class Method:
         kernels: of FBP that it asks a draw for.
         is_fbp: its volume is FBP with the first of them: means and variances of its ROIs are exact.
         network: it is this MBIR, whose own response to noise controls what is drawn.
+        made: a function of a module and its arguments that make the same method in another process; None: it is sent
+            as it is, which a ``run`` that is no function of a module does not allow.
     """
 
     name: str
@@ -98,6 +100,10 @@ class Method:
     kernels: tuple[str, ...] = ()
     is_fbp: bool = False
     network: Mbir | None = None
+    made: tuple[Callable[..., Any], tuple[Any, ...]] | None = None
+
+    def __reduce__(self) -> Any:
+        return self.made or (Method, tuple(getattr(self, f.name) for f in fields(self)))
 
 
 def method_of(spec: Any) -> Method:
@@ -112,8 +118,12 @@ def method_of(spec: Any) -> Method:
         return spec
     if callable(spec):
         return _of_function(getattr(spec, "__name__", "function"), spec)
-    if not isinstance(spec, str):
-        raise TypeError(f"a method must be a name or a function of (scan, grid), got {type(spec).__name__}")
+    if isinstance(spec, str):
+        return replace(_named(spec), made=(method_of, (spec,)))
+    raise TypeError(f"a method must be a name or a function of (scan, grid), got {type(spec).__name__}")
+
+
+def _named(spec: str) -> Method:
     head, _, base = spec.partition("@")
     if base:
         return _filtered(head, base, spec) if head in FILTERS else denoiser(_loaded(head), base, spec)
@@ -155,7 +165,9 @@ def denoiser(function: Callable[..., Any], base: Any, name: str = "") -> Method:
         volume = before.run(draw)
         return function(volume, draw.sigma(before)) if with_sigma else function(volume)
 
-    return Method(name or f"{plain}@{before.name}", run, key=_source_of(function), kernels=before.kernels)
+    name = name or f"{plain}@{before.name}"
+    made = denoiser, (function, before, name)
+    return Method(name, run, key=_source_of(function), kernels=before.kernels, made=made)
 
 
 @checked
@@ -212,7 +224,8 @@ def _mbir(spec: str, rest: str) -> Method:
 
 
 def _of_function(name: str, function: Callable[..., Any]) -> Method:
-    return Method(name, lambda draw: function(draw.scan, draw.grid), key=_source_of(function))
+    made = _of_function, (name, function)
+    return Method(name, lambda draw: function(draw.scan, draw.grid), key=_source_of(function), made=made)
 
 
 def _of_files(spec: str, folder: Path) -> Method:

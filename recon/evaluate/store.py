@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import functools
 import hashlib
 import importlib
 import json
@@ -16,7 +15,9 @@ from typing import Any, TypeVar, cast
 import numpy as np
 import torch
 
-from torchpcct.files import VERSION, clear_folder, written_whole
+from recon.evaluate import execute
+from recon.evaluate.sources import source_digest
+from torchpcct.files import clear_folder, written_whole
 
 __all__ = ["Pieces", "Store", "packed", "unpacked"]
 
@@ -54,6 +55,14 @@ class Store:
         path = self.folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
+
+    def has(self, name: str, key: str) -> bool:
+        """Whether a piece was finished with this key."""
+        try:
+            with np.load(self.folder / (name + ".npz"), allow_pickle=False) as file:
+                return str(file["key"]).partition(_MARK)[0] == key
+        except Exception:  # none, or damaged
+            return False
 
     def piece(self, name: str, key: str, compute: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         """The arrays of a piece: read if it was finished with the same key, else computed and written.
@@ -94,9 +103,9 @@ T = TypeVar("T")
 class Pieces:
     """Finished parts of one study, of whatever kind, so that the same command goes on after an interruption.
 
-    A piece is used again only with the same settings and the same source (and weights): a result never mixes two
-    versions of this software. Unlike those of a :class:`Store` that a study fills on purpose, they are of no use once
-    the report stands: :meth:`clear` takes them away.
+    A piece is used again only with the same settings and the same source (and weights) of all that the study imports:
+    a result never mixes two versions of them. Unlike those of a :class:`Store` that a study fills on purpose, they are
+    of no use once the report stands: :meth:`clear` takes them away.
 
     Args:
         folder: of the study's results, where they lie in ``pieces``; None: nothing is kept.
@@ -107,8 +116,8 @@ class Pieces:
 
     def __init__(self, folder: str | Path | None, settings: Any) -> None:
         self._store = None if folder is None else Store(Path(folder) / self.FOLDER)
-        self._key = "" if folder is None else f"{settings!r} {source_digest()}"
-        self._prefix = ""
+        self._key = "" if folder is None else f"{settings!r} {_study_digest(settings)}"
+        self._settings, self._prefix = settings, ""
         self._asked: set[str] = set()
 
     def __call__(self, name: str, compute: Callable[[], T]) -> T:
@@ -124,6 +133,35 @@ class Pieces:
             return compute()
         found: T = unpacked(self._store.piece(self._prefix + name, self._key, lambda: packed(compute())))
         return found
+
+    def ahead(self, function: Callable[..., Any], *calls: tuple[Any, ...]) -> None:
+        """Let other processes compute pieces of calls that are independent, before this one reads them one by one.
+
+        Nothing without an executor (:mod:`recon.evaluate.execute`), or where nothing is kept.
+
+        Args:
+            function: of a module; called as ``function(settings, pieces, *call)`` it computes pieces as the study does.
+            calls: texts and numbers, which also name the job.
+        """
+        executor = execute.current()
+        if self._store is None or executor is None:
+            return
+        name, root = function.__name__.strip("_"), self._store.folder
+        jobs = [
+            execute.Job(
+                " ".join(map(str, (name, *call))), _ahead, (self._settings, self._prefix, function, call),
+                makes=("**/*.npz",), module=function.__module__,
+            )
+            for call in calls
+        ]  # fmt: skip
+        done = {job.name: f"done/{hashlib.sha256((self._prefix + job.name).encode()).hexdigest()[:12]}" for job in jobs}
+        left = [job for job in jobs if not self._store.has(done[job.name], self._key)]
+        execute.run(
+            left,
+            root,
+            executor,
+            finished=lambda job: self._store.piece(done[job.name], self._key, dict),  # type: ignore
+        )
 
     def within(self, prefix: str) -> Pieces:
         """The same, with names that begin with ``prefix/``."""
@@ -141,15 +179,16 @@ class Pieces:
         clear_folder(Path(folder) / cls.FOLDER)
 
 
-@functools.cache
-def source_digest() -> str:
-    """SHA-256 of this software: sources and weights."""
-    total = hashlib.sha256(VERSION.encode())
-    for package in ("torchpcct", "recon"):
-        root = Path(str(importlib.import_module(package).__file__)).parent
-        for path in sorted(p for ending in ("*.py", "*.safetensors") for p in root.rglob(ending)):
-            total.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
-    return total.hexdigest()
+def _ahead(root: Path, settings: Any, prefix: str, function: Callable[..., Any], call: tuple[Any, ...]) -> None:
+    pieces = Pieces(root.parent, settings)
+    pieces._prefix = prefix
+    function(settings, pieces, *call)
+
+
+def _study_digest(settings: Any) -> str:
+    """Of the module ``measure`` beside a study's settings, with all it imports."""
+    module = type(settings).__module__
+    return source_digest(f"{module.rpartition('.')[0]}.measure") if module.startswith("recon.") else source_digest()
 
 
 def packed(value: Any) -> dict[str, Any]:

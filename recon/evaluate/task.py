@@ -27,7 +27,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from torch import Tensor
 
-from recon.evaluate.store import Store, source_digest
+from recon.evaluate.sources import source_digest
+from recon.evaluate.store import Store
 from recon.fbp.exact_noise import line_integral_variance
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.acquisition.path_lengths import tissue_path_lengths
@@ -142,9 +143,14 @@ class Task:
 
     @cached_property
     def fingerprint(self) -> str:
-        """Of all that a task's results depend on: itself, and this software."""
+        """Of all that a task's results depend on: itself, and the sources that compute them."""
+        digest = source_digest("recon.evaluate.measure", type(self).__module__)
         plain = [_plain(getattr(self, f.name)) for f in fields(self) if f.name not in ("title", "exposures_s")]
-        return hashlib.sha256(f"{plain} {source_digest()}".encode()).hexdigest()[:16]
+        return hashlib.sha256(f"{plain} {digest}".encode()).hexdigest()[:16]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what it has kept of its own computations, to be sent."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
 
     # --- noise-free scans and what they say ---------------------------------------------------------------------
 

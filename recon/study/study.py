@@ -33,7 +33,7 @@ from torchpcct.validate import whole
 __all__ = ["Clock", "Progress", "ProgressBars", "StudySettings", "environment", "silent", "time_line"]
 
 Progress = Callable[[str, float], None]
-"""Called with the name of a step and its finished fraction, 0…1."""
+"""Called with the name of a step (after a bar, ``|``, what changes in the meantime) and its finished fraction, 0…1."""
 
 
 def silent(step: str, fraction: float) -> None:
@@ -55,13 +55,16 @@ class ProgressBars:
     def __call__(self, step: str, fraction: float) -> None:
         if not self.enabled:
             return
+        step, _, more = step.partition("|")
         if step != self._step:
             from tqdm import tqdm
 
             self.close()
             self._step = step
-            form = "{desc:<28} {bar:30} {percentage:3.0f}% {elapsed}<{remaining}"
+            form = "{desc:<28} {bar:30} {percentage:3.0f}% {elapsed}<{remaining}{postfix}"
             self._bar = tqdm(total=100, desc=step, unit="%", leave=True, bar_format=form)
+        if more:
+            self._bar.set_postfix_str(more, refresh=False)
         self._bar.update(100 * fraction - self._bar.n)
 
     def of(self, step: str) -> Callable[[float], None]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -56,27 +55,24 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     scanners = wide_scanners(8)
     parts["transmission"] = transmission(scanners)
     parts["ramps"] = ramp_figures(scanners, s.exposure_s)
-    ctdi = pieces("ctdi", partial(ctdi_figures, scanners, s.exposure_s, s.histories, s.seed))
+    pieces.ahead(
+        _kept, *((name,) for name in ("ctdi", "patient", *(f"{k}_{n}" for k in ("noise", "map") for n in scenes)))
+    )
+    ctdi = _kept(s, pieces, "ctdi")
     progress("dose", 0.3)
     parts["ctdi_ratios"] = {k: ratios(v) for k, v in ctdi.items()}
-    # The CTDI phantom's map is drawn only, its doses are those in the bores: no scatter.
-    asked = {"ctdi": (max(s.map_mm / 2, 1.0), 0), "thorax": (s.map_mm, s.histories)}
     maps = {}
-    for k, (name, (spacing, histories)) in enumerate(asked.items()):
-        grid = phantom_grid(name, spacing)
-        mapped = partial(dose_maps, scenes[name], scanners, grid, s.exposure_s, histories, s.seed)
-        maps[name] = pieces(f"map_{name}", mapped)
+    for k, name in enumerate(("ctdi", "thorax")):
+        maps[name] = _kept(s, pieces, f"map_{name}")
         progress("dose", 0.3 + 0.3 * (k + 1))
     parts["thorax_dose_ratio"] = thorax_ratios(maps["thorax"], scenes["thorax"])
-    patient = partial(patient_ratio, scanners, s.exposure_s, s.histories // 2, s.seed)
-    parts["patient_dose_ratio"] = pieces("patient", patient)
+    parts["patient_dose_ratio"] = _kept(s, pieces, "patient")
     progress("dose", 1.0)
     clock.lap("dose")
 
-    scanners, seeds = wide_scanners(s.views, s.detector), range(s.seed, s.seed + s.realizations)
     found = {}
-    for k, (name, scene) in enumerate(scenes.items()):
-        found[name] = pieces(f"noise_{name}", partial(noise, name, scene, scanners, s.exposure_s, s.kernel, seeds))
+    for k, name in enumerate(scenes):
+        found[name] = _kept(s, pieces, f"noise_{name}")
         progress("noise", (k + 1) / len(scenes))
     parts["noise"] = {name: values for name, (values, _) in found.items()}
     clock.lap("noise")
@@ -94,3 +90,24 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     clock.lap(step)
     images = {name: image for name, (_, image) in found.items()}
     return Measured(s, parts, ctdi, maps, images, clock.seconds)
+
+
+def _kept(settings: Settings, pieces: Pieces, name: str) -> Any:
+    """A piece of the study by its name."""
+    s, (kind, _, scene) = settings, name.partition("_")
+
+    def compute() -> Any:
+        if kind == "noise":
+            scanners, seeds = wide_scanners(s.views, s.detector), range(s.seed, s.seed + s.realizations)
+            return noise(scene, phantoms()[scene], scanners, s.exposure_s, s.kernel, seeds)
+        scanners = wide_scanners(8)
+        if kind == "ctdi":
+            return ctdi_figures(scanners, s.exposure_s, s.histories, s.seed)
+        if kind == "patient":
+            return patient_ratio(scanners, s.exposure_s, s.histories // 2, s.seed)
+        # The CTDI phantom's map is drawn only, its doses are those in the bores: no scatter.
+        spacing, histories = (max(s.map_mm / 2, 1.0), 0) if scene == "ctdi" else (s.map_mm, s.histories)
+        grid = phantom_grid(scene, spacing)
+        return dose_maps(phantoms()[scene], scanners, grid, s.exposure_s, histories, s.seed)
+
+    return pieces(name, compute)

@@ -55,6 +55,7 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
         spectrum.append(followed(f"energy_{i}", partial(at_energy, energy, max(1000, s.photons // 4), rng)))
         progress("photons followed, energies", (i + 1) / len(ENERGIES_KEV))
     clock.lap("energies")
+    pieces.ahead(_pile_up, *((t,) for t in s.dead_times_ns))
     parts = {
         "counts": counts(),
         "efficiency": efficiency,
@@ -63,7 +64,11 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
         "charge_sharing": [
             followed(f"sharing_{c:g}", partial(charge_sharing, c, s.photons, rng)) for c in s.charge_sharing
         ],
-        "pile_up": [pieces(f"pile_up_{t:g}", partial(pile_up, t)) for t in s.dead_times_ns],
+        "pile_up": [_pile_up(s, pieces, t) for t in s.dead_times_ns],
     }
     clock.lap("rates")
     return Measured(s, parts, clock.seconds)
+
+
+def _pile_up(settings: Settings, pieces: Pieces, dead_time_ns: float) -> Any:
+    return pieces(f"pile_up_{dead_time_ns:g}", partial(pile_up, dead_time_ns))

@@ -94,14 +94,14 @@ def verdict(
 def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
     """Reconstruct every case by every method; see :mod:`recon.study.study`."""
     clock, pieces = Clock(), Pieces(folder, settings)
-    used = {CASES[name].base for name in settings.cases}
-    bases = {name: make(settings, pieces.within(name), progress) for name, make in _BASES.items() if name in used}
+    bases = _bases(settings, pieces, progress)
     clock.lap("simulate")
+    pieces.ahead(_sound_ahead, *((name, method) for name, base in bases.items() for method in _methods(base, settings)))
     for base in bases.values():
-        for method in settings.methods:
-            if method != "tissues" or base.plaque is not None:
-                base.sound[method] = base.pieces(f"sound_{method}", partial(_sound, base, method))
+        for method in _methods(base, settings):
+            base.sound[method] = base.pieces(f"sound_{method}", partial(_sound, base, method))
     clock.lap("sound scans")
+    pieces.ahead(_case_ahead, *((name,) for name in settings.cases))
     rows = []
     for k, name in enumerate(settings.cases):
         rows += _case(name, bases[CASES[name].base], settings, pieces.within(f"case_{name}"), progress)
@@ -160,6 +160,27 @@ def _body_base(settings: Settings, pieces: Pieces, progress: Progress) -> _Base:
 
 
 _BASES = {"plaque": _plaque_base, "body": _body_base}
+
+
+def _bases(settings: Settings, pieces: Pieces, progress: Progress) -> dict[str, _Base]:
+    used = {CASES[name].base for name in settings.cases}
+    return {name: make(settings, pieces.within(name), progress) for name, make in _BASES.items() if name in used}
+
+
+def _methods(base: _Base, settings: Settings) -> list[str]:
+    return [m for m in settings.methods if m != "tissues" or base.plaque is not None]
+
+
+def _sound_ahead(settings: Settings, pieces: Pieces, name: str, method: str) -> None:
+    base = _BASES[name](settings, pieces.within(name), silent)
+    base.pieces(f"sound_{method}", partial(_sound, base, method))
+
+
+def _case_ahead(settings: Settings, pieces: Pieces, name: str) -> None:
+    base = _BASES[CASES[name].base](settings, pieces.within(CASES[name].base), silent)
+    for method in _methods(base, settings):
+        base.sound[method] = base.pieces(f"sound_{method}", partial(_sound, base, method))
+    _case(name, base, settings, pieces.within(f"case_{name}"), silent)
 
 
 def _reconstruct(scan: Scan, grid: VolumeGrid, method: str) -> Volume:

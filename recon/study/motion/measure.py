@@ -59,6 +59,8 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     m = Measured(settings, seconds=clock.seconds)
     scene, plaque = plaque_scene()
     reference = Reference.of(scene, plaque, inset_grid(plaque, settings.voxel_mm))
+    fractions = {"PCCT": (0.0, *settings.fractions), "EID-CT": (0.0, *settings.eid_fractions)}
+    pieces.ahead(_scan_ahead, *((name, f) for name in SCANNERS for f in dict.fromkeys(fractions[name])))
     for name in SCANNERS:
         with clock.step(f"{name}, residual motion"):
             still, moving = _residual(m, name, reference, pieces.within(name), progress)
@@ -74,15 +76,7 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
 def _residual(m: Measured, name: str, reference: Reference, pieces: Pieces, progress: Progress) -> tuple[Scan, Scan]:
     """Images with residual motion; returns the scans at rest and of the largest motion."""
     s, grid = m.settings, reference.grid
-    scanner = SCANNERS[name](paper.FULL_VIEWS[name] // s.thinning)
-    on = duty(scanner, paper.FULL_VIEWS[name])
-
-    def simulate(fraction: float) -> Scan:
-        scene = plaque_scene(motion=s.motion.scaled(fraction))[0]
-        run = partial(acquire, scene, scanner, region=grid, rotation_s=s.rotation_s, duty=on)
-        return pieces(f"scan_{fraction:g}", run)
-
-    still = moving = simulate(0.0)
+    still = moving = _scan(s, pieces, name, 0.0)
     rest = reconstruct_fbp(still, grid)
     m.at_rest[name] = observe(rest, reference, rest)
     path = view_motion(s.motion, still.geometry, s.rotation_s)
@@ -92,9 +86,23 @@ def _residual(m: Measured, name: str, reference: Reference, pieces: Pieces, prog
         m.step_mm = float(np.linalg.norm(np.diff(path, axis=0), axis=1).max())
     fractions = s.fractions if name == "PCCT" else s.eid_fractions
     for done, fraction in enumerate(fractions):
-        moving = simulate(fraction)
+        moving = _scan(s, pieces, name, fraction)
         mean = np.tile(fraction * path.mean(0), (len(path), 1))
         in_place, back = reconstruct_fbp(moving, grid), reconstruct_fbp(moving, grid, mean)
         m.residual[name, fraction] = (observe(in_place, reference, rest), observe(back, reference, rest))
         progress(name, (done + 1) / len(fractions))
     return still, moving
+
+
+def _scan(s: Settings, pieces: Pieces, name: str, fraction: float) -> Scan:
+    scanner = SCANNERS[name](paper.FULL_VIEWS[name] // s.thinning)
+    scene, plaque = plaque_scene(motion=s.motion.scaled(fraction))
+    run = partial(
+        acquire, scene, scanner, region=inset_grid(plaque, s.voxel_mm), rotation_s=s.rotation_s,
+        duty=duty(scanner, paper.FULL_VIEWS[name]),
+    )  # fmt: skip
+    return pieces(f"scan_{fraction:g}", run)
+
+
+def _scan_ahead(settings: Settings, pieces: Pieces, name: str, fraction: float) -> None:
+    _scan(settings, pieces.within(name), name, fraction)

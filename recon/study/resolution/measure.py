@@ -145,8 +145,9 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
         clock.lap(name)
     variants: dict[float, tuple[float, list[Blurred]]] = {}
     bulges = sorted({plaque.bulge, *settings.bulges_mm})
+    pieces.ahead(_kept_variant, *((bulge,) for bulge in bulges))
     for bulge in bulges:
-        variants[bulge] = pieces(f"bulge_{bulge:g}", partial(_variant, bulge, settings))
+        variants[bulge] = _kept_variant(settings, pieces, bulge)
         progress("variants", len(variants) / len(bulges))
     smoothed = _smooth(scanners["PCCT"], scanners["EID-CT"])
     clock.lap("variants")
@@ -216,6 +217,10 @@ def _middle_slices(scene: Scene, plaque: Plaque, scanner: Scanner, on: float) ->
     scanner = scanner.replace(geometry=replace(scanner.geometry, rows=_MIDDLE_ROWS))
     scan = acquire(scene, scanner, region=grid, duty=on)
     return grid, InsetFbp(scan, [grid], [REFERENCE_KERNEL])(scan)[0][0]
+
+
+def _kept_variant(settings: Settings, pieces: Pieces, bulge: float) -> tuple[float, list[Blurred]]:
+    return pieces(f"bulge_{bulge:g}", partial(_variant, bulge, settings))
 
 
 def _variant(bulge: float, settings: Settings) -> tuple[float, list[Blurred]]:

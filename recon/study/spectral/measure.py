@@ -95,13 +95,9 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     data["water"] = {k: v.tolist() for k, v in pieces("water", partial(water_hu, VMI_ENERGIES_KEV, s.views)).items()}
     done("water and starved rays")
     lines, volumes, data["rays"] = [], [], []
+    pieces.ahead(_noisy_ahead, *((k,) for k in range(s.realizations)))
     for k in range(s.realizations):
-
-        def draw(k: int = k) -> tuple[Tensor, list[Tensor], dict[str, Any]]:
-            noisy, statistics = scan.noisy(s.exposure_s, s.seed + k)
-            return scan.fbp.images(noisy)[0][0], [noisy] if k < s.mbir_realizations else [], statistics
-
-        volume, used, statistics = pieces(f"noisy_{k}", draw)
+        volume, used, statistics = _noisy(scan, pieces, k)
         data["rays"].append(statistics)
         volumes.append(volume)
         lines += used
@@ -128,6 +124,21 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
         data["calibration"] = pieces("calibration", costs)
         clock.lap("wrong calibrations")
     return Measured(s, data, scan, tissues, images, clock.seconds, time.process_time() - spent)
+
+
+def _noisy(scan: SpectralScan, pieces: Pieces, k: int) -> tuple[Tensor, list[Tensor], dict[str, Any]]:
+    """FBP of a realisation, its line integrals if MBIR needs them, and what is told of its rays."""
+    s = scan.settings
+
+    def draw() -> tuple[Tensor, list[Tensor], dict[str, Any]]:
+        noisy, statistics = scan.noisy(s.exposure_s, s.seed + k)
+        return scan.fbp.images(noisy)[0][0], [noisy] if k < s.mbir_realizations else [], statistics
+
+    return pieces(f"noisy_{k}", draw)
+
+
+def _noisy_ahead(settings: Settings, pieces: Pieces, k: int) -> None:
+    _noisy(SpectralScan(settings, pieces=pieces), pieces, k)
 
 
 def _curve(curve: VmiCurve) -> dict[str, Any]:

@@ -1,0 +1,586 @@
+"""Jobs in other processes and on other machines, through any :class:`concurrent.futures.Executor`.
+
+A job computes files of a folder (pieces of a :class:`~recon.evaluate.store.Store`, volumes); afterwards the one program
+that everybody knows reads them and goes on, as if it had computed them itself before it was interrupted. So what comes
+out does not depend on where it was computed, and whatever dies, nothing finished is lost.
+
+* serial: no executor;
+* :class:`Processes`: of this machine (spawned), one job each at a time; a process that dies takes its own job alone;
+* :class:`Cluster`: the workers of a Dask scheduler. Who repeats a job of a worker that died is Dask.
+
+Where a worker sees the folder (the disk is shared) it writes there; where it does not, it computes in a folder of its
+own, and the files come back with the job's result.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import importlib
+import logging
+import multiprocessing
+import os
+import pickle
+import platform
+import socket
+import sys
+import threading
+import time
+from collections import Counter, defaultdict, deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor as Pool
+from concurrent.futures import wait as wait_for
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from tempfile import gettempdir
+from typing import Any
+
+from recon.evaluate.sources import source_digest
+from torchpcct.files import VERSION, WriteError, marker, written_whole
+from torchpcct.validate import whole
+
+__all__ = [
+    "Cluster",
+    "Job",
+    "LeftOut",
+    "Plan",
+    "Planned",
+    "Processes",
+    "Unportable",
+    "current",
+    "packed_call",
+    "run",
+    "using",
+]
+
+log = logging.getLogger(__name__)
+
+DEATHS = 3
+"""Of workers, or of their disks, until a job is left out."""
+_ANSWER_S = 8.0
+"""That a scheduler may take."""
+_AHEAD = 4
+"""Jobs for a worker that are submitted before one of them is done."""
+
+_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)
+
+Progress = Callable[[str, float], None]
+
+
+class LeftOut(RuntimeError):
+    """Jobs that could not be done anywhere; all others are done, and kept."""
+
+
+class Planned(Exception):
+    """All jobs were listed, none was run (``--dry-run``)."""
+
+
+class Unportable(TypeError):
+    """A function or value that no other process can be given."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """Something to compute.
+
+    Args:
+        name: unique; it says to people what it is.
+        function: of a module, called as ``function(folder, *args)``; it writes into ``folder`` what is not there yet.
+        args: to be pickled; all that the result depends on, seeds too.
+        makes: patterns of the files in ``folder`` that are wanted back from a disk that is not shared.
+        after: names of jobs that have to be done before.
+        module: the one whose sources, with all they import, must be the worker's; empty: that of ``function``.
+        seconds, mib, bytes: expected on one core, in memory, and on the disk; 0: not known.
+    """
+
+    name: str
+    function: Callable[..., Any]
+    args: tuple[Any, ...]
+    makes: tuple[str, ...] = ()
+    after: tuple[str, ...] = ()
+    module: str = ""
+    seconds: float = 0.0
+    mib: float = 0.0
+    bytes: float = 0.0
+
+
+@dataclass(frozen=True)
+class _Run:
+    """What the jobs of a run share."""
+
+    folder: str
+    marker: str
+    client: tuple[str, int]
+    threads: int | None
+    version: str
+    path: str
+
+
+@dataclass
+class _Done:
+    """What comes back: ``problem`` is what a disk said, ``said`` what was logged as a warning."""
+
+    where: str
+    value: Any = None
+    files: dict[str, bytes] = field(default_factory=dict)
+    seconds: float = 0.0
+    compiled_s: float = 0.0
+    problem: str = ""
+    said: list[str] = field(default_factory=list)
+
+
+# --- where jobs are run -------------------------------------------------------------------------------------------
+
+
+_current: ContextVar[Executor | None] = ContextVar("executor", default=None)
+
+
+def current() -> Executor | None:
+    """The executor of the innermost :func:`using`; None: everything is computed here, one after another."""
+    return _current.get()
+
+
+@contextlib.contextmanager
+def using(executor: Executor | None) -> Iterator[None]:
+    """Let evaluations and studies of a block run their jobs by an executor."""
+    token = _current.set(executor)
+    try:
+        yield
+    finally:
+        _current.reset(token)
+
+
+class Processes(ThreadPoolExecutor):
+    """Processes of this machine. Each has a thread that waits for it, and is replaced if it dies.
+
+    Args:
+        workers: number of processes.
+        threads: of each; None: they share the cores.
+    """
+
+    def __init__(self, workers: int, threads: int | None = None) -> None:
+        self.workers = whole("workers", workers)
+        self.threads = whole("threads", threads or max(1, (os.cpu_count() or 1) // workers))
+        super().__init__(workers)
+        self._own, self._pools = threading.local(), list[Pool]()
+        for _ in range(workers):  # all of them load what is slow to load, while the first jobs are thought of
+            self.submit(_load)
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """See :class:`concurrent.futures.Executor`; ``BrokenProcessPool`` is the death of this job's process alone."""
+        return super().submit(self._in_process, fn, *args, **kwargs)
+
+    def _in_process(self, fn: Callable[..., Any], *args: Any) -> Any:
+        pool: Pool | None = getattr(self._own, "pool", None)
+        if pool is None:
+            pool = Pool(1, multiprocessing.get_context("spawn"), initializer=_end_with_parent)
+            self._own.pool = pool
+            self._pools.append(pool)
+        try:
+            return pool.submit(fn, *args).result()
+        except BrokenExecutor:
+            self._own.pool = None
+            raise
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """See :class:`concurrent.futures.Executor`."""
+        super().shutdown(wait, cancel_futures=cancel_futures)
+        for pool in self._pools:
+            pool.shutdown(wait, cancel_futures=cancel_futures)
+
+
+def _load() -> None:
+    importlib.import_module("recon.evaluate.experiment")
+
+
+def _end_with_parent() -> None:
+    """A process whose parent was killed would wait for its next job forever."""
+    parent: Any = multiprocessing.parent_process()
+
+    def end() -> None:
+        parent.join()
+        os._exit(1)
+
+    if parent is not None:
+        threading.Thread(target=end, daemon=True).start()
+
+
+class Cluster(Executor):
+    """The workers of a Dask scheduler, started with ``--nthreads 1``.
+
+    Args:
+        scheduler: its address, or the file of ``dask scheduler --scheduler-file``.
+        threads: of each worker.
+
+    Raises:
+        ImportError: ``distributed`` is not installed.
+        OSError: no scheduler answers.
+    """
+
+    def __init__(self, scheduler: str, threads: int | None = None) -> None:
+        try:
+            from distributed import Client
+        except ImportError as error:
+            raise ImportError("--scheduler needs Dask: pip install 'torchpcct[cluster]'") from error
+        is_file = scheduler.endswith(".json") or Path(scheduler).is_file()
+        if is_file and not Path(scheduler).is_file():
+            raise FileNotFoundError(f"{scheduler} does not exist: dask scheduler --scheduler-file writes it")
+        given = {"scheduler_file": scheduler} if is_file else {"address": scheduler}
+        quiet = logging.getLogger("distributed")
+        level, self.address, self.threads = quiet.level, scheduler, whole("threads", threads or 1)
+        quiet.setLevel(logging.CRITICAL)  # its own account of the same, in many lines
+        try:
+            self.client = Client(**given, timeout=_ANSWER_S, set_as_default=False)
+        except (OSError, ValueError, TimeoutError) as error:
+            raise ConnectionError(f"no Dask scheduler answers at {scheduler} within {_ANSWER_S:g} s") from error
+        finally:
+            quiet.setLevel(level)
+        self.avoid: set[str] = set()
+        self._asked: tuple[float, list[str]] = -9.0, []
+        from cloudpickle import dumps
+
+        self.dumps = dumps
+
+        self.first = [self.client.submit(_load, workers=[a], pure=False) for a in self._addresses]
+
+    @property
+    def workers(self) -> int:
+        """As many as there are now."""
+        return len(self._addresses)
+
+    @property
+    def _addresses(self) -> list[str]:
+        now = time.monotonic()
+        if now - self._asked[0] > 1.0:  # a way to the scheduler and back
+            self._asked = now, list(self.client.scheduler_info(-1)["workers"])
+        return [a for a in self._asked[1] if a not in self.avoid]
+
+    @property
+    def dashboard(self) -> str:
+        """Address of the scheduler's page."""
+        return str(self.client.dashboard_link)
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """See :class:`concurrent.futures.Executor`."""
+        only = {"workers": self._addresses} if self.avoid else {}
+        found: Future[Any] = self.client.get_executor(pure=False, **only).submit(fn, *args, **kwargs)
+        return found
+
+    def check(self) -> None:
+        """Raise ``ConnectionError`` if the scheduler is gone, or was: it has forgotten what it was given."""
+        lost = any(state.status == "lost" for state in list(self.client.futures.values()))
+        if lost or self.client.status in ("closing", "closed"):
+            raise _gone(self)
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Part from the scheduler, which goes on; what was submitted and is not done is dropped."""
+        self.client.close()
+
+
+# --- what a worker does -------------------------------------------------------------------------------------------
+
+
+def _where() -> tuple[str, str | None, int]:
+    """This worker's name, its folder if Dask gave it one, and how many jobs it takes at once."""
+    distributed = sys.modules.get("distributed")
+    try:
+        worker: Any = distributed.get_worker()  # type: ignore[union-attr]
+    except (AttributeError, ValueError):
+        return f"{socket.gethostname()} process {os.getpid()}", None, 1
+    return str(worker.address), str(worker.local_directory), int(worker.state.nthreads)
+
+
+@cache
+def _use_threads(threads: int) -> None:
+    """In a worker: torch, BLAS and our own kernels. Dask sets none of the last two, and N workers would fight."""
+    import torch
+    from threadpoolctl import threadpool_limits
+
+    from torchpcct.threads import set_num_threads
+
+    threadpool_limits(threads)
+    torch.set_num_threads(threads)
+    set_num_threads(threads)
+
+
+@contextlib.contextmanager
+def _compile_time() -> Iterator[list[float]]:
+    """Seconds in which numba compiled kernels, one number for each."""
+    from numba.core import event
+
+    found: list[float] = []
+
+    class Timer(event.TimingListener):
+        def on_end(self, event: Any) -> None:
+            super().on_end(event)
+            if self.done:
+                found.append(self.duration)
+
+    with event.install_listener("numba:compile", Timer()):
+        yield found
+
+
+@contextlib.contextmanager
+def _heard(own: bool) -> Iterator[list[str]]:
+    """Warnings that a worker logs, which the client says instead; of its own process it has heard them."""
+    said: list[str] = []
+
+    class Listener(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            said.append(record.getMessage())
+
+    listener = logging.NullHandler() if own else Listener(logging.WARNING)
+    logging.getLogger().addHandler(listener)
+    try:
+        yield said
+    finally:
+        logging.getLogger().removeHandler(listener)
+
+
+def _work(call: bytes, module: str, digest: str, makes: tuple[str, ...], of: _Run) -> _Done:
+    """Run a job where this is called."""
+    own = of.client == (platform.node(), os.getpid())
+    where, scratch, at_once = _where()
+    if not own:
+        if at_once > 1:
+            raise ValueError(f"the worker {where} takes {at_once} jobs at once: start it with --nthreads 1 (more "
+                             "workers of a machine: --nworkers)")  # fmt: skip
+        if of.path not in sys.path and os.path.isdir(of.path):
+            sys.path.insert(0, of.path)
+        if (VERSION, source_digest(module)) != (of.version, digest):
+            raise ValueError(f"the worker {where} has another torchpcct (its version {VERSION}, here {of.version}; the "
+                             f"sources of {module} differ): install the same one")  # fmt: skip
+        if of.threads is not None:
+            _use_threads(of.threads)
+    function, args = pickle.loads(call)
+    shared = own or Path(of.marker).exists()
+    folder = Path(of.folder) if shared else Path(scratch or gettempdir()) / Path(of.marker).name
+    start = time.perf_counter()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with _compile_time() as compiled, _heard(own) as said:
+            value = function(folder, *args)
+    except OSError as error:
+        if own or (error.errno not in _DISK and not isinstance(error, WriteError)):
+            raise
+        return _Done(where, problem=str(error))
+    made = {} if shared else {
+        p.relative_to(folder).as_posix(): p.read_bytes() for pattern in makes for p in folder.glob(pattern)
+    }  # fmt: skip
+    seconds = time.perf_counter() - start
+    return _Done(where, value, made, seconds, sum(compiled), said=said)
+
+
+# --- the client ---------------------------------------------------------------------------------------------------
+
+
+def packed_call(executor: Executor | None, value: Any) -> bytes:
+    """A value as a job of this executor carries it.
+
+    Raises:
+        Unportable: it cannot be pickled (a lambda, a function in a function), or another process would not find it.
+    """
+    dumps = getattr(executor, "dumps", None)
+    try:
+        return bytes((dumps or pickle.dumps)(value))
+    except Exception as error:  # whatever pickling it raises
+        raise Unportable(str(error)) from error
+
+
+def run(
+    jobs: Sequence[Job], folder: Path, executor: Executor, progress: Progress | None = None,
+    finished: Callable[[Job], Any] | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Run jobs, as many at once as there are workers.
+
+    Args:
+        jobs: with what they need before them.
+        folder: that they write into, made if need be.
+        executor: any; by one of this module a job whose worker dies is repeated.
+        progress: called with a text and the finished fraction.
+        finished: called with each job that is done, its files in ``folder``.
+
+    Returns:
+        Name → what the job's function gave.
+
+    Raises:
+        LeftOut: jobs whose workers, or whose disks, failed three times; all others are done.
+        Unportable: a job that cannot be pickled.
+        ConnectionError: the scheduler is gone.
+        what a job's function raises; those that are done are kept.
+    """
+    if isinstance(executor, Plan):
+        raise Planned(_table(jobs))
+    if not jobs:
+        return {}
+    folder.mkdir(parents=True, exist_ok=True)
+    with marker(folder) as here:
+        of = _Run(
+            str(folder.resolve()), str(here.resolve()), (platform.node(), os.getpid()),
+            getattr(executor, "threads", None), VERSION, os.getcwd(),
+        )  # fmt: skip
+        return _run(jobs, folder, executor, of, _Log(executor, jobs), progress, finished)
+
+
+def _run(
+    jobs: Sequence[Job], folder: Path, executor: Executor, of: _Run, book: _Log,
+    progress: Progress | None, finished: Callable[[Job], Any] | None,
+) -> dict[str, Any]:  # fmt: skip
+    names = {job.name for job in jobs}
+    needs = {job.name: names.intersection(job.after) for job in jobs}
+    next_: dict[str, list[Job]] = defaultdict(list)
+    for job in jobs:
+        for name in needs[job.name]:
+            next_[name].append(job)
+    ready = deque(job for job in jobs if not needs[job.name])
+    values, lost, deaths = dict[str, Any](), dict[str, str](), Counter[str]()
+    running: dict[Future[_Done], Job] = {}
+    said: set[str] = set()
+
+    def leave_out(job: Job, why: str) -> None:
+        if lost.setdefault(job.name, why) is why:
+            for other in next_[job.name]:
+                leave_out(other, f"needs {job.name}")
+
+    try:
+        while ready or running:
+            workers = getattr(executor, "workers", 16)
+            while ready and len(running) < _AHEAD * max(1, workers):
+                job = ready.popleft()
+                if not workers and getattr(executor, "avoid", None):
+                    leave_out(job, "no worker is left")
+                    continue
+                module = job.module or job.function.__module__
+                call = packed_call(executor, (job.function, job.args))
+                running[executor.submit(_work, call, module, source_digest(module), job.makes, of)] = job
+            for future in wait_for(running, 1.0, FIRST_COMPLETED)[0] if running else ():
+                job = running.pop(future)
+                done, why = _outcome(future, executor)
+                if done is None:
+                    deaths[job.name] += DEATHS if "KilledWorker" in why else 1
+                    book.note(f"failed   {job.name}: {why}")
+                    if deaths[job.name] < DEATHS:
+                        ready.append(job)
+                    else:
+                        leave_out(job, why)
+                    continue
+                _keep(folder, done.files)
+                values[job.name] = done.value
+                book.done(job, done)
+                for text in dict.fromkeys(done.said):
+                    if text not in said:
+                        said.add(text)
+                        log.warning("%s", text)
+                if finished is not None:
+                    finished(job)
+                for other in next_[job.name]:
+                    needs[other.name].discard(job.name)
+                    if not needs[other.name] and other.name not in lost:
+                        ready.append(other)
+            if isinstance(executor, Cluster):
+                executor.check()
+            if progress is not None:
+                progress(book.text(len(values), len(running), len(lost)), len(values) / len(jobs))
+    finally:
+        for future in running:
+            future.cancel()
+    if lost:
+        listed = [f"{name} ({why})" for name, why in lost.items()]
+        raise LeftOut(
+            f"{len(lost)} of {len(jobs)} jobs are missing: {'; '.join(listed[:5])}{'; …' if listed[5:] else ''}. The "
+            "others are done and kept: the same command tries these again"
+        )
+    return values
+
+
+def _keep(folder: Path, files: dict[str, bytes]) -> None:
+    """Write what came back from another disk."""
+    for name, data in files.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with written_whole(path) as part:
+            part.write_bytes(data)
+
+
+def _outcome(future: Future[_Done], executor: Executor) -> tuple[_Done | None, str]:
+    """What a job gave, or why it has to be repeated."""
+    try:
+        done = future.result()
+    except CancelledError:
+        raise _gone(executor) from None
+    except BrokenExecutor:
+        if not isinstance(executor, Processes):
+            raise
+        return None, "its process died"
+    except Exception as error:
+        if type(error).__name__ != "KilledWorker":  # of Dask, which has repeated it
+            raise
+        return None, "KilledWorker: every worker that took it died"
+    if not done.problem:
+        return done, ""
+    if not isinstance(executor, Cluster):
+        raise WriteError(done.problem)
+    executor.avoid.add(done.where)
+    log.warning("%s: %s; its jobs go elsewhere", done.where, done.problem)
+    return None, f"{done.where}: {done.problem}"
+
+
+def _gone(executor: Executor) -> ConnectionError:
+    return ConnectionError(
+        f"the scheduler {getattr(executor, 'address', '')} is gone: what is done is kept, the same command goes on"
+    )
+
+
+class _Log:
+    """What a run says of itself: a line for each job in the executor's log file, and its progress."""
+
+    def __init__(self, executor: Executor, jobs: Sequence[Job]) -> None:
+        self.path: Path | None = getattr(executor, "log", None)
+        self.weights = {job.name: job.seconds or 1.0 for job in jobs}
+        self.start, self.finished, self.compiled_s = time.perf_counter(), 0.0, 0.0
+        self.note(f"{len(jobs)} jobs, torchpcct {VERSION}, {platform.node()}: {' '.join(sys.argv)}")
+
+    def note(self, text: str) -> None:
+        """Write a line."""
+        if self.path is not None:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with self.path.open("a", encoding="utf-8") as file:
+                file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {text}\n")
+
+    def done(self, job: Job, by: _Done) -> None:
+        """A job is done."""
+        self.finished += self.weights[job.name]
+        self.compiled_s += by.compiled_s
+        compiled = f", {by.compiled_s:.1f} s of it compiling" if by.compiled_s else ""
+        back = f", {sum(map(len, by.files.values()))} bytes back" if by.files else ""
+        self.note(f"done     {job.name}: {by.seconds:.3f} s{compiled} on {by.where}{back}")
+
+    def text(self, done: int, running: int, failed: int) -> str:
+        """Of the progress: the step, and after a bar what changes."""
+        left = sum(self.weights.values()) - self.finished
+        seconds = left * (time.perf_counter() - self.start) / self.finished if self.finished else None
+        until = (
+            "" if seconds is None else f", {seconds / 60:.0f} min left" if seconds > 90 else f", {seconds:.0f} s left"
+        )
+        compiled = f", {self.compiled_s:.0f} s compiling" if self.compiled_s else ""
+        return f"jobs|{done} done, {running} running, {failed} failed{until}{compiled}"
+
+
+class Plan(Executor):
+    """No executor: :func:`run` lists the jobs and raises :class:`Planned` with the list."""
+
+    workers = 1
+
+
+def _table(jobs: Sequence[Job]) -> str:
+    rows = [f"{'s':>8} {'MiB':>6} {'kB kept':>8}  job"]
+    rows += [f"{j.seconds:8.1f} {j.mib:6.0f} {j.bytes / 1e3:8.0f}  {j.name}" for j in jobs]
+    total = sum(j.seconds for j in jobs)
+    rows.append(
+        f"{len(jobs)} jobs, about {total / 3600:.2f} core hours, {max((j.mib for j in jobs), default=0.0):.0f} MiB in "
+        f"a process, {sum(j.bytes for j in jobs) / 1e6:.1f} MB kept (estimates of one core; 0: not known)"
+    )
+    return "\n".join(rows)
