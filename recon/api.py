@@ -15,7 +15,7 @@ from recon.fbp.inset import InsetFbp
 from recon.mbir.reconstruct import reconstruct_mbir
 from recon.metal import metal_warnings
 from recon.pwls.inset_problem import reconstruct_pwls
-from torchpcct.defects import dead_readings, mended
+from torchpcct.defects import dead_readings, repair_defects
 from torchpcct.geometry import VolumeGrid
 from torchpcct.reading_checks import reading_warnings
 from torchpcct.scan import Scan
@@ -96,7 +96,7 @@ def reconstruct(
                 "raise the exposure or bin the readings"
             )
     choice("method", method, METHODS)
-    whole = [(s, [*texts, *reading_warnings(s)]) for s, texts in map(mended, scans)]
+    whole = [(s, [*texts, *reading_warnings(s)]) for s, texts in map(repair_defects, scans)]
     scans = [s for s, _ in whole]
     for text in {text for _, texts in whole for text in texts}:
         _LOG.warning("%s", text)

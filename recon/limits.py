@@ -67,7 +67,7 @@ def contrast_limit(
     inside: NDArray[np.bool_],
     contrast: tuple[int, int],
     *,
-    hu: float,
+    mu_per_hu: float,
     free_sd_hu: float = 200.0,
     iterations: int = 400,
     tolerance: float = 1e-6,
@@ -79,7 +79,7 @@ def contrast_limit(
         inside: ``(tissues, z, y, x)`` masks of the tissues (:func:`known_inside`), each of one unknown value; voxels
             in no mask are free.
         contrast: indices of the two tissues.
-        hu: 1 HU in mm⁻¹.
+        mu_per_hu: 1 HU in mm⁻¹.
         free_sd_hu: standard deviation of each free voxel.
         iterations, tolerance: of the conjugate gradients.
 
@@ -95,7 +95,7 @@ def contrast_limit(
     free = (1.0 - masks.sum(0)) * free_sd_hu
     pair = (present.index(contrast[0]), present.index(contrast[1]))
     return _smallest_sd(
-        gram, masks, (lambda z: free * z, lambda y: free * y), tuple(free.shape), pair, hu, iterations, tolerance
+        gram, masks, (lambda z: free * z, lambda y: free * y), tuple(free.shape), pair, mu_per_hu, iterations, tolerance
     )
 
 
@@ -154,7 +154,7 @@ def deformation_limit(
     outlines: NDArray[np.float32],
     contrast: tuple[int, int],
     *,
-    hu: float,
+    mu_per_hu: float,
     voxel_mm: float,
     displacement_mm: float,
     correlation_mm: float = 0.5,
@@ -175,7 +175,7 @@ def deformation_limit(
         fractions: ``(tissues, z, y, x)`` volume fractions of the tissues whose values are unknown.
         outlines: ``(outlines, z, y, x)`` HU per mm of displacement (:func:`outline_maps`).
         contrast: indices of the two tissues in ``fractions``.
-        hu: 1 HU in mm⁻¹.
+        mu_per_hu: 1 HU in mm⁻¹.
         voxel_mm: edge of the cubic voxels.
         displacement_mm: standard deviation of the displacement; 0: the shapes are known.
         correlation_mm: ℓ of its correlation exp(−r² / 2ℓ²).
@@ -197,7 +197,7 @@ def deformation_limit(
         return separable_filter(v, kernel, "constant")
 
     unknown = (lambda z: (change * smooth(z)).sum(0), lambda y: smooth(change * y))
-    return _smallest_sd(gram, masks, unknown, tuple(change.shape), contrast, hu, iterations, tolerance)
+    return _smallest_sd(gram, masks, unknown, tuple(change.shape), contrast, mu_per_hu, iterations, tolerance)
 
 
 def _smallest_sd(
@@ -206,7 +206,7 @@ def _smallest_sd(
     unknown: tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]],
     shape: tuple[int, ...],
     contrast: tuple[int, int],
-    hu: float,
+    mu_per_hu: float,
     iterations: int,
     tolerance: float,
 ) -> float:
@@ -217,10 +217,10 @@ def _smallest_sd(
     def curve(v: Tensor) -> Tensor:
         """The inverse covariance of all unknowns, ``(1, values + fields)``."""
         a, z = v[0, :count], v[0, count:].reshape(shape)
-        y = gram.apply((torch.einsum("k,kzyx->zyx", a, masks) + forward(z)) * hu) * hu
+        y = gram.apply((torch.einsum("k,kzyx->zyx", a, masks) + forward(z)) * mu_per_hu) * mu_per_hu
         return torch.cat([torch.einsum("kzyx,zyx->k", masks, y), (transposed(y) + z).flatten()])[None]
 
-    diagonal = torch.stack([(m * gram.apply(m * hu)).sum() * hu for m in masks])
+    diagonal = torch.stack([(m * gram.apply(m * mu_per_hu)).sum() * mu_per_hu for m in masks])
     # The mean of the other diagonal, from a random vector of signs (Hutchinson).
     signs = torch.randint(0, 2, shape, generator=torch.Generator().manual_seed(0)).flatten().to(torch.float32) * 2 - 1
     own = float((signs * curve(torch.cat([torch.zeros(count), signs])[None])[0, count:]).mean().clamp_min(1.0))

@@ -30,7 +30,7 @@ class NormalOperator(Protocol):
         """Eigenvalues of a circulant approximation on the frequencies of ``rfftn``."""
         ...
 
-    def information(self, hu: float) -> float:
+    def information(self, mu_per_hu: float) -> float:
         """On a wave of 0.5 lp/mm, 1/(HU² mm³) (2-D: mm²); ``hu`` is 1 HU in mm⁻¹."""
         ...
 

@@ -1,4 +1,4 @@
-"""Metal in a volume: nothing here corrects what it does to the tissue beside it, so that it must be said."""
+"""Metal in a volume: nothing here corrects what it does to the tissue beside it, so that a warning names it."""
 
 from __future__ import annotations
 

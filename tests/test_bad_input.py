@@ -28,7 +28,7 @@ from torchpcct import (
     metrics,
     spectral,
 )
-from torchpcct.detector_window import DetectorWindow, shadow
+from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.metrics import cnr, mean_interval, sd_interval
 from torchpcct.metrics.residual_test import residual_test
 from torchpcct.scanner import SiliconDetector, Source, TransportedSilicon, presets
@@ -129,8 +129,11 @@ CALLS = {
     "projector: NaN motion": (lambda: Projector(CONE_2, GRID, motion=np.full((8, 3), NAN)), "motion"),
     "projector: memory": (lambda: Projector(CONE_2, GRID, memory=0), "memory"),
     "projector: source inside": (lambda: Projector(CONE_2, VolumeGrid((2, 4, 4), 300.0)), "source"),
-    "shadow: beyond the field": (lambda: shadow(CONE_2, VolumeGrid((1, 1, 1), 1.0, (0, 0, 90.0))), "field of view"),
-    "shadow: motion": (lambda: shadow(CONE_2, GRID, motion=np.zeros((2, 3))), "motion"),
+    "footprint: beyond the field": (
+        lambda: footprint(CONE_2, VolumeGrid((1, 1, 1), 1.0, (0, 0, 90.0))),
+        "field of view",
+    ),
+    "footprint: motion": (lambda: footprint(CONE_2, GRID, motion=np.zeros((2, 3))), "motion"),
     "fbp: numpy": (lambda: fbp(np.zeros(CONE_2.shape), CONE_2, GRID), "sinogram"),
     "fbp: shape": (lambda: fbp(Y[1:], CONE_2, GRID), "sinogram"),
     "fbp: integers": (lambda: fbp(Y.long(), CONE_2, GRID), "sinogram"),
@@ -140,11 +143,11 @@ CALLS = {
     "fbp: 2-D grid": (lambda: fbp(Y, CONE_2, GRID.slice), "grid"),
     "filter: weights": (lambda: filter_sinogram(Y, CONE_2, weights=np.ones((8, 3))), "weights"),
     "interleave: shape": (lambda: interleave(Y[..., 1:], CONE_2), "sinogram"),
-    "pwls: data": (lambda: pwls(A, np.zeros(1), Y + 1, QGGMRF(1.0, 300.0), hu=2e-5), "y must"),
-    "pwls: shape": (lambda: pwls(A, Y[1:], Y + 1, QGGMRF(1.0, 300.0), hu=2e-5), "y must"),
-    "pwls: NaN": (lambda: pwls(A, Y * NAN, Y + 1, QGGMRF(1.0, 300.0), hu=2e-5), "y holds NaN"),
-    "pwls: weights": (lambda: pwls(A, Y, Y - 1, QGGMRF(1.0, 300.0), hu=2e-5), "weights"),
-    "pwls: no weights": (lambda: pwls(A, Y, Y, QGGMRF(1.0, 300.0), hu=2e-5), "weights"),
+    "pwls: data": (lambda: pwls(A, np.zeros(1), Y + 1, QGGMRF(1.0, 300.0), mu_per_hu=2e-5), "y must"),
+    "pwls: shape": (lambda: pwls(A, Y[1:], Y + 1, QGGMRF(1.0, 300.0), mu_per_hu=2e-5), "y must"),
+    "pwls: NaN": (lambda: pwls(A, Y * NAN, Y + 1, QGGMRF(1.0, 300.0), mu_per_hu=2e-5), "y holds NaN"),
+    "pwls: weights": (lambda: pwls(A, Y, Y - 1, QGGMRF(1.0, 300.0), mu_per_hu=2e-5), "weights"),
+    "pwls: no weights": (lambda: pwls(A, Y, Y, QGGMRF(1.0, 300.0), mu_per_hu=2e-5), "weights"),
     "cnr: shapes": (lambda: cnr([1.0, 2.0], [1.0, 2.0, 3.0]), "shape"),
     "cnr: one": (lambda: cnr([1.0], [1.0]), "at least 2"),
     "cnr: NaN": (lambda: cnr([1.0, NAN], [1.0, 2.0]), "NaN"),

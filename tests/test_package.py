@@ -76,10 +76,10 @@ def test_the_cards_are_those_of_the_weights():
     shipped, folder = Mbir.load(), ROOT / "recon" / "mbir" / "weights"
     assert json.loads((folder / "card.json").read_text())["sha256_of_tensors"] == shipped.weights_sha256
     low, high = shipped.model.seen_scale_hu.tolist()
-    for name, said in (("training.md", ""), ("card.md", f"Noise scales of {low:.0f} to {high:.0f} HU")):
+    for name, expected_text in (("training.md", ""), ("card.md", f"Noise scales of {low:.0f} to {high:.0f} HU")):
         text = (folder / name).read_text(encoding="utf-8")
         assert f"`{shipped.weights_sha256[:16]}…`" in text, name
-        assert said in text
+        assert expected_text in text
 
 
 @pytest.mark.slow

@@ -2,8 +2,8 @@
 
 A reading of 0 where hundreds are expected has the logarithm of a ray through lead, and FBP draws it as a streak or a
 ring of thousands of HU. It cannot be noise: the Poisson probability of 0 at an expectation of 30 is 1e-13. Metal can
-darken rays down to 0, too, but its shadow has edges: the cells beside it dim before it reaches them, it walks over the
-columns from view to view, and it neither comes nor goes from one view to the next.
+darken rays down to 0, too, but its footprint has edges: the cells beside it dim before it reaches them, it walks over
+the columns from view to view, and it neither comes nor goes from one view to the next.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from torchpcct.robust import MEDIAN_TO_SD
 from torchpcct.scan import Scan
 from torchpcct.threads import run
 
-__all__ = ["Cells", "Defects", "cell_sums", "dark_views", "dead_readings", "find_defects", "is_mended", "mended",
-           "photon_and_light", "wrong_cells"]  # fmt: skip
+__all__ = ["Cells", "Defects", "cell_sums", "dark_views", "dead_readings", "find_defects", "is_repaired",
+           "photon_and_light", "repair_defects", "wrong_cells"]  # fmt: skip
 
 BRIGHT = 30.0
 """Expected readings from which 0 cannot be noise (probability 1e-13)."""
@@ -40,11 +40,11 @@ _LASTING = 3
 _WIDTH = 6
 """Most cells side by side that are lost together."""
 _DIMMED = 0.1
-"""Step of the logarithm of the mean reading over all views, from the second to the first cell beside a shadow that
+"""Step of the logarithm of the mean reading over all views, from the second to the first cell beside a footprint that
 turns about the axis, on both sides."""
 _DIP = 1.0
-"""Step of the logarithm from the second to the first cell beside a shadow, on both sides: what blur and the thin edge
-of an opaque body leave. A bright detail three cells wide has 0.6."""
+"""Step of the logarithm from the second to the first cell beside a footprint, on both sides: what blur and the thin
+edge of an opaque body leave. A bright detail three cells wide has 0.6."""
 
 
 @dataclass(frozen=True)
@@ -295,7 +295,7 @@ def _company(n: NDArray[Any], at: NDArray[np.int64], first: NDArray[np.int64], s
 def _unshadowed(
     n: NDArray[Any], at: NDArray[np.int64], first: NDArray[np.int64], columns: int, light: float
 ) -> tuple[NDArray[np.int64], int, int]:
-    """Those of the zeros ``at`` ``(k, 3)`` that are no shadow; how many of them are of cells that were dead for a
+    """Those of the zeros ``at`` ``(k, 3)`` that are no footprint; how many of them are of cells that were dead for a
     while, and how many cells those are.
 
     Args:
@@ -304,7 +304,7 @@ def _unshadowed(
     """
     if not len(at):
         return at, 0, 0
-    # From view to view a shadow moves by so many columns at most.
+    # From view to view a footprint moves by so many columns at most.
     moving = math.ceil(math.pi * columns / len(n))
     single = _isolated(n, at, light)
     if len(single) > _FREQUENT * n.size:
@@ -332,11 +332,11 @@ def _unshadowed(
 
     middle = starts + lengths // 2
     lit = (np.minimum(*near) > light) & (distance > 0).all(0)
-    # A shadow that walks has its edges in other columns while it stays on a cell.
+    # A footprint that walks has its edges in other columns while it stays on a cell.
     still = (distance == distance[:, middle[which]]).all(0)
     narrow = distance[:, middle].sum(0) - 1 <= _WIDTH
     good = narrow & (share(lit) >= 0.75) & (share(still) >= 0.75) & (share(dip) <= _DIP)
-    # Before and after: as bright as its neighbours then, and no shadow has come from elsewhere and gone elsewhere.
+    # Before and after: as bright as its neighbours then, and no footprint has come from elsewhere and gone elsewhere.
     moved, tested = np.ones(len(starts), bool), np.zeros(len(starts), bool)
     for step, place in ((-1, starts), (1, starts + lengths - 1)):
         p = at[place]
@@ -376,8 +376,8 @@ def _flank(n: NDArray[Any], at: NDArray[np.int64], side: int) -> tuple[NDArray[A
     return distance, near, np.where(far > 0, far, near)
 
 
-def is_mended(scan: Scan) -> bool:
-    """Whether :func:`mended` looks at a scan: at noisy readings of a known noise, without energy bins."""
+def is_repaired(scan: Scan) -> bool:
+    """Whether :func:`repair_defects` looks at a scan: at noisy readings of a known noise, without energy bins."""
     noisy = not (scan.noise_free or scan.logged)
     return noisy and scan.counts.ndim <= 3 and (scan.quantum is not None or scan.counting)
 
@@ -389,7 +389,7 @@ def photon_and_light(scan: Scan) -> tuple[float, float]:
     return photon, BRIGHT * photon + _SIGMAS * scan.electronic_noise
 
 
-def mended(scan: Scan, cells: Cells | None = None, photon: float | None = None) -> tuple[Scan, list[str]]:
+def repair_defects(scan: Scan, cells: Cells | None = None, photon: float | None = None) -> tuple[Scan, list[str]]:
     """A scan whose impossible readings are bridged by their neighbours, and what was done.
 
     Of a scan without window they are dead from then on (``scan.dead``): they weigh nothing. In views of which more is
@@ -406,8 +406,8 @@ def mended(scan: Scan, cells: Cells | None = None, photon: float | None = None) 
         sentence for what was found now or at an earlier call.
     """
     g = scan.geometry
-    before = list(scan.info.get("mended", []))
-    if not is_mended(scan):
+    before = list(scan.info.get("repaired", scan.info.get("mended", [])))  # its former name
+    if not is_repaired(scan):
         return scan, before
     window, dead = scan.window, scan.dead
     air = scan.air if window is None else scan.air[window.first_row : window.first_row + window.rows]
@@ -443,10 +443,10 @@ def mended(scan: Scan, cells: Cells | None = None, photon: float | None = None) 
         few = dead.float().mean(axes, keepdim=True) <= MOST_DEAD
         changes["dead"] = (mask & few) | (torch.zeros_like(mask) if scan.dead is None else scan.dead)
     texts = [*before, found.text]
-    return replace(scan, **changes, info={**scan.info, "mended": texts, "dead_readings": int(dead.sum())}), texts
+    return replace(scan, **changes, info={**scan.info, "repaired": texts, "dead_readings": int(dead.sum())}), texts
 
 
 def dead_readings(scan: Scan) -> int:
-    """How many readings of a scan are bridged by their neighbours, after :func:`mended`."""
+    """How many readings of a scan are bridged by their neighbours, after :func:`repair_defects`."""
     known = 0 if scan.dead is None else int(scan.dead.sum())
     return max(known, int(scan.info.get("dead_readings", 0)))

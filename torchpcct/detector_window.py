@@ -1,4 +1,4 @@
-"""The part of the detector that a grid casts its shadow on."""
+"""The part of the detector that a grid casts its footprint on."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, Volume
 from torchpcct.validate import checked, whole
 from torchpcct.vector_geometry import VectorGeometry
 
-__all__ = ["DetectorWindow", "shadow"]
+__all__ = ["DetectorWindow", "footprint"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +153,7 @@ class DetectorWindow:
 
 
 @checked
-def shadow(geometry: Geometry, grid: VolumeGrid, margin: int = 0, motion: Any = None) -> DetectorWindow:
+def footprint(geometry: Geometry, grid: VolumeGrid, margin: int = 0, motion: Any = None) -> DetectorWindow:
     """The smallest window that sees every voxel corner of ``grid`` in every view.
 
     Args:

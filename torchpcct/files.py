@@ -26,6 +26,7 @@ __all__ = [
     "LEFTOVER",
     "VERSION",
     "WriteError",
+    "atomic_write",
     "clear_folder",
     "fingerprint",
     "is_own_hdf5",
@@ -35,7 +36,6 @@ __all__ = [
     "require_writable",
     "seal",
     "write_hdf5",
-    "written_whole",
 ]
 
 LEFTOVER = re.compile(r"\.(?P<process>\d+)-(?P<machine>[0-9a-f]{6})-[0-9a-f]{8}\.part\.")
@@ -138,7 +138,7 @@ def clear_folder(folder: str | os.PathLike[str]) -> None:
 
 
 @contextmanager
-def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
+def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary name beside ``path``, for a file or a folder; flush what is there to the disk, rename it.
 
     Whoever reads ``path`` at any moment, also after a crash, finds the old content or the new one, whole; so do any
@@ -254,7 +254,7 @@ def write_hdf5(path: str | os.PathLike[str], kind: str) -> Iterator[Any]:
     """
     import h5py
 
-    with written_whole(path) as part:
+    with atomic_write(path) as part:
         with _signals_wait(), _Unfailing(part, "w+b") as raw:
             try:
                 with h5py.File(raw, "w", userblock_size=_BLOCK) as file:

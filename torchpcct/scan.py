@@ -49,7 +49,8 @@ class Scan:
         counting: True: readings are photon counts with Poisson noise. False: an energy-integrating detector's signal.
         info: provenance (scanner, plan, versions), JSON values.
         quantum: energy integrating only: variance over expectation of every stored reading without electronic noise,
-            in keV (Σ s² N̄ / Σ s N̄ over the quanta that reach the detector behind the object), the shape of ``counts``.
+            in keV (Σ s² N̄ / Σ s N̄ over the quanta that reach the detector behind the object), the shape of
+            ``counts``.
             None: the noise of this signal is not known.
         electronic_noise: energy integrating only: standard deviation in keV that the electronics add to every reading,
             whatever the exposure.

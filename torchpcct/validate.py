@@ -6,17 +6,38 @@ import functools
 import inspect
 import math
 import re
+import warnings
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any, TypeVar, cast
 
 import numpy as np
 
 __all__ = [
-    "UNITS", "broadcast", "checked", "choice", "coverage", "meant", "number", "numbers", "per_axis", "reals", "whole",
+    "UNITS",
+    "broadcast",
+    "checked",
+    "choice",
+    "coverage",
+    "meant",
+    "number",
+    "numbers",
+    "per_axis",
+    "reals",
+    "renamed",
+    "whole",
 ]  # fmt: skip
 
 UNITS = ("HU", "mm^-1", "pixel^-1")
 """Of scans and volumes; of ``pixel^-1`` all lengths are in pixels."""
+
+
+def renamed(old: str, new: str, value: Any) -> Any:
+    """``value``, which came as the argument ``old`` that is now called ``new``: with a ``DeprecationWarning``."""
+    level, frame = 2, inspect.currentframe()
+    while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] in ("torchpcct", "recon"):
+        level, frame = level + 1, frame.f_back
+    warnings.warn(f"{old} is now called {new}", DeprecationWarning, stacklevel=max(2, level - 2))
+    return value
 
 
 def number(
@@ -193,7 +214,7 @@ def checked(function: F) -> F:
         TypeError: of the function that is made, for such an argument.
     """
     signature = inspect.signature(function)
-    said = {name: str(p.annotation) for name, p in signature.parameters.items()
+    annotations = {name: str(p.annotation) for name, p in signature.parameters.items()
             if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)}  # fmt: skip
 
     @functools.wraps(function)
@@ -203,9 +224,9 @@ def checked(function: F) -> F:
         except TypeError:
             return function(*args, **kwargs)  # Python's own words name the function, too
         for name, value in given.items():
-            if name not in said or value is signature.parameters[name].default:
+            if name not in annotations or value is signature.parameters[name].default:
                 continue
-            kinds = _alternatives(said[name])
+            kinds = _alternatives(annotations[name])
             if not any(_is(value, kind, function.__globals__) for kind in kinds):
                 remedy = ": torch.from_numpy makes one" if "Tensor" in kinds and isinstance(value, np.ndarray) else ""
                 wanted = " or ".join(dict.fromkeys(_in_words(kind) for kind in kinds))

@@ -20,7 +20,7 @@ from torch import Tensor
 from recon.mbir.mbir import WEIGHTS_FORMAT
 from recon.mbir.weights_io import digest, write_tensors
 from recon.study.study import environment
-from torchpcct.files import written_whole
+from torchpcct.files import atomic_write
 from train.config import TrainConfig
 
 __all__ = ["export", "finite"]
@@ -89,7 +89,7 @@ def export(folder: Path, weights: Mapping[str, Tensor], config: TrainConfig, sta
     write_tensors(folder / "weights.safetensors", WEIGHTS_FORMAT, stored, header)
     texts = {"card.json": json.dumps(card, indent=2, ensure_ascii=False) + "\n", "training.md": _markdown(card, config)}
     for name, text in texts.items():
-        with written_whole(folder / name) as part:
+        with atomic_write(folder / name) as part:
             part.write_text(text, encoding="utf-8")
 
 

@@ -41,6 +41,7 @@ def _section(cls: Any, values: Any, where: str) -> Any:
     if not isinstance(values, Mapping):
         raise ValueError(f"{label} must be a mapping of names to values, got {values!r}")
     known = [f.name for f in fields(cls)]
+    values = {"fidelities" if k == "looks" else k: v for k, v in values.items()}  # its former name
     for key in values:
         if key not in known:
             name = f"{where}.{key}" if where else str(key)
@@ -146,10 +147,11 @@ class ObjectiveConfig:
             bodies and one voxel about them.
         noise_free: of ``data`` and ``white`` of the same scene without noise, against those with noise: what is left
             there is blur and overshoot.
-        contrast: of the ROI contrasts' errors at look 1; viewing: share of it that is left at look 0, linear between.
-        bias: κ at look 0 and at look 1, linear between.
+        contrast: of the ROI contrasts' errors at fidelity 1; viewing: share of it that is left at fidelity 0, linear
+            between.
+        bias: κ at fidelity 0 and at fidelity 1, linear between.
         contrast_sd: an ROI contrast error, in noise units, that counts as 1.
-        looks: range of the look, uniform.
+        fidelities: range of the fidelity, uniform.
         validation_exposures_s: exposures of the validation scans.
         validation_draws: noise draws of each validation scene, contrast and exposure; 2 give a variance.
 
@@ -166,7 +168,7 @@ class ObjectiveConfig:
     viewing: float = 1.0
     bias: tuple[float, float] = (1.0, 1.0)
     contrast_sd: float = 0.15
-    looks: tuple[float, float] = (0.0, 1.0)
+    fidelities: tuple[float, float] = (0.0, 1.0)
     validation_exposures_s: tuple[float, ...] = (0.35, 2.0)
     validation_draws: int = 6
 
@@ -177,12 +179,12 @@ class ObjectiveConfig:
         _set(self, contrast_sd=number("contrast_sd", self.contrast_sd, positive=True))
         first, last = numbers("bias", self.bias, 2)
         if not (first >= 0 and last >= 0):
-            raise ValueError(f"bias must be two weights of at least 0, of look 0 and look 1, got {self.bias}")
+            raise ValueError(f"bias must be two weights of at least 0, of fidelity 0 and fidelity 1, got {self.bias}")
         _set(self, bias=(first, last))
-        low, high = numbers("looks", self.looks, 2)
+        low, high = numbers("fidelities", self.fidelities, 2)
         if not 0 <= low <= high <= 1:
-            raise ValueError(f"looks must be a range within 0 … 1, got {self.looks}")
-        _set(self, looks=(low, high))
+            raise ValueError(f"fidelities must be a range within 0 … 1, got {self.fidelities}")
+        _set(self, fidelities=(low, high))
         exposures = numbers("validation_exposures_s", self.validation_exposures_s, positive=True)
         _set(
             self, validation_exposures_s=exposures, validation_draws=whole("validation_draws", self.validation_draws, 2)

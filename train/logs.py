@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from tqdm import tqdm
 
-from torchpcct.files import written_whole
+from torchpcct.files import atomic_write
 
 __all__ = ["Logs", "Table", "save_picture"]
 
@@ -82,7 +82,7 @@ class Table:
             self._file = None
 
     def _rewrite(self) -> None:
-        with written_whole(self.path) as part, open(part, "w", encoding="utf-8", newline="") as file:
+        with atomic_write(self.path) as part, open(part, "w", encoding="utf-8", newline="") as file:
             writer = self._writer(file)
             writer.writeheader()
             writer.writerows(self._rows)
@@ -114,7 +114,7 @@ def save_picture(path: Path, image: NDArray[Any]) -> None:
     grey = np.rint(255 * np.nan_to_num(shade.clip(0, 1))).astype(np.uint8)
     factor = max(1, math.ceil(SMALLEST_PICTURE / min(grey.shape)))
     grey = grey.repeat(factor, 0).repeat(factor, 1)
-    with written_whole(path) as part:
+    with atomic_write(path) as part:
         Image.fromarray(grey).save(part, format="PNG")
 
 

@@ -10,8 +10,8 @@ terms, all from two independent noise draws of each scene with errors e₁, e₂
 * ``contrast``: the errors d of ROI contrasts, small ones and that of a whole core, (d₁² + d₂²) / 2 + κ d₁ d₂. The
   product of two draws is an unbiased estimate of the squared bias, so κ trades variance against bias.
 
-Every scene has a random look, so that one network serves all of them: from the least error, which shrinks what it is
-unsure of, at look 0, to the least bias at look 1. The contrast's weight and κ grow with it.
+Every scene has a random fidelity, so that one network serves all of them: from the least error, which shrinks what it
+is unsure of, at fidelity 0, to the least bias at fidelity 1. The contrast's weight and κ grow with it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from recon.mbir.problem import NormalisedProblem
-from recon.mbir.unrolled import DEFAULT_LOOK, start
+from recon.mbir.unrolled import DEFAULT_FIDELITY, start
 from train.config import ObjectiveConfig
 from train.data import Batch, Data, seed_of
 from train.scenes.held_out import CHECKPOINT_SEED, ValidationScenes, validation_scenes
@@ -89,20 +89,21 @@ class Objective:
         self.single = single
 
     def __call__(self, model: nn.Module, batch: Batch, progress: float = 0.0) -> Loss:
-        """Loss of a batch; ``progress`` is the finished share of the training. Looks are drawn from torch's generator.
+        """Loss of a batch; ``progress`` is the finished share of the training. Fidelities are drawn from torch's
+        generator.
 
-        Both draws of a scene have the same look.
+        Both draws of a scene have the same fidelity.
         """
         c = self.config
         n = batch.size
-        low, high = c.looks
-        look = low + (high - low) * torch.rand(n)
+        low, high = c.fidelities
+        fidelity = low + (high - low) * torch.rand(n)
         steps = 1 if progress < self.single else None
         free = bool(c.noise_free) and float(torch.rand(())) < _NOISE_FREE_SHARE
         copies = 3 if free else 2
         problem = batch.with_noise_free if free else batch.problem
         truth = batch.truth.repeat(copies, 1, 1, 1)
-        error = model(problem, look.repeat(copies), steps=steps) - truth / problem.scale_hu.reshape(-1, 1, 1, 1)
+        error = model(problem, fidelity.repeat(copies), steps=steps) - truth / problem.scale_hu.reshape(-1, 1, 1, 1)
         data = (error * problem.apply(error)).mean(dim=(1, 2, 3))
         places = c.edge * _edges(batch.truth) + c.body * _bodies(batch.truth)
         weight = 1.0 + places.repeat(copies, 1, 1, 1)
@@ -115,8 +116,8 @@ class Objective:
         variance, product = d.square().mean(0), d[0] * d[1]
         total = 0.5 * noisy.sum()
         tame = 1.0 / (1.0 + variance.detach() / _TAME_CONTRAST)
-        kappa = (c.bias[0] + (c.bias[1] - c.bias[0]) * look)[:, None]
-        weight = c.contrast * (c.viewing + (1.0 - c.viewing) * look)[:, None]
+        kappa = (c.bias[0] + (c.bias[1] - c.bias[0]) * fidelity)[:, None]
+        weight = c.contrast * (c.viewing + (1.0 - c.viewing) * fidelity)[:, None]
         total = total + (weight * tame * (variance + kappa * product)).sum()
         parts = {
             "data": data[: 2 * n].sum() / 2, "white": white[: 2 * n].sum() / 2,
@@ -131,7 +132,7 @@ class Objective:
 
     @torch.no_grad()
     def validate(
-        self, model: nn.Module, data: Data, seed: int = CHECKPOINT_SEED, look: float = DEFAULT_LOOK
+        self, model: nn.Module, data: Data, seed: int = CHECKPOINT_SEED, fidelity: float = DEFAULT_FIDELITY
     ) -> Validation:
         """Figures on held-out plaques; small contrasts and lesions count, and that no contrast is invented.
 
@@ -139,7 +140,7 @@ class Objective:
             model: in evaluation mode.
             data: whose first situation is used.
             seed: of the scenes and their noise.
-            look: of the reconstruction.
+            fidelity: of the reconstruction.
         """
         c, d = self.config, data.config
         held = validation_scenes(d.shape, (d.voxel_mm,) * 3, seed=seed, contrasts=(-60.0, 0.0))
@@ -149,7 +150,7 @@ class Objective:
         for exposure in c.validation_exposures_s:
             rows = []
             for i in range(held.image.shape[0]):
-                row, picture = self._of_scene(model, data, held, i, exposure, seed, look)
+                row, picture = self._of_scene(model, data, held, i, exposure, seed, fidelity)
                 rows.append(row)
                 if i < 2:
                     pictures[f"{exposure:g}s_{i}"] = picture
@@ -175,7 +176,7 @@ class Objective:
         return Validation(float(np.mean(scores)), figures, pictures)
 
     def _of_scene(
-        self, model: nn.Module, data: Data, held: ValidationScenes, i: int, exposure: float, seed: int, look: float
+        self, model: nn.Module, data: Data, held: ValidationScenes, i: int, exposure: float, seed: int, fidelity: float
     ) -> tuple[dict[str, float], NDArray[np.float32]]:
         """Figures of one held-out plaque, and a picture: truth beside the first volume."""
         c, d = self.config, data.config
@@ -189,7 +190,7 @@ class Objective:
         for signal in gram.apply(truth) * (hu * exposure):  # the same noise for all contrasts
             problem = NormalisedProblem.from_statistic(gram, signal + noise, exposures, hu, d.voxel_mm)
             scale = problem.scale_hu.reshape(-1, 1, 1, 1)
-            volumes.append(model(problem, look) * scale)
+            volumes.append(model(problem, fidelity) * scale)
             linear.append(start(problem, problem.spectrum()) * scale)
         found, plain = (torch.einsum("cnzyx,rzyx->rcn", torch.stack(v), rois).double() for v in (volumes, linear))
         true = torch.einsum("czyx,rzyx->rc", truth, rois).double()

@@ -1,7 +1,7 @@
 """
 MBIR for looking and for measuring
 ==================================
-What does the option ``look`` of the learned reconstruction trade?
+What does the option ``fidelity`` of the learned reconstruction trade?
 """
 
 import matplotlib.pyplot as plt
@@ -14,12 +14,12 @@ from torchpcct.scene.plaque import plaque_scene
 scene, plaque = plaque_scene()
 inset = VolumeGrid((51, 45, 45), 0.2, plaque.position[::-1])
 scan = acquire(scene, presets.pcct(views=492), exposure_s=0.7, seed=1, region=inset, duty=1 / 4)
-volumes = {look: recon.reconstruct(scan, inset, "mbir", look=look) for look in (0.0, 0.5, 1.0)}
+volumes = {fidelity: recon.reconstruct(scan, inset, "mbir", fidelity=fidelity) for fidelity in (0.0, 0.5, 1.0)}
 fig, axes = plt.subplots(1, 3, figsize=(10, 3.2), layout="constrained")
-for ax, (look, volume) in zip(axes, volumes.items(), strict=True):
+for ax, (fidelity, volume) in zip(axes, volumes.items(), strict=True):
     noise = float(volume.data[:, :8].std())  # rows of plain fat
     shown = ax.imshow(volume.data[25], cmap="gray", vmin=-150, vmax=450, extent=(-4.5, 4.5) * 2, origin="lower")
-    ax.set(title=f"look = {look:g}: {noise:.0f} HU in fat", xlabel="x, mm", ylabel="y, mm")
-    print(f"look {look:g}: noise in fat {noise:.1f} HU")
+    ax.set(title=f"look = {fidelity:g}: {noise:.0f} HU in fat", xlabel="x, mm", ylabel="y, mm")
+    print(f"look {fidelity:g}: noise in fat {noise:.1f} HU")
 fig.colorbar(shown, ax=axes, label="HU")
 print("what the training did not see:", volumes[0.5].report["warnings"] or "nothing")

@@ -41,7 +41,7 @@ from recon.cli.scans import add_lower_dose, add_reconstruct, add_show_config, ad
 from recon.cli.starting import add_demo, add_doctor, add_train, demo_steps, train
 from recon.study import registry
 from torchpcct import __version__
-from torchpcct.files import WriteError, require_writable, written_whole
+from torchpcct.files import WriteError, atomic_write, require_writable
 from torchpcct.validate import whole
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ def _verify(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         if not (root / name).exists() or (root / name).read_text(encoding="utf-8") != text:
             stale.append(name)
             if arguments.write:
-                with written_whole(root / name) as part:
+                with atomic_write(root / name) as part:
                     part.write_text(text, encoding="utf-8")
     outcome = "say what the results say" if not stale else f"rendered: {', '.join(stale)}"
     print(outcome if arguments.write or not stale else f"stale: {', '.join(stale)} (--write renders them)")
@@ -135,7 +135,7 @@ def _add_compare(commands: Commands) -> None:
         "same command goes on.",
         "folder for report.html, .md, .json and compare.png (default out/compare)",
     )  # fmt: skip
-    examples(parser, "torchpcct compare --quick", "torchpcct compare --n 200 --methods fbp:soft pwls mbir:look=1")
+    examples(parser, "torchpcct compare --quick", "torchpcct compare --n 200 --methods fbp:soft pwls mbir:fidelity=1")
     parser.add_argument("--n", type=int, metavar="N", help="realisations (default 16)")
     parser.add_argument("--methods", nargs="+", metavar="METHOD", help="as of evaluate --method")
     parser.add_argument("--quick", action="store_true", help="reduced views and methods: a first look, < 45 s")
@@ -146,7 +146,7 @@ def _add_hardcases(commands: Commands) -> None:
     parser = command(
         commands, "hardcases", _own_study, registry.STUDIES["hardcases"],
         "Break the plaque's scan in many ways, reconstruct what is left by every method, and print the error, what was "
-        "said, and whether it was wrong without a word.",
+        "said, and whether it was wrong without a warning.",
         "folder for report.html, .md, .json and the figure (default out/hardcases)",
     )  # fmt: skip
     examples(parser, "torchpcct hardcases --quick", "torchpcct hardcases --methods fbp pwls --views 246")

@@ -42,9 +42,9 @@ _STUDY_METHODS = (
     "bilateral@fbp:detail",
     "pwls",
     "mbir:prior=bilateral",
-    "mbir:look=0",
+    "mbir:fidelity=0",
     "mbir",
-    "mbir:look=1",
+    "mbir:fidelity=1",
     "mbir:tissues",
 )
 """Of ``dose-factor``: every method of the package, and each filter on the kernel on which it has the least error."""
@@ -180,7 +180,7 @@ def add_evaluate(commands: Commands) -> None:
     examples(
         parser, "torchpcct evaluate --task nodule --method mbir --n 20",
         "torchpcct evaluate --task my.yaml --method mylab.nets:reconstruct --denoiser mylab.nets:denoise@fbp:detail",
-        before="methods: fbp:KERNEL, pwls, mbir, mbir:look=1, mbir:weights=FILE, mbir:tissues,\n"
+        before="methods: fbp:KERNEL, pwls, mbir, mbir:fidelity=1, mbir:weights=FILE, mbir:tissues,\n"
         "         FILTER@fbp:KERNEL (gaussian, perona_malik, bilateral, nlm, tv, bm4d),\n"
         "         package.module:function of (scan, grid), files:FOLDER\n\n",
     )  # fmt: skip

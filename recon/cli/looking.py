@@ -19,7 +19,7 @@ from recon.cli.parsing import (
     length_of,
     without_ending,
 )
-from torchpcct.files import written_whole
+from torchpcct.files import atomic_write
 from torchpcct.validate import number
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def _is_dicom(path: Path) -> bool:
 def _info(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     import yaml
 
-    from torchpcct.defects import dead_readings, mended
+    from torchpcct.defects import dead_readings, repair_defects
     from torchpcct.formats.geometry_yaml import geometry_values
     from torchpcct.formats.scans import open_scan
     from torchpcct.volume import Volume
@@ -80,7 +80,7 @@ def _info(arguments: argparse.Namespace, progress: ProgressBars) -> None:
             "exposure_s": scan.exposure_s, "seed": scan.seed, "counting": scan.counting, "unit": scan.unit,
             "windowed": scan.window is not None, "mean": float(scan.counts.mean()), "zero_share": scan.zero_fraction,
             **({"lengths": "in pixels, the file does not know their size"} if scan.unit == "pixel^-1" else {}),
-            "dead_readings": dead_readings(mended(scan)[0]), "info": dict(scan.info),
+            "dead_readings": dead_readings(repair_defects(scan)[0]), "info": dict(scan.info),
         }  # fmt: skip
     if arguments.json:
         print(as_json({"file": str(path), **about}))
@@ -125,14 +125,14 @@ def _view(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         names = [without_ending(file) for file in files]
         labels = [n if names.count(n) == 1 else str(f) for n, f in zip(names, files, strict=True)]
         shown = [(label, v, *scale) for label, v, scale in zip(labels, volumes, scales, strict=True)]
-        with written_whole(arguments.out) as part:
+        with atomic_write(arguments.out) as part:
             part.write_text(viewer_page(shown, ", ".join(labels)), encoding="utf-8")
         size = arguments.out.stat().st_size / 1e6
         print(f"{arguments.out}: {', '.join(labels)}, {size:.1f} MB; open it in a browser (no network is needed)")
         return
     level, width = scales[0]
     figure, index = _draw_slice(volumes[0], arguments.plane, arguments.slice, level, width)
-    with written_whole(arguments.out) as part:
+    with atomic_write(arguments.out) as part:
         figure.savefig(part)
     print(f"{arguments.out}: slice {index} along {arguments.plane}, level {level:.4g}, window {width:.4g}")
 

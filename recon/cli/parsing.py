@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
-from torchpcct.files import WriteError, require_folder, require_writable, written_whole
+from torchpcct.files import WriteError, atomic_write, require_folder, require_writable
 from torchpcct.validate import meant
 
 __all__ = [
@@ -156,17 +156,17 @@ def as_options(text: str, actions: Sequence[argparse.Action]) -> str:
     return text
 
 
-class _Said(logging.Handler):
-    """Says every text once, on the standard error."""
+class _ShownOnce(logging.Handler):
+    """Shows every text once, on the standard error."""
 
     def __init__(self, actions: Sequence[argparse.Action]) -> None:
         super().__init__()
-        self.actions, self.said = actions, set[str]()
+        self.actions, self.shown = actions, set[str]()
 
     def warn(self, text: str) -> None:
-        """Say a warning, unless it was said before."""
-        if text not in self.said:
-            self.said.add(text)
+        """Show a warning, unless it was shown before."""
+        if text not in self.shown:
+            self.shown.add(text)
             print(f"warning: {as_options(text, self.actions)}", file=sys.stderr)
 
     def emit(self, record: logging.LogRecord) -> None:
@@ -178,13 +178,13 @@ class _Said(logging.Handler):
 
 @contextmanager
 def saying(actions: Sequence[argparse.Action], verbose: bool) -> Iterator[Callable[[str], None]]:
-    """While a command runs: what the library logs, what it warns of, and what the command adds, each said once.
+    """While a command runs: what the library logs, what it warns of, and what the command adds, each shown once.
 
     Args:
         actions: of the command's parser, for :func:`as_options`.
         verbose: say what is logged below warnings, too.
     """
-    handler, root = _Said(actions), logging.getLogger()
+    handler, root = _ShownOnce(actions), logging.getLogger()
     level = root.level
     root.addHandler(handler)
     root.setLevel(logging.INFO if verbose else logging.WARNING)
@@ -219,7 +219,7 @@ def tell(arguments: argparse.Namespace, short: str, config: dict[str, Any], **su
     done = yaml.safe_dump(config, sort_keys=False, allow_unicode=True)
     for ending, content in zip(_BESIDE, (text, done), strict=True):
         try:
-            with written_whole(file.with_name(file.name + ending)) as part:
+            with atomic_write(file.with_name(file.name + ending)) as part:
                 part.write_text(content.rstrip() + "\n", encoding="utf-8")
         except WriteError as error:
             raise WriteError(f"{error}; {file} itself is written") from error

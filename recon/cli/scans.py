@@ -318,7 +318,7 @@ def _require_voxels(shape: tuple[int, ...]) -> None:
         )
 
 
-_OPTIONS = {"kernel": "fbp", "look": "mbir", "tissues": "mbir", "point": "mbir", "weights": "mbir"}
+_OPTIONS = {"kernel": "fbp", "fidelity": "mbir", "tissues": "mbir", "point": "mbir", "weights": "mbir"}
 """Options that one method has."""
 
 
@@ -362,8 +362,8 @@ def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     ]  # fmt: skip
     refused = []
 
-    def tell_of(name: str, said: list[str], text: str, error: str) -> None:
-        for warning in said:
+    def tell_of(name: str, messages: list[str], text: str, error: str) -> None:
+        for warning in messages:
             arguments.warn(f"{name}: {warning}")
         refused.extend([f"{name}: {error}"] if error else [])
         print(text or f"{name}: {error}")
@@ -381,16 +381,16 @@ def reconstruct_one(folder: Path, options: dict[str, Any], out: str) -> tuple[li
     """A scan of many, anywhere: warnings, what is printed, and why it is refused."""
     from recon.study.study import ProgressBars
 
-    said: list[str] = []
-    arguments = argparse.Namespace(**options, out=folder / out, warn=said.append)
+    messages: list[str] = []
+    arguments = argparse.Namespace(**options, out=folder / out, warn=messages.append)
     with contextlib.redirect_stdout(io.StringIO()) as printed:
         try:
             _reconstruct_scan(arguments, ProgressBars(False))
         except WriteError:
             raise
         except (ValueError, TypeError, OSError, ImportError, OverflowError) as error:
-            return said, "", str(error)
-    return said, printed.getvalue().rstrip(), ""
+            return messages, "", str(error)
+    return messages, printed.getvalue().rstrip(), ""
 
 
 def _reconstruct_scan(arguments: argparse.Namespace, progress: ProgressBars) -> None:
@@ -545,14 +545,20 @@ def add_reconstruct(commands: Commands) -> None:
     )  # fmt: skip
     examples(
         parser, "torchpcct reconstruct tooth.h5 --find-axis --out tooth.nii.gz",
-        "torchpcct reconstruct scan.h5 --method mbir --look 1 --out mbir.nii.gz",
+        "torchpcct reconstruct scan.h5 --method mbir --fidelity 1 --out mbir.nii.gz",
         "torchpcct reconstruct scans/*.h5 --out volumes --workers 4",
     )  # fmt: skip
     axes = ("Z", "Y", "X")
     how = parser.add_argument_group("method")
     how.add_argument("--method", default="fbp", help="fbp, pwls or mbir (default fbp)")
     how.add_argument("--kernel", help="FBP kernel: soft, standard, detail, bone, ram-lak")
-    how.add_argument("--look", type=float, help="of MBIR: 0, quiet … 1, more contrast and noise (default 0.5)")
+    how.add_argument(
+        "--fidelity",
+        "--look",
+        type=float,
+        metavar="F",
+        help="of MBIR: 0, quiet … 1, more contrast and noise (default 0.5)",
+    )
     how.add_argument("--tissues", action="store_true", help="MBIR with the tissues of the vessel in the inset")
     how.add_argument("--weights", type=Path, metavar="FILE", help="of MBIR: your own (default: those that ship)")
     how.add_argument("--point", type=float, nargs=3, metavar=axes, help="where a reader sees its plaque, mm")
@@ -566,13 +572,15 @@ def add_reconstruct(commands: Commands) -> None:
         "--extent", type=_length, nargs="+", metavar="MM", help=f"edge lengths, Z Y X (default: what is seen); {own}"
     )
     _add_reader_options(parser, "+")
-    mended = parser.add_argument_group("corrections of the scan")
-    mended.add_argument(
+    repair_defects = parser.add_argument_group("corrections of the scan")
+    repair_defects.add_argument(
         "--find-axis",
         action="store_true",
         help="find the rotation axis: of a full turn, or half a turn of parallel rays",
     )
-    mended.add_argument("--clean", action="store_true", help="take out stripes and outliers (parallel and fan beams)")
+    repair_defects.add_argument(
+        "--clean", action="store_true", help="take out stripes and outliers (parallel and fan beams)"
+    )
     where.add_argument(
         "--memory",
         metavar="SIZE",

@@ -1,9 +1,9 @@
-"""Noise realisations of a task: one noisy scan and its twin without the signal, and what methods take of them.
+"""Noise realisations of a task: one noisy scan with the signal and one without, and what methods take of them.
 
-Realisation k draws the readings with the seed ``seed + k``, the same at every exposure and for every method. The twin
-carries the same relative noise: its line integrals before linearisation differ from the scan's by what the signal
-changes without noise. (The counts behind a signal that is worth looking for differ by a few per cent at most.) So what
-is linear is computed once, and the signal's noise-free part added.
+Realisation k draws the readings with the seed ``seed + k``, the same at every exposure and for every method. The scan
+without the signal carries the same relative noise: its line integrals before linearisation differ from the scan's by
+what the signal changes without noise. (The counts behind a signal that is worth looking for differ by a few per cent at
+most.) So what is linear is computed once, and the signal's noise-free part added.
 """
 
 from __future__ import annotations
@@ -112,13 +112,13 @@ class Draws:
 
     def response(self, network: Mbir, reader: Any, exposure_s: float) -> dict[str, Any]:
         """``adjoints`` ``(2 · rois, z, y, x)`` of MBIR's ROI means, ``mean`` and ``covariance`` of what they give."""
-        twins = [self.noise_free(p, exposure_s).statistic for p in (True, False)]
+        both = [self.noise_free(p, exposure_s).statistic for p in (True, False)]
         g = response(
-            lambda b: network(self.problem, b, exposure_s), self.problem, reader.weights, twins[0], exposure_s
+            lambda b: network(self.problem, b, exposure_s), self.problem, reader.weights, both[0], exposure_s
         )  # fmt: skip
         covariance = statistic_covariance(self.problem, g, exposure_s, self.clean[0])
         rois = len(g) // 2
-        mean = np.stack([torch.einsum("zyx,rzyx->r", b.double(), g).numpy().reshape(rois, 2) for b in twins])
+        mean = np.stack([torch.einsum("zyx,rzyx->r", b.double(), g).numpy().reshape(rois, 2) for b in both])
         return {"adjoints": g.numpy(), "mean": mean, "covariance": covariance.reshape(rois, 2, rois, 2)}
 
     def noise_free(self, present: bool, exposure_s: float) -> Simulated:
@@ -156,9 +156,15 @@ class Simulated:
     """
 
     def __init__(
-        self, draws: Draws, scan: Scan | None, exposure_s: float, k: int, present: bool, twin: Simulated | None = None
+        self,
+        draws: Draws,
+        scan: Scan | None,
+        exposure_s: float,
+        k: int,
+        present: bool,
+        with_signal: Simulated | None = None,
     ) -> None:
-        self._draws, self._scan, self._twin = draws, scan, twin
+        self._draws, self._scan, self._with_signal = draws, scan, with_signal
         self.exposure_s, self.k, self.present = exposure_s, k, present
 
     @property
@@ -180,14 +186,14 @@ class Simulated:
         """The scan itself."""
         if self._scan is not None:
             return self._scan
-        assert self._twin is not None
+        assert self._with_signal is not None
         present, absent = self._draws.clean
-        return replace(self._twin.scan, counts=self._twin.scan.counts * (absent.counts / present.counts))
+        return replace(self._with_signal.scan, counts=self._with_signal.scan.counts * (absent.counts / present.counts))
 
     @cached_property
     def _fbp(self) -> Tensor:
-        if self._twin is not None:
-            return self._twin._fbp - self._draws.signal_fbp
+        if self._with_signal is not None:
+            return self._with_signal._fbp - self._draws.signal_fbp
         return self._draws.filtered(self.scan)[0]
 
     def fbp(self, kernel: str) -> Tensor:
@@ -199,8 +205,8 @@ class Simulated:
     @cached_property
     def statistic(self) -> Tensor:
         """AᵀW y ``(z, y, x)`` with the weights of the exposure."""
-        if self._twin is not None:
-            return self._twin.statistic - self.exposure_s * self._draws.signal_statistic
+        if self._with_signal is not None:
+            return self._with_signal.statistic - self.exposure_s * self._draws.signal_statistic
         b = self.problem.statistic(self.scan).b
         return b * self.exposure_s if self.scan.noise_free else b
 
@@ -210,7 +216,7 @@ class Simulated:
         gram = problem.gram.scaled(self.exposure_s)
         with torch.no_grad():
             found = solve_normal(
-                self.statistic[None], gram.apply, gram, DEFAULT_PRIOR, hu=problem.mu_ref / 1000.0,
+                self.statistic[None], gram.apply, gram, DEFAULT_PRIOR, mu_per_hu=problem.mu_ref / 1000.0,
                 spacing=problem.grid.spacing, tolerance=_PWLS_TOLERANCE_HU,
             )  # fmt: skip
         return to_hu(found.x + problem.level, problem.mu_ref)[0]

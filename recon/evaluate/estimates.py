@@ -82,12 +82,14 @@ class _Figures:
         out[roi] = row
         return out
 
-    def mean(self, weights: Floats, twin: int) -> Figure:
+    def mean(self, weights: Floats, without_signal: int) -> Figure:
         """Expectation of a functional of the ROI means, with (0) or without (1) the signal."""
         if self.exact is not None:
-            return float((weights * self.r.clean_rois[twin]).sum())
-        values, control = (np.einsum("nrs,rs->n", v[:, twin], weights) for v in (self.r.rois, self.reference.draws))
-        return controlled_mean(values, control, float((weights * self.reference.mean[twin]).sum()))
+            return float((weights * self.r.clean_rois[without_signal]).sum())
+        values, control = (
+            np.einsum("nrs,rs->n", v[:, without_signal], weights) for v in (self.r.rois, self.reference.draws)
+        )
+        return controlled_mean(values, control, float((weights * self.reference.mean[without_signal]).sum()))
 
     def log_variance(self, weights: Floats) -> Figure:
         """ln of its variance with the signal."""

@@ -39,7 +39,7 @@ from tempfile import gettempdir
 from typing import Any
 
 from recon.evaluate.sources import source_digest
-from torchpcct.files import VERSION, WriteError, marker, written_whole
+from torchpcct.files import VERSION, WriteError, atomic_write, marker
 from torchpcct.validate import whole
 
 __all__ = [
@@ -501,7 +501,7 @@ def _keep(folder: Path, files: dict[str, bytes]) -> None:
     for name, data in files.items():
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        with written_whole(path) as part:
+        with atomic_write(path) as part:
             part.write_bytes(data)
 
 

@@ -26,10 +26,10 @@ from recon.evaluate.methods import Method, method_of
 from recon.evaluate.store import Store
 from recon.evaluate.task import Facts, Task
 from recon.evaluate.tasks import read_task
-from torchpcct.files import written_whole
+from torchpcct.files import atomic_write
 from torchpcct.validate import checked, numbers, whole
 
-__all__ = ["Evaluation", "Seen", "evaluate", "export_scans"]
+__all__ = ["Evaluation", "TaskResult", "evaluate", "export_scans"]
 
 log = logging.getLogger(__name__)
 
@@ -39,8 +39,8 @@ LEAST = 8
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
-    """What was seen of one task, for pictures and text.
+class TaskResult:
+    """What was found of one task, for pictures and text.
 
     Attributes:
         task, facts: what was looked at.
@@ -63,12 +63,12 @@ class Evaluation:
     Attributes:
         records: one for each figure: task, method, exposure_s, figure, where, value, low, high, unit, n. ``low`` and
             ``high`` end the 95 % interval; NaN: the value is exact, or a time.
-        seen: of each task.
+        results: of each task.
         settings: of the run.
     """
 
     records: list[Record]
-    seen: list[Seen]
+    results: list[TaskResult]
     settings: dict[str, Any]
 
 
@@ -256,7 +256,7 @@ def _block(folder: Path, bench: bytes, exposure: float, names: Sequence[str], k:
 def _task(
     task: Task, methods: Sequence[Method], exposures: Sequence[float], n: int, seed: int, folder: Path,
     progress: Progress | None,
-) -> tuple[list[Record], Seen]:  # fmt: skip
+) -> tuple[list[Record], TaskResult]:  # fmt: skip
     store, everyone = Store(folder / task.name), _everyone(task, methods)
     reference = everyone[0]
     draws = Draws(task, store, seed, [k for m in everyone for k in m.kernels])
@@ -287,7 +287,7 @@ def _task(
             volumes[method.name, exposure] = (own.first, own.first_clean)
             records += records_of(task.name, method.name, exposure, own, base, control, facts, true, reader.rois, exact)
     true_hu = dict(zip(reader.rois, true.tolist(), strict=True))
-    return records, Seen(task, facts, true_hu, truth[0].numpy(), volumes)
+    return records, TaskResult(task, facts, true_hu, truth[0].numpy(), volumes)
 
 
 @checked
@@ -324,6 +324,6 @@ def export_scans(
                     if progress is not None:
                         progress(f"{task.name}: {exposure:g} s", (k + 2) / (n + 1))
         grid = {"shape": task.grid.shape, "spacing": task.grid.spacing, "center": task.grid.center}
-        with written_whole(Path(folder) / task.name / "grid.json") as part:
+        with atomic_write(Path(folder) / task.name / "grid.json") as part:
             part.write_text(json.dumps(grid) + "\n", encoding="utf-8")
     return written

@@ -2,7 +2,7 @@
 
 A method's name says all:
 
-* ``fbp:KERNEL``, ``pwls``, ``mbir``; ``mbir:look=1``, ``mbir:weights=mine.safetensors``, ``mbir:tissues``, and
+* ``fbp:KERNEL``, ``pwls``, ``mbir``; ``mbir:fidelity=1``, ``mbir:weights=mine.safetensors``, ``mbir:tissues``, and
   ``mbir:prior=bilateral``, the same data steps with the bilateral filter that the network is given and no network;
 * ``FILTER@BASE``: a filter of :mod:`recon.evaluate.rivals` after a linear method, ``bilateral@fbp:detail``;
 * ``package.module:function``: a function of ``(scan, grid)`` that gives a volume in HU; with ``@BASE`` a denoiser, a
@@ -33,7 +33,7 @@ from recon.mbir.network import bilateral_prior
 from recon.mbir.tissues import TissueMbir
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
-from torchpcct.validate import checked, choice, meant, number
+from torchpcct.validate import checked, choice, meant, number, renamed
 from torchpcct.volume import Volume
 
 __all__ = ["Draw", "Method", "deepinv_denoiser", "denoiser", "method_of"]
@@ -210,13 +210,14 @@ def _mbir(spec: str, rest: str) -> Method:
     given: dict[str, str] = {}
     for part in filter(None, rest.split(",")):
         key, _, value = part.partition("=")
-        given[choice("option of mbir", key, ("weights", "look", "tissues", "prior"))] = value
+        key = renamed("mbir:look", "mbir:fidelity", "fidelity") if key == "look" else key
+        given[choice("option of mbir", key, ("weights", "fidelity", "tissues", "prior"))] = value
     network = Mbir.load(given.get("weights"))
-    if "look" in given:
-        network = network.looking(number("look", float(given["look"]), low=0.0, high=1.0))
+    if "fidelity" in given:
+        network = network.with_fidelity(number("fidelity", float(given["fidelity"]), low=0.0, high=1.0))
     if "prior" in given:
         choice("prior of mbir", given["prior"], ("bilateral",))
-        network = Mbir(network.model, network.look, prior=bilateral_prior)
+        network = Mbir(network.model, network.fidelity, prior=bilateral_prior)
     if "tissues" in given:
         fitted = TissueMbir(network)
         return Method(spec, lambda draw: draw.mbir(fitted), key=network.weights_sha256)

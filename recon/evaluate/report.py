@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from recon.evaluate.estimates import Record, pivot
-from recon.evaluate.experiment import Evaluation, Seen
-from torchpcct.files import written_whole
+from recon.evaluate.experiment import Evaluation, TaskResult
+from torchpcct.files import atomic_write
 from torchpcct.viz import base64_text
 
 __all__ = ["page", "plain", "save", "task_sections", "text_of"]
@@ -32,12 +32,12 @@ _STYLE = (
     "img{max-width:100%}code{background:#f2f4f6;overflow-wrap:anywhere}"
 )
 _INTRO = """\
-Dose factor: how many times the dose {reference} needs for the same figure. Brackets: 95 % intervals over {n} noise
-realisations, the same for all methods; figures without are exact. Noise: of a voxel, over realisations. Error: root
-mean square near the bodies. Undershoot: least error beside them without noise; far below 0 it is a dark rim. Slope:
-contrast that the signal adds over the true one; contrasts are compared at slope 1. Without signal: contrast read where
-there is none. CNR: of the paper's protocol. d′: of an observer who knows where to look. Limit: an unbiased estimate
-that knows all outlines."""
+Dose factor: the dose that {reference} needs for the same figure, divided by the method's. Brackets: 95 % intervals over
+{n} noise realisations, the same for all methods; figures without brackets are exact. Noise: of a voxel, over
+realisations. Error: root mean square near the bodies. Undershoot: least error beside them without noise; far below 0
+means a dark rim. Slope: contrast that the signal adds over the true one; contrasts are compared at slope 1. Without
+signal: contrast read where there is none. CNR: of the paper's protocol. d′: of an observer who knows the place. Limit:
+an unbiased estimate that knows all outlines."""
 
 
 def text_of(evaluation: Evaluation) -> str:
@@ -49,7 +49,8 @@ def task_sections(evaluation: Evaluation) -> list[str]:
     """Markdown of each task."""
     n = evaluation.settings["n"]
     return [
-        _task_text(seen, [r for r in evaluation.records if r["task"] == seen.task.name], n) for seen in evaluation.seen
+        _task_text(seen, [r for r in evaluation.records if r["task"] == seen.task.name], n)
+        for seen in evaluation.results
     ]
 
 
@@ -58,7 +59,7 @@ def plain(records: list[Record]) -> list[Record]:
     return [{k: None if isinstance(v, float) and math.isnan(v) else v for k, v in r.items()} for r in records]
 
 
-def _task_text(seen: Seen, records: list[Record], n: int) -> str:
+def _task_text(seen: TaskResult, records: list[Record], n: int) -> str:
     task = seen.task
     values = ", ".join(f"{t} {v:.0f}" for t, v in zip(seen.facts.tissues, seen.facts.values_hu, strict=True))
     lines = [
@@ -87,9 +88,9 @@ def _task_text(seen: Seen, records: list[Record], n: int) -> str:
     for exposure in exposures:
         here = [r for r in records if r["exposure_s"] == exposure]
         limit = next(r["value"] for r in here if r["figure"] == "dose factor: limit of the data")
-        said = f"Dose factors (limit of the data over the lesion: {limit:.2f}):"
+        summary = f"Dose factors (limit of the data over the lesion: {limit:.2f}):"
         tables = (_table(here, factors), "", _table(here, columns))
-        lines += [f"### {exposure:g} s", "", said, "", *tables, "", _best(here, factors), ""]
+        lines += [f"### {exposure:g} s", "", summary, "", *tables, "", _best(here, factors), ""]
     return "\n".join(lines)
 
 
@@ -117,7 +118,7 @@ def _cell(r: Record) -> str:
 
 def _best(records: list[Record], factors: list[tuple[str, str, str]]) -> str:
     """Which method needs least dose, for every figure; those whose intervals reach it are named with it."""
-    said = []
+    summary = []
     for label, figure, where in factors:
         found = [r for r in records if r["figure"] == figure and r["where"] == where]
         if len(found) < 2:
@@ -126,8 +127,8 @@ def _best(records: list[Record], factors: list[tuple[str, str, str]]) -> str:
         floor = best["low"] if math.isfinite(best["low"]) else best["value"]
         rest = [r["method"] for r in found if r is not best
                 and (r["high"] if math.isfinite(r["high"]) else r["value"]) >= floor]  # fmt: skip
-        said.append(f"{label}: {best['method']}" + (f" (not told apart: {', '.join(rest)})" if rest else ""))
-    return "Least dose: " + "; ".join(said) + "." if said else ""
+        summary.append(f"{label}: {best['method']}" + (f" (not told apart: {', '.join(rest)})" if rest else ""))
+    return "Least dose: " + "; ".join(summary) + "." if summary else ""
 
 
 def save(evaluation: Evaluation, folder: str | os.PathLike[str], command: str = "") -> list[Path]:
@@ -135,7 +136,7 @@ def save(evaluation: Evaluation, folder: str | os.PathLike[str], command: str = 
     out = Path(folder)
     out.mkdir(parents=True, exist_ok=True)
     text = text_of(evaluation) + (f"\nCommand: `{command}`.\n" if command else "")
-    for seen in evaluation.seen:
+    for seen in evaluation.results:
         name = seen.task.name
         text = text.replace(f"## {name}\n", f"## {name}\n\n![{name}]({name}.png)\n")
     table = io.StringIO()
@@ -144,7 +145,7 @@ def save(evaluation: Evaluation, folder: str | os.PathLike[str], command: str = 
     writer.writerows([{k: "" if isinstance(v, float) and math.isnan(v) else v for k, v in r.items()}
                       for r in evaluation.records])  # fmt: skip
     data = {"settings": evaluation.settings, "command": command, "records": plain(evaluation.records)}
-    pictures = {f"{s.task.name}.png": _picture(s) for s in evaluation.seen}
+    pictures = {f"{s.task.name}.png": _picture(s) for s in evaluation.results}
     files: dict[str, bytes] = {
         "report.md": text.encode(), "report.csv": table.getvalue().encode(),
         "report.json": (json.dumps(data, indent=1) + "\n").encode(),
@@ -152,12 +153,12 @@ def save(evaluation: Evaluation, folder: str | os.PathLike[str], command: str = 
         "report.html": page("Evaluation", text, pictures).encode(),
     }  # fmt: skip
     for name, content in files.items():
-        with written_whole(out / name) as part:
+        with atomic_write(out / name) as part:
             part.write_bytes(content)
     return [out / name for name in files]
 
 
-def _picture(seen: Seen) -> bytes:
+def _picture(seen: TaskResult) -> bytes:
     """The signal's fullest slice: truth, then every method at every exposure."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

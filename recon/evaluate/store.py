@@ -17,7 +17,7 @@ import torch
 
 from recon.evaluate import execute
 from recon.evaluate.sources import source_digest
-from torchpcct.files import clear_folder, written_whole
+from torchpcct.files import atomic_write, clear_folder
 
 __all__ = ["Pieces", "Store", "packed", "unpacked"]
 
@@ -89,7 +89,7 @@ class Store:
         sealed = {"key": np.array(key + _MARK + _digest(key, arrays)), **arrays}
         for _ in range(_TRIES):
             try:
-                with written_whole(self.path(name + ".npz")) as part:  # its folder again, which others may clear
+                with atomic_write(self.path(name + ".npz")) as part:  # its folder again, which others may clear
                     np.savez(part, **sealed)
                 break
             except (FileNotFoundError, FileExistsError) as error:  # of its folder

@@ -1,7 +1,7 @@
 """A task: a thing to see or to measure, what it lies in, and the scanner that looks at it.
 
-A task is data. It has a scene, a *signal* (one body of it, or several) and a *background* (the body around); its twin
-is the same scene with the background's material in the signal. From these follows what is read of every volume:
+A task is data. It has a scene, a *signal* (one body of it, or several) and a *background* (the body around). The scene
+without signal has the background's material in its place. From these follows what is read of every volume:
 
 * ``lesion``: mean over the whole signal less mean over the background around it; ``slice``: the same in the axial slice
   that holds most of the signal; ``small``: of some voxels in the signal's middle and the nearest of the background;
@@ -135,7 +135,7 @@ class Task:
 
     @cached_property
     def absent(self) -> Scene:
-        """The twin without the signal."""
+        """The scene without the signal."""
         scene = self.scene
         for name in self.signal:
             scene = scene.replace_material(name, self.scene[self.background].material)

@@ -21,7 +21,7 @@ from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, Volume
 from torchpcct.validate import checked, whole
 from torchpcct.vector_geometry import VectorGeometry
 
-__all__ = ["IdealCircle", "Straightened", "at_slices", "ideal_circle", "straighten"]
+__all__ = ["IdealCircle", "Rebinned", "at_slices", "ideal_circle", "rebin_to_circle"]
 
 Floats = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ class IdealCircle(NamedTuple):
     maps: Floats
 
 
-class Straightened(NamedTuple):
+class Rebinned(NamedTuple):
     """A scan on an ideal circle.
 
     Attributes:
@@ -78,7 +78,7 @@ def ideal_circle(geometry: VectorGeometry) -> IdealCircle:
 
 
 @checked
-def straighten(sinogram: Tensor, geometry: VectorGeometry) -> Straightened:
+def rebin_to_circle(sinogram: Tensor, geometry: VectorGeometry) -> Rebinned:
     """Resample a scan of any flat detectors onto an ideal circle about z.
 
     Args:
@@ -97,11 +97,11 @@ def straighten(sinogram: Tensor, geometry: VectorGeometry) -> Straightened:
         out = out.squeeze(-2)
     elif geometry.parallel:
         out = out.transpose(-3, -2)
-    return Straightened(out, circle.geometry, circle.motion, circle.slices)
+    return Rebinned(out, circle.geometry, circle.motion, circle.slices)
 
 
 @checked
-def at_slices(s: Straightened, grid: VolumeGrid) -> Tensor:
+def at_slices(s: Rebinned, grid: VolumeGrid) -> Tensor:
     """Sinograms ``(..., z, views, columns)`` of a grid's slices, interpolated between the rows of parallel rays.
 
     Raises:

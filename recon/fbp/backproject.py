@@ -146,7 +146,7 @@ class BackprojectionPlan:
         if missing.any():
             raise ValueError(
                 f"the window misses columns that the grid needs in view {int(np.argmax(missing))}: "
-                "use torchpcct.detector_window.shadow(geometry, grid, margin=1, motion=motion)"
+                "use torchpcct.detector_window.footprint(geometry, grid, margin=1, motion=motion)"
             )
         if isinstance(geometry, ConeBeam):
             z = self.grid.axes[0][[0, -1]] + np.array([self.shifts[:, 2].min(), self.shifts[:, 2].max()])
@@ -157,7 +157,7 @@ class BackprojectionPlan:
             if short:
                 raise ValueError(
                     f"the window's rows {w.first_row}…{w.first_row + w.rows - 1} do not cover the grid: "
-                    "use torchpcct.detector_window.shadow(geometry, grid, margin=1, motion=motion)"
+                    "use torchpcct.detector_window.footprint(geometry, grid, margin=1, motion=motion)"
                 )
 
     def _arguments(self, dtype: torch.dtype) -> list[Any]:
@@ -271,7 +271,7 @@ def backproject(
 ) -> Tensor:
     """Backproject filtered data with FBP's distance weights: the second half of filtered backprojection.
 
-    Voxel driven, with linear interpolation along columns and rows. A voxel whose shadow lies above or below the
+    Voxel driven, with linear interpolation along columns and rows. A voxel whose footprint lies above or below the
     detector's rows reads the outermost row. It is not the adjoint of a projector; that is the projector's ``T``.
 
     Args:
@@ -279,8 +279,8 @@ def backproject(
         geometry: parallel or fan beam (2-D grid), or cone beam (3-D grid).
         grid: voxels to reconstruct. A grid about the isocentre may be larger than the field of view: voxels outside
             are 0. A grid beside the isocentre must lie inside.
-        window: the readings that ``filtered`` holds, default: the whole detector. It must hold the grid's shadow,
-            ``torchpcct.detector_window.shadow(geometry, grid, margin=1, motion=motion)``.
+        window: the readings that ``filtered`` holds, default: the whole detector. It must hold the grid's footprint,
+            ``torchpcct.detector_window.footprint(geometry, grid, margin=1, motion=motion)``.
         motion: displacement of the grid in every view, ``(views, 2)`` (y, x) or ``(views, 3)`` (z, y, x) mm as for
             :class:`torchpcct.projector.Projector`, or None: everything that the data hold moves with the grid, and the
             image shows it at rest. What stands still must be backprojected on its own, without motion (see

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from recon.fbp.angular_weights import SAME_VIEW, angular_weights, is_offset
-from recon.fbp.any_orbit import straighten
+from recon.fbp.any_orbit import rebin_to_circle
 from recon.fbp.detector_edges import cut_off
 from torchpcct.defects import BRIGHT, GAIN_ERROR
-from torchpcct.detector_window import shadow
+from torchpcct.detector_window import footprint
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid, view_step
 from torchpcct.robust import MEDIAN_TO_SD
 from torchpcct.scan import Scan
@@ -26,7 +26,7 @@ STREAK_CELLS = 10.0
 """Distance between the paths of neighbouring views at the border of the field of view, in cells at the axis, from which
 streaks of an object at the border are wider than what the kernels smooth. 1968 views of the paper's scanner: 1.6."""
 _CENTRE_MARGIN = 8
-"""Columns beside a grid's shadow that the test of the rotation centre looks at."""
+"""Columns beside a grid's footprint that the test of the rotation centre looks at."""
 
 
 _FEWEST_COLUMNS, _SIGMAS, _ALIKE = 16, 8.0, 0.25
@@ -174,12 +174,12 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
 
     whole, window, about = scan, scan.window, (0.0, 0.0)
     if window is not None:
-        window, about = shadow(scan.geometry, grid, margin=_CENTRE_MARGIN).within(window), tuple(grid.center[-2:])
+        window, about = footprint(scan.geometry, grid, margin=_CENTRE_MARGIN).within(window), tuple(grid.center[-2:])
         scan = scan.crop(window)
     lines, geometry = scan.line_integrals(), scan.geometry
     if isinstance(geometry, VectorGeometry):
         try:
-            circle = straighten(lines, geometry)
+            circle = rebin_to_circle(lines, geometry)
         except ValueError:  # nearly no circle: only an iterative method takes it
             return []
         if circle.motion is not None:  # of sources beside the circle opposite rays need not meet

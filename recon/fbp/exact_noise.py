@@ -39,7 +39,7 @@ __all__ = [
 ]
 
 FILTER_MARGIN_COLUMNS = 32
-"""Columns on either side of the shadow whose noise is counted. The filter's tail falls as 1 / n², its square as
+"""Columns on either side of the footprint whose noise is counted. The filter's tail falls as 1 / n², its square as
 1 / n⁴: what lies beyond adds less than 1e-4 to the variance of an ROI mean."""
 
 
@@ -182,8 +182,8 @@ def functional_covariance(fbp: InsetFbp, functionals: Tensor, ray_covariance: Te
         )
     if tuple(functionals.shape[1:]) != grid.shape:
         raise ValueError(f"functionals must have the shape (n, *{grid.shape}), got {tuple(functionals.shape)}")
-    traces = BackprojectionPlan(fbp.geometry, grid, fbp.shadow).transpose(functionals.to(ray_covariance.dtype))
-    seen = w.with_rows(fbp.shadow.first_row, fbp.shadow.rows)
+    traces = BackprojectionPlan(fbp.geometry, grid, fbp.footprint).transpose(functionals.to(ray_covariance.dtype))
+    seen = w.with_rows(fbp.footprint.first_row, fbp.footprint.rows)
     (h,) = _filtered(fbp, traces, seen, 1.0)
     return np.stack([_gram(h, c) for c in w.crop(ray_covariance, seen)], axis=-1)
 
@@ -211,8 +211,8 @@ def voxel_covariance(clean: Scan, fbp: InsetFbp, exposure_s: float, voxel: Seque
     hu = 1000.0 / fbp.linearisation.mu_ref
 
     def reconstruct(lines: Tensor) -> Tensor:
-        filtered = filter_windowed(lines, fbp.geometry, window, fbp.kernels, fbp.shadow)
-        return backproject(filtered, fbp.geometry, grid, fbp.shadow)[0] * hu
+        filtered = filter_windowed(lines, fbp.geometry, window, fbp.kernels, fbp.footprint)
+        return backproject(filtered, fbp.geometry, grid, fbp.footprint)[0] * hu
 
     leaf = torch.zeros_like(variance, requires_grad=True)
     with torch.enable_grad():
@@ -227,23 +227,23 @@ def _traces(fbp: InsetFbp, grid: VolumeGrid, rois: Sequence[RoiMean], clean: Sca
     Filtering stays within a row, so the rows that no ROI sees are left out."""
     if clean.window is None:
         raise ValueError("the noise of ROI means needs a windowed scan: acquire it with region=")
-    spread = BackprojectionPlan(fbp.geometry, grid, fbp.shadow, fbp.motion).transpose
+    spread = BackprojectionPlan(fbp.geometry, grid, fbp.footprint, fbp.motion).transpose
     traces = spread(torch.stack([r.weights for r in rois]).to(clean.counts.dtype))
     seen = (traces != 0).sum((0, 1, 3)).nonzero()
     first, last = int(seen.min()), int(seen.max())
-    return fbp.shadow.first_row + first, traces[:, :, first : last + 1].contiguous()
+    return fbp.footprint.first_row + first, traces[:, :, first : last + 1].contiguous()
 
 
 def _near(fbp: InsetFbp, clean: Scan, first_row: int, rows: int) -> DetectorWindow:
     """Where the filtered traces are not negligible."""
     assert clean.window is not None
-    near = fbp.shadow.widened(FILTER_MARGIN_COLUMNS, clean.window)
+    near = fbp.footprint.widened(FILTER_MARGIN_COLUMNS, clean.window)
     return near.with_rows(first_row, rows)
 
 
 def _filtered(fbp: InsetFbp, traces: Tensor, window: DetectorWindow, scale: float) -> Iterator[Tensor]:
     """``scale`` times the adjoint vectors of every kernel, ``(rois, views, rows, columns)`` on ``window``."""
-    traced = fbp.shadow.with_rows(window.first_row, window.rows)
+    traced = fbp.footprint.with_rows(window.first_row, window.rows)
     weights = angular_weights(fbp.geometry)
     for kernel in fbp.kernels:
         plan = FilterPlan(fbp.geometry, (kernel,), weights, window, traced)

@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.fbp.angular_weights import angular_weights, view_steps
-from recon.fbp.any_orbit import Straightened, at_slices, straighten
+from recon.fbp.any_orbit import Rebinned, at_slices, rebin_to_circle
 from recon.fbp.backproject import BackprojectionPlan, backproject, check_data, data_shape
 from recon.fbp.coverage import check_rows, refuse_helix
 from recon.fbp.detector_edges import Rows, continued, cut_off, mirrored
 from recon.fbp.filter_plan import FilterPlan, kernel_names
 from recon.linear_operator import apply_linear
 from torchpcct.dead_cells import bridge
-from torchpcct.detector_window import DetectorWindow, shadow
+from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid, view_step
 from torchpcct.validate import checked, number, reals
 from torchpcct.vector_geometry import VectorGeometry
@@ -108,7 +108,7 @@ def filter_windowed(
     """Like :func:`filter_sinogram`, for data that are zero outside a window.
 
     Filtering is linear: after the scan of a background has been filtered once, the scan of a small inset or of other
-    noise in its shadow is filtered from that shadow alone. The result equals that of the whole rows to rounding.
+    noise in its footprint is filtered from that footprint alone. The result equals that of the whole rows to rounding.
 
     Args:
         difference: ``(..., views, [rows,] columns)`` on ``window_in``.
@@ -224,7 +224,7 @@ def fbp(
             nearly so (:mod:`recon.fbp.any_orbit`).
         grid: voxels to reconstruct, 2-D for parallel and fan beams, 3-D for cone beams.
         kernel: reconstruction kernel ``"soft"``, ``"standard"``, ``"detail"``, ``"bone"``, ``"ram-lak"``, or several.
-        window: readings to filter and backproject; default: the grid's shadow.
+        window: readings to filter and backproject; default: the grid's footprint.
         weights: angular weights that replace the automatic ones, see :func:`filter_sinogram`.
         motion: displacement of everything in the scan in every view, see :func:`backproject`.
         outside: attenuation in mm⁻¹ (unit of ``sinogram`` per mm) of the object beyond the detector's edges, e.g. that
@@ -242,7 +242,7 @@ def fbp(
     if isinstance(geometry, VectorGeometry):
         if window is not None:
             raise ValueError("a window belongs to a circular scan: leave it out for a VectorGeometry")
-        straight = straighten(sinogram, geometry if motion is None else geometry.moved(motion))
+        straight = rebin_to_circle(sinogram, geometry if motion is None else geometry.moved(motion))
         return straightened_fbp(straight, grid, kernel, weights=weights, outside=outside)
     check_data("sinogram", sinogram, data_shape(geometry, DetectorWindow.full(geometry)))
     refuse_helix(geometry, motion)
@@ -258,7 +258,7 @@ def fbp(
 
 @checked
 def straightened_fbp(
-    straight: Straightened, grid: VolumeGrid, kernel: str | Sequence[str], *, weights: Any = None, outside: float | None
+    straight: Rebinned, grid: VolumeGrid, kernel: str | Sequence[str], *, weights: Any = None, outside: float | None
 ) -> Tensor:
     """:func:`fbp` of a scan that was resampled onto an ideal circle."""
     lines, plane = straight.sinogram, grid
@@ -307,10 +307,10 @@ def _completed(rows: Rows, grid: VolumeGrid, motion: Any, outside: float | None)
 
 
 def _read_window(rows: Rows, grid: VolumeGrid, window: DetectorWindow | None, motion: Any) -> DetectorWindow:
-    """``window`` on the completed rows; None: the shadow of the grid."""
+    """``window`` on the completed rows; None: the footprint of the grid."""
     if window is not None:
         return DetectorWindow(window.first_column + rows.added, window.columns, window.first_row, window.rows)
     try:
-        return shadow(rows.geometry, grid, margin=1, motion=motion)
+        return footprint(rows.geometry, grid, margin=1, motion=motion)
     except ValueError:
         return DetectorWindow.full(rows.geometry)  # a grid larger than the field of view: the backprojection decides

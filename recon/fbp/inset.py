@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.fbp.angular_weights import angular_weights
-from recon.fbp.any_orbit import Straightened, ideal_circle, straighten
+from recon.fbp.any_orbit import Rebinned, ideal_circle, rebin_to_circle
 from recon.fbp.backproject import backproject
 from recon.fbp.coverage import check_rows
 from recon.fbp.fbp import filter_sinogram, filter_windowed, straightened_fbp
-from torchpcct.detector_window import DetectorWindow, shadow
+from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import ConeBeam, Geometry, VolumeGrid
 from torchpcct.scan import Scan
 from torchpcct.scene.motion import SinusoidalMotion
@@ -73,7 +73,7 @@ def static_fbp(lines: Tensor, geometry: ConeBeam, grid: VolumeGrid, kernel: str 
     Raises:
         ValueError: a wrong shape, a grid outside the field of view.
     """
-    part = shadow(geometry, grid, margin=1)
+    part = footprint(geometry, grid, margin=1)
     return backproject(_static(lines, geometry, kernel, part), geometry, grid, part)
 
 
@@ -89,7 +89,7 @@ def _static(lines: Tensor, geometry: ConeBeam, kernel: str | Sequence[str], part
 
 @checked
 def require_inside(inner: DetectorWindow, window: DetectorWindow) -> None:
-    """Refuse a grid whose shadow ``inner`` the scan's window does not hold (ValueError)."""
+    """Refuse a grid whose footprint ``inner`` the scan's window does not hold (ValueError)."""
     if not window.holds(inner):
         raise ValueError(
             "the grid reaches beyond the region that this scan was acquired for: acquire it with a larger region"
@@ -165,12 +165,12 @@ class InsetFbp:
         self._lines: Tensor | None = None
         if scan.window is None:
             self._require_slices(scan)
-            self.shadow = DetectorWindow.full(self.geometry)
+            self.footprint = DetectorWindow.full(self.geometry)
             return
         paths = (None,) if motion is None else (None, motion)
-        windows = [shadow(self.geometry, grid, margin=1, motion=path) for grid in self.grids for path in paths]
-        self.shadow = DetectorWindow.union(windows, self.geometry.columns)
-        require_inside(self.shadow, scan.window)
+        windows = [footprint(self.geometry, grid, margin=1, motion=path) for grid in self.grids for path in paths]
+        self.footprint = DetectorWindow.union(windows, self.geometry.columns)
+        require_inside(self.footprint, scan.window)
         self._lines = scan.surround_line_integrals() if surround is None else surround
         self._of_scan = surround is None
         cells = self.geometry.shape[1:]
@@ -178,8 +178,8 @@ class InsetFbp:
             raise ValueError(
                 f"surround must have the shape (channels, {cells[0]}, {cells[1]}), got {tuple(self._lines.shape)}"
             )
-        # (kernels, [channels,] views, rows, columns) on the grids' shadow.
-        self._surround = _static(self._lines, self.geometry, self.kernels, self.shadow)
+        # (kernels, [channels,] views, rows, columns) on the grids' footprint.
+        self._surround = _static(self._lines, self.geometry, self.kernels, self.footprint)
 
     def _require_slices(self, scan: Scan) -> None:
         if self.geometry.has_rows:
@@ -195,7 +195,7 @@ class InsetFbp:
     @cached_property
     def _rest(self) -> list[Tensor]:
         """The surround on every grid, per mm."""
-        return [backproject(self._surround, self.geometry, grid, self.shadow) for grid in self.grids]
+        return [backproject(self._surround, self.geometry, grid, self.footprint) for grid in self.grids]
 
     def images(self, lines: Tensor, outside: float | None = None) -> list[Tensor]:
         """Images of line integrals on the window.
@@ -212,7 +212,7 @@ class InsetFbp:
         Raises:
             ValueError, TypeError: a wrong shape or dtype.
         """
-        g, part = self.geometry, self.shadow
+        g, part = self.geometry, self.footprint
         if self.window is None or self._lines is None:
             return self._whole(self._straight(lines), outside)
         channels = tuple(self._lines.shape[:-2])
@@ -226,12 +226,12 @@ class InsetFbp:
         moving = [backproject(filtered, g, grid, part, motion=self.motion) for grid in self.grids]
         return [self._over_batch(rest, m) + m for rest, m in zip(self._rest, moving, strict=True)]
 
-    def _straight(self, lines: Tensor) -> Straightened:
+    def _straight(self, lines: Tensor) -> Rebinned:
         if isinstance(self.geometry, VectorGeometry):
-            return straighten(lines, self.geometry)
-        return Straightened(lines, self.geometry, None)
+            return rebin_to_circle(lines, self.geometry)
+        return Rebinned(lines, self.geometry, None)
 
-    def _whole(self, straight: Straightened, outside: float | None) -> list[Tensor]:
+    def _whole(self, straight: Rebinned, outside: float | None) -> list[Tensor]:
         grids = self.grids if self.geometry.has_rows else [grid.slice for grid in self.grids]
         return [straightened_fbp(straight, grid, self.kernels, outside=outside) for grid in grids]
 

@@ -1,6 +1,6 @@
 """Volumes larger than memory: a scan is read, filtered and backprojected slab by slab along z, each written at once.
 
-Of a cone beam a slab needs the detector rows of its shadow, of a stack of parallel or fan-beam slices those slices.
+Of a cone beam a slab needs the detector rows of its footprint, of a stack of parallel or fan-beam slices those slices.
 What decides about the whole (whether the rows end inside the object, how many readings are dead) is found in a first
 pass over the scan; every slab then gets the same bits as in one piece.
 """
@@ -32,8 +32,8 @@ from recon.fbp.fbp import filter_windowed
 from recon.metal import metal_warnings
 from recon.pwls.memory import available_bytes, memory_bytes, pwls_bytes, resident_bytes
 from torchpcct.dead_cells import MOST_DEAD
-from torchpcct.defects import Cells, cell_sums, dark_views, is_mended, mended, photon_and_light, wrong_cells
-from torchpcct.detector_window import DetectorWindow, shadow
+from torchpcct.defects import Cells, cell_sums, dark_views, is_repaired, photon_and_light, repair_defects, wrong_cells
+from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.formats.scans import adapted, open_scan, own_options
 from torchpcct.formats.volume_slabs import CHUNK, SlabFile, check_slab_name
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
@@ -136,7 +136,7 @@ class ScanSlices:
             if self.cells is None
             else Cells(self.cells.views, *(c[low : low + raw.geometry.rows] for c in self.cells[1:]))
         )
-        scan, own = mended(raw, cells, self.photon)[0], slice(first - low, stop - low)
+        scan, own = repair_defects(raw, cells, self.photon)[0], slice(first - low, stop - low)
         _give_back()
         if halo and scan.dead is not None:
             self._check_bridged(scan.dead, own, low)
@@ -151,7 +151,7 @@ class ScanSlices:
     def find_cells(self, step: int) -> None:
         """Find the cells of a cone beam that are dead or of a wrong gain, by all rows, ``step`` rows at a time."""
         g = self.geometry
-        if not g.has_rows or not is_mended(self.first):
+        if not g.has_rows or not is_repaired(self.first):
             return
         start = max((self.count - step) // 2, 0)
         self.photon, light = photon_and_light(self._open(start, start + step))
@@ -249,7 +249,7 @@ class _Fbp:
         self.wide: Any = replace(wide, rows=geometry.rows, offset=(geometry.offset[0], wide.offset[1])) if isinstance(
             geometry, ConeBeam) else wide  # fmt: skip
         try:
-            self.window = shadow(self.wide, self.plane, margin=1)
+            self.window = footprint(self.wide, self.plane, margin=1)
         except ValueError:
             self.window = DetectorWindow.full(self.wide)
         self.plan = BackprojectionPlan(self.wide, self.plane, self.window)

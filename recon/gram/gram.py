@@ -167,19 +167,19 @@ class Gram:
         """The b_c on the in-plane grid, ``(terms, ny, nx)``; the first is 1."""
         return self._basis
 
-    def information(self, hu: float) -> float:
+    def information(self, mu_per_hu: float) -> float:
         """The data's information on a 0.5 lp/mm in-plane wave, in 1/(HU² mm³) (2-D: 1/(HU² mm²)).
 
         Its inverse is the noise power that unregularised least squares has there, in HU² mm³. It is proportional to
         the exposure and does not depend on the voxel size (as long as voxels are below 1 mm).
 
         Args:
-            hu: 1 HU in mm⁻¹ (μ_ref / 1000).
+            mu_per_hu: 1 HU in mm⁻¹ (μ_ref / 1000).
         """
         kernel = self._spectra[0]
         # A wave that is constant along z sees the sum over the bands.
         summed = (kernel[:1].real + 2 * kernel[1:].real.sum(0, keepdim=True)).sum(0)
-        return information_at_reference(summed, self.padded, self.grid.spacing, hu) * self.factor
+        return information_at_reference(summed, self.padded, self.grid.spacing, mu_per_hu) * self.factor
 
     def noise(self, batch: tuple[int, ...] = (), *, generator: torch.Generator) -> Tensor:
         """Draw AᵀW n for counting noise n ~ N(0, W⁻¹) without a projector: covariance G (stationary part).
@@ -221,14 +221,16 @@ class _SelfAdjoint(torch.autograd.Function):
         return ctx.gram.apply(grads[0]), None
 
 
-def information_at_reference(spectra: Tensor, period: tuple[int, int], spacing: tuple[float, ...], hu: float) -> float:
+def information_at_reference(
+    spectra: Tensor, period: tuple[int, int], spacing: tuple[float, ...], mu_per_hu: float
+) -> float:
     """Information on a 0.5 lp/mm in-plane wave that is constant along z, in 1/(HU² mm³) (2-D: 1/(HU² mm²)).
 
     Args:
         spectra: ``(slices, period[0], period[1] // 2 + 1)`` in-plane spectra of what AᵀWA answers to such waves.
         period: voxels of the ring that the spectra are of.
         spacing: voxel size per axis in mm.
-        hu: 1 HU in mm⁻¹.
+        mu_per_hu: 1 HU in mm⁻¹.
     """
     hy, hx = spacing[-2:]
     f = torch.hypot(torch.fft.fftfreq(period[0], hy)[:, None], torch.fft.rfftfreq(period[1], hx)[None, :])
@@ -238,7 +240,7 @@ def information_at_reference(spectra: Tensor, period: tuple[int, int], spacing: 
     ring = distance <= max(0.1, float(distance.min()) * 1.001)
     # S ∝ 1/f: refer every frequency of the ring to the reference.
     per_slice = (spectra[:, ring.to(spectra.device)] * (f[ring] / REFERENCE_FREQUENCY).to(spectra)).mean(1)
-    return float(per_slice.median()) * hu**2 / math.prod(spacing)
+    return float(per_slice.median()) * mu_per_hu**2 / math.prod(spacing)
 
 
 def check_weights(weights: Any, shape: tuple[int, ...]) -> None:

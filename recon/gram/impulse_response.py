@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchpcct.detector_window import DetectorWindow, shadow
+from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import ConeBeam, Geometry, VolumeGrid
 
 __all__ = ["Nodes", "kernel_at", "node_positions", "slice_reach"]
@@ -79,7 +79,7 @@ def kernel_at(projector: Any, weights: Tensor, node: tuple[int, int], reach: int
 
     column = around((1, 1))
     window = projector.window or DetectorWindow.full(geometry)
-    part = shadow(geometry, column, margin=1).within(window)
+    part = footprint(geometry, column, margin=1).within(window)
     w = window.crop(weights.unsqueeze(1) if flat else weights, part)
     w = w.squeeze(1) if flat else w
     make = type(projector)

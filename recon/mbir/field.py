@@ -104,11 +104,11 @@ class FieldGram:
         """Eigenvalues of the circulant model at the middle, ``rfftn`` layout; of slices the same at all z."""
         return self._spectrum
 
-    def information(self, hu: float) -> float:
+    def information(self, mu_per_hu: float) -> float:
         """So that the noise scale of the middle is right, see :class:`recon.mbir.problem.NormalisedProblem`."""
         n = self._model.grid.ndim
         spacing = (self._voxel_mm,) * n
-        return self._model.information(hu, spacing) * self._voxel_mm ** (n - 3)
+        return self._model.information(mu_per_hu, spacing) * self._voxel_mm ** (n - 3)
 
 
 def _turned(spectrum: Tensor, shape: Sequence[int]) -> Tensor:
@@ -210,7 +210,7 @@ def reconstruct_field_mbir(
     Args:
         scans: without a known surround, of one geometry.
         grid: ``(z, y, x)``; of a parallel or fan beam ``(y, x)`` or ``(slices, y, x)``.
-        network: with its weights and look.
+        network: with its weights and fidelity.
         progress: called with the finished fraction.
         memory: bytes that may be used; None: what the machine has left.
 
@@ -285,7 +285,7 @@ def _one(
     scales = normal.scale_hu * gram.ratio
     parts = {"prior": model.network, **network.parts}
     prior = partial(blockwise, parts.pop("prior"), scales)
-    u = model(normal, network.look, prior=prior, solves=SOLVES, **parts)
+    u = model(normal, network.fidelity, prior=prior, solves=SOLVES, **parts)
     left = normal.beta - normal.apply(u)
     whole = normal.beta + normal.apply(_stacked(problem, around)[None] / (scales * hu))
     rest = (u[0] * scales) * hu
@@ -307,8 +307,8 @@ def _one(
     if strange:
         warnings.insert(0, f'the network was not trained for this ({"; ".join(strange)}): use method="pwls"')
     info = {
-        "method": "mbir", "iterations": model.steps, "look": network.look,
-        "residual": float(low_residual(replace(normal, beta=whole), left, network.look)),
+        "method": "mbir", "iterations": model.steps, "fidelity": network.fidelity,
+        "residual": float(low_residual(replace(normal, beta=whole), left, network.fidelity)),
         "chi2": float(torch.stack(squares).sum()) / max(readings, 1), "noise_scale_hu": (low, high),
         "weights_sha256": network.weights_sha256, "warnings": list(dict.fromkeys(warnings)),
     }  # fmt: skip
@@ -329,7 +329,7 @@ def _surround(problem: FieldProblem, slices: Sequence[tuple[Tensor, Tensor]]) ->
     found = []
     for y, w in slices:
         result = pwls(
-            problem.projector, y, w, prior, hu=hu, start=problem.start(y), tolerance=SURROUND_HU,
+            problem.projector, y, w, prior, mu_per_hu=hu, start=problem.start(y), tolerance=SURROUND_HU,
             max_exact=SURROUND_PAIRS,
         )  # fmt: skip
         found.append(result.x)

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from recon.mbir.network import NetworkConfig
 from recon.mbir.problem import NormalisedProblem
-from recon.mbir.unrolled import DEFAULT_LOOK, Unrolled, look_frequency
+from recon.mbir.unrolled import DEFAULT_FIDELITY, Unrolled, fidelity_frequency
 from recon.mbir.weights_io import digest, read_tensors
 from recon.pwls.inset_problem import InsetProblem
 from torchpcct.geometry import VolumeGrid
@@ -58,29 +58,30 @@ class Mbir:
 
     Args:
         model: with its weights.
-        look: 0 (viewing) … 1 (measuring), see :mod:`recon.mbir.unrolled`.
-        parts: for ablations, ``steps``, ``last_word`` and ``prior`` of :meth:`recon.mbir.unrolled.Unrolled.forward`.
+        fidelity: 0 (viewing) … 1 (measuring), see :mod:`recon.mbir.unrolled`.
+        parts: for ablations, ``steps``, ``final_data_consistency`` and ``prior`` of
+            :meth:`recon.mbir.unrolled.Unrolled.forward`.
 
     Raises:
-        ValueError: a look outside of 0 … 1.
+        ValueError: a fidelity outside of 0 … 1.
     """
 
     name = "mbir"
 
-    def __init__(self, model: Unrolled, look: float = DEFAULT_LOOK, **parts: Any) -> None:
-        look_frequency(look)
+    def __init__(self, model: Unrolled, fidelity: float = DEFAULT_FIDELITY, **parts: Any) -> None:
+        fidelity_frequency(fidelity)
         self.model = model.eval().requires_grad_(False)
-        self.look = look
+        self.fidelity = fidelity
         self.parts = parts
         self.voxel_mm = model.network.config.voxel_mm
 
     @classmethod
-    def load(cls, path: str | Path | None = None, look: float = DEFAULT_LOOK) -> Mbir:
+    def load(cls, path: str | Path | None = None, fidelity: float = DEFAULT_FIDELITY) -> Mbir:
         """From a weights file; None: the weights that ship with the package.
 
         Args:
             path: of the file.
-            look: as for the class.
+            fidelity: as for the class.
 
         Raises:
             FileNotFoundError: no such file.
@@ -98,7 +99,7 @@ class Mbir:
                 f"{source} holds no weights of this unrolled reconstruction: {error} (shipped weights come back with "
                 "a new installation of the package)"
             ) from error
-        return cls(model, look)
+        return cls(model, fidelity)
 
     @property
     def weights_sha256(self) -> str:
@@ -130,7 +131,7 @@ class Mbir:
     def solved(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> Solution:
         """The same with what it was made of."""
         normal = self.problem(problem, b, exposure_s)
-        return Solution(normal, self.model(normal, self.look, **self.parts), [{} for _ in range(b.shape[0])])
+        return Solution(normal, self.model(normal, self.fidelity, **self.parts), [{} for _ in range(b.shape[0])])
 
     @staticmethod
     def in_hu(problem: InsetProblem, u: Tensor, normal: NormalisedProblem) -> Tensor:
@@ -144,15 +145,15 @@ class Mbir:
         scale = normal.scale_hu.reshape(-1, 1, 1, 1) * (problem.mu_ref / 1000.0)
         return (from_hu(hu, problem.mu_ref) - problem.level) / scale
 
-    def looking(self, look: float) -> Self:
-        """The same method with another look.
+    def with_fidelity(self, fidelity: float) -> Self:
+        """The same method with another fidelity.
 
         Raises:
-            ValueError: a look outside of 0 … 1.
+            ValueError: a fidelity outside of 0 … 1.
         """
-        look_frequency(look)
+        fidelity_frequency(fidelity)
         other = copy.copy(self)
-        other.look = look
+        other.fidelity = fidelity
         return other
 
     @torch.no_grad()

@@ -5,8 +5,8 @@ would make of it, and gives a new estimate. (To give what must be added, the noi
 as long to learn: the noise passes through every layer then.) Convolutions have no bias and every nonlinearity is a
 leaky ReLU, so the network is homogeneous: twice the input gives twice the output, and a volume of zeros stays zero
 (Mohan, Kadkhodaie, Simoncelli, Fernandez-Granda 2020, ICLR: bias-free networks generalise over noise levels). What it
-must know beside, the noise scale in HU (tissues have their HU), the look and the step, changes gains of its channels
-only.
+must know beside, the noise scale in HU (tissues have their HU), the fidelity and the step, changes gains of its
+channels only.
 
 A homogeneous network shrinks what it is unsure of towards 0, and 0 is the value of the surround unless ``local_mm`` is
 given: then the network works on differences from a Gaussian mean about each voxel, and a constant that is added to the
@@ -33,7 +33,7 @@ from torchpcct.validate import number, whole
 __all__ = ["GUIDE_VOXELS", "Network", "NetworkConfig", "bilateral_prior", "edge_preserved"]
 
 CONDITIONS = 3
-"""Numbers that steer the gains: logarithm of the noise scale, look, step."""
+"""Numbers that steer the gains: logarithm of the noise scale, fidelity, step."""
 GUIDE_VOXELS = 1.4
 """Width of the Gaussian that makes the bilateral filter's guide."""
 _FIRST, _SECOND = (2.8, 2.5, 1), (1.4, 4.0, 2)
@@ -108,7 +108,7 @@ class Network(nn.Module):
 
         Args:
             estimate, towards: ``(batch, z, y, x)`` in noise units.
-            condition: ``(batch, 3)``: ln(noise scale / 200 HU), look − ½, number of the step.
+            condition: ``(batch, 3)``: ln(noise scale / 200 HU), fidelity − ½, number of the step.
             smoothed: :func:`edge_preserved` of ``towards``, for a network with ``bilateral``.
         """
         views = [estimate, towards]

@@ -40,7 +40,7 @@ class NormalisedProblem:
 
     @classmethod
     def from_statistic(
-        cls, gram: NormalOperator, b: Tensor, exposure: Tensor, hu: float, voxel_mm: float
+        cls, gram: NormalOperator, b: Tensor, exposure: Tensor, mu_per_hu: float, voxel_mm: float
     ) -> NormalisedProblem:
         """From AᵀW y.
 
@@ -48,13 +48,13 @@ class NormalisedProblem:
             gram: AᵀWA at unit exposure.
             b: ``(batch, z, y, x)``, AᵀW y with the weights of the exposures, y in line integrals of mm⁻¹.
             exposure: ``(batch,)`` factors on its weights.
-            hu: 1 HU in mm⁻¹.
+            mu_per_hu: 1 HU in mm⁻¹.
             voxel_mm: size of the cubic voxels.
         """
-        unit = gram.information(hu)
+        unit = gram.information(mu_per_hu)
         scale = (unit * exposure.to(b) * voxel_mm**3).rsqrt()
-        factor = exposure.to(b) * (scale * hu) ** 2
-        return cls(gram, b * (scale * hu).reshape(-1, 1, 1, 1), scale, factor, voxel_mm)
+        factor = exposure.to(b) * (scale * mu_per_hu) ** 2
+        return cls(gram, b * (scale * mu_per_hu).reshape(-1, 1, 1, 1), scale, factor, voxel_mm)
 
     def apply(self, u: Tensor) -> Tensor:
         """H u."""

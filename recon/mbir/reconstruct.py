@@ -18,6 +18,7 @@ from recon.pwls.field_problem import is_whole_field
 from recon.pwls.inset_problem import InsetProblem
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
+from torchpcct.validate import renamed
 from torchpcct.volume import Volume
 
 __all__ = ["reconstruct_mbir"]
@@ -33,11 +34,12 @@ def reconstruct_mbir(
     network: Mbir | None = None,
     problem: InsetProblem | None = None,
     batch: int = 4,
-    look: float | None = None,
+    fidelity: float | None = None,
     noise_map: bool = False,
     tissues: bool = False,
     point: Any = None,
     vessel_prior: VesselPrior | None = None,
+    look: float | None = None,
 ) -> list[Volume]:
     """Unrolled MBIR with the learned prior, of an inset or of a whole field (:mod:`recon.mbir.field`).
 
@@ -48,7 +50,7 @@ def reconstruct_mbir(
         network: with its weights; None: those of the package.
         problem: kept from an earlier call with the same scan and (working) grid; None: made here.
         batch: volumes at a time.
-        look: 0, quiet images for viewing, … 1, for measuring: more of the contrast, at more noise
+        fidelity: 0, quiet images for viewing, … 1, for measuring: more of the contrast, at more noise
             (:mod:`recon.mbir.unrolled`); None: that of ``network``, which is 0.5 unless it was loaded with another.
         noise_map: add an estimate of each voxel's standard deviation, ``report["noise_sd_hu"]``.
         tissues: fit the tissues of a contrast-enhanced vessel first, and let the network reconstruct what they leave
@@ -57,23 +59,26 @@ def reconstruct_mbir(
             is the one without, with a warning.
         point: ``(z, y, x)`` mm where a reader sees the plaque, for ``tissues``; None: in the largest vessel.
         vessel_prior: what ``tissues`` believes of the vessel's tissues before the data; None: a coronary artery.
+        look: the former name of ``fidelity``.
 
     Returns:
-        Volumes in HU. Report: ``iterations``, ``look``, ``residual`` (what is left of the data at the low frequencies
-        that are the data's own, over what there was, :func:`recon.mbir.unrolled.low_residual`), ``chi2`` (weighted
-        squared residual per reading), ``weights_sha256``, of noisy scans ``residual_p``
+        Volumes in HU. Report: ``iterations``, ``fidelity``, ``residual`` (what is left of the data at the low
+        frequencies that are the data's own, over what there was, :func:`recon.mbir.unrolled.low_residual`), ``chi2``
+        (weighted squared residual per reading), ``weights_sha256``, of noisy scans ``residual_p``
         (:mod:`torchpcct.metrics.residual_test`: does the volume explain its data?), ``warnings``, ``seconds``; with
         ``tissues`` what was read of them, under that name.
 
     Raises:
         ValueError, TypeError: see :class:`recon.pwls.inset_problem.InsetProblem`; a problem that was made for another
-            grid; a look outside of 0 … 1.
+            grid; a fidelity outside of 0 … 1.
         FileNotFoundError: the package has no weights.
     """
     start = time.perf_counter()
     network = network or Mbir.load()
     if look is not None:
-        network = network.looking(look)
+        fidelity = renamed("look", "fidelity", look)
+    if fidelity is not None:
+        network = network.with_fidelity(fidelity)
     if point is not None and not tissues:
         raise ValueError("point says where a plaque is: give it with tissues=True")
     if vessel_prior is not None and not tissues:
@@ -100,7 +105,7 @@ def reconstruct_mbir(
             solution = network.solved(problem, b, exposure)
             normal, u = solution.normal, solution.u
             left = normal.beta - normal.apply(u)
-            residuals = low_residual(normal, left, network.look).tolist()
+            residuals = low_residual(normal, left, network.fidelity).tolist()
             # ‖y − A u‖²_W less ‖y‖²_W = uᵀ H u − 2 βᵀ u
             misfit = -(u * (left + normal.beta)).sum(dim=(1, 2, 3), dtype=torch.float64)
             hu = network.in_hu(problem, u, normal)
@@ -108,7 +113,8 @@ def reconstruct_mbir(
         for k, (volume, statistic) in enumerate(zip(hu, statistics, strict=True)):
             chi2 = (statistic.energy + float(misfit[k])) / statistic.readings
             info: dict[str, Any] = {
-                "method": "mbir", "iterations": network.model.steps, "look": network.look, "residual": residuals[k],
+                "method": "mbir", "iterations": network.model.steps, "fidelity": network.fidelity,
+                "residual": residuals[k],
                 "chi2": chi2, "seconds": round(seconds, 3), "weights_sha256": network.weights_sha256,
             }  # fmt: skip
             info |= solution.notes[k]

@@ -42,7 +42,7 @@ class TissueMbir(Mbir):
     Not differentiable: the fit of the tissues is not unrolled.
 
     Args:
-        network: gives weights, look and parts.
+        network: gives weights, fidelity and parts.
         point: ``(z, y, x)`` mm where a reader sees the plaque; None: in the largest vessel.
         seed: of the reading's Monte Carlo.
         vessel_prior: what is believed of the vessel before the data; None: what a reading believes, a coronary artery.
@@ -54,7 +54,7 @@ class TissueMbir(Mbir):
     def __init__(
         self, network: Mbir, point: Any = None, seed: int = 0, vessel_prior: VesselPrior | None = None
     ) -> None:
-        super().__init__(network.model, network.look, **network.parts)
+        super().__init__(network.model, network.fidelity, **network.parts)
         self.point = None if point is None else numbers("point", point, 3, unit="mm")
         self.seed, self.vessel_prior = seed, vessel_prior
 
@@ -92,7 +92,7 @@ class TissueMbir(Mbir):
         """
         drawn = self.in_noise_units(problem, image[None], normal)
         left = replace(normal, beta=normal.beta - normal.apply(drawn))
-        return (drawn + self.model(left, self.look, **self.parts))[0]
+        return (drawn + self.model(left, self.fidelity, **self.parts))[0]
 
 
 def _unused(why: str) -> dict[str, Any]:

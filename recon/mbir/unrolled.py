@@ -1,4 +1,4 @@
-"""The unrolled reconstruction: data steps and one network in turn, and the data have the last word where they are sure.
+"""The unrolled reconstruction: data steps and one network in turn, and a final data consistency at low frequencies.
 
 In the normalised problem (:mod:`recon.mbir.problem`), f in line pairs per mm:
 
@@ -13,8 +13,8 @@ In the normalised problem (:mod:`recon.mbir.problem`), f in line pairs per mm:
 Both solves are a few conjugate gradients with the circulant H_c for H as preconditioner. (A fixed step with it is not
 safe: at the rim of the inset its eigenvalues reach 2.2.)
 
-f_c is the *look*, the one trade-off that a user cares about: 0 for viewing, quiet images; 1 for measuring, more of the
-contrast at more noise. The network knows it, so the noise that it must leave alone does not surprise it.
+f_c is the *fidelity*, the one trade-off that a user cares about: 0 for viewing, quiet images; 1 for measuring, more of
+the contrast at more noise. The network knows it, so the noise that it must leave alone does not surprise it.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ from recon.mbir.problem import NormalisedProblem, filtered, squared_frequencies
 from torchpcct.validate import number, whole
 
 __all__ = [
-    "DEFAULT_LOOK",
+    "DEFAULT_FIDELITY",
     "REFERENCE_SCALE_HU",
     "Unrolled",
+    "fidelity_frequency",
     "guide_noise",
     "limited",
-    "look_frequency",
     "low_residual",
     "start",
 ]
@@ -46,8 +46,8 @@ Prior = Callable[..., Tensor]
 """A :class:`recon.mbir.network.Network`, or a function with the arguments of its ``forward``."""
 REFERENCE_SCALE_HU = 200.0
 """Noise scale at which its conditioning variable is 0: about 1 s of the paper's scan."""
-DEFAULT_LOOK = 0.5
-"""Between the least error, at look 0, and contrast, which a higher look gives and noise pays for."""
+DEFAULT_FIDELITY = 0.5
+"""Between the least error, at fidelity 0, and contrast, which a higher fidelity gives and noise pays for."""
 
 _START = (0.01, 0.8)
 """λ and μ of the start: the Wiener filter whose contrast slope is that of soft FBP (the study's ``linear``)."""
@@ -59,8 +59,8 @@ _TOWARDS = 0.1
 """δ: higher frequencies than the data determine are not amplified."""
 _LEAST = 1e-4
 """Of L: beyond, the network is held as firmly as float32 allows."""
-_LOOKS = (0.2, 0.8)
-"""f_c in line pairs per mm of look 0 and 1."""
+_CUTOFFS = (0.2, 0.8)
+"""f_c in line pairs per mm of fidelity 0 and 1."""
 _NEARBY = 5
 """Voxels that count as near an edge: 1 mm."""
 _EDGE = 10.0
@@ -68,14 +68,14 @@ _EDGE = 10.0
 vessels (``tests/bench/prior_parts.md``)."""
 
 
-def look_frequency(look: float) -> float:
-    """f_c in line pairs per mm, of half height of the low-pass within which the data have the last word.
+def fidelity_frequency(fidelity: float) -> float:
+    """f_c in line pairs per mm, of half height of the low-pass of the final data consistency.
 
     Raises:
-        ValueError: a look outside of 0 … 1.
+        ValueError: a fidelity outside of 0 … 1.
     """
-    look = number("look", look, low=0.0, high=1.0)
-    return _LOOKS[0] + (_LOOKS[1] - _LOOKS[0]) * look
+    fidelity = number("fidelity", fidelity, low=0.0, high=1.0)
+    return _CUTOFFS[0] + (_CUTOFFS[1] - _CUTOFFS[0]) * fidelity
 
 
 class Unrolled(nn.Module):
@@ -98,10 +98,10 @@ class Unrolled(nn.Module):
     def forward(
         self,
         problem: NormalisedProblem,
-        look: float | Tensor = DEFAULT_LOOK,
+        fidelity: float | Tensor = DEFAULT_FIDELITY,
         callback: Callable[[int, Tensor], None] | None = None,
         steps: int | None = None,
-        last_word: bool = True,
+        final_data_consistency: bool = True,
         prior: Prior | None = None,
         solves: tuple[int, int] | None = None,
     ) -> Tensor:
@@ -109,10 +109,10 @@ class Unrolled(nn.Module):
 
         Args:
             problem: normalised problem.
-            look: 0 … 1, one for all or ``(batch,)``.
+            fidelity: 0 … 1, one for all or ``(batch,)``.
             callback: called with the number of each step and the volume after it.
             steps: fewer than K; None: K. With 0 the reconstruction is linear, and the solves go on until it is.
-            last_word: whether the data have it; without, the network's last volume is the result, whatever the look.
+            final_data_consistency: whether that step is taken; without it the network's last volume is the result.
             prior: in the place of the network: block by block (:mod:`recon.mbir.field`), or for comparisons
                 (:func:`recon.mbir.network.bilateral_prior`).
             solves: conjugate gradients of start and data consistency; None: those of an inset's model.
@@ -122,7 +122,7 @@ class Unrolled(nn.Module):
             low, high = self.seen_scale_hu.unbind()
             least = scale.min() if not low else torch.minimum(low, scale.min())
             self.seen_scale_hu = torch.stack([least, torch.maximum(high, scale.max())])
-        looks = torch.as_tensor(look, dtype=scale.dtype, device=scale.device).expand(scale.shape)
+        fidelities = torch.as_tensor(fidelity, dtype=scale.dtype, device=scale.device).expand(scale.shape)
         level = torch.log(scale / REFERENCE_SCALE_HU).clamp(-3.0, 3.0)
         spectrum = problem.spectrum()
         solves = solves or (_LINEAR_SOLVES if steps == 0 else _SOLVES)
@@ -133,12 +133,12 @@ class Unrolled(nn.Module):
         smoothed = None
         for k in range(self.steps if steps is None else steps):
             towards = v + filtered(problem.beta - problem.apply(v), 1.0 / (spectrum + _TOWARDS))
-            condition = torch.stack([level, looks - 0.5, torch.full_like(level, float(k))], 1)
+            condition = torch.stack([level, fidelities - 0.5, torch.full_like(level, float(k))], 1)
             smoothed = edge_preserved(towards, noise) if self.bilateral else None
             v = (prior or self.network)(v, towards, condition, smoothed)
             if callback is not None:
                 callback(k + 1, v)
-        u = consistent(problem, spectrum, v, looks, solves[1]) if last_word else v
+        u = consistent(problem, spectrum, v, fidelities, solves[1]) if final_data_consistency else v
         return u if smoothed is None else limited(u, smoothed, noise)
 
 
@@ -174,18 +174,19 @@ def guide_noise(spectrum: Tensor, shape: Sequence[int], voxel_mm: float) -> Tens
     return ((power * pairs).sum((-3, -2, -1)) / math.prod(shape)).sqrt()
 
 
-def _low_pass(problem: NormalisedProblem, looks: Tensor) -> Tensor:
+def _low_pass(problem: NormalisedProblem, fidelities: Tensor) -> Tensor:
     """L on the frequencies of ``rfftn``, ``(batch, z, y, x//2 + 1)``."""
-    cut = _LOOKS[0] + (_LOOKS[1] - _LOOKS[0]) * looks.reshape(-1, 1, 1, 1)
+    cut = _CUTOFFS[0] + (_CUTOFFS[1] - _CUTOFFS[0]) * fidelities.reshape(-1, 1, 1, 1)
     f2 = squared_frequencies(problem.beta.shape[-3:], problem.voxel_mm).to(problem.beta)
     return torch.exp(-math.log(2.0) * f2 / cut.square())
 
 
 def consistent(
-    problem: NormalisedProblem, spectrum: Tensor, v: Tensor, looks: Tensor, iterations: int = _SOLVES[1]
+    problem: NormalisedProblem, spectrum: Tensor, v: Tensor, fidelities: Tensor, iterations: int = _SOLVES[1]
 ) -> Tensor:
-    """``v`` with its low frequencies replaced by the data's, ``(batch, z, y, x)``; ``looks`` ``(batch,)`` in 0 … 1."""
-    low_pass = _low_pass(problem, looks).clamp_min(_LEAST)
+    """``v`` with its low frequencies replaced by the data's, ``(batch, z, y, x)``; ``fidelities`` ``(batch,)`` in 0 …
+    1."""
+    low_pass = _low_pass(problem, fidelities).clamp_min(_LEAST)
     hold = (spectrum + _TOWARDS) * (1.0 / low_pass - 1.0)
     inverse = 1.0 / (spectrum + hold)
     return v + conjugate_gradient(
@@ -220,14 +221,14 @@ def _largest_nearby(v: Tensor) -> Tensor:
     return v
 
 
-def low_residual(problem: NormalisedProblem, left: Tensor, look: float) -> Tensor:
+def low_residual(problem: NormalisedProblem, left: Tensor, fidelity: float) -> Tensor:
     """‖L (β − H u)‖ over ‖L β‖, ``(batch,)``: 0 where the low frequencies are wholly the data's own.
 
     Args:
         problem: normalised problem.
         left: β − H u, ``(batch, z, y, x)``.
-        look: 0 … 1.
+        fidelity: 0 … 1.
     """
-    low_pass = _low_pass(problem, torch.full_like(problem.scale_hu, look))
+    low_pass = _low_pass(problem, torch.full_like(problem.scale_hu, fidelity))
     sizes = [filtered(v, low_pass).flatten(1).norm(dim=1) for v in (left, problem.beta)]
     return sizes[0] / sizes[1].clamp_min(torch.finfo(sizes[1].dtype).tiny)

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchpcct.files import written_whole
+from torchpcct.files import atomic_write
 
 __all__ = ["TensorFileError", "digest", "read_tensors", "write_tensors"]
 
@@ -51,7 +51,7 @@ def write_tensors(path: Path, kind: str, tensors: Mapping[str, Tensor], metadata
     plain = {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}
     text = json.dumps(dict(metadata), ensure_ascii=False, allow_nan=False)
     header = {"format": kind, "sha256": digest(plain), "metadata": text, "sha256_of_metadata": _sha256(text)}
-    with written_whole(path) as part:
+    with atomic_write(path) as part:
         part.write_bytes(save(plain, header))  # save_file writes a temporary file of its own, and leaves it if killed
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from recon.plaque.reading import CERTAIN, PlaqueReading
-from torchpcct.files import written_whole
+from torchpcct.files import atomic_write
 from torchpcct.viz import Panel, panels
 from torchpcct.volume import Volume
 
@@ -164,10 +164,10 @@ def save(
         ("report.md", table(reading, others, deviations)),
         ("report.json", json.dumps(data, indent=1) + "\n"),
     ):
-        with written_whole(folder / name) as part:
+        with atomic_write(folder / name) as part:
             part.write_text(text, encoding="utf-8")
     Volume(torch.from_numpy(labels), reading.grid).save(folder / "tissues.nii.gz")
     Volume(torch.from_numpy(reading.image), reading.grid).save(folder / "image.nii.gz")
-    with written_whole(folder / "plaque.png") as part:
+    with atomic_write(folder / "plaque.png") as part:
         picture(reading, others).savefig(part)
     return [folder / n for n in ("report.md", "report.json", "tissues.nii.gz", "image.nii.gz", "plaque.png")]

@@ -12,7 +12,7 @@ from recon.gram.gram import Gram
 from recon.pwls.joint import joint_pwls, mean_weights
 from recon.pwls.qggmrf import DEFAULT_PRIOR, QGGMRF
 from recon.pwls.whitening import Whitening
-from torchpcct.detector_window import DetectorWindow, shadow
+from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import VolumeGrid
 from torchpcct.projector import Projector
 from torchpcct.scan import Scan
@@ -48,7 +48,7 @@ class BasisProblem:
         scale = torch.from_numpy(model.row_factor)[:, None]
         information = inverse(cramer_rao(background.double(), model, scale=scale))
         self.grid, self.geometry = grid, scan.geometry
-        self.window = shadow(scan.geometry, grid, margin=1)
+        self.window = footprint(scan.geometry, grid, margin=1)
         self.background = background
         self.level = static_fbp(background, scan.geometry, grid).double().mean((-1, -2, -3))
         on_rays = self.window.take(information)
@@ -66,11 +66,11 @@ class BasisProblem:
         return float(((((f11 - f22) / 2).square() + f12.square()) / mean.square()).mean().sqrt())
 
     def data(self, lines: Tensor, window: DetectorWindow) -> Tensor:
-        """Whitened line integrals on the grid's shadow, background taken off, ``(..., 2, views, rows, columns)``.
+        """Whitened line integrals on the grid's footprint, background taken off, ``(..., 2, views, rows, columns)``.
 
         Args:
             lines: ``(..., 2, views, rows, columns)`` in mm on ``window``.
-            window: of the data; it must hold the grid's shadow.
+            window: of the data; it must hold the grid's footprint.
         """
         inside = window.crop(lines, self.window)
         return self.whitening.apply(inside - self.window.take(self.background.to(lines.dtype)))

@@ -109,18 +109,18 @@ class FieldModel:
         inner = [self.spectrum if z == self.at[0] else self._spectrum((z, *self.at[1:])) for z in slices[1:-1]]
         return list(zip([outer[0], *inner, outer[1]], _shares(slices, self.seen), strict=True))
 
-    def information(self, hu: float, spacing: tuple[float, ...] | None = None) -> float:
+    def information(self, mu_per_hu: float, spacing: tuple[float, ...] | None = None) -> float:
         """The data's information at 0.5 lp/mm in the middle of the grid, see :meth:`recon.gram.gram.Gram.information`.
 
         Args:
-            hu: 1 HU in mm⁻¹.
+            mu_per_hu: 1 HU in mm⁻¹.
             spacing: as if the voxels had this size in mm; None: their own.
         """
         rolled = torch.roll(self._column, [-k for k in self.at[-2:]], (-2, -1))
         # Slices that the rays do not meet say nothing.
         kept = rolled[rolled[..., 0, 0] > 0]
         return information_at_reference(
-            torch.fft.rfft2(kept).real, (rolled.shape[-2], rolled.shape[-1]), spacing or self.grid.spacing, hu
+            torch.fft.rfft2(kept).real, (rolled.shape[-2], rolled.shape[-1]), spacing or self.grid.spacing, mu_per_hu
         )
 
     def scaled(self, factor: float) -> FieldModel:

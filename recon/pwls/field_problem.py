@@ -242,7 +242,7 @@ def reconstruct_field(
         results, tests = [], []
         for k, (y, w) in enumerate(slices):
             result = pwls(
-                problem.projector, y, w, prior, hu=problem.mu_ref / 1000.0, start=problem.start(y), **options,
+                problem.projector, y, w, prior, mu_per_hu=problem.mu_ref / 1000.0, start=problem.start(y), **options,
             )  # fmt: skip
             results.append(result)
             if not scan.noise_free:

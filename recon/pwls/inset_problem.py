@@ -1,4 +1,4 @@
-"""Model-based reconstruction of a small inset: crop to its shadow, take the background off, solve PWLS, give HU."""
+"""Model-based reconstruction of a small inset: crop to its footprint, take the background off, solve PWLS, give HU."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from recon.pwls.field_problem import is_whole_field, reconstruct_field, unfinish
 from recon.pwls.pwls import PwlsOptions, data_model, pwls
 from recon.pwls.qggmrf import DEFAULT_PRIOR, QGGMRF
 from recon.pwls.surround import UnknownSurround
-from torchpcct.detector_window import DetectorWindow, shadow
+from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import VolumeGrid
 from torchpcct.projector import Projector
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
@@ -43,7 +43,7 @@ class Statistic:
     Args:
         b: AᵀW y, ``grid.shape``, y with the background taken off.
         energy: yᵀW y.
-        readings: number of readings in the inset's shadow.
+        readings: number of readings in the inset's footprint.
     """
 
     b: Tensor
@@ -95,7 +95,7 @@ class InsetProblem:
         if scan.surround is None:
             self._start_unknown(scan, exposure, motion)
             return
-        require_inside(shadow(scan.geometry, grid, margin=1), self.outer)
+        require_inside(footprint(scan.geometry, grid, margin=1), self.outer)
         self._background = scan.surround_line_integrals()
         # The background's own value inside the inset, from the same data by FBP.
         self.level = float(static_fbp(self._background, scan.geometry, grid).mean())
@@ -112,7 +112,7 @@ class InsetProblem:
         if motion is not None:
             raise ValueError("motion compensation needs the surround at rest: acquire the scan with region=")
         geometry, grid = self.geometry, self.grid
-        self.window = shadow(geometry, grid, margin=1)
+        self.window = footprint(geometry, grid, margin=1)
         self.weights = self.outer.crop(scan.weights(), self.window) / exposure
         self.projector = Projector(geometry, grid, self.window)
         self.model = data_model(self.projector, self.weights, nodes=self._nodes)
@@ -121,7 +121,7 @@ class InsetProblem:
 
     def _place(self, motion: Any) -> None:
         geometry, grid = self.geometry, self.grid
-        self.window = shadow(geometry, grid, margin=1, motion=motion)
+        self.window = footprint(geometry, grid, margin=1, motion=motion)
         self.weights = self.window.take(self._cell_weights).contiguous()
         self.projector = Projector(geometry, grid, self.window, motion)
         if motion is None:
@@ -129,7 +129,7 @@ class InsetProblem:
             return
         # A displaced grid sees its voxels as the grid at rest does, a magnification of 0.3 % apart, but through the
         # weights of where it is.
-        still = shadow(geometry, grid, margin=1)
+        still = footprint(geometry, grid, margin=1)
         first = np.clip(self.window.first_column, 0, geometry.columns - still.columns)
         along = DetectorWindow(first, still.columns, still.first_row, still.rows)
         weights = along.take(self._cell_weights).contiguous()
@@ -171,7 +171,7 @@ class InsetProblem:
         return other
 
     def data(self, scan: Scan) -> Tensor:
-        """Line integrals of a scan on the grid's shadow, background taken off, ``(views, rows, columns)``."""
+        """Line integrals of a scan on the grid's footprint, background taken off, ``(views, rows, columns)``."""
         if (scan.window or DetectorWindow.full(scan.geometry)) != self.outer or scan.geometry != self.geometry:
             raise ValueError("this scan has another geometry or window than the one the problem was made for")
         if self._around is not None:
@@ -236,7 +236,7 @@ class InsetProblem:
         exposure = self.exposure(scans)
         lines = [self.data(s) for s in scans] if data is None else list(data)
         result = pwls(
-            self.projector, torch.stack(lines), self.weights * exposure, prior, hu=self.mu_ref / 1000.0,
+            self.projector, torch.stack(lines), self.weights * exposure, prior, mu_per_hu=self.mu_ref / 1000.0,
             gram=self.model.scaled(exposure), **options,
         )  # fmt: skip
         return to_hu(result.x + self.level, self.mu_ref), dict(result.report)

@@ -60,7 +60,7 @@ def joint_pwls(
     information: Tensor,
     prior: QGGMRF | BoundPrior,
     *,
-    hu: float = 1.0,
+    mu_per_hu: float = 1.0,
     gram: Gram | None = None,
     tolerance: float = 0.2,
     max_exact: int = 20,
@@ -76,7 +76,7 @@ def joint_pwls(
             It should be near a multiple of the identity (:class:`recon.pwls.whitening.Whitening`): that is for speed
             alone.
         prior: in noise-normalised units, or bound already.
-        hu: the value of the channels that counts as 1 HU.
+        mu_per_hu: the value of the channels that counts as 1 HU.
         gram: FFT model of Aᵀ diag(½ tr F) A, kept from an earlier call; None: made here.
         tolerance: stop when the images are this close to the minimum: root mean square over both channels, in HU.
         max_exact: largest number of exact projection pairs (each of two channels).
@@ -103,7 +103,8 @@ def joint_pwls(
         return out
 
     result = solve_normal(
-        A.T(weighted), exact, gram if gram is not None else Gram(A, mean_weights(information)), prior, hu=hu,
+        A.T(weighted), exact, gram if gram is not None else Gram(A, mean_weights(information)), prior,
+        mu_per_hu=mu_per_hu,
         spacing=A.grid.spacing, channels=True, tolerance=tolerance, max_exact=max_exact, callback=callback,
     )  # fmt: skip
     return PwlsResult(result.x, {**result.report, "method": "joint-pwls", "seconds": time.perf_counter() - started})

@@ -32,8 +32,8 @@ from recon.pwls.field_model import FieldModel, GradientStep
 from recon.pwls.memory import gram_bytes, require_memory
 from recon.pwls.model_solver import ModelSolver, line_search
 from recon.pwls.qggmrf import QGGMRF, BoundPrior
-from torchpcct.detector_window import shadow
-from torchpcct.validate import checked, number, whole
+from torchpcct.detector_window import footprint
+from torchpcct.validate import checked, number, renamed, whole
 
 __all__ = ["PwlsOptions", "PwlsResult", "data_model", "pwls", "solve_normal", "weighted_data"]
 
@@ -96,13 +96,14 @@ def pwls(
     weights: Tensor,
     prior: QGGMRF | BoundPrior,
     *,
-    hu: float = 2e-5,
+    mu_per_hu: float = 2e-5,
     gram: NormalOperator | FieldModel | None = None,
     start: Tensor | None = None,
     tolerance: float = 0.2,
     max_exact: int = 200,
     memory: int | None = None,
     callback: Callable[[dict[str, Any]], None] | None = None,
+    hu: float | None = None,
 ) -> PwlsResult:
     """Minimise ½‖y − A x‖²_W + R(x), in 2-D and 3-D, for an inset or a whole field of view.
 
@@ -115,7 +116,7 @@ def pwls(
         weights: W, ``A.range_shape``: expected inverse variances of y (from smooth expected counts: weights taken
             from the noisy counts themselves bias the result).
         prior: a prior in noise-normalised units, or one that is bound already.
-        hu: 1 HU in mm⁻¹ (μ of water / 1000); default: water at about 64 keV.
+        mu_per_hu: 1 HU in mm⁻¹ (μ of water / 1000); default: water at about 64 keV.
         gram: model of AᵀWA with these weights (:class:`recon.gram.gram.Gram` or
             :class:`recon.pwls.field_model.FieldModel`, kept from an earlier call); default: :func:`data_model`.
         start: first volume ``(..., *grid.shape)`` mm⁻¹, default 0. It costs one exact pair and does not change the
@@ -129,6 +130,7 @@ def pwls(
             predicted before anything is allocated.
         callback: called before each outer iteration with a dict of ``outer``, ``exact_pairs``, ``gradient``,
             ``rmsd_hu`` and ``x``, the volumes so far ``(batch, *grid.shape)``, not to be changed.
+        hu: the former name of ``mu_per_hu``.
 
     Returns:
         The volume in the dtype of y, and the report.
@@ -138,6 +140,8 @@ def pwls(
             a tolerance ≤ 0, too little memory.
         TypeError: data or weights that are not float tensors.
     """
+    if hu is not None:
+        mu_per_hu = renamed("hu", "mu_per_hu", hu)
     started = time.perf_counter()
     check_weights(weights, A.range_shape)
     known = weights > 0
@@ -154,8 +158,8 @@ def pwls(
     axes = len(A.range_shape)
     energy = dot(weighted, torch.where(known, y, torch.zeros_like(y)), axes)
     result, change = _solve(
-        A.T(weighted), exact, model, prior, hu=hu, spacing=A.grid.spacing, start=start, tolerance=tolerance,
-        max_exact=max_exact, callback=callback,
+        A.T(weighted), exact, model, prior, mu_per_hu=mu_per_hu, spacing=A.grid.spacing, start=start,
+        tolerance=tolerance, max_exact=max_exact, callback=callback,
     )  # fmt: skip
     misfit = (energy.reshape(-1) + 2 * change).clamp_min(0) / int(known.sum())
     return PwlsResult(result.x, {**result.report, "misfit": misfit.tolist(), "seconds": time.perf_counter() - started})
@@ -177,7 +181,7 @@ def data_model(A: Any, weights: Tensor, nodes: int = 9) -> Gram | FieldModel:
     inset = False
     if geometry is not None and gram_bytes(geometry, A.grid, weights.element_size(), nodes) <= GRAM_BYTES:
         try:
-            inset = shadow(geometry, A.grid).columns <= INSET_SHARE * geometry.columns
+            inset = footprint(geometry, A.grid).columns <= INSET_SHARE * geometry.columns
         except ValueError:  # the grid reaches beyond the field of view
             inset = False
     return Gram(A, weights, nodes) if inset else FieldModel(A, weights)
@@ -213,7 +217,7 @@ def solve_normal(
     gram: Any,
     prior: QGGMRF | BoundPrior,
     *,
-    hu: float,
+    mu_per_hu: float,
     spacing: tuple[float, ...],
     channels: bool = False,
     start: Tensor | None = None,
@@ -226,15 +230,15 @@ def solve_normal(
     Args:
         b: ``(..., [channels,] *grid.shape)``.
         exact: x ↦ H x = AᵀWA x; ``gram.apply`` itself solves the model's problem.
-        gram: the model of H: ``apply(x)``, ``periodic_spectrum()`` and, for a :class:`QGGMRF`, ``information(hu)``; or
-            a :class:`recon.pwls.field_model.FieldModel`.
+        gram: the model of H: ``apply(x)``, ``periodic_spectrum()`` and, for a :class:`QGGMRF`,
+            ``information(mu_per_hu)``; or a :class:`recon.pwls.field_model.FieldModel`.
         spacing: voxel size per axis in mm.
         channels: whether the volumes have an axis of channels, which the prior joins and ``gram`` treats alike.
-        prior, hu, start, tolerance, max_exact, callback: see :func:`pwls`.
+        prior, mu_per_hu, start, tolerance, max_exact, callback: see :func:`pwls`.
     """
     return _solve(
-        b, exact, gram, prior, hu=hu, spacing=spacing, channels=channels, start=start, tolerance=tolerance,
-        max_exact=max_exact, callback=callback,
+        b, exact, gram, prior, mu_per_hu=mu_per_hu, spacing=spacing, channels=channels, start=start,
+        tolerance=tolerance, max_exact=max_exact, callback=callback,
     )[0]  # fmt: skip
 
 
@@ -244,7 +248,7 @@ def _solve(
     gram: Any,
     prior: QGGMRF | BoundPrior,
     *,
-    hu: float,
+    mu_per_hu: float,
     spacing: tuple[float, ...],
     channels: bool = False,
     start: Tensor | None,
@@ -260,7 +264,9 @@ def _solve(
     whole("max_exact", max_exact)
     if start is not None and tuple(start.shape[-axes:]) != tuple(shape):
         raise ValueError(f"start must have shape (..., {', '.join(map(str, shape))}), got {tuple(start.shape)}")
-    bound = prior.bind(gram.information(hu), spacing, hu, channels) if isinstance(prior, QGGMRF) else prior
+    bound = (
+        prior.bind(gram.information(mu_per_hu), spacing, mu_per_hu, channels) if isinstance(prior, QGGMRF) else prior
+    )
     lead = b.shape[:-axes]
     b = b.reshape(-1, *shape)
     proposer: ModelSolver | GradientStep
@@ -295,10 +301,12 @@ def _solve(
         inner.append(count)
         gradient = data_gradient + bound.gradient(x)
         gradients.append(float((dot(gradient, gradient, axes).sqrt() / reference).max()))
-        proposed = float((dot(step, step, axes) / step[0].numel()).sqrt().max()) / hu
+        proposed = float((dot(step, step, axes) / step[0].numel()).sqrt().max()) / mu_per_hu
         proposals.append(proposed)
         by_model = isinstance(proposer, ModelSolver)
-        distances.append(ahead(proposals) if by_model else approach.remaining() / hu if approach.known else proposed)
+        distances.append(
+            ahead(proposals) if by_model else approach.remaining() / mu_per_hu if approach.known else proposed
+        )
         if callback is not None:
             callback({
                 "outer": len(inner), "exact_pairs": pairs, "gradient": gradients[-1], "rmsd_hu": distances[-1], "x": x,
@@ -345,7 +353,7 @@ def _solve(
         "rmsd_hu": distances,
         "converged": converged,
         "undetermined": 1.0 - float(determined.double().mean()),
-        "undetermined_rmsd_hu": beyond.remaining() / hu,
+        "undetermined_rmsd_hu": beyond.remaining() / mu_per_hu,
         "tolerance_hu": tolerance,
         "model": "gram" if isinstance(proposer, ModelSolver) else "gradient",
         "model_misfit": misfit,

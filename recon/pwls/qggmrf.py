@@ -10,13 +10,13 @@ p = q = 2 is the quadratic prior (with half the curvature, see :func:`quadratic`
 
 The energy is a Riemann sum over the volume, so it does not depend on the voxel size, to first order::
 
-    R(x) = λ V Σ_{pairs} ω_d ρ((x_j − x_k) / (hu d)),      V voxel volume, d distance in mm,
+    R(x) = λ V Σ_{pairs} ω_d ρ((x_j − x_k) / (mu_per_hu d)),      V voxel volume, d distance in mm,
 
 with ω_d ∝ d (the usual weight 1/d on squared differences) and Σ_d ω_d = the number of dimensions: a linear ramp of
 g HU/mm costs ½ λ g² per mm³ when g ≪ T. λ is in 1/(HU² mm) and comes from the noise level, see :meth:`QGGMRF.bind`.
 
-For several channels at once t is the Euclidean length of their common gradient, ``|x_j − x_k| / (hu d)``: an edge in
-one channel relaxes the penalty of all channels there, as basis images share the edges of the tissues (vectorial
+For several channels at once t is the Euclidean length of their common gradient, ``|x_j − x_k| / (mu_per_hu d)``: an
+edge in one channel relaxes the penalty of all channels there, as basis images share the edges of the tissues (vectorial
 regularisation, Sapiro and Ringach 1996; for spectral CT Rigie and La Rivière 2015). The length treats all directions in
 the space of channels alike, so the channels must be of equal, uncorrelated noise
 (:class:`recon.pwls.whitening.Whitening`).
@@ -77,14 +77,16 @@ class QGGMRF:
         if self.neighbors not in (6, 26):
             raise ValueError(f"neighbors must be 6 or 26 (2-D: 4 or 8), got {self.neighbors}")
 
-    def bind(self, information: float, spacing: Sequence[float], hu: float, channels: bool = False) -> BoundPrior:
+    def bind(
+        self, information: float, spacing: Sequence[float], mu_per_hu: float, channels: bool = False
+    ) -> BoundPrior:
         """The prior for one grid and noise level.
 
         Args:
-            information: the data's information at 0.5 lp/mm, in 1/(HU² mm³) (``Gram.information(hu)``); the same for
-                each channel.
+            information: the data's information at 0.5 lp/mm, in 1/(HU² mm³) (``Gram.information(mu_per_hu)``); the same
+                for each channel.
             spacing: voxel size per axis in mm, (y, x) or (z, y, x).
-            hu: 1 HU in mm⁻¹ (μ_ref / 1000); the value of the channels that counts as 1 HU.
+            mu_per_hu: 1 HU in mm⁻¹ (μ_ref / 1000); the value of the channels that counts as 1 HU.
             channels: for volumes with an axis of channels.
         """
         number("information", information, positive=True)
@@ -92,7 +94,7 @@ class QGGMRF:
         threshold = self.threshold
         if self.relative and lam > 0:
             threshold = self.threshold / math.sqrt(lam)
-        return BoundPrior(lam, threshold, self.p, self.q, self.neighbors, tuple(spacing), hu, channels)
+        return BoundPrior(lam, threshold, self.p, self.q, self.neighbors, tuple(spacing), mu_per_hu, channels)
 
 
 DEFAULT_PRIOR = QGGMRF(strength=0.3, threshold=16.0, relative=True)
@@ -117,7 +119,7 @@ class BoundPrior:
         threshold: T in HU/mm.
         p, q, neighbors: see :class:`QGGMRF`.
         spacing: voxel size per axis in mm.
-        hu: 1 HU in mm⁻¹.
+        mu_per_hu: 1 HU in mm⁻¹.
         channels: whether the volumes have an axis of channels before those of the grid.
     """
 
@@ -127,13 +129,13 @@ class BoundPrior:
     q: float
     neighbors: int
     spacing: tuple[float, ...]
-    hu: float
+    mu_per_hu: float
     channels: bool = False
 
     def __post_init__(self) -> None:
         if len(self.spacing) not in (2, 3) or min(self.spacing) <= 0:
             raise ValueError(f"spacing must be 2 or 3 lengths in mm, got {self.spacing}")
-        number("hu (μ_ref / 1000)", self.hu, positive=True, unit="mm⁻¹")
+        number("mu_per_hu (μ_ref / 1000)", self.mu_per_hu, positive=True, unit="mm⁻¹")
         number("lam", self.lam, low=0.0)
 
     # -- the potential: the only place where its formula stands ---------------------------------------------------
@@ -203,7 +205,7 @@ class BoundPrior:
         for step, d, _ in self.offsets:
             a, b = _pair(x, step)
             change = torch.linalg.vector_norm(a - b, dim=-self.axes, keepdim=True) if self.channels else a - b
-            yield change / (self.hu * d)
+            yield change / (self.mu_per_hu * d)
 
     def value(self, x: Tensor) -> Tensor:
         """R(x), ``(...)``, without unit. Differentiable."""
@@ -219,7 +221,7 @@ class BoundPrior:
 
     def weights(self, x: Tensor) -> list[Tensor]:
         """Curvature of every pair at x, one tensor per entry of :attr:`offsets`, in mm²."""
-        scale = self.lam * self._volume / self.hu**2
+        scale = self.lam * self._volume / self.mu_per_hu**2
         return [
             self.curvature(t) * (scale * omega / d**2)
             for t, (_, d, omega) in zip(self.gradients(x), self.offsets, strict=True)
@@ -290,8 +292,8 @@ class BoundPrior:
             full = (0,) * (3 - len(step)) + step
             for sign in (1, -1) if both else (-1,):
                 steps.append([sign * i for i in full])
-                scales.append(1.0 / (self.hu * d))
-                factors.append(self.lam * self._volume * omega / (self.hu * d) ** 2)
+                scales.append(1.0 / (self.mu_per_hu * d))
+                factors.append(self.lam * self._volume * omega / (self.mu_per_hu * d) ** 2)
         power = self.p - self.q
         if self.p == 2.0 and math.isinf(self.threshold):
             kind = 0
@@ -311,7 +313,7 @@ class BoundPrior:
         for step, d, omega in self.offsets:
             phase = sum((2 * math.pi * mesh[a] * step[a] for a in range(n)), torch.zeros_like(mesh[0]))
             total = total + (omega / d**2) * (2 - 2 * torch.cos(phase))
-        return total * (self.lam * self._volume * at_zero / self.hu**2)
+        return total * (self.lam * self._volume * at_zero / self.mu_per_hu**2)
 
 
 def _pair(x: Tensor, step: tuple[int, ...]) -> tuple[Tensor, Tensor]:

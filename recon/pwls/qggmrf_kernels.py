@@ -99,7 +99,7 @@ def majorize(begin, end, x, v, steps, scales, factors, kind, form, out):
     Args:
         x, v: ``(batch, nz, ny, nx)`` contiguous.
         steps: ``(neighbours, 3)`` int64, ALL neighbours (both signs).
-        scales, factors: ``(neighbours,)`` in the dtype of x: 1 / (hu d) and λ V ω / (hu d)².
+        scales, factors: ``(neighbours,)`` in the dtype of x: 1 / (mu_per_hu d) and λ V ω / (mu_per_hu d)².
         kind: 0 quadratic, 1 p = 2 and q = 1 (no powers), 2 general.
         form: ``(5,)`` in the dtype of x: 1 / T, p − q, q / p, p − 2, ε / T.
         out: like x.

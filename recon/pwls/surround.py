@@ -1,6 +1,6 @@
 """What lies around an inset when nobody knows it: found by a coarse FBP of the whole field, and taken off the data.
 
-The readings of the inset's shadow hold the patient too. Their line integrals are split as
+The readings of the inset's footprint hold the patient too. Their line integrals are split as
 
     y = A x + (y_coarse of what the inset does not hold) + noise,
 
@@ -46,8 +46,8 @@ class UnknownSurround:
     Args:
         geometry: of the whole scan.
         grid: ``(z, y, x)`` grid of the inset.
-        window: its shadow.
-        projector: of the inset on its shadow.
+        window: its footprint.
+        projector: of the inset on its footprint.
 
     Attributes:
         coarse: the grid of the whole field.
@@ -110,7 +110,7 @@ class UnknownSurround:
             level: the constant in mm⁻¹ that the inset's voxels are counted from.
 
         Returns:
-            ``(views, rows, columns)`` on the inset's shadow.
+            ``(views, rows, columns)`` on the inset's footprint.
         """
         volume = self.volume(lines)
         kept = self._all.crop(lines, self.window)

@@ -101,5 +101,5 @@ def effects_section(effects: Iterable[Effect], tolerance_hu: float | None = None
         for e in effects
     ]
     limit = "" if tolerance_hu is None else f" An effect that costs less than {tolerance_hu:g} HU is left out."
-    head = f"## What was modelled\n\nCost: error in HU over the shadow of the inset if the effect is omitted.{limit}"
+    head = f"## What was modelled\n\nCost: error in HU over the footprint of the inset if the effect is omitted.{limit}"
     return f"{head}\n\n{markdown_table(['effect', '', 'cost, HU', 'note'], rows)}"

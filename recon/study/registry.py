@@ -1,6 +1,6 @@
 """The studies by name: what ``torchpcct study NAME`` runs, loaded when they are asked for.
 
-What a study must be is said in :mod:`recon.study.study`.
+What a study must be is described in :mod:`recon.study.study`.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from recon.evaluate.report import page
-from torchpcct.files import written_whole
+from torchpcct.files import atomic_write
 
 __all__ = ["Report", "by_sign", "markdown_table", "or_dash", "records_table"]
 
@@ -98,7 +98,7 @@ class Report:
         title = f"torchpcct: {self.name}"
         contents |= {**pictures, "report.html": page(title, self.text, pictures).encode()}
         for name, content in contents.items():
-            with written_whole(out / name) as part:
+            with atomic_write(out / name) as part:
                 part.write_bytes(content)
         return [out / name for name in contents]
 

@@ -27,7 +27,7 @@ from scipy import ndimage
 import recon
 from recon.study.study import environment
 from torchpcct.acquisition.path_lengths import tissue_path_lengths
-from torchpcct.files import written_whole
+from torchpcct.files import atomic_write
 from torchpcct.geometry import ConeBeam, FanBeam, VolumeGrid, full_turn
 from torchpcct.scan import Scan
 from torchpcct.scene.materials import material
@@ -154,7 +154,7 @@ def main() -> None:
         for name, part in (("stack", whole), ("slice", whole.middle())):
             found = {**kept.get((name, photons), {}), **figures(part, photons, options.methods)}
             result["runs"].append({"data": name, "photons": photons, "methods": compared(found)})
-            with written_whole(options.out) as file:
+            with atomic_write(options.out) as file:
                 file.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
 
 

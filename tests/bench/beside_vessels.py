@@ -27,7 +27,7 @@ from torch import Tensor
 from recon.evaluate.vessels import vessel
 from recon.plaque import TissueData, read_plaque
 from torchpcct import Projector
-from torchpcct.files import written_whole
+from torchpcct.files import atomic_write
 from torchpcct.geometry import VolumeGrid
 
 FIRST_SEED, OUTER_MM, WALL_MM, WALL_HU, PLAIN_BLOOD_HU, HALF_MM = 9000, 1.7, 0.2, 50.0, 40.0, 4.2
@@ -107,13 +107,13 @@ def main() -> None:
         path = options.work / f"{kind.replace(' ', '_')}_{e:g}s_{k}.json"
         if k < n and e in EXPOSURES_S[kind] and not path.exists():
             print(found := read(draws, kind, k, e, options.particles), flush=True)
-            with written_whole(path) as part:
+            with atomic_write(path) as part:
                 part.write_text(json.dumps(found), encoding="utf-8")
     rows = [json.loads(p.read_text(encoding="utf-8")) for p in sorted(options.work.glob("*.json"))]
     told = {f"{kind}, {e:g} s": dict(Counter(r["outcome"] for r in rows if (r["kind"], r["exposure_s"]) == (kind, e)))
             for kind in COUNTS for e in EXPOSURES_S[kind]}  # fmt: skip
     result = {"particles": options.particles, "outcomes": told, "readings": rows}
-    with written_whole(Path(__file__).with_suffix(".json")) as part:
+    with atomic_write(Path(__file__).with_suffix(".json")) as part:
         part.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     print(json.dumps(told, indent=1))
 

@@ -24,7 +24,7 @@ from recon.pwls.inset_problem import InsetProblem
 from recon.study.paper.plaque_scan import inset_grid
 from torchpcct import VolumeGrid
 from torchpcct.acquisition.acquire import acquire
-from torchpcct.files import written_whole
+from torchpcct.files import atomic_write
 from torchpcct.metrics import edge_profile, edge_width, ellipsoid_distance
 from torchpcct.scan import Scan
 from torchpcct.scanner import presets
@@ -46,7 +46,7 @@ METHODS: dict[str, tuple[str, float, dict[str, Any]]] = {
     "FBP standard": ("fbp", FBP_GRID_MM, {"kernel": "standard"}),
     "PWLS": ("pwls", GRID_MM, {}),
     "MBIR": ("mbir", GRID_MM, {}),
-    "MBIR, look 1": ("mbir", GRID_MM, {"look": 1.0}),
+    "MBIR, fidelity 1": ("mbir", GRID_MM, {"fidelity": 1.0}),
 }
 
 
@@ -100,7 +100,7 @@ def main() -> None:
                 rows.append({"method": name, "direction": direction, "exposure_s": dose, "width_mm": found})
                 print(f"{name:13s} {direction:9s} {dose:g} s  {found:.2f} mm", flush=True)
     data = {"draws": args.draws, "rows": rows, "processor_seconds": round(time.process_time() - began)}
-    with written_whole(args.out) as part:
+    with atomic_write(args.out) as part:
         part.write_text(json.dumps(data, indent=1) + "\n")
 
 

@@ -28,7 +28,7 @@ from recon.pwls.inset_problem import InsetProblem
 from recon.study.paper.plaque_scan import inset_grid
 from recon.study.study import environment
 from torchpcct import VolumeGrid, acquire
-from torchpcct.files import written_whole
+from torchpcct.files import atomic_write
 from torchpcct.scan import Scan
 from torchpcct.scanner import presets
 from torchpcct.scene.plaque import plaque_scene
@@ -89,7 +89,7 @@ def main() -> None:
     result = {"command": f"python tests/bench/inset_times.py --rounds {options.rounds}", **environment(),
               "threads": [torch.get_num_threads(), get_num_threads()], "shapes": shapes,
               "exposure_s": options.exposure, "rows": rows}  # fmt: skip
-    with written_whole(options.out) as part:
+    with atomic_write(options.out) as part:
         part.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     for row in rows:
         print(f"{row['method']:26} {row['seconds']:6.2f} s [{row['least_seconds']:.2f}, {row['most_seconds']:.2f}]  "

@@ -32,7 +32,7 @@ from results import write_results
 from recon.evaluate.store import Store
 from recon.mbir.weights_io import read_tensors, write_tensors
 from torchpcct import ConeBeam, Scan, Volume, VolumeGrid, full_turn
-from torchpcct.files import LEFTOVER, WriteError, written_whole
+from torchpcct.files import LEFTOVER, WriteError, atomic_write
 
 LONGEST = 4.0
 """Until a kill, in times that a write takes."""
@@ -44,7 +44,7 @@ SCANS = [Scan.from_counts(RNG.poisson(5e4, CONE.shape), CONE, air=5e4) for _ in 
 
 
 def _text(path: Path, k: int) -> None:
-    with written_whole(path) as part:
+    with atomic_write(path) as part:
         part.write_text(json.dumps(NUMBERS[k].tolist()), encoding="utf-8")
 
 

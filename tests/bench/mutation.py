@@ -61,7 +61,7 @@ _SHIPPED = "tests/recon/mbir/test_shipped_prior.py"
 _STEP = _SHIPPED + "::test_the_network_is_given_a_step_towards_the_data_and_where_it_is"
 _SHARE = _SHIPPED + "::test_the_error_is_that_share_of_the_rivals"
 _KEPT = _SHIPPED + "::test_fat_and_lumen_keep_their_values"
-_WORD = _SHIPPED + "::test_the_last_word_makes_the_network_s_volume_explain_the_data"
+_WORD = _SHIPPED + "::test_final_data_consistency_makes_the_network_s_volume_explain_the_data"
 _UN, _MB, _READ = "recon/mbir/unrolled.py", "recon/mbir/mbir.py", "recon/plaque/reading.py"
 _PQ = "tests/recon/plaque/test_quality.py::"
 _METAL = "tests/recon/test_metal.py::"
@@ -167,7 +167,7 @@ FAULTS = (
     Fault("damaged pieces pass", "recon/evaluate/store.py", "if mark and digest !=", "if False and digest !=",
           _C + "test_damaged_pieces_are_computed_again"),
     Fault("threads left behind by a fork", "torchpcct/threads.py", "after_in_child=_renew", "after_in_parent=_renew",
-          "tests/torchpcct/projector/test_manners.py::test_a_forked_process_computes_on_threads_of_its_own"),
+          "tests/torchpcct/projector/test_base.py::test_a_forked_process_computes_on_threads_of_its_own"),
     Fault("ends of pieces forgotten", "torchpcct/threads.py", "self.kernel(begin, end,", "self.kernel(begin, end - 1,",
           "tests/torchpcct/test_threads.py::test_every_index_once"),
     Fault("kernels with two copies of a function", "torchpcct/projector/cpu/cone_kernels.py", '"forceinline": True',
@@ -192,7 +192,7 @@ FAULTS = (
     Fault("pieces of another version", "recon/evaluate/store.py",
           'f"{settings!r} {source_digest()}"', 'f"{settings!r}"', _SAME),
     Fault("pieces written in place", "recon/evaluate/store.py",
-          'with written_whole(self.path(name + ".npz")) as part:', "for part in [path]:",
+          'with atomic_write(self.path(name + ".npz")) as part:', "for part in [path]:",
           _P + "test_kills_at_random_moments_lose_one_piece_at_most"),
     Fault("a threshold that ignores the noise", "recon/pwls/qggmrf.py", "threshold=16.0, relative=True)",
           "threshold=300.0)", "tests/recon/pwls/test_inset_problem.py::test_the_default_prior_follows_the_noise"),
@@ -218,9 +218,9 @@ FAULTS = (
           "test_a_step_towards_the_data_is_not_mostly_noise_where_other_rays_are_starved_than_in_the_middle"),
     Fault("tissues that do not fit are used", _TISSUE, "if reading.warnings:", "if False:",
           _M + "test_tissues_that_do_not_explain_the_data_are_not_used"),
-    Fault("another look forgets the tissues", "recon/mbir/mbir.py", "other = copy.copy(self)",
-          "other: Any = Mbir(self.model, self.look, **self.parts)",
-          _M + "test_another_look_keeps_the_tissues_and_noise_units_are_the_inverse_of_hu"),
+    Fault("another fidelity forgets the tissues", "recon/mbir/mbir.py", "other = copy.copy(self)",
+          "other: Any = Mbir(self.model, self.fidelity, **self.parts)",
+          _M + "test_another_fidelity_keeps_the_tissues_and_noise_units_are_the_inverse_of_hu"),
     Fault("MBIR's tissues do not hear what is believed", _TISSUE, "vessel_prior=self.vessel_prior", "vessel_prior=None",
           _M + "test_what_is_believed_of_the_vessel_reaches_the_reading"),
     Fault("half of a plaque body is not drawn", "recon/plaque/kernels.py", "points[:, 0], cz - largest",
@@ -300,9 +300,10 @@ FAULTS = (
           "model.load_state_dict({k: v if 'seen' in k else 0 * v for k, v in tensors.items()})", _SHARE),
     Fault("weights in another order", _MB, "model.load_state_dict(tensors)",
           "model.load_state_dict({k: v if 'seen' in k else v.flip(0) for k, v in tensors.items()})", _SHARE),
-    Fault("the last word against the data", _UN, "return v + conjugate_gradient(", "return v - conjugate_gradient(",
-          _WORD),
-    Fault("no last word", _UN, "looks, solves[1]) if last_word else v", "looks, solves[1]) if False else v", _WORD),
+    Fault("final data consistency against the data", _UN, "return v + conjugate_gradient(",
+          "return v - conjugate_gradient(", _WORD),
+    Fault("no final data consistency", _UN, "fidelities, solves[1]) if final_data_consistency else v",
+          "fidelities, solves[1]) if False else v", _WORD),
     Fault("the surround's zero is lost", _MB, "return to_hu(u * scale + problem.level, problem.mu_ref)",
           "return to_hu(u * scale + 1.02 * problem.level, problem.mu_ref)", _KEPT),
     Fault("the surround's zero is another", "recon/pwls/inset_problem.py",

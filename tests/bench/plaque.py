@@ -35,7 +35,7 @@ from recon.plaque.reading import CERTAIN, read_regions
 from recon.pwls.inset_problem import InsetProblem
 from recon.study.paper.plaque_scan import inset_grid
 from torchpcct.acquisition.acquire import acquire
-from torchpcct.files import written_whole
+from torchpcct.files import atomic_write
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.plaque_measures import cap_on_line, lumen_area
 from torchpcct.projector import Projector
@@ -164,7 +164,7 @@ class Draws:
             seen = self.problem.projector.T(self.problem.weights * exposure_s * self._exact(above))
             b = seen + gram.noise(generator=torch.Generator().manual_seed(k))
             found = {"b": b.numpy()}
-        with written_whole(path) as part, part.open("wb") as file:
+        with atomic_write(path) as part, part.open("wb") as file:
             np.savez(file, **found)
         return torch.from_numpy(found["b"]), torch.from_numpy(found["fbp"]) if "fbp" in found else None
 
@@ -210,10 +210,10 @@ class Draws:
                 if what.scene == "paper":
                     found["fbp_thresholds"] = _thresholds(fbp, self.grid, seeds, centre)
             shares = {n: np.round(255 * v).astype(np.uint8) for n, v in reading.regions.items()}
-            with written_whole(path.with_suffix(".npz")) as part, part.open("wb") as file:
+            with atomic_write(path.with_suffix(".npz")) as part, part.open("wb") as file:
                 np.savez_compressed(file, **shares)
         found |= {"seconds": time.perf_counter() - start, "cpu_seconds": time.process_time() - cpu}
-        with written_whole(path) as part:
+        with atomic_write(path) as part:
             part.write_text(json.dumps(found), encoding="utf-8")
 
     def beside(self, case: str, k: int, network: Mbir) -> None:
@@ -229,7 +229,7 @@ class Draws:
             volume = network(self.problem, b[None], what.exposure_s)[0]
         with np.load(path.with_suffix(".npz")) as shares:
             found["mbir"] = read_regions({n: shares[n] / 255.0 for n in shares.files}, volume)
-        with written_whole(path) as part:
+        with atomic_write(path) as part:
             part.write_text(json.dumps(found), encoding="utf-8")
 
     def _held_out(self, k: int) -> tuple[torch.Tensor, Any, dict[str, float]]:
@@ -487,7 +487,7 @@ def main() -> None:
     result = summary(options.work)
     result |= {"seeds": f"0 … {options.n - 1}, the same of scan, point and Monte Carlo", "torch": torch.__version__}
     write_results(options.out, "report", result, text(result))
-    with written_whole(options.out / "plaque.png") as part:
+    with atomic_write(options.out / "plaque.png") as part:
         picture(result).savefig(part, dpi=120)
     print(text(result))
 

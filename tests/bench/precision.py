@@ -30,7 +30,7 @@ from recon.mbir.problem import NormalisedProblem
 from recon.pwls.pwls import pwls
 from recon.pwls.qggmrf import QGGMRF
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Projector, Scan, VolumeGrid, full_turn
-from torchpcct.detector_window import shadow
+from torchpcct.detector_window import footprint
 from torchpcct.metrics.observer import hotelling_scores
 from torchpcct.spectral import SpectralModel, decompose
 
@@ -58,7 +58,7 @@ def inset(n: int) -> tuple[Projector, Tensor, VolumeGrid]:
     """An inset of n//2 × n × n voxels in a wide cone beam, and weights that vary by half."""
     grid = VolumeGrid((max(n // 2, 2), n, n), 0.2)
     geometry = ConeBeam(full_turn(120), 300.0, 500.0, 12 * n, n, 0.4)
-    A = Projector(geometry, grid, shadow(geometry, grid, margin=1))
+    A = Projector(geometry, grid, footprint(geometry, grid, margin=1))
     return A, 1e4 * (1 + 0.5 * noise(A.range_shape, 3).sin()), grid
 
 
@@ -113,7 +113,7 @@ def methods(n: int, tolerance: float = 1e-3) -> Iterator[Row]:
     bound = prior.bind(model.information(HU), grid.spacing, HU)
     yield {"what": "gradient of the q-GGMRF", **about, **both(lambda v: bound.gradient(v[None])[0], x)}
     found = [
-        pwls(A, v, w, prior, hu=HU, gram=g, tolerance=tolerance, max_exact=100).x.double() / HU
+        pwls(A, v, w, prior, mu_per_hu=HU, gram=g, tolerance=tolerance, max_exact=100).x.double() / HU
         for v, w, g in ((y, weights, model), (y.double(), weights.double(), exact))
     ]
     yield {"what": "PWLS, HU", **about, **hu(*found)}
@@ -184,7 +184,7 @@ def light_weights(share: float, n: int = 8) -> Row:
     for factor in (share, 0.0):
         w = torch.where(third, weights * factor, weights)
         data = torch.where(third, y + 1.0, y)
-        found.append(pwls(A, data, w, prior, hu=HU, tolerance=1e-3, max_exact=100).x.double() / HU)
+        found.append(pwls(A, data, w, prior, mu_per_hu=HU, tolerance=1e-3, max_exact=100).x.double() / HU)
     return {"what": "PWLS, nearly zero weights", "share": share, **hu(*found)}
 
 
@@ -198,8 +198,8 @@ def starts(where: str, start: str, n: int = 8) -> Row:
         weights = torch.full(A.range_shape, 1e6)
     y = A(body(grid)) + noise(A.range_shape, 4) / weights.sqrt()
     first = {"zero": None, "noise": 0.5 * MU * noise(grid.shape, 5), "10⁴ HU": torch.full(grid.shape, 11 * MU)}[start]
-    exact = pwls(A, y.double(), weights.double(), QGGMRF(0.15, 100.0), hu=HU, tolerance=0.01)
-    found = pwls(A, y, weights, QGGMRF(0.15, 100.0), hu=HU, start=first)
+    exact = pwls(A, y.double(), weights.double(), QGGMRF(0.15, 100.0), mu_per_hu=HU, tolerance=0.01)
+    found = pwls(A, y, weights, QGGMRF(0.15, 100.0), mu_per_hu=HU, start=first)
     return {"what": f"PWLS, {where}, from {start}", **hu(found.x.double() / HU, exact.x / HU)}
 
 

@@ -57,7 +57,7 @@ def _one_orientation(network: Mbir) -> Mbir:
 
 USES: dict[str, Callable[[Mbir], Mbir]] = {
     "all parts, one orientation instead of eight": _one_orientation,
-    "all parts, without data consistency at the end": lambda n: Mbir(n.model, n.look, last_word=False),
+    "all parts, without data consistency at the end": lambda n: Mbir(n.model, n.look, final_data_consistency=False),
     "the filtered view alone, no network": lambda n: Mbir(n.model, n.look, prior=bilateral_prior),
     "the linear start alone": lambda n: Mbir(n.model, n.look, steps=0),
 }

@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from torchpcct.detector_window import shadow
+from torchpcct.detector_window import footprint
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
 from torchpcct.projector import Projector
 from torchpcct.threads import get_num_threads, set_num_threads
@@ -113,9 +113,9 @@ def cases() -> list[Callable[[], Case]]:
             ParallelBeam(np.arange(720) * math.pi / 720, 729, 1.0),
             VolumeGrid((512, 512), 1.0),
         ),
-        lambda: Case("inset 128², 1968 × 1500", flat, inset, shadow(flat, inset)),
-        lambda: Case("inset 45² × 56, 0.2 mm", paper, plaque[0], shadow(paper, plaque[0]), soft),
-        lambda: Case("inset 90² × 113, 0.1 mm", paper, plaque[1], shadow(paper, plaque[1]), soft),
+        lambda: Case("inset 128², 1968 × 1500", flat, inset, footprint(flat, inset)),
+        lambda: Case("inset 45² × 56, 0.2 mm", paper, plaque[0], footprint(paper, plaque[0]), soft),
+        lambda: Case("inset 90² × 113, 0.1 mm", paper, plaque[1], footprint(paper, plaque[1]), soft),
         lambda: Case(  # fewer bodies: the exact integrals of 13 million readings take a minute
             "cone 128³, 360 × 192²",
             ConeBeam(full_turn(360), 600.0, 1200.0, 192, 192, 1.5),

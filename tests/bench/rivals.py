@@ -82,7 +82,7 @@ class Methods:
         b, p = place.b * dose + (0.0 if noise is None else noise[1]), self.bench.problem
         gram = p.gram.scaled(dose)
         with torch.no_grad():
-            found = solve_normal(b[None], gram.apply, gram, DEFAULT_PRIOR, hu=p.mu_ref / 1000.0,
+            found = solve_normal(b[None], gram.apply, gram, DEFAULT_PRIOR, mu_per_hu=p.mu_ref / 1000.0,
                                  spacing=p.grid.spacing, tolerance=2.0)  # fmt: skip
         return to_hu(found.x + p.level, p.mu_ref)[0]
 

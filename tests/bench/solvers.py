@@ -2,9 +2,9 @@
 
     python tests/bench/solvers.py [--views 1968] [--voxel 0.2] [--out tests/bench]
 
-The problem is the paper's plaque at 2.0 s with the package's q-GGMRF prior, on the inset's shadow. The reference is the
-float64 minimum, converged to 1e-3 HU. FISTA is the accelerated gradient method with the separable (SQS) majoriser of
-data and prior (Beck, Teboulle 2009; Erdogan, Fessler 1999); OS-SQS replaces the data gradient by that of one of
+The problem is the paper's plaque at 2.0 s with the package's q-GGMRF prior, on the inset's footprint. The reference is
+the float64 minimum, converged to 1e-3 HU. FISTA is the accelerated gradient method with the separable (SQS) majoriser
+of data and prior (Beck, Teboulle 2009; Erdogan, Fessler 1999); OS-SQS replaces the data gradient by that of one of
 12 subsets of the views, with momentum (Kim, Ramani, Fessler 2015). One pair is one A and one Aᵀ of all views.
 """
 
@@ -52,7 +52,7 @@ class Problem:
         self.gram_seconds = time.perf_counter() - start
         self.prior = DEFAULT_PRIOR.bind(self.gram.information(self.hu), grid.spacing, self.hu)
         self.reference = pwls(
-            self.A, self.y.double(), self.w.double(), self.prior, hu=self.hu, gram=self.gram, tolerance=1e-3,
+            self.A, self.y.double(), self.w.double(), self.prior, mu_per_hu=self.hu, gram=self.gram, tolerance=1e-3,
             max_exact=60,
         ).x  # fmt: skip
 
@@ -70,7 +70,7 @@ def ours(p: Problem) -> Iterator[tuple[float, float, float]]:
     """(pairs, seconds, HU) of PWLS stopped after more and more pairs."""
     for most in (1, 2, 3, 4, 6):
         start = time.perf_counter()
-        result = pwls(p.A, p.y, p.w, p.prior, hu=p.hu, gram=p.gram, tolerance=1e-6, max_exact=most)
+        result = pwls(p.A, p.y, p.w, p.prior, mu_per_hu=p.hu, gram=p.gram, tolerance=1e-6, max_exact=most)
         yield result.report["exact_pairs"], time.perf_counter() - start, p.rmsd(result.x)
 
 

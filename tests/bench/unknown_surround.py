@@ -35,7 +35,7 @@ from recon.pwls.pwls import pwls
 from recon.study.paper.plaque_scan import inset_grid
 from torchpcct import Projector, VolumeGrid
 from torchpcct.acquisition.acquire import acquire
-from torchpcct.files import written_whole
+from torchpcct.files import atomic_write
 from torchpcct.metrics.placement import place_rois
 from torchpcct.metrics.roi import axial_grid
 from torchpcct.scan import Scan
@@ -149,7 +149,7 @@ def volumes(ways: Ways, scan: Scan, dose: float) -> tuple[dict[str, Tensor], dic
     for way, y in data.items():
         began = time.process_time()
         result = pwls(
-            problem.projector, y, problem.weights * dose, DEFAULT_PRIOR, hu=problem.mu_ref / 1000.0,
+            problem.projector, y, problem.weights * dose, DEFAULT_PRIOR, mu_per_hu=problem.mu_ref / 1000.0,
             gram=problem.model.scaled(dose), tolerance=0.3,
         )  # fmt: skip
         found[f"pwls, {way}"] = to_hu(result.x + problem.level, problem.mu_ref)
@@ -216,7 +216,7 @@ def main() -> None:
         found[name] = {"views": geometry.views, "columns": geometry.columns, "draws": options.draws, "threads": 1,
                        **measured(ways, options.draws)}  # fmt: skip
         print(name, json.dumps(found[name], indent=1), flush=True)
-        with written_whole(options.out) as part:
+        with atomic_write(options.out) as part:
             part.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
 
 

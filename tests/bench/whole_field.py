@@ -86,7 +86,14 @@ class Problem:
         self.minimum: Tensor | None = None
         if reference:
             self.minimum = pwls(
-                self.A, self.y.double(), self.w.double(), self.prior, hu=HU, start=first, tolerance=1e-2, max_exact=400
+                self.A,
+                self.y.double(),
+                self.w.double(),
+                self.prior,
+                mu_per_hu=HU,
+                start=first,
+                tolerance=1e-2,
+                max_exact=400,
             ).x
 
     def rmsd(self, x: Tensor) -> float:
@@ -106,7 +113,7 @@ def ours(p: Problem) -> tuple[list[Point], dict[str, Any]]:
         points.append((spent[0], p.rmsd(at["x"][0])))
         spent[1] = time.process_time()
 
-    result = pwls(p.A, p.y, p.w, p.asked, hu=HU, start=p.first, tolerance=1.0, callback=note)
+    result = pwls(p.A, p.y, p.w, p.asked, mu_per_hu=HU, start=p.first, tolerance=1.0, callback=note)
     return points, dict(result.report)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from torchpcct.detector_window import DetectorWindow, shadow
+from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid, full_turn
 
 Case = tuple[Geometry, VolumeGrid, DetectorWindow | None]
@@ -85,7 +85,7 @@ def fan_wide() -> Case:
 def fan_window() -> Case:
     geometry = FanBeam(full_turn(10), 60.0, 110.0, 40, 1.0, 0.25, "curved")
     grid = VolumeGrid((6, 5), 0.9, (-6.0, 4.0))
-    return geometry, grid, shadow(geometry, grid, 1)
+    return geometry, grid, footprint(geometry, grid, 1)
 
 
 @_case
@@ -113,7 +113,7 @@ def cone_curved_offset() -> Case:
 def cone_window() -> Case:
     geometry = ConeBeam(full_turn(9), 60.0, 110.0, 60, 12, (0.9, 1.1), detector="curved")
     grid = VolumeGrid((4, 6, 5), (0.8, 0.9, 1.0), (0.5, -7.0, 5.0))
-    return geometry, grid, shadow(geometry, grid)
+    return geometry, grid, footprint(geometry, grid)
 
 
 @_case

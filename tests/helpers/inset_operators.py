@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from torchpcct import ConeBeam, Projector, VolumeGrid
-from torchpcct.detector_window import shadow
+from torchpcct.detector_window import footprint
 from torchpcct.geometry import full_turn
 
 HU = 2e-5
@@ -17,7 +17,7 @@ def problem(views=240, shape=(8, 13, 13), voxel=0.4, rows=10, dtype=torch.float3
     """An off-centre inset of the deep-silicon scanner, with weights that change smoothly over views and columns."""
     geometry = ConeBeam(full_turn(views), 626.0, 1098.0, 1500, rows, (0.5, 0.35), detector="curved")
     grid = VolumeGrid(shape, voxel, CENTER)
-    part = shadow(geometry, grid, margin=1)
+    part = footprint(geometry, grid, margin=1)
     A = Projector(geometry, grid, part if window else None)
     gamma = geometry.fan_angles[part.column_indices] if window else geometry.fan_angles[None].repeat(views, 0)
     path = 2 * np.sqrt(120.0**2 - (626.0 * np.sin(np.clip(gamma, -0.17, 0.17))) ** 2)

@@ -87,7 +87,7 @@ def test_the_example_configuration_is_complete(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "expected_text"),
     [
         ("scene: [", "is no YAML"),
         ("scene: {kind: water, diameter: 100}\nexposure: 1", "unknown exposure; it takes scene, scanner, exposure_s"),
@@ -106,10 +106,10 @@ def test_the_example_configuration_is_complete(tmp_path, capsys):
         ("scene: {kind: water}\ntolerance_hu: -1", "tolerance_hu must be"),
     ],
 )
-def test_configurations_that_are_none_are_refused(tmp_path, text, said):
+def test_configurations_that_are_none_are_refused(tmp_path, text, expected_text):
     Volume(torch.zeros(2, 2, 2), VolumeGrid((2, 2, 2), 1.0), unit="mm^-1").save(tmp_path / "v.h5")
     (tmp_path / "scene.yaml").write_text(text, encoding="utf-8")
-    with pytest.raises((ValueError, TypeError), match=said):
+    with pytest.raises((ValueError, TypeError), match=expected_text):
         read_config(tmp_path / "scene.yaml")
 
 
@@ -124,7 +124,7 @@ def test_the_seed_is_the_options_if_there_is_one_and_0_is_one(tmp_path, capsys):
 def test_scenes_by_their_kind(tmp_path):
     """Water, the paper's plaque and a volume in HU, with the defaults in what the scan keeps."""
     Volume(torch.zeros(2, 2, 2), VolumeGrid((2, 2, 2), 1.0)).save(tmp_path / "v.h5")
-    for text, kind, said in (
+    for text, kind, expected_text in (
         ("{kind: water}", Scene, {"kind": "water"}),
         ("{kind: plaque, core_contrast: 0.5}", Scene, {"kind": "plaque", "core_contrast": 0.5}),
         (
@@ -136,7 +136,7 @@ def test_scenes_by_their_kind(tmp_path):
         (tmp_path / "scene.yaml").write_text(f"scene: {text}", encoding="utf-8")
         config = read_config(tmp_path / "scene.yaml")
         assert isinstance(config.scene, kind)
-        assert config.values["scene"] == said
+        assert config.values["scene"] == expected_text
 
 
 def test_numbers_by_the_names_of_their_axes(tmp_path):
@@ -156,7 +156,7 @@ def test_numbers_by_the_names_of_their_axes(tmp_path):
     assert named.region == listed.region == VolumeGrid((6, 5, 4), (1, 2, 2), (3, 2, 1))
     assert named.scene["a"] == listed.scene["a"]
     assert named.scene["a"].shape.position == (1, 2, 3)
-    for text, said in (
+    for text, expected_text in (
         (
             "{kind: water, position: {x: 1, y: 2, w: 3}}",
             "scene.position must be numbers, or a mapping of the axes x, y",
@@ -164,7 +164,7 @@ def test_numbers_by_the_names_of_their_axes(tmp_path):
         ("{kind: water, position: {x: 1, z: 3}}", "position must be 3 numbers"),
     ):
         (tmp_path / "bad.yaml").write_text(f"scene: {text}", encoding="utf-8")
-        with pytest.raises(ValueError, match=said):
+        with pytest.raises(ValueError, match=expected_text):
             read_config(tmp_path / "bad.yaml")
 
 
@@ -179,20 +179,23 @@ def test_what_is_above_muscle_in_a_volume_is_said_and_chosen(tmp_path, capsys):
     Volume(labels, VolumeGrid((2, 10, 10), 4.0)).save(tmp_path / "labels.h5")
     Volume(labels, VolumeGrid((2, 10, 10), 3.0)).save(tmp_path / "coarse.h5")
     path, scanner = tmp_path / "scene.yaml", "\nscanner: {preset: pcct, views: 4, rows: 1, columns: 60}"
-    for dense, said in (
+    for dense, expected_text in (
         ("", "4.0% of the voxels as bone"),
         (", dense: iodine", "4.0% of the voxels as iodine"),
         (", dense: labels.h5", "2.0% of the voxels as bone, 2.0% of the voxels as iodine, 0.0% of the voxels as water"),
     ):
         path.write_text(f"scene: {{kind: volume, file: v.h5{dense}}}{scanner}", encoding="utf-8")
         assert main(["simulate", "--config", str(path), "--dry-run", "--out", str(tmp_path / "s.h5")]) == 0
-        assert said in capsys.readouterr().out
+        assert expected_text in capsys.readouterr().out
     assert main(["simulate", "--config", str(path), "--out", str(tmp_path / "s.h5")]) == 0
-    assert said in capsys.readouterr().out
+    assert expected_text in capsys.readouterr().out
     assert read_config(tmp_path / "s.h5.yaml").values["scene"]["dense"] == str(tmp_path / "labels.h5")
-    for dense, said in (("gold", "scene.dense must be bone, iodine, water"), ("coarse.h5", "not those of v.h5")):
+    for dense, expected_text in (
+        ("gold", "scene.dense must be bone, iodine, water"),
+        ("coarse.h5", "not those of v.h5"),
+    ):
         path.write_text(f"scene: {{kind: volume, file: v.h5, dense: {dense}}}", encoding="utf-8")
-        with pytest.raises(ValueError, match=said):
+        with pytest.raises(ValueError, match=expected_text):
             read_config(path)
 
 
@@ -226,9 +229,9 @@ def test_a_foreign_scan_without_pixel_size(tmp_path, capsys):
     assert "unit: pixel^-1" in capsys.readouterr().out
     command = ["reconstruct", path, "--find-axis", "--out", str(tmp_path / "tooth.nii.gz")]
     assert main(command) == 0
-    said = capsys.readouterr().out
-    assert "axis at column 23." in said
-    assert "of 1 × 1 × 1 pixels (the file does not know their size: --pitch MM)" in said
+    output = capsys.readouterr().out
+    assert "axis at column 23." in output
+    assert "of 1 × 1 × 1 pixels (the file does not know their size: --pitch MM)" in output
     report = (tmp_path / "tooth.nii.gz.json").read_text(encoding="utf-8")
     assert '"spacing_pixels": [1.0, 1.0, 1.0],' in report  # lists on one line
     assert "mean_hu" not in report
@@ -256,8 +259,8 @@ def test_names_and_grey_scale_of_their_own(tmp_path, capsys, monkeypatch):
     ramp = torch.linspace(0.0, 0.2, 48).reshape(3, 4, 4)
     Volume(ramp, VolumeGrid((3, 4, 4), 1.0), unit="mm^-1").save("small.nii.gz")
     assert main(["view", "small.nii.gz"]) == 0
-    said = capsys.readouterr().out
-    assert "level 0.1, window 0.19" in said
+    output = capsys.readouterr().out
+    assert "level 0.1, window 0.19" in output
     Volume(10000 * ramp - 1000, VolumeGrid((3, 4, 4), 1.0)).save("series")
     assert main(["view", "series"]) == 0
     assert "level 40, window 400" in capsys.readouterr().out
@@ -354,14 +357,14 @@ def test_a_report_says_what_it_was_made_of_and_how(tmp_path, capsys):
     Scan.from_counts(counts, replace(geometry, offset=0.0), air=1e5, mu_water=0.02).save(path)
     command = ["reconstruct", str(path), "--find-axis", "--out", str(out)]
     assert main(command) == 0
-    said = capsys.readouterr()
-    assert "axis at column 20.9" in said.out
+    output = capsys.readouterr()
+    assert "axis at column 20.9" in output.out
     report = Volume.load(out).report
     assert report["axis"]["column"] == pytest.approx(20.9, abs=report["axis"]["error"])
     assert report["command"] == shlex.join(["torchpcct", *command])
     assert report["torchpcct"] == __version__
     assert report["input_sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
-    assert all(said.err.count(text) <= 1 for text in report["warnings"])
+    assert all(output.err.count(text) <= 1 for text in report["warnings"])
     assert json.loads((tmp_path / "v.h5.json").read_text(encoding="utf-8"))["command"] == report["command"]
     assert main([*command, "--force", "--weights", str(path)]) == 2
     assert "--weights is an option of --method mbir" in capsys.readouterr().err

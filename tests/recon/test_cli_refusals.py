@@ -20,7 +20,7 @@ import torch
 from recon.cli import main
 from recon.evaluate.store import Store
 from torchpcct import ParallelBeam, Scan, Volume, VolumeGrid
-from torchpcct.files import _part, require_writable, written_whole
+from torchpcct.files import _part, atomic_write, require_writable
 
 ROOT = Path(__file__).parent.parent.parent
 
@@ -36,7 +36,7 @@ ROOT = Path(__file__).parent.parent.parent
         (["reconstruct", "{tmp}/f", "--out", "{tmp}/a.h5"], "unknown scan format 'f'"),
         (["reconstruct", "{tmp}/f", "--out", "{tmp}/none/a.h5"], "create it first"),
         (["reconstruct", "{tmp}/f", "--tissues", "--out", "{tmp}/a.h5"], "--tissues is an option of --method mbir"),
-        (["reconstruct", "{tmp}/f", "--method", "pwls", "--look", "0", "--out", "{tmp}/a.h5"], "not of pwls"),
+        (["reconstruct", "{tmp}/f", "--method", "pwls", "--fidelity", "0", "--out", "{tmp}/a.h5"], "not of pwls"),
         (["simulate", "--views", "0", "--out", "{tmp}/a.h5"], "--views must be at least 1"),
         (["simulate", "--exposure", "nan", "--out", "{tmp}/a.h5"], "--exposure must be finite"),
         (["simulate", "--exposure", "-1", "--out", "{tmp}/a.h5"], "--exposure must be greater than 0"),
@@ -92,7 +92,7 @@ def test_what_a_killed_process_left_is_swept_by_the_next_write(tmp_path):
     os.utime(series, (time.time() - 3600,) * 2)
     fresh.write_bytes(b"half")
     for name in ("v.h5", "w.h5"):
-        with written_whole(tmp_path / name) as part:
+        with atomic_write(tmp_path / name) as part:
             part.write_bytes(b"whole")
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted(
         [mine.name, other.name, elsewhere.name, fresh.name, "v.h5", "w.h5"]
@@ -215,7 +215,7 @@ def test_files_of_others_are_replaced_by_force_only(tmp_path, lines, capsys):
     (tmp_path / "study" / "report.md").write_text("mine", encoding="utf-8")
     (tmp_path / "d.nii").mkdir()
     before = _contents(tmp_path / "study")
-    for words, said in (
+    for words, expected_text in (
         (["reconstruct", scan, "--out", "patient.nii.gz"], "patient.nii.gz exists and was not made by torchpcct recon"),
         (["reconstruct", scan, "--out", "tooth.h5"], "tooth.h5 exists and was not made by torchpcct reconstruct: name"),
         (["reconstruct", scan, "--out", "w.mha"], "w.mha.json exists"),
@@ -230,7 +230,7 @@ def test_files_of_others_are_replaced_by_force_only(tmp_path, lines, capsys):
     ):
         words[-1] = str(tmp_path / words[-1])
         assert main(words) == 2, words
-        assert said in capsys.readouterr().err
+        assert expected_text in capsys.readouterr().err
     assert _contents(tmp_path / "study") == before
     for name in ("patient.nii.gz", "w.mha", "x.nii"):
         command = ["reconstruct", scan, "--out", str(tmp_path / name)]
@@ -245,7 +245,7 @@ def test_a_result_that_cannot_be_written_is_found_before_it_is_computed(tmp_path
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "a").write_text("")
     one, two = str(lines / "one.h5"), str(lines / "two.h5")
-    for words, said in (
+    for words, expected_text in (
         ([one, "--out", "series"], "a DICOM CT series holds HU, this volume is in mm^-1"),
         ([two, "--out", "full"], "is not empty: series in one folder mix"),
         ([two, "--out", "slice.dcm"], "a DICOM series is a folder"),
@@ -255,7 +255,7 @@ def test_a_result_that_cannot_be_written_is_found_before_it_is_computed(tmp_path
         ([two, "--voxel", "0.01", "--extent", "3", "3", "--out", "a.h5"], "a.h5 needs 0.00 GiB, 0.00 GiB are free"),
     ):
         assert main(["reconstruct", *words[:-1], str(tmp_path / words[-1])]) == 2, words
-        assert said in capsys.readouterr().err
+        assert expected_text in capsys.readouterr().err
     assert [p.name for p in tmp_path.iterdir()] == ["full"]
 
 

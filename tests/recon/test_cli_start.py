@@ -24,24 +24,24 @@ def _commands():
 
 def test_without_a_command_it_says_where_to_begin(capsys):
     assert main([]) == 0
-    said = capsys.readouterr().out
-    assert len(said.splitlines()) <= 24
-    assert max(map(len, said.splitlines())) <= 120
-    examples = re.findall(r" {2}(torchpcct .*)", said)
+    output = capsys.readouterr().out
+    assert len(output.splitlines()) <= 24
+    assert max(map(len, output.splitlines())) <= 120
+    examples = re.findall(r" {2}(torchpcct .*)", output)
     assert len(examples) >= 6
     for line in examples:  # they are commands that the parser takes
         make_parser()[0].parse_args(shlex.split(line)[1:])
     for name in _commands():
-        assert re.search(rf"\b{name}\b", said)
+        assert re.search(rf"\b{name}\b", output)
 
 
 def test_every_command_stands_in_the_help_once_and_has_examples_that_it_takes(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "120")
     with pytest.raises(SystemExit):
         main(["--help"])
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     for name in _commands():
-        assert len(re.findall(rf"^  {name} ", said, re.MULTILINE)) == 1
+        assert len(re.findall(rf"^  {name} ", output, re.MULTILINE)) == 1
         with pytest.raises(SystemExit) as stop:
             main([name, "--help"])
         assert stop.value.code == 0
@@ -55,14 +55,14 @@ def test_every_command_stands_in_the_help_once_and_has_examples_that_it_takes(ca
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "expected_text"),
     [
         ("recontruct scan.h5", "unknown command 'recontruct' (did you mean 'reconstruct'?)"),
         ("reconstruct scan.h5 --kernal soft", "unrecognized arguments: --kernal soft (did you mean '--kernel'?)"),
         ("simulate --out a.h5 --device cdua", "(did you mean 'cuda'?)"),
         ("evaluate --task nodul --out {out}", "(did you mean 'nodule'?)"),
         ("evaluate --method pwsl --out {out}", "(did you mean 'pwls'?)"),
-        ("evaluate --method mbri:look=1 --out {out}", "(did you mean 'mbir'?)"),
+        ("evaluate --method mbri:fidelity=1 --out {out}", "(did you mean 'mbir'?)"),
         ("evaluate --method fbp:sotf --out {out}", "(did you mean 'soft'?)"),
         ("evaluate --exposure -1 --out {out}", "--exposure[0] must be greater than 0 s"),
         ("study nosie --out {out}", "(did you mean 'noise'?)"),
@@ -71,13 +71,13 @@ def test_every_command_stands_in_the_help_once_and_has_examples_that_it_takes(ca
         ("view a.h5 --html a.html --slice 3", "--slice and --plane belong to a picture"),
     ],
 )
-def test_a_slip_is_answered_with_what_was_meant(words, said, capsys, tmp_path):
+def test_a_slip_is_answered_with_what_was_meant(words, expected_text, capsys, tmp_path):
     try:
         status = main(shlex.split(words.format(out=tmp_path / "out")))
     except SystemExit as stop:
         status = stop.code
     assert status == 2
-    assert said in capsys.readouterr().err
+    assert expected_text in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("quick", [True, pytest.param(False, marks=pytest.mark.slow)])
@@ -107,9 +107,9 @@ def test_the_demo_does_what_its_lines_do(quick, tmp_path, capsys, monkeypatch):
 
 def test_doctor_names_what_is_broken_and_what_to_do(capsys, monkeypatch):
     assert main(["doctor"]) == 0
-    said = capsys.readouterr().out
-    assert len(re.findall("^ok ", said, re.MULTILINE)) == len(doctor._CHECKS)
-    assert re.search("weights +sha256 [0-9a-f]{64}, as their card says", said)
+    output = capsys.readouterr().out
+    assert len(re.findall("^ok ", output, re.MULTILINE)) == len(doctor._CHECKS)
+    assert re.search("weights +sha256 [0-9a-f]{64}, as their card says", output)
     monkeypatch.setattr("torchpcct.projector.Projector.T", lambda self, y: 1.001 * torch.ones(8, 20, 20))
     monkeypatch.setattr("recon.mbir.mbir.Mbir.weights_sha256", "0" * 64)
     monkeypatch.setattr("recon.api.reconstruct", lambda *_, **__: Volume(torch.full((40, 40), 9.0), _[1]))

@@ -43,14 +43,14 @@ def dense(gram, inside, contrast, sd):
 @pytest.mark.parametrize("sd", [50.0, 400.0])
 def test_against_a_dense_inverse(inset, fractions, sd):
     inside = known_inside(fractions)
-    found = contrast_limit(inset, inside, (1, 2), hu=HU, free_sd_hu=sd)
+    found = contrast_limit(inset, inside, (1, 2), mu_per_hu=HU, free_sd_hu=sd)
     assert found == pytest.approx(dense(inset, inside, (1, 2), sd), rel=2e-3)
 
 
 def test_less_knowledge_is_worse(inset, fractions):
-    sds = [contrast_limit(inset, known_inside(fractions, r), (0, 2), hu=HU) for r in (0, 1)]
+    sds = [contrast_limit(inset, known_inside(fractions, r), (0, 2), mu_per_hu=HU) for r in (0, 1)]
     assert sds[1] > 1.05 * sds[0]
-    halved = contrast_limit(inset.scaled(0.25), known_inside(fractions), (0, 2), hu=HU, free_sd_hu=400.0)
+    halved = contrast_limit(inset.scaled(0.25), known_inside(fractions), (0, 2), mu_per_hu=HU, free_sd_hu=400.0)
     assert halved == pytest.approx(2 * sds[0], rel=0.02)
 
 
@@ -96,7 +96,14 @@ def test_deformations_against_a_dense_inverse(inset, ball, displacement):
     t = np.array([1.0, -1.0])
     expected = math.sqrt(t @ np.linalg.inv(m.T @ marginal @ m) @ t)
     found = deformation_limit(
-        inset, fractions[1:], maps, (0, 1), hu=HU, voxel_mm=VOXEL, displacement_mm=displacement, correlation_mm=0.8
+        inset,
+        fractions[1:],
+        maps,
+        (0, 1),
+        mu_per_hu=HU,
+        voxel_mm=VOXEL,
+        displacement_mm=displacement,
+        correlation_mm=0.8,
     )
     # White noise beyond the grid's edge is cut off, so the field is a little smaller there.
     assert found == pytest.approx(expected, rel=0.06 if displacement else 2e-3)
@@ -106,7 +113,7 @@ def test_less_known_outlines_are_worse(inset, ball):
     labels, fractions = ball
     maps = outline_maps(labels, (0.0, 100.0, 40.0), FACTOR, VOXEL / FACTOR)
     sds = [
-        deformation_limit(inset, fractions[1:], maps, (0, 1), hu=HU, voxel_mm=VOXEL, displacement_mm=d)
+        deformation_limit(inset, fractions[1:], maps, (0, 1), mu_per_hu=HU, voxel_mm=VOXEL, displacement_mm=d)
         for d in (0.0, 0.1, 0.3)
     ]  # fmt: skip
     assert sds[0] < sds[1] < sds[2]
@@ -114,10 +121,10 @@ def test_less_known_outlines_are_worse(inset, ball):
 
 def test_refusals(inset, fractions):
     with pytest.raises(ValueError, match="no voxel"):
-        contrast_limit(inset, known_inside(fractions, 3), (1, 2), hu=HU)
+        contrast_limit(inset, known_inside(fractions, 3), (1, 2), mu_per_hu=HU)
     with pytest.raises(ValueError, match="rings"):
         known_inside(fractions, -1)
     with pytest.raises(ValueError, match="displacement_mm must be at least 0"):
-        deformation_limit(inset, fractions, fractions, (1, 2), hu=HU, voxel_mm=1.0, displacement_mm=-0.1)
+        deformation_limit(inset, fractions, fractions, (1, 2), mu_per_hu=HU, voxel_mm=1.0, displacement_mm=-0.1)
     with pytest.raises(ValueError, match="no multiple of factor"):
         outline_maps(np.zeros((4, 4, 5), int), (0.0,), 2, 0.1)

@@ -38,7 +38,7 @@ def test_fbp_names_metal_in_hu_and_knows_nothing_of_it_in_other_units():
         return 2 * np.sqrt(np.clip(radius**2 - columns**2, 0, None))
 
     grid = VolumeGrid((40, 40), 0.5)
-    for pin, unit, said in ((0.0, {"mu_water": 0.02}, False), (0.4, {"mu_water": 0.02}, True), (0.4, {}, False)):
+    for pin, unit, warned in ((0.0, {"mu_water": 0.02}, False), (0.4, {"mu_water": 0.02}, True), (0.4, {}, False)):
         lines = np.broadcast_to(0.02 * disc(12) + pin * disc(1.5), geometry.shape)
         volume = reconstruct(Scan.from_line_integrals(lines, geometry, photons=1e5, **unit), grid, "fbp")
-        assert any("metal" in text for text in volume.report["warnings"]) is said
+        assert any("metal" in text for text in volume.report["warnings"]) is warned

@@ -154,11 +154,11 @@ def test_a_dead_column_and_a_dead_view_are_mended_and_named(clean, method):
             broken[v, :, column - first] = 0
     broken[70] = 0
     good = reconstruct(scan, GRID, method)
-    mended = reconstruct(replace(scan, counts=broken), GRID, method)
-    assert "dead detector cells, 1 views without signal" in mended.report["warnings"][0]
+    repaired = reconstruct(replace(scan, counts=broken), GRID, method)
+    assert "dead detector cells, 1 views without signal" in repaired.report["warnings"][0]
     # The noise of a good scan at this dose is the measure.
     noise = float((good.data - reconstruct(clean, GRID, method).data).std())
-    assert float((mended.data - good.data).square().mean().sqrt()) < noise
+    assert float((repaired.data - good.data).square().mean().sqrt()) < noise
 
 
 BODIES = ((90.0, 60.0, 8.0, -5.0, 0.02), (12.0, 9.0, 50.0, 10.0, 0.03), (20.0, 15.0, -30.0, 8.0, -0.015))
@@ -183,7 +183,7 @@ def _said(readings, geometry, method):
 
 
 def test_wrong_descriptions_and_readings_are_named():
-    """Each was wrong without a word; a sound scan says nothing."""
+    """Each was wrong without a warning; a sound scan says nothing."""
     g, counts = _ellipse_scan(180, 200)
     words = {
         "steps between the views": (counts, replace(g, angles=0.98 * g.angles)),
@@ -217,7 +217,7 @@ def test_fbp_of_a_wrong_rotation_centre_is_named(clean):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "expected_text"),
     [
         (lambda n, air, gain: n * torch.exp(0.1 - 0.1 * n / air), "above those of the known surround"),
         (lambda n, air, gain: n + 0.001 * air, "above those of the known surround"),
@@ -227,7 +227,7 @@ def test_fbp_of_a_wrong_rotation_centre_is_named(clean):
     ],
     ids=["pile-up", "dark signal", "saturation", "gains", "sound"],
 )
-def test_a_window_that_does_not_read_its_surround_is_named(clean, change, said):
+def test_a_window_that_does_not_read_its_surround_is_named(clean, change, expected_text):
     """FBP of an inset took them for the inset's own, 30 to 120 HU off; PWLS and MBIR see them in their residual."""
     air = clean._at_window(clean.air)
     gain = clean.window.take(1 + 0.01 * torch.randn(clean.air.shape, generator=torch.Generator().manual_seed(0)))
@@ -236,8 +236,8 @@ def test_a_window_that_does_not_read_its_surround_is_named(clean, change, said):
         found = [
             t for t in consistency_warnings(changed.with_noise(4.0, seed), GRID) if "surround" in t or "gains" in t
         ]
-        assert len(found) == bool(said)
-        assert not said or said in found[0]
+        assert len(found) == bool(expected_text)
+        assert not expected_text or expected_text in found[0]
     # Noise of few counts, and readings that were lost, are no such thing.
     few = clean.with_noise(0.02, 0)
     lost = torch.rand(few.counts.shape, generator=torch.Generator().manual_seed(1)) < 0.1

@@ -8,7 +8,7 @@ import torch
 from scipy.ndimage import gaussian_filter1d
 
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, full_turn
-from torchpcct.defects import dead_readings, find_defects, mended
+from torchpcct.defects import dead_readings, find_defects, repair_defects
 from torchpcct.scanner.linearisation import WaterLinearisation
 
 VIEWS, ROWS, COLUMNS = 90, 6, 60
@@ -100,19 +100,19 @@ def test_a_scan_is_mended_and_says_so(counts):
     g = ConeBeam(full_turn(VIEWS), 626.0, 1098.0, COLUMNS, ROWS, 1.0)
     water = WaterLinearisation(np.ones((COLUMNS, 1)), np.ones(COLUMNS), 0.02)
     scan = Scan(counts, AIR, g, water, exposure_s=1.0, seed=0)
-    same, said = mended(scan)
+    same, texts = repair_defects(scan)
     assert same is scan
-    assert said == []
+    assert texts == []
     broken = counts.clone()
     broken[:, :, 33] = 0
-    fixed, said = mended(replace(scan, counts=broken))
-    assert "6 dead detector cells" in said[0]
+    fixed, texts = repair_defects(replace(scan, counts=broken))
+    assert "6 dead detector cells" in texts[0]
     truth = torch.from_numpy(np.log(4000 / expected()))
     error = (fixed.line_integrals() - truth)[:, :, 33]
     # Before: ln(4000 / ½) ≈ 9 for 2.4; now noise of two readings and the curvature between them.
     assert float(error.square().mean().sqrt()) < 0.12
     clean = replace(scan, counts=broken, exposure_s=None, seed=None)
-    assert mended(clean)[0] is clean
+    assert repair_defects(clean)[0] is clean
 
 
 def foreign(kind, slices):
@@ -134,17 +134,17 @@ def foreign(kind, slices):
 @pytest.mark.parametrize(("kind", "slices"), [("parallel", False), ("parallel", True), ("fan", False), ("cone", False)])
 def test_cells_that_are_dead_for_part_of_the_turn_are_bridged_and_weigh_nothing(kind, slices):
     (sound, broken), bad = foreign(kind, slices)
-    assert mended(sound)[0] is sound
-    fixed, said = mended(broken)
+    assert repair_defects(sound)[0] is sound
+    fixed, texts = repair_defects(broken)
     assert torch.equal(fixed.dead, bad)
-    assert "dead for part of the views" in said[0]
+    assert "dead for part of the views" in texts[0]
     assert dead_readings(fixed) == int(bad.sum())
     assert not fixed.weights()[bad].any()
     # The logarithm of 0 was 6 off.
     assert float((fixed.line_integrals() - sound.line_integrals())[bad].abs().max()) < 0.8
-    again, repeated = mended(fixed)
+    again, repeated = repair_defects(fixed)
     assert again is fixed
-    assert repeated == said
+    assert repeated == texts
 
 
 @pytest.mark.parametrize("blur", [0.3, 0.6])

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from recon.evaluate.store import Store
-from torchpcct.files import WriteError, clear_folder, require_folder, write_hdf5, written_whole
+from torchpcct.files import WriteError, atomic_write, clear_folder, require_folder, write_hdf5
 
 FULL = """
 import os, resource, sys
@@ -56,22 +56,22 @@ def test_what_cannot_be_written_is_an_error_in_one_sentence_and_leaves_nothing(t
         capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path}, check=False,
     )  # fmt: skip
     assert run.returncode == 0, run.stderr[-3000:]
-    said = run.stdout.splitlines()
-    assert len(said) == 3 * 10 - 3
-    assert [s for s in said if not (s.startswith("cannot write ") and s.endswith("File too large"))] == []
+    output = run.stdout.splitlines()
+    assert len(output) == 3 * 10 - 3
+    assert [s for s in output if not (s.startswith("cannot write ") and s.endswith("File too large"))] == []
     assert run.stderr == ""
     assert list(tmp_path.iterdir()) == []
 
 
 def test_two_writers_of_one_name_do_not_meet(tmp_path, monkeypatch):
     path = tmp_path / "f"
-    with written_whole(path) as one, written_whole(path) as other:
+    with atomic_write(path) as one, atomic_write(path) as other:
         one.write_text("one")
         other.write_text("other")
     assert path.read_text() == "one"  # who ends last
     gone = tmp_path / one.name  # seen, and renamed by its writer before it could be looked at
     monkeypatch.setattr(Path, "glob", lambda *_: [gone])
-    with written_whole(path) as part:
+    with atomic_write(path) as part:
         part.write_text("three")
     assert [p.name for p in tmp_path.iterdir()] == ["f"]
 
@@ -123,7 +123,7 @@ def test_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
     path = tmp_path / "f"
 
     def write(text):
-        with written_whole(path) as part:
+        with atomic_write(path) as part:
             part.write_text(text)
 
     def full(*_):

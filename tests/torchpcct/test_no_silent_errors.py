@@ -13,7 +13,7 @@ from small_scan import GRID, SCENE, scanner
 
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Projector, Scan, Volume, VolumeGrid, acquire, full_turn
 from torchpcct.acquisition.acquire import plan
-from torchpcct.detector_window import DetectorWindow, shadow
+from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import view_step
 from torchpcct.metrics import cnr_interval, mean_interval, sd_interval
 from torchpcct.scanner.linearisation import WaterLinearisation
@@ -155,7 +155,7 @@ def test_the_row_offset_moves_the_rows_up(detector):
     seen = y.sum(dim=(0, 2))
     assert seen.argmax() == 5
     assert float(seen[5] / seen.sum()) == pytest.approx(1.0)
-    window = shadow(g, grid)
+    window = footprint(g, grid)
     assert window.first_row <= 5 < window.first_row + window.rows
     assert window.rows <= 3
 
@@ -164,7 +164,7 @@ def test_the_row_offset_moves_the_rows_up(detector):
 def test_a_grid_that_no_row_sees_casts_no_shadow(z):
     g = ConeBeam(full_turn(8), 500.0, 1000.0, 64, 16, 1.0)
     with pytest.raises(ValueError, match="above or below all 16 rows"):
-        shadow(g, VolumeGrid((4, 4, 4), 0.5, (z, 0.0, 0.0)))
+        footprint(g, VolumeGrid((4, 4, 4), 0.5, (z, 0.0, 0.0)))
 
 
 @pytest.mark.parametrize("level", [2.0, 1.0, 0.0, -0.5, math.nan, 95])

@@ -11,7 +11,7 @@ from analytic import Ellipsoid, line_integrals
 
 from recon import reconstruct
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, VolumeGrid, full_turn
-from torchpcct.defects import mended
+from torchpcct.defects import repair_defects
 from torchpcct.reading_checks import reading_warnings
 from torchpcct.readings import log_bias, smoothed
 
@@ -38,8 +38,8 @@ def water(volume):
     return float(volume.data[torch.from_numpy(at)].mean())
 
 
-def said(readings, **description):
-    return reading_warnings(mended(Scan.from_counts(readings, FAN, mu_water=MU, **description))[0])
+def warnings_of(readings, **description):
+    return reading_warnings(repair_defects(Scan.from_counts(readings, FAN, mu_water=MU, **description))[0])
 
 
 def test_transmissions_are_no_counts():
@@ -85,7 +85,7 @@ WRONG = {
 @pytest.mark.parametrize("what", WRONG)
 def test_a_wrong_description_is_named(what):
     readings, description, expected = WRONG[what]
-    found = said(readings(), **description)
+    found = warnings_of(readings(), **description)
     assert len(found) == 1
     assert re.search(expected, found[0])
 
@@ -119,5 +119,5 @@ def test_sound_scans_are_not_accused(kind, air):
         scan = Scan.from_line_integrals(-np.log((n + 0.5) / air), g)
     else:
         scan = Scan.from_counts(n, g, air=np.broadcast_to(air * profile, g.shape[1:]))
-    fixed, found = mended(scan)
+    fixed, found = repair_defects(scan)
     assert (found, reading_warnings(fixed)) == ([], [])

@@ -141,7 +141,7 @@ def test_inset_from_the_window_equals_the_fbp_of_whole_rows(clean, whole):
 
 
 def test_noise_beyond_the_window_does_not_matter(clean, whole):
-    """Noise is drawn around the inset's shadow only: the inset's noise is the same to a few per mille."""
+    """Noise is drawn around the inset's footprint only: the inset's noise is the same to a few per mille."""
     noise_a = (
         InsetFbp(clean, [INSET], ["soft"])(clean.with_noise(2.0, 3))[0] - InsetFbp(clean, [INSET], ["soft"])(clean)[0]
     )

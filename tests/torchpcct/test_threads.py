@@ -1,4 +1,4 @@
-"""Sharing of kernels among threads: every index once, whoever calls and whatever goes wrong (forks: test_manners)."""
+"""Sharing of kernels among threads: every index once, whoever calls and whatever goes wrong (forks: test_base)."""
 
 import gc
 import subprocess

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchpcct.files import written_whole
+from torchpcct.files import atomic_write
 from torchpcct.geometry import VolumeGrid
 from torchpcct.volume import Volume
 
@@ -29,7 +29,7 @@ def test_files_round_trip(tmp_path):
 
 def test_no_half_written_file(tmp_path):
     def interrupted():
-        with written_whole(tmp_path / "v.h5") as part:
+        with atomic_write(tmp_path / "v.h5") as part:
             part.write_bytes(b"half")
             raise KeyboardInterrupt
 

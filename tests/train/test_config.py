@@ -40,7 +40,7 @@ def test_sections_from_plain_values():
         ("data: {situations: []}", "data: situations must name"),
         ("objective: {nonsense: 1}", r"unknown key 'objective\.nonsense'"),
         ("objective: {bias: [-1, 0]}", "objective: bias must be two weights of at least 0"),
-        ("objective: {looks: [0.5, 1.5]}", "objective: looks must be a range within"),
+        ("objective: {fidelities: [0.5, 1.5]}", "objective: fidelities must be a range within"),
         ("objective: {validation_draws: 1}", "objective: validation_draws must be at least 2"),
         ("network: {channels: [8, 8]}", "network: channels must name 3 levels"),
         ("steps: 3.5", "steps must be a whole number"),

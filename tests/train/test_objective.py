@@ -19,11 +19,11 @@ class Given(nn.Module):
 
     def __init__(self, volumes=None):
         super().__init__()
-        self.volumes, self.steps, self.looks = volumes, [], []
+        self.volumes, self.steps, self.fidelities = volumes, [], []
 
-    def forward(self, problem, look, steps=None):
+    def forward(self, problem, fidelity, steps=None):
         self.steps.append(steps)
-        self.looks.append(look)
+        self.fidelities.append(fidelity)
         return torch.zeros_like(problem.beta) if self.volumes is None else self.volumes
 
 
@@ -74,9 +74,9 @@ def test_steps_follow_the_training(data):
     for progress in (0.0, 0.49, 0.5, 1.0):
         objective(model, batch, progress)
     assert model.steps == [1, 1, None, None]
-    look = model.looks[0]
-    assert torch.equal(look[:2], look[2:])
-    assert 0 <= float(look.min()) <= float(look.max()) <= 1
+    fidelity = model.fidelities[0]
+    assert torch.equal(fidelity[:2], fidelity[2:])
+    assert 0 <= float(fidelity.min()) <= float(fidelity.max()) <= 1
 
 
 class Linear(nn.Module):
@@ -86,7 +86,7 @@ class Linear(nn.Module):
         super().__init__()
         self.gain = gain
 
-    def forward(self, problem, look):
+    def forward(self, problem, fidelity):
         return self.gain * start(problem, problem.spectrum())
 
 
@@ -117,9 +117,10 @@ def test_bias_weighs_more_where_one_measures(data):
     push = roi / roi.square().sum((1, 2, 3), keepdim=True).clamp_min(1e-6)
     given = Given(truth_of(batch) + 0.01 * torch.cat([push, push]))
     totals = [
-        float(Objective(ObjectiveConfig(bias=(0.0, 4.0), looks=(look, look)))(given, batch).total) for look in (0, 1)
+        float(Objective(ObjectiveConfig(bias=(0.0, 4.0), fidelities=(fidelity, fidelity)))(given, batch).total)
+        for fidelity in (0, 1)
     ]
-    even = float(Objective(ObjectiveConfig(bias=(0.0, 0.0), looks=(1, 1)))(given, batch).total)
+    even = float(Objective(ObjectiveConfig(bias=(0.0, 0.0), fidelities=(1, 1)))(given, batch).total)
     assert totals[0] == pytest.approx(even)
     assert totals[1] > totals[0]
 
@@ -132,7 +133,7 @@ def test_the_scene_without_noise_counts_with_its_weight(data):
             super().__init__()
             self.calls = []
 
-        def forward(self, problem, look, steps=None):
+        def forward(self, problem, fidelity, steps=None):
             self.calls.append(len(problem.beta))
             truth = batch.truth.repeat(len(problem.beta) // batch.size, 1, 1, 1)
             return truth / problem.scale_hu.reshape(-1, 1, 1, 1) + 0.3

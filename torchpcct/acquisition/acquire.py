@@ -72,7 +72,7 @@ def acquire(
         scanner: source, filters, bowtie, detector and geometry.
         exposure_s: duration of the (one-turn) scan in s at the source's current; None: expected readings.
         seed: realisation of the noise, ≥ 0. A reading's noise depends on the seed and its place alone.
-        region: keep only the readings around this grid's shadow (the rest of the detector then reads the
+        region: keep only the readings around this grid's footprint (the rest of the detector then reads the
             rotationally symmetric bodies, noise free). All other bodies must lie inside.
         rotation_s: time of one turn in s, for moving scenes; None: ``exposure_s``.
         duty: share of each view's time with the beam on: 1 continuous, → 0 pulsed (no blur by the gantry's turn).

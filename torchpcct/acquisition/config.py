@@ -221,12 +221,17 @@ def _voxels(given: dict[str, Any], folder: Path) -> tuple[VoxelScene, dict[str, 
     if volume.unit != "HU":
         raise ValueError(f"{given['file']} is in {volume.unit}: a scene is made of a volume in HU")
     dense: Any = given.get("dense", "bone")
-    said = {"kind": "volume", "file": str((folder / given["file"]).resolve()), "energy_kev": energy, "dense": dense}
+    description = {
+        "kind": "volume",
+        "file": str((folder / given["file"]).resolve()),
+        "energy_kev": energy,
+        "dense": dense,
+    }
     if dense not in DENSE:
         if not isinstance(dense, str) or not (folder / dense).exists():
             raise ValueError(f"scene.dense must be {', '.join(DENSE)}, or a volume file of labels, got {dense!r}")
         labels = Volume.load(folder / dense)
         if labels.grid != volume.grid:
             raise ValueError(f"scene.dense: the voxels of {dense} are not those of {given['file']}")
-        said["dense"], dense = str((folder / dense).resolve()), np.asarray(labels.data)
-    return VoxelScene(np.asarray(volume.data), volume.grid, energies_kev=energy, dense=dense), said
+        description["dense"], dense = str((folder / dense).resolve()), np.asarray(labels.data)
+    return VoxelScene(np.asarray(volume.data), volume.grid, energies_kev=energy, dense=dense), description

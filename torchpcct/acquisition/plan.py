@@ -19,7 +19,7 @@ import numpy as np
 
 from torchpcct.acquisition.bodies import Bodies
 from torchpcct.acquisition.transmission import SUB_RAY_COUNTS, Beam, expected_readings, sub_rays
-from torchpcct.detector_window import DetectorWindow, shadow
+from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import ConeBeam, VolumeGrid
 from torchpcct.scanner.pileup import PileUpMap
 from torchpcct.scanner.scanner import Scanner
@@ -28,7 +28,7 @@ from torchpcct.validate import number
 __all__ = ["NOISE_MARGIN_COLUMNS", "Effect", "Plan", "make_plan"]
 
 NOISE_MARGIN_COLUMNS = 128
-"""Columns kept on either side of a region's shadow. The ramp filter reaches further, but its tail falls as 1 / n²:
+"""Columns kept on either side of a region's footprint. The ramp filter reaches further, but its tail falls as 1 / n²:
 noise beyond 128 columns adds less than 1 % to the spectrum of the filtered noise at the lowest frequency that a
 1 mm ROI can tell from zero."""
 
@@ -63,7 +63,7 @@ class Plan:
     """What :func:`torchpcct.acquire` will compute.
 
     Attributes:
-        effects: every effect with its cost in HU (rms over the shadow of the inset, per its mean chord).
+        effects: every effect with its cost in HU (rms over the footprint of the inset, per its mean chord).
         points: ``(sub-rays, 5)`` beam samples of :func:`torchpcct.acquisition.transmission.sub_rays`.
         active: the readings that see the varying bodies; None: no view differs from another.
         kept: the readings that the scan will hold; None: the whole detector.
@@ -115,14 +115,14 @@ def active_window(geometry: ConeBeam, bodies: Bodies) -> DetectorWindow:
     box = VolumeGrid((1, 1, 1), tuple(extent), tuple(((bodies.low + bodies.high) / 2)[::-1]))
     try:
         # Four columns more for the beam's width: a focal spot and a cell are wider than a ray.
-        return shadow(geometry, box, margin=4)
+        return footprint(geometry, box, margin=4)
     except ValueError:
         return DetectorWindow.full(geometry)
 
 
 def _kept_window(geometry: ConeBeam, region: VolumeGrid, bodies: Bodies) -> DetectorWindow:
-    """The readings around the shadow of ``region``, every row; it must hold all bodies that vary."""
-    kept = shadow(geometry, region, margin=NOISE_MARGIN_COLUMNS).with_rows(0, geometry.rows)
+    """The readings around the footprint of ``region``, every row; it must hold all bodies that vary."""
+    kept = footprint(geometry, region, margin=NOISE_MARGIN_COLUMNS).with_rows(0, geometry.rows)
     if bodies.varying:
         # Without the four columns for the beam's width.
         seen = active_window(geometry, bodies)
@@ -200,7 +200,7 @@ def make_plan(
     Args:
         bodies: the scene, prepared for the scanner's geometry.
         scanner: what scans it.
-        region: grid around whose shadow readings are kept; None: the whole detector.
+        region: grid around whose footprint readings are kept; None: the whole detector.
         tolerance_hu: effects of the beam that would change less are left out.
         sub_ray_count: force a number of sub-rays instead of choosing it.
 
@@ -224,7 +224,7 @@ def make_plan(
     chord = max(float(np.linalg.norm((bodies.high - bodies.low)[:2])) / 2, 1.0)
 
     def cost(difference: Any) -> float:
-        """Error of the line integrals as a CT number: rms over the shadow, spread over the bodies' chord."""
+        """Error of the line integrals as a CT number: rms over the footprint, spread over the bodies' chord."""
         if not mask.any():
             return 0.0
         rms = math.sqrt(float(np.mean(difference[mask] ** 2)))

@@ -107,9 +107,9 @@ def _pixel_size(file: Any) -> tuple[float | None, str]:
         if name in file:
             unit = _text(file[name].attrs.get("units", "m")).lower()
             value = float(np.ravel(file[name][()])[0])
-            said = f"the file's pixel size is {value:g} {unit}"
+            known_size = f"the file's pixel size is {value:g} {unit}"
             known = unit in _MM and math.isfinite(value) and value > 0
-            return value * _MM[unit] if known else None, said
+            return value * _MM[unit] if known else None, known_size
     return None, "the file does not know its pixel size"
 
 

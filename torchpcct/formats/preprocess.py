@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchpcct.dead_cells import bridge
-from torchpcct.defects import mended
+from torchpcct.defects import repair_defects
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam
 from torchpcct.metrics.rotation_axis import RotationAxis, at_axis, rotation_axis
 from torchpcct.robust import MEDIAN_TO_SD
@@ -44,8 +44,8 @@ def centred(scan: Scan, axis: float | RotationAxis | None = None) -> Scan:
     found = find_axis(scan) if axis is None else axis
     if not isinstance(found, RotationAxis):
         return replace(scan, geometry=at_axis(scan.geometry, found))
-    said = {"column": found.column, "error": found.error, "found_from": found.how}
-    return replace(scan, geometry=at_axis(scan.geometry, found.column), info={**scan.info, "axis": said})
+    found_axis = {"column": found.column, "error": found.error, "found_from": found.how}
+    return replace(scan, geometry=at_axis(scan.geometry, found.column), info={**scan.info, "axis": found_axis})
 
 
 @checked
@@ -53,15 +53,15 @@ def cleaned(scan: Scan, *, snr: float = 3.0, threshold: float = 0.08) -> Scan:
     """The same parallel or fan-beam scan without outliers and stripes (:func:`without_outliers`,
     :func:`without_stripes`).
 
-    Readings that no object can cause (:func:`torchpcct.defects.mended`) are bridged before. The others are changed by
-    the factor that their logarithms ask for, so that the scan keeps its weights.
+    Readings that no object can cause (:func:`torchpcct.defects.repair_defects`) are bridged before. The others are
+    changed by the factor that their logarithms ask for, so that the scan keeps its weights.
 
     Raises:
         ValueError: a cone beam, or a scan of a part of the detector.
     """
     if scan.geometry.has_rows:
         raise ValueError("stripes are taken from sinograms (views, columns): of a parallel or fan beam, without window")
-    scan = mended(scan)[0]  # cells without signal for part of the turn are no stripes: nothing is left of them
+    scan = repair_defects(scan)[0]  # cells without signal for part of the turn are no stripes: nothing is left of them
     lines = scan._logarithm()  # before the water correction, which belongs to the true readings
     if scan.dead is not None:
         lines = bridge(lines, scan.dead, rows=False)

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from torchpcct.files import is_own_hdf5, require_folder, require_writable, written_whole
+from torchpcct.files import atomic_write, is_own_hdf5, require_folder, require_writable
 from torchpcct.formats.damage import check_size, needed, reading
 from torchpcct.geometry import VolumeGrid
 from torchpcct.validate import UNITS
@@ -152,7 +152,7 @@ def write_nifti(path: str | os.PathLike[str], data: Any, grid: VolumeGrid, unit:
 
     # NIfTI stores (x, y, z).
     image = nibabel.Nifti1Image(np.asarray(data, dtype=np.float32).transpose(2, 1, 0), None, nifti_header(grid, unit))
-    with written_whole(path) as part, part.open("wb") as raw:
+    with atomic_write(path) as part, part.open("wb") as raw:
         if not str(path).endswith(".gz"):
             image.to_stream(raw)
         else:
@@ -228,7 +228,7 @@ def write_meta_image(path: str | os.PathLike[str], data: Any, grid: VolumeGrid, 
         "DimSize": " ".join(map(str, reversed(grid.shape))), "Unit": unit, "ElementType": "MET_FLOAT",
         "ElementDataFile": "LOCAL",
     }  # fmt: skip
-    with written_whole(path) as part, part.open("wb") as file:
+    with atomic_write(path) as part, part.open("wb") as file:
         file.write("".join(f"{name} = {value}\n" for name, value in fields.items()).encode())
         file.write(packed)
 
@@ -316,7 +316,7 @@ def write_dicom(folder: str | os.PathLike[str], data: Any, grid: VolumeGrid, uni
         d.WindowCenter, d.WindowWidth, d.KVP, d.AcquisitionNumber = "40", "400", "", ""
         d.PixelData = image.tobytes()
         images.append(d)
-    with written_whole(os.path.realpath(folder)) as part:
+    with atomic_write(os.path.realpath(folder)) as part:
         part.mkdir()
         for k, d in enumerate(images):
             d.save_as(part / f"{k + 1:04d}.dcm", enforce_file_format=True)

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from torchpcct.files import WriteError, require_folder, written_whole
+from torchpcct.files import WriteError, atomic_write, require_folder
 from torchpcct.formats.damage import check_size, needed, reading
 from torchpcct.formats.volume_files import nifti_header
 from torchpcct.geometry import VolumeGrid
@@ -114,7 +114,7 @@ class SlabFile:
             self.journal.unlink(missing_ok=True)
 
     def _note(self) -> None:
-        with written_whole(self.journal) as part:
+        with atomic_write(self.journal) as part:
             part.write_text(json.dumps({"key": self.key, "done": self.done, "notes": self.notes}))
 
     def discard(self) -> None:
@@ -166,7 +166,7 @@ def _create(path: Path, grid: VolumeGrid, unit: str, chunk: int) -> Any:
 
 def write_ome_zarr(path: str | os.PathLike[str], data: Any, grid: VolumeGrid, unit: str) -> None:
     """Write a whole volume ``(z, y, x)`` as OME-Zarr 0.5: a folder, float32, mm."""
-    with written_whole(path) as part:
+    with atomic_write(path) as part:
         _create(part, grid, unit, CHUNK)["0"][...] = np.asarray(data, dtype=np.float32)
         if Path(path).is_dir():
             shutil.rmtree(path)

@@ -19,12 +19,12 @@ def announce_compilation() -> None:
     from numba.core import event
 
     class Announce(event.Listener):
-        said = False
+        announced = False
 
         def on_start(self, event: Any) -> None:
             function = getattr(event.data.get("dispatcher"), "py_func", None)
-            if not self.said and getattr(function, "__module__", "").startswith(OURS):
-                Announce.said = True
+            if not self.announced and getattr(function, "__module__", "").startswith(OURS):
+                Announce.announced = True
                 _LOG.warning(
                     "compiling kernels for this processor: this call takes up to a minute longer, later ones read them "
                     "from numba's cache"

@@ -1,4 +1,4 @@
-"""Which passes a tensor takes: the CPU's, or on CUDA the Triton twins, once they have reproduced the CPU's."""
+"""Which passes a tensor takes: the CPU's, or on CUDA the Triton counterparts, once they have reproduced the CPU's."""
 
 from __future__ import annotations
 

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import Geometry, VolumeGrid
+from torchpcct.projector.base import Operator
 from torchpcct.projector.engine import ENGINES, Engine
-from torchpcct.projector.manners import Operator
 from torchpcct.projector.tables import Tables, VectorTables
 from torchpcct.projector.vectors import as_circular
 from torchpcct.vector_geometry import VectorGeometry
@@ -96,7 +96,7 @@ class Projector(Operator):
 
     In and out have one dtype (float32 or float64) and one device; float16 and bfloat16, as autocast leaves them, are
     computed and returned in float32. ``A @ x``, ``A.H``, ``A.norm()`` and the operator in the form of other libraries
-    (``as_scipy``, ``as_pylops``, ``as_deepinv``) come from :class:`torchpcct.projector.manners.Operator`. Units: ``x``
+    (``as_scipy``, ``as_pylops``, ``as_deepinv``) come from :class:`torchpcct.projector.base.Operator`. Units: ``x``
     in mm⁻¹ gives line integrals without unit. Both directions are differentiable any number of times and work under
     ``torch.func``. NaN and Inf in the input reach the output (a NaN may also reach readings that share a grid line with
     it). ``torch.compile`` and, within the process, ``torch.export`` take a pass as one operation. The module has no
@@ -108,7 +108,7 @@ class Projector(Operator):
             :class:`~torchpcct.vector_geometry.VectorGeometry`: what is a circular scan, at rest or moving (a helix),
             takes the passes of one, anything else general ones on the CPU, several times slower.
         grid: the voxel grid.
-        window: the part of the detector to compute (``torchpcct.detector_window.shadow``), or None for all of it.
+        window: the part of the detector to compute (``torchpcct.detector_window.footprint``), or None for all of it.
         motion: displacement of the grid in every view, ``(views, 2)`` (y, x) or ``(views, 3)`` (z, y, x) mm, or None:
             a volume that moves rigidly with its object is projected and reconstructed at rest.
         memory: bytes of working memory that a pass may hold besides its input and output (see

@@ -77,8 +77,8 @@ def answer(data: dict[str, Any]) -> str:
             ("noise", "patient", "for the noise of a voxel in fat"),
         )
     ]  # fmt: skip
-    said = ", ".join(f"{interval(r)} {what}" for r, what in parts if r is not None)
-    text += f"{'; at' if text else 'At'} {best:.2f} s FBP needs, in doses of MBIR, {said}"
+    summary = ", ".join(f"{interval(r)} {what}" for r, what in parts if r is not None)
+    text += f"{'; at' if text else 'At'} {best:.2f} s FBP needs, in doses of MBIR, {summary}"
     s = data["settings"]
     if s["views"] < FULL_VIEWS or s["n"] < FEW_DRAWS:
         text += (f" (WARNING: {s['views']} views, {s['n']} realisations: a test of the program, which says "

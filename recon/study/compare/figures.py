@@ -17,7 +17,7 @@ __all__ = ["sections_figure"]
 
 def sections_figure(m: Measured) -> Any:
     """Axial and sagittal sections of one realisation at the largest exposure, the truth first, and without noise."""
-    seen = m.evaluation.seen[0]
+    seen = m.evaluation.results[0]
     grid, dose = seen.task.grid, max(m.settings.exposures_s)
     image = axial_grid(grid.center)
     section = VolumeGrid((int(8.75 / image.spacing[1]), 1, image.shape[2]), image.spacing[1], image.center)

@@ -62,7 +62,7 @@ def _screen(m: Measured, sentence: str) -> str:
         for exposure in m.settings.exposures_s for method in m.settings.methods
     ]  # fmt: skip
     table = markdown_table(["dose factor", *(label for label, _, _ in columns)], rows)
-    reference = m.evaluation.seen[0].task.reference
+    reference = m.evaluation.results[0].task.reference
     meaning = (
         f"Dose factor: how many times the dose {reference} needs for the same figure, and its 95 % interval from "
         f"{m.settings.n} noise realisations. Contrasts, errors, resolution, pictures: report.html."

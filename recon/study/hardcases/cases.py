@@ -35,7 +35,7 @@ def _lost(share: float) -> Case:
 
 
 def _cells(title: str, rows: slice, columns: int, factor: float) -> Case:
-    """Detector cells near the centre of the first view's shadow, multiplied by ``factor`` in every view."""
+    """Detector cells near the centre of the first view's footprint, multiplied by ``factor`` in every view."""
 
     def apply(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
         assert scan.window is not None
@@ -229,7 +229,7 @@ _PLAQUE: dict[str, Case] = {
     "motion": Case("strong motion", _moving, tissues=True),
     "spectrum": Case("spectrum off by 2 keV", _harder),
     "bowtie": Case("bowtie 1 mm beside its calibration", _bowtie),
-    "truncated": Case("columns cut off inside of the inset's shadow", _narrow),
+    "truncated": Case("columns cut off inside of the inset's footprint", _narrow),
     "gain-drift": Case("gain drifts by 1 %", _per_view(0.01, drift=True)),
     "calcification": _scanned("a calcification of 1500 HU beside the lumen", _calcified),
     "stent": _scanned("a stent in the lumen", _stented),

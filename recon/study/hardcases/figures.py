@@ -8,7 +8,7 @@ from recon.study.hardcases.measure import RIGHT_NOISES, Measured
 
 __all__ = ["draw"]
 
-_COLOURS = {"right": "tab:green", "said": "tab:orange", "unseen": "tab:grey", "SILENT": "tab:red"}
+_COLOURS = {"right": "tab:green", "warned": "tab:orange", "unseen": "tab:grey", "SILENT": "tab:red"}
 
 
 def draw(measured: Measured) -> Any:

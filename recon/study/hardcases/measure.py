@@ -1,4 +1,4 @@
-"""Every case by every method: the error against the sound scan of the same noise, what was said, the verdict.
+"""Every case by every method: the error against the sound scan of the same noise, its warnings, the verdict.
 
 The error against the truth, beside that of soft FBP from the same scan, says whether a method makes a case worse than
 need be: a prior or weights that the case fools.
@@ -53,7 +53,7 @@ class Measured:
     Attributes:
         rows: one for each case and method: ``case``, ``base``, ``title``, ``method``, ``error_hu`` (rms of the
             difference to the sound scan's volume, of another scene what it adds to the error against the truth; None if
-            refused), ``noise_hu`` (rms of the sound scan's noise), ``finite``, ``said`` (warnings, or the refusal),
+            refused), ``noise_hu`` (rms of the sound scan's noise), ``finite``, ``messages`` (warnings, or the refusal),
             ``refused``, ``seconds``, ``verdict``, ``truth_hu`` (rms of the difference to the truth), ``soft_hu`` (that
             of soft FBP from the same scan; either is None if refused).
         seconds: per step.
@@ -68,19 +68,19 @@ def verdict(
     error_hu: float | None,
     noise_hu: float,
     finite: bool,
-    said: list[str],
+    messages: list[str],
     noise: float = 1.0,
     worse: float = 1.0,
     unseen: str = "",
 ) -> str:
-    """``right``, ``said`` (wrong or refused, in words), ``unseen`` (no data can show it) or ``SILENT`` (wrong without a
-    word).
+    """``right``, ``warned`` (wrong or refused, with a message), ``unseen`` (no data can show it) or ``SILENT`` (wrong
+    without a word).
 
     Args:
         error_hu: rms error in HU; None: refused.
         noise_hu: rms noise of the sound result.
         finite: whether all values are.
-        said: warnings and refusals beside those of the sound scan.
+        messages: warnings and refusals beside those of the sound scan.
         noise: of :class:`recon.study.hardcases.cases.Case`: what it adds is no error.
         worse: error against the truth over that of soft FBP; more than :data:`WORSE` is not right.
         unseen: why no data can show it, or empty.
@@ -88,7 +88,7 @@ def verdict(
     allowed = (RIGHT_NOISES + 1.3 * max(noise**2 - 1.0, 0.0) ** 0.5) * noise_hu
     if error_hu is not None and finite and error_hu <= allowed and worse <= WORSE:
         return "right"
-    return "said" if said else "unseen" if unseen else "SILENT"
+    return "warned" if messages else "unseen" if unseen else "SILENT"
 
 
 def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
@@ -189,10 +189,10 @@ def _reconstruct(scan: Scan, grid: VolumeGrid, method: str) -> Volume:
 
 
 def _sound(base: _Base, method: str) -> tuple[torch.Tensor, list[str], float, float]:
-    with _heard() as said:
+    with _heard() as messages:
         volume = _reconstruct(base.noisy, base.grid, method)
         noise = _rms(volume.data - _reconstruct(base.clean, base.grid, method).data)
-    texts = [*volume.report.get("warnings", ()), *said]
+    texts = [*volume.report.get("warnings", ()), *messages]
     return volume.data, texts, noise, _rms(volume.data - base.truth)
 
 
@@ -274,14 +274,14 @@ def _from_truth(scan: Scan | Exception, grid: VolumeGrid, truth: torch.Tensor, s
 
 def _row(scan: Scan | Exception, grid: VolumeGrid, method: str, by: _Against) -> dict[str, Any]:
     start = time.perf_counter()
-    with _heard() as said:
+    with _heard() as messages:
         try:
             if isinstance(scan, Exception):
                 raise scan
             volume = _reconstruct(scan, grid, method)
         except (ValueError, TypeError) as error:
             return {
-                "error_hu": None, "noise_hu": by.noise, "finite": True, "said": [str(error)], "refused": True,
+                "error_hu": None, "noise_hu": by.noise, "finite": True, "messages": [str(error)], "refused": True,
                 "seconds": time.perf_counter() - start, "verdict": verdict(None, by.noise, True, [str(error)]),
                 "truth_hu": None, "soft_hu": by.soft,
             }  # fmt: skip
@@ -290,12 +290,12 @@ def _row(scan: Scan | Exception, grid: VolumeGrid, method: str, by: _Against) ->
     error_hu, truth_hu = (_rms((volume.data - other)[by.seen]) for other in (by.sound, by.truth))
     if by.usual_truth is not None:
         error_hu = max(truth_hu**2 - _rms((by.sound - by.usual_truth)[by.seen]) ** 2, 0.0) ** 0.5
-    texts = list(dict.fromkeys([*volume.report.get("warnings", []), *said]))
+    texts = list(dict.fromkeys([*volume.report.get("warnings", []), *messages]))
     more = [t for t in texts if _kind(t) not in by.usual]
     # The standard kernel is sharper and noisier than the soft one by intent.
     worse = 1.0 if by.soft is None or method == "fbp" else truth_hu / by.soft
     return {
-        "error_hu": error_hu, "noise_hu": by.noise, "finite": finite, "said": texts, "refused": False,
+        "error_hu": error_hu, "noise_hu": by.noise, "finite": finite, "messages": texts, "refused": False,
         "seconds": seconds, "verdict": verdict(error_hu, by.noise, finite, more, by.lost, worse, by.unseen),
         "truth_hu": truth_hu, "soft_hu": by.soft,
     }  # fmt: skip
@@ -313,11 +313,11 @@ def _rms(difference: torch.Tensor) -> float:
 @contextmanager
 def _heard() -> Iterator[list[str]]:
     """The warnings that are logged meanwhile; they do not reach the terminal."""
-    said: list[str] = []
+    messages: list[str] = []
 
     class Listener(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:
-            said.append(record.getMessage())
+            messages.append(record.getMessage())
 
     listener = Listener(logging.WARNING)
     loggers = [logging.getLogger("recon"), logging.getLogger("torchpcct")]
@@ -326,7 +326,7 @@ def _heard() -> Iterator[list[str]]:
         log.addHandler(listener)
         log.propagate = False
     try:
-        yield said
+        yield messages
     finally:
         for log, propagate in zip(loggers, before, strict=True):
             log.removeHandler(listener)

@@ -53,10 +53,10 @@ def build_report(measured: Measured) -> Report:
         "difference to the volume of the sound scan with the same noise, without what a case adds to the scene and the "
         f"voxels beside it. A result is *right* if that is at most {RIGHT_NOISES:g} of the noise (more where quanta "
         f"are lost) and PWLS and MBIR are no further from the truth than soft FBP of the same scan ({WORSE:g} times), "
-        "*said* if it is wrong but a warning says so, *refused* if there is none, *unseen* if no data can show it "
-        "(below), and SILENT if it is wrong without a word.\n\n"
-        f"**Silent errors: {counts['SILENT']}** of {len(measured.rows)}; right {counts['right']}, said or refused "
-        f"{counts['said']}, unseen {counts['unseen']}."
+        "*warned* if it is wrong but a warning says so, *refused* if there is none, *unseen* if no data can show it "
+        "(below), and SILENT if it is wrong without a warning.\n\n"
+        f"**Silent errors: {counts['SILENT']}** of {len(measured.rows)}; right {counts['right']}, warned or refused "
+        f"{counts['warned']}, unseen {counts['unseen']}."
     )
     sections = [text, *tables, _UNSEEN, time_line(measured.seconds, f"seed {s.seed}")]
     return Report("hardcases", data, "\n\n".join(sections), {"hardcases.png": draw(measured)})
@@ -67,7 +67,7 @@ def _table(measured: Measured, base: str) -> str:
     rows = [r for r in measured.rows if r["base"] == base]
     if not rows:
         return ""
-    usual = {r["method"]: set(r["said"]) for r in rows if r["case"] in ("sound", "body-sound")}
+    usual = {r["method"]: set(r["messages"]) for r in rows if r["case"] in ("sound", "body-sound")}
     table = markdown_table(
         [
             "case",
@@ -78,7 +78,7 @@ def _table(measured: Measured, base: str) -> str:
             "soft FBP",
             "finite",
             "verdict",
-            "what was said",
+            "warning or refusal",
         ],
         [
             [
@@ -89,7 +89,7 @@ def _table(measured: Measured, base: str) -> str:
                 *("–" if r[key] is None else f"{r[key]:.1f}" for key in ("truth_hu", "soft_hu")),
                 "yes" if r["finite"] else "NO",
                 ("refused" if r["refused"] else r["verdict"]),
-                "; ".join(t for t in r["said"] if t not in usual.get(r["method"], ()))[:160].replace("|", "/"),
+                "; ".join(t for t in r["messages"] if t not in usual.get(r["method"], ()))[:160].replace("|", "/"),
             ]
             for r in rows
         ],

@@ -18,7 +18,7 @@ from recon.fbp.inset import InsetFbp, static_fbp
 from recon.study.paper.plaque_scan import duty, inset_grid
 from recon.study.spectral.settings import Settings
 from torchpcct.acquisition.acquire import acquire
-from torchpcct.detector_window import DetectorWindow, shadow
+from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.placement import place_rois
 from torchpcct.metrics.roi import axial_grid
@@ -41,8 +41,8 @@ from torchpcct.threads import get_num_threads
 __all__ = ["SpectralScan", "second_order_bound", "starved_rays", "water_hu"]
 
 NOISE_COLUMNS = 32
-"""Columns kept on either side of the inset's shadow: the ramp filter's tail falls as 1 / n², its square as 1 / n⁴, so
-the noise beyond adds less than 1e-4 to the variance of an ROI mean."""
+"""Columns kept on either side of the inset's footprint: the ramp filter's tail falls as 1 / n², its square as 1 / n⁴,
+so the noise beyond adds less than 1e-4 to the variance of an ROI mean."""
 
 _ROD_MM = 8.0
 """Radius of the water rod at the plaque's place."""
@@ -58,7 +58,7 @@ def _acquired(
     """The noise-free readings that the FBP of ``grid`` needs, and their window."""
     scan = acquire(scene, scanner, region=grid, duty=on, progress=progress)
     assert scan.window is not None
-    window = shadow(scan.geometry, grid).widened(NOISE_COLUMNS, scan.window)
+    window = footprint(scan.geometry, grid).widened(NOISE_COLUMNS, scan.window)
     return scan.crop(window), window
 
 

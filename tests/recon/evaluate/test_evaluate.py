@@ -77,7 +77,7 @@ def test_ready_tasks_have_regions(name):
 
 
 def test_what_a_task_knows(task, found):
-    (seen,) = found.seen
+    (seen,) = found.results
     values = dict(zip(seen.facts.tissues, seen.facts.values_hu, strict=True))
     assert values["patient"] == pytest.approx(0.0, abs=1.0)
     assert 30.0 < values["signal"] < 70.0
@@ -134,7 +134,7 @@ def test_a_changed_task_takes_no_old_results(tmp_path):
     for text in texts:
         (tmp_path / "insert.yaml").write_text(text, encoding="utf-8")
         again = read_task(tmp_path / "insert.yaml")
-        (seen,) = evaluate(again, "fbp:soft", n=8, folder=tmp_path / "pieces").seen
+        (seen,) = evaluate(again, "fbp:soft", n=8, folder=tmp_path / "pieces").results
         slopes.append(seen.true_hu["lesion"])
     assert slopes[0] < -20.0
     assert slopes[1] > 50.0
@@ -160,7 +160,7 @@ def test_report_and_tidy_table(found, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("run", "said"),
+    ("run", "expected_text"),
     [
         (lambda d: d.fbp("soft")[1:], "shape"),
         (lambda d: d.fbp("soft") * math.nan, "NaN"),
@@ -170,13 +170,13 @@ def test_report_and_tidy_table(found, tmp_path):
         (lambda d: Volume(d.fbp("soft"), VolumeGrid(d.grid.shape, 0.4)), "asked was"),
     ],
 )  # fmt: skip
-def test_what_a_method_gives_is_checked(task, folder, run, said):
-    with pytest.raises((ValueError, TypeError), match=said):
-        evaluate(task, Method(said, run, kernels=("soft",)), n=8, folder=folder)
+def test_what_a_method_gives_is_checked(task, folder, run, expected_text):
+    with pytest.raises((ValueError, TypeError), match=expected_text):
+        evaluate(task, Method(expected_text, run, kernels=("soft",)), n=8, folder=folder)
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "expected_text"),
     [
         ({"signal": "core"}, "no body 'core'"),
         ({"signal": []}, "names no body"),
@@ -188,15 +188,15 @@ def test_what_a_method_gives_is_checked(task, folder, run, said):
         ({"scene": {"kind": "volume", "file": "a.nii"}}, "a.nii"),
     ],
 )
-def test_bad_tasks_are_named(tmp_path, folder, changes, said):
+def test_bad_tasks_are_named(tmp_path, folder, changes, expected_text):
     path = tmp_path / "bad.yaml"
     path.write_text(yaml.safe_dump({**yaml.safe_load(INSERT), **changes}), encoding="utf-8")
-    with pytest.raises((ValueError, TypeError, OSError), match=said):
+    with pytest.raises((ValueError, TypeError, OSError), match=expected_text):
         assert read_task(path).regions
 
 
 @pytest.mark.parametrize(
-    ("spec", "said"),
+    ("spec", "expected_text"),
     [
         ("fbp:hard", "kernel"), ("mbir:sharp=1", "option of mbir"), ("mbir:prior=tv", "prior of mbir"),
         ("nothing", "unknown method"),
@@ -204,8 +204,8 @@ def test_bad_tasks_are_named(tmp_path, folder, changes, said):
         ("json:loads@nowhere", "unknown method"), (3, "must be a name"),
     ],
 )  # fmt: skip
-def test_bad_methods_are_named(spec, said):
-    with pytest.raises((ValueError, TypeError, FileNotFoundError), match=said):
+def test_bad_methods_are_named(spec, expected_text):
+    with pytest.raises((ValueError, TypeError, FileNotFoundError), match=expected_text):
         method_of(spec)
 
 

@@ -202,8 +202,8 @@ def test_an_unreachable_scheduler_is_told_in_one_sentence(tmp_path, capsys):
     command = ["evaluate", "--out", str(tmp_path), "--scheduler"]
     assert main([*command, "tcp://127.0.0.1:9"]) == 2
     assert time.monotonic() - start < 10.0
-    (said,) = [line for line in capsys.readouterr().err.splitlines() if line]
-    assert "no Dask scheduler answers at tcp://127.0.0.1:9" in said
+    (output,) = [line for line in capsys.readouterr().err.splitlines() if line]
+    assert "no Dask scheduler answers at tcp://127.0.0.1:9" in output
     assert main([*command, str(tmp_path / "none.json")]) == 2
     assert "dask scheduler --scheduler-file writes it" in capsys.readouterr().err
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 from analytic import Ellipsoid, Gaussian
 
-from recon.fbp.any_orbit import straighten
+from recon.fbp.any_orbit import rebin_to_circle
 from recon.fbp.fbp import fbp
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
@@ -82,7 +82,7 @@ def test_wobbling_cone_beam():
 def test_an_ideal_circle_stays_itself():
     for geometry, rows in ((CONE, CONE.rows), (FAN, None)):
         data = lines(to_vectors(geometry), geometry.columns, rows)
-        s = straighten(data, VectorGeometry.of(geometry))
+        s = rebin_to_circle(data, VectorGeometry.of(geometry))
         assert s.motion is None
         assert s.geometry.shape == geometry.shape
         torch.testing.assert_close(s.sinogram, data, atol=1e-9, rtol=0)
@@ -117,16 +117,16 @@ def test_what_fbp_cannot_do_is_refused():
     helix = v.copy()
     helix[:, [2, 5]] += np.linspace(-10, 10, len(v))[:, None]
     with pytest.raises(ValueError, match=r"climbs by 20\.00 mm.*of a helix is not provided.*recon\.pwls"):
-        straighten(data, VectorGeometry(helix, CONE.columns, CONE.rows))
+        rebin_to_circle(data, VectorGeometry(helix, CONE.columns, CONE.rows))
     with pytest.raises(ValueError, match=r"table travels by 20\.00 mm.*recon\.pwls"):
         fbp(data, CONE, VolumeGrid((2, 8, 8), 2.0), motion=helical_motion(CONE, 20.0 * 180 / 179))
     before = np.concatenate([v[:, :3], 1.5 * v[:, :3], v[:, 6:]], 1)
     with pytest.raises(ValueError, match="does not stand behind the axis"):
-        straighten(data, VectorGeometry(before, CONE.columns, CONE.rows))
+        rebin_to_circle(data, VectorGeometry(before, CONE.columns, CONE.rows))
     tilted = np.concatenate([-v[:, :3], v[:, 3:]], 1)
     tilted[:, 2] = 20.0
     with pytest.raises(ValueError, match=r"leave the plane of rotation by up to 2\.86°"):
-        straighten(data, VectorGeometry(tilted, CONE.columns, CONE.rows, parallel=True))
+        rebin_to_circle(data, VectorGeometry(tilted, CONE.columns, CONE.rows, parallel=True))
     edge_on = VectorGeometry.of(replace(CONE, pitch=(1.6, 15.0))).turned(slant=1.45)  # 0.8 m to either side
     with pytest.raises(ValueError, match="a detector reaches behind its source"):
-        straighten(data, edge_on)
+        rebin_to_circle(data, edge_on)

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from recon.fbp.fbp import backproject, fbp, filter_sinogram, filter_windowed, interleave
 from recon.fbp.ramp import KERNELS
-from torchpcct.detector_window import DetectorWindow, shadow
+from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid, full_turn
 
 MU = 0.02
@@ -343,7 +343,7 @@ def test_bad_input_is_named():
         filter_sinogram(data.numpy(), geometry)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"weights must have the shape \(9,\) or \(9, 19\), got \(8,\)"):
         fbp(data, geometry, grid, weights=np.ones(8))
-    window = shadow(geometry, grid, margin=1)
+    window = footprint(geometry, grid, margin=1)
     narrow = DetectorWindow(window.first_column + 2, window.columns - 3)
     with pytest.raises(ValueError, match=r"misses columns that the grid needs in view 0.*margin=1"):
         backproject(filter_sinogram(data, geometry, window=narrow), geometry, grid, narrow)
@@ -364,7 +364,7 @@ import ctypes
 import numpy as np, torch
 from recon.fbp.fbp import fbp
 from recon.fbp.filter_plan import CHUNK_BYTES
-from torchpcct.detector_window import DetectorWindow, shadow
+from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import ConeBeam, FanBeam, VolumeGrid, full_turn
 torch.set_num_threads(1)
 def peak():
@@ -383,7 +383,7 @@ with open("/proc/self/clear_refs", "w") as f:
     f.write("5")
 before = peak()
 fbp(data, geometry, grid, ("soft", "bone"))
-window = shadow(geometry, grid, margin=1) if inset else DetectorWindow.full(geometry)
+window = footprint(geometry, grid, margin=1) if inset else DetectorWindow.full(geometry)
 kept = 2 * 4 * (window.views * window.rows * window.columns + grid.voxels)
 print(peak() - before, kept, CHUNK_BYTES)
 """

@@ -13,7 +13,7 @@ from recon.fbp.angular_weights import angular_weights
 from recon.fbp.backproject import BackprojectionPlan, backproject
 from recon.fbp.fbp import fbp, filter_sinogram, filter_windowed
 from recon.fbp.filter_plan import FilterPlan
-from torchpcct.detector_window import DetectorWindow, shadow
+from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid, full_turn
 from torchpcct.threads import get_num_threads, set_num_threads
 
@@ -200,7 +200,7 @@ def test_windows_change_nothing(columns, detector):
     """Filtering into, and out of, windows that follow an inset equals cropping the whole."""
     geometry = ConeBeam(full_turn(24), 600, 1000, columns, 8, (2.0, 400 / columns), (0, 0.3), detector)
     grid = VolumeGrid((4, 6, 5), 2.0, (1.0, 31.0, -25.0))
-    window = shadow(geometry, grid, margin=1)
+    window = footprint(geometry, grid, margin=1)
     data = torch.randn((2, *geometry.shape), dtype=torch.float64, generator=torch.Generator().manual_seed(5))
     index = torch.from_numpy(window.column_indices)[:, None, :].expand(24, window.rows, window.columns)
     rows = slice(window.first_row, window.first_row + window.rows)

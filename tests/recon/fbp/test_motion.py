@@ -16,7 +16,7 @@ from recon.fbp.inset import InsetFbp, view_motion
 from recon.pwls.inset_problem import InsetProblem
 from recon.pwls.qggmrf import QGGMRF
 from torchpcct.acquisition.acquire import acquire
-from torchpcct.detector_window import DetectorWindow, shadow
+from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
 from torchpcct.scanner import presets
 from torchpcct.scene import Body, Scene, SinusoidalMotion
@@ -74,7 +74,7 @@ def test_each_view_sees_the_grid_where_it_is_then(name, dtype, tolerance):
 def test_window_and_transpose(name):
     geometry, grid = SCANS[name]
     motion = _path(grid.ndim)
-    window = shadow(geometry, grid, margin=1, motion=motion)
+    window = footprint(geometry, grid, margin=1, motion=motion)
     generator = torch.Generator().manual_seed(1)
     plan = BackprojectionPlan(geometry, grid, window, motion)
     x = torch.randn(grid.shape, dtype=torch.float64, generator=generator)

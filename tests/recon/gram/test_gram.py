@@ -9,7 +9,7 @@ from inset_operators import CENTER, HU, matrix, problem, tissue
 from recon.gram.gram import Gram
 from recon.gram.positive_definite import make_definite
 from torchpcct import FanBeam, Projector, VolumeGrid
-from torchpcct.detector_window import shadow
+from torchpcct.detector_window import footprint
 from torchpcct.geometry import full_turn
 
 
@@ -86,7 +86,7 @@ def test_without_a_window_and_in_a_plane():
     assert torch.allclose(Gram(A, w).apply(x), Gram(windowed, w2).apply(x), rtol=1e-3, atol=1e-3 * float(w.max()) * HU)
     fan = FanBeam(full_turn(200), 626.0, 1098.0, 700, 0.7, detector="curved")
     grid = VolumeGrid((15, 15), 0.5, CENTER[1:])
-    B = Projector(fan, grid, shadow(fan, grid))
+    B = Projector(fan, grid, footprint(fan, grid))
     ones = torch.ones(B.range_shape)
     gram = Gram(B, ones)
     y, x2 = (torch.from_numpy(a - c) for a, c in zip(grid.axes, grid.center, strict=True))

@@ -32,7 +32,7 @@ def test_report(clean, problem, network):
     report = volume.report
     assert report["method"] == "mbir"
     assert report["iterations"] == 2
-    assert report["look"] == network.look
+    assert report["fidelity"] == network.fidelity
     assert 0 < report["residual"] < 1
     assert report["chi2"] == pytest.approx(1.0, abs=0.05)
     assert report["warnings"] == []
@@ -42,7 +42,7 @@ def test_report(clean, problem, network):
 
 def test_noise_free_values_in_hu(clean, problem):
     """An untrained network adds nothing: a linear filter, means in the ball and in fat are those of FBP."""
-    plain = Mbir(Unrolled(NetworkConfig((6, 8, 8), 0.4), 2), look=1.0)
+    plain = Mbir(Unrolled(NetworkConfig((6, 8, 8), 0.4), 2), fidelity=1.0)
     found = reconstruct(clean, GRID, "mbir", network=plain, problem=problem).data
     fbp = reconstruct(clean, GRID, "fbp", kernel="soft").data
     for place in (np.s_[3:5, 8:10, 8:10], np.s_[3:5, :2, :2]):
@@ -68,22 +68,23 @@ def test_residual_and_chi2_by_their_definitions(clean, problem, network):
     assert report["chi2"] == pytest.approx(float((problem.weights * rest.square()).sum() / y.numel()), rel=2e-3)
     normal = network.problem(problem, problem.statistic(scan).b[None], 1.0)
     u = x[None] * 1000.0 / problem.mu_ref / normal.scale_hu
-    expected = float(low_residual(normal, normal.beta - normal.apply(u), network.look))
+    expected = float(low_residual(normal, normal.beta - normal.apply(u), network.fidelity))
     assert report["residual"] == pytest.approx(expected, rel=0.01)
 
 
-def test_look(clean, problem, network):
+def test_fidelity(clean, problem, network):
     """By name or with the network; more of it, more of the data's noise; out of range: refused."""
     scan = clean.with_noise(1.0, 0)
     quiet, middle, sharp = (
-        reconstruct(scan, GRID, "mbir", network=network, problem=problem, look=look) for look in (0.0, 0.5, 1.0)
+        reconstruct(scan, GRID, "mbir", network=network, problem=problem, fidelity=fidelity)
+        for fidelity in (0.0, 0.5, 1.0)
     )
-    assert [v.report["look"] for v in (quiet, middle, sharp)] == [0.0, 0.5, 1.0]
+    assert [v.report["fidelity"] for v in (quiet, middle, sharp)] == [0.0, 0.5, 1.0]
     assert float(quiet.data.std()) < float(middle.data.std()) < float(sharp.data.std())
     kept = reconstruct(scan, GRID, "mbir", network=Mbir(network.model, 1.0), problem=problem)
     assert torch.equal(kept.data, sharp.data)
-    with pytest.raises(ValueError, match="look"):
-        reconstruct(scan, GRID, "mbir", network=network, problem=problem, look=1.5)
+    with pytest.raises(ValueError, match="fidelity"):
+        reconstruct(scan, GRID, "mbir", network=network, problem=problem, fidelity=1.5)
 
 
 def test_shipped_weights(clean):
@@ -92,7 +93,7 @@ def test_shipped_weights(clean):
     fine = InsetProblem(clean, VolumeGrid((16, 36, 36), 0.2, CENTER))
     scans = [clean.with_noise(1.0, seed) for seed in range(4)]
     found = reconstruct(scans, fine.grid, "mbir", network=shipped, problem=fine)
-    linear = reconstruct(scans, fine.grid, "mbir", network=Mbir(shipped.model, shipped.look, steps=0), problem=fine)
+    linear = reconstruct(scans, fine.grid, "mbir", network=Mbir(shipped.model, shipped.fidelity, steps=0), problem=fine)
     sd = [float(torch.stack([v.data for v in volumes]).std(0).mean()) for volumes in (found, linear)]
     assert sd[0] < 0.7 * sd[1]
 
@@ -166,8 +167,20 @@ def test_metal_is_outside_of_what_the_prior_knows(network):
     assert network.check([scale], 1800.0) == []
     assert any("metal" in text for text in network.check([scale], 3000.0))
     # A tooth in mm⁻¹ reaches 4 mm⁻¹: no metal, no HU, and both ends of its noise in one sentence.
-    said = network.check([1e4, 2e4], 2e5, "mm^-1", 0.02)
-    assert len(said) == 2
-    assert not any("HU" in text or "metal" in text for text in said)
-    assert "the noise scale of the scan, 0.2 mm^-1 and 0.4 mm^-1, lies outside" in said[0]
-    assert "the volume reaches 4.02 mm^-1" in said[1]
+    texts = network.check([1e4, 2e4], 2e5, "mm^-1", 0.02)
+    assert len(texts) == 2
+    assert not any("HU" in text or "metal" in text for text in texts)
+    assert "the noise scale of the scan, 0.2 mm^-1 and 0.4 mm^-1, lies outside" in texts[0]
+    assert "the volume reaches 4.02 mm^-1" in texts[1]
+
+
+def test_former_names_still_work(clean, problem, network):
+    """``look``, now ``fidelity``: as an argument, in a method's name and on the command line."""
+    from recon.evaluate import method_of
+
+    now = reconstruct(clean, GRID, "mbir", network=network, problem=problem, fidelity=0.8)
+    with pytest.warns(DeprecationWarning, match="look is now called fidelity"):
+        before = reconstruct(clean, GRID, "mbir", network=network, problem=problem, look=0.8)
+    assert torch.equal(now.data, before.data)
+    with pytest.warns(DeprecationWarning, match="mbir:look is now called mbir:fidelity"):
+        assert method_of("mbir:look=0.8").network.fidelity == 0.8

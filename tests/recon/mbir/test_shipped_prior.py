@@ -55,10 +55,10 @@ def found(drawn, request):
     soft, standard = backproject(kernels, drawn.A.geometry, drawn.A.grid, drawn.A.window) / HU - 1000.0 * (1.0 - LEVEL)
     with torch.no_grad():
         volumes = {"soft": soft, "standard": standard, "mbir": network(drawn.scan, b, exposure),
-                   "linear": Mbir(network.model, network.look, steps=0)(drawn.scan, b, exposure)}  # fmt: skip
+                   "linear": Mbir(network.model, network.fidelity, steps=0)(drawn.scan, b, exposure)}  # fmt: skip
         normal = network.problem(drawn.scan, b, exposure)
-        free = network.model(normal, network.look, last_word=False)
-    return SimpleNamespace(exposure=exposure, volumes=volumes, normal=normal, look=network.look, free=free,
+        free = network.model(normal, network.fidelity, final_data_consistency=False)
+    return SimpleNamespace(exposure=exposure, volumes=volumes, normal=normal, fidelity=network.fidelity, free=free,
                            out=network.in_noise_units(drawn.scan, volumes["mbir"], normal))  # fmt: skip
 
 
@@ -89,8 +89,8 @@ def test_fat_and_lumen_keep_their_values(drawn, found):
     assert float(volume[:, lumen].mean()) == pytest.approx(drawn_vessel.VALUES["lumen"], rel=0.06)
 
 
-def test_the_last_word_makes_the_network_s_volume_explain_the_data(found):
-    left = [low_residual(found.normal, found.normal.beta - found.normal.apply(u), found.look).max()
+def test_final_data_consistency_makes_the_network_s_volume_explain_the_data(found):
+    left = [low_residual(found.normal, found.normal.beta - found.normal.apply(u), found.fidelity).max()
             for u in (found.free, found.out)]  # fmt: skip
     assert left[1] < 0.4 * left[0]
     assert energy(found.normal, found.out) < energy(found.normal, found.free)

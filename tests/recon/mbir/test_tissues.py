@@ -127,7 +127,7 @@ def test_what_is_believed_of_the_vessel_reaches_the_reading(drawn, network, fine
     monkeypatch.setattr(tissues, "read_plaque", reading)
     b = statistic(drawn, fine, 1)
     for believed in (None, VesselPrior(wall=(20.0, 5.0))):
-        TissueMbir(network, vessel_prior=believed).looking(1.0).solved(drawn, b, 1.0)
+        TissueMbir(network, vessel_prior=believed).with_fidelity(1.0).solved(drawn, b, 1.0)
     assert seen == [None, VesselPrior(wall=(20.0, 5.0))]
 
 
@@ -166,11 +166,11 @@ def test_from_a_scan(clean, problem, caplog):
     assert "no tissues were fitted" in caplog.text
 
 
-def test_another_look_keeps_the_tissues_and_noise_units_are_the_inverse_of_hu(drawn, network, truth, fine):
-    method = TissueMbir(network, (0.0, 0.0, 1.0)).looking(1.0)
+def test_another_fidelity_keeps_the_tissues_and_noise_units_are_the_inverse_of_hu(drawn, network, truth, fine):
+    method = TissueMbir(network, (0.0, 0.0, 1.0)).with_fidelity(1.0)
     assert isinstance(method, TissueMbir)
-    assert (method.look, method.point) == (1.0, (0.0, 0.0, 1.0))
-    assert network.look != 1.0
+    assert (method.fidelity, method.point) == (1.0, (0.0, 0.0, 1.0))
+    assert network.fidelity != 1.0
     normal = network.problem(drawn, statistic(drawn, fine, 1), 1.0)
     back = method.in_hu(drawn, method.in_noise_units(drawn, truth[None], normal), normal)
     assert torch.allclose(back[0], truth, atol=1e-3)

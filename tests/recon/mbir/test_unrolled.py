@@ -1,4 +1,4 @@
-"""The unrolled reconstruction: its linear parts against dense solutions, its look, hard cases."""
+"""The unrolled reconstruction: its linear parts against dense solutions, its fidelity, hard cases."""
 
 import math
 from dataclasses import replace
@@ -10,7 +10,7 @@ from inset_operators import HU, matrix, problem, tissue
 from recon.gram.gram import Gram
 from recon.mbir.network import NetworkConfig, bilateral_prior
 from recon.mbir.problem import NormalisedProblem, filtered, squared_frequencies
-from recon.mbir.unrolled import Unrolled, look_frequency, low_residual, start
+from recon.mbir.unrolled import Unrolled, fidelity_frequency, low_residual, start
 
 SMALL = NetworkConfig((6, 8, 8), 0.4)
 SHAPE = (8, 12, 12)
@@ -71,19 +71,25 @@ def test_no_steps_are_linear(scan):
     assert float((whole[2] - whole[0] + 2 * whole[1]).std()) > 0.01
 
 
-def test_the_data_have_the_last_word(scan):
-    """Whatever the network adds, the low frequencies of what the scanner sees stay the data's, the more the look."""
+def test_final_data_consistency(scan):
+    """Whatever the network adds, the low frequencies of what the scanner sees stay the data's, the more the
+    fidelity."""
     p = normal(scan, noise=1.0)
     quiet, loud = model(), model()
     loud.network.leave.weight.mul_(30.0)
     left = {}
-    for look in (0.0, 0.5, 1.0):
-        free, bound = (loud(p, look, last_word=word) for word in (False, True))
-        left[look] = [float(low_residual(p, p.beta - p.apply(u), look)) for u in (free, bound)]
-        assert left[look][1] < 0.35 * left[look][0]
+    for fidelity in (0.0, 0.5, 1.0):
+        free, bound = (loud(p, fidelity, final_data_consistency=word) for word in (False, True))
+        left[fidelity] = [float(low_residual(p, p.beta - p.apply(u), fidelity)) for u in (free, bound)]
+        assert left[fidelity][1] < 0.35 * left[fidelity][0]
         # Both networks agree on them.
-        low = torch.exp(-math.log(2) * squared_frequencies(SHAPE, 0.4) / look_frequency(look) ** 2)
-        apart = [filtered(quiet(p, look, last_word=w) - loud(p, look, last_word=w), low).norm() for w in (False, True)]
+        low = torch.exp(-math.log(2) * squared_frequencies(SHAPE, 0.4) / fidelity_frequency(fidelity) ** 2)
+        apart = [
+            filtered(
+                quiet(p, fidelity, final_data_consistency=w) - loud(p, fidelity, final_data_consistency=w), low
+            ).norm()
+            for w in (False, True)
+        ]
         assert apart[1] < 0.6 * apart[0]
     assert low_residual(p, p.beta, 0.5) == pytest.approx(1.0)
 
@@ -99,22 +105,22 @@ def test_another_prior_takes_the_place_of_the_network(scan):
         model()(p, 0.5, prior=bilateral_prior)
 
 
-def test_noise_grows_with_the_look(scan):
+def test_noise_grows_with_the_fidelity(scan):
     net = model(steps=1)
     torch.nn.init.zeros_(net.network.leave.weight)
     p = normal(scan, noise=1.0, batch=6)
-    sd = [float(net(p, look).std(0).mean()) for look in (0.0, 0.5, 1.0)]
+    sd = [float(net(p, fidelity).std(0).mean()) for fidelity in (0.0, 0.5, 1.0)]
     assert sd[0] < sd[1] < sd[2]
-    looks = torch.tensor([0.0, 0.5, 1.0, 0.0, 0.5, 1.0])
-    torch.testing.assert_close(net(p, looks)[1], net(p, 0.5)[1])
+    fidelities = torch.tensor([0.0, 0.5, 1.0, 0.0, 0.5, 1.0])
+    torch.testing.assert_close(net(p, fidelities)[1], net(p, 0.5)[1])
 
 
-def test_frequencies_of_the_look():
-    assert look_frequency(0.0) == pytest.approx(0.2)
-    assert look_frequency(1.0) == pytest.approx(0.8)
+def test_frequencies_of_the_fidelity():
+    assert fidelity_frequency(0.0) == pytest.approx(0.2)
+    assert fidelity_frequency(1.0) == pytest.approx(0.8)
     for bad in (-0.1, 1.1, math.nan):
-        with pytest.raises(ValueError, match="look"):
-            look_frequency(bad)
+        with pytest.raises(ValueError, match="fidelity"):
+            fidelity_frequency(bad)
 
 
 def test_batch_equals_single(scan):
@@ -157,7 +163,7 @@ def test_extreme_data_stay_in_proportion(scan, size):
 
 def test_callback_sees_every_step(scan):
     net, p, seen = model(), normal(scan, noise=1.0), []
-    free = net(p, callback=lambda k, v: seen.append((k, v)), last_word=False)
+    free = net(p, callback=lambda k, v: seen.append((k, v)), final_data_consistency=False)
     assert [k for k, _ in seen] == [0, 1, 2]
     assert torch.equal(seen[0][1], start(p, p.spectrum()))
     assert torch.equal(seen[2][1], free)

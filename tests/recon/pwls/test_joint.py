@@ -135,10 +135,12 @@ def test_correlation_that_changes_from_ray_to_ray_is_information():
     y = A(truth) + correlated_noise(f, (6,), 3)
     weak = quadratic(0.02)
     joint = joint_pwls(A, y, f, weak, tolerance=0.2, max_exact=60).x
-    alone = pwls(A, y, w * (1 - 0.81), weak, hu=1.0, tolerance=0.2, max_exact=60).x
+    alone = pwls(A, y, w * (1 - 0.81), weak, mu_per_hu=1.0, tolerance=0.2, max_exact=60).x
     clean = A(truth).expand_as(y)
     scatter = rms(joint, joint_pwls(A, clean[0], f, weak, tolerance=0.2, max_exact=60).x.expand_as(joint))
-    apart = rms(alone, pwls(A, clean[0], w * (1 - 0.81), weak, hu=1.0, tolerance=0.2, max_exact=60).x.expand_as(alone))
+    apart = rms(
+        alone, pwls(A, clean[0], w * (1 - 0.81), weak, mu_per_hu=1.0, tolerance=0.2, max_exact=60).x.expand_as(alone)
+    )
     assert scatter == pytest.approx(math.sqrt(0.19) * apart, rel=0.15)
 
 
@@ -148,7 +150,7 @@ def test_equal_uncorrelated_channels_are_two_scalar_problems(inset):
     isotropic = torch.stack([w, torch.zeros_like(w), w])
     gram = Gram(A, w)
     joint = joint_pwls(A, y, isotropic, quadratic(0.15), gram=gram, tolerance=0.02)
-    alone = pwls(A, y, w, quadratic(0.15), hu=1.0, gram=gram, tolerance=0.02)
+    alone = pwls(A, y, w, quadratic(0.15), mu_per_hu=1.0, gram=gram, tolerance=0.02)
     assert rms(joint.x, alone.x) < 0.05
 
 

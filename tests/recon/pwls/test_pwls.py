@@ -63,9 +63,9 @@ def test_distance_is_right_where_the_model_converges_slowly(prior):
     y = noisy(A, w)
     gram = Gram(A, w, nodes=1)
     bound = prior.bind(gram.information(HU), A.grid.spacing, HU)
-    exact = pwls(A, y.double(), w.double(), bound, hu=HU, gram=Gram(A, w.double(), nodes=1), tolerance=1e-3).x
+    exact = pwls(A, y.double(), w.double(), bound, mu_per_hu=HU, gram=Gram(A, w.double(), nodes=1), tolerance=1e-3).x
     for tolerance in (2.0, 0.2):
-        found = pwls(A, y, w, bound, hu=HU, gram=gram, tolerance=tolerance)
+        found = pwls(A, y, w, bound, mu_per_hu=HU, gram=gram, tolerance=tolerance)
         assert found.report["model"] == "gram"
         true = hu_rms(found.x, exact)
         assert true < tolerance
@@ -76,12 +76,12 @@ def test_distance_is_right_where_the_model_converges_slowly(prior):
 def test_exact_minimum_within_three_pairs(inset, dense, prior):
     A, w, gram, y = inset
     x = reference(dense, A, w, y, prior, gram.information(HU))
-    result = pwls(A, y, w, prior, hu=HU, gram=gram, max_exact=3, tolerance=0.5)
+    result = pwls(A, y, w, prior, mu_per_hu=HU, gram=gram, max_exact=3, tolerance=0.5)
     assert hu_rms(result.x, x) < 1.0
     report = result.report
     assert report["converged"]
     assert report["exact_pairs"] <= 3
-    tight = pwls(A, y, w, prior, hu=HU, gram=gram, tolerance=0.02)
+    tight = pwls(A, y, w, prior, mu_per_hu=HU, gram=gram, tolerance=0.02)
     assert hu_rms(tight.x, x) < 0.05
     # The reported distance is honest.
     assert hu_rms(result.x, x) < 3 * report["rmsd_hu"][-1] + 0.02
@@ -91,7 +91,7 @@ def test_exact_minimum_within_three_pairs(inset, dense, prior):
 def test_double_precision_converges_further(inset, dense):
     A, w, gram, y = inset
     x = reference(dense, A, w, y, EDGE, gram.information(HU))
-    result = pwls(A, y.double(), w.double(), EDGE, hu=HU, gram=gram, tolerance=1e-5, max_exact=40)
+    result = pwls(A, y.double(), w.double(), EDGE, mu_per_hu=HU, gram=gram, tolerance=1e-5, max_exact=40)
     assert result.x.dtype == torch.float64
     assert hu_rms(result.x, x) < 1e-4
 
@@ -102,8 +102,8 @@ def test_any_start_gives_the_same_volume(inset, start):
     first = torch.full(A.domain_shape, 1e4 * HU)
     if start == "noise":
         first = torch.randn(A.domain_shape, generator=torch.Generator().manual_seed(2)) * 1000 * HU
-    plain = pwls(A, y, w, EDGE, hu=HU, gram=gram, tolerance=0.05)
-    other = pwls(A, y, w, EDGE, hu=HU, gram=gram, tolerance=0.05, start=first, max_exact=30)
+    plain = pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, tolerance=0.05)
+    other = pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, tolerance=0.05, start=first, max_exact=30)
     assert other.report["converged"]
     assert hu_rms(plain.x, other.x) < 0.15
 
@@ -111,11 +111,11 @@ def test_any_start_gives_the_same_volume(inset, start):
 def test_batch_of_realisations(inset):
     A, w, gram, _ = inset
     y = noisy(A, w, 7, (2, 2))
-    result = pwls(A, y, w, EDGE, hu=HU, gram=gram, tolerance=0.05)
+    result = pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, tolerance=0.05)
     assert result.x.shape == (2, 2, *A.domain_shape)
-    alone = pwls(A, y[1, 0], w, EDGE, hu=HU, gram=gram, tolerance=0.05)
+    alone = pwls(A, y[1, 0], w, EDGE, mu_per_hu=HU, gram=gram, tolerance=0.05)
     assert hu_rms(result.x[1, 0], alone.x) < 0.1
-    assert pwls(A, y[:0], w, EDGE, hu=HU, gram=gram).x.shape == (0, 2, *A.domain_shape)
+    assert pwls(A, y[:0], w, EDGE, mu_per_hu=HU, gram=gram).x.shape == (0, 2, *A.domain_shape)
 
 
 def masked(w, case):
@@ -141,7 +141,7 @@ def test_lost_readings(inset, dense, case):
     y = torch.where(w > 0, y, torch.full((), torch.nan))
     gram = Gram(A, w)
     x = reference(dense, A, w, y, EDGE, gram.information(HU))
-    result = pwls(A, y, w, EDGE, hu=HU, gram=gram, tolerance=0.1, max_exact=30)
+    result = pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, tolerance=0.1, max_exact=30)
     assert result.report["converged"]
     assert hu_rms(result.x, x) < 1.0
 
@@ -150,8 +150,8 @@ def test_a_gram_of_other_weights_only_costs_pairs(inset):
     A, w, gram, y = inset
     lost = masked(w, 0.05)
     prior = EDGE.bind(gram.information(HU), A.grid.spacing, HU)
-    right = pwls(A, y, lost, prior, hu=HU, tolerance=0.05, max_exact=30)
-    wrong = pwls(A, y, lost, prior, hu=HU, gram=gram, tolerance=0.05, max_exact=30)
+    right = pwls(A, y, lost, prior, mu_per_hu=HU, tolerance=0.05, max_exact=30)
+    wrong = pwls(A, y, lost, prior, mu_per_hu=HU, gram=gram, tolerance=0.05, max_exact=30)
     assert wrong.report["converged"]
     assert hu_rms(right.x, wrong.x) < 0.2
 
@@ -159,21 +159,21 @@ def test_a_gram_of_other_weights_only_costs_pairs(inset):
 def test_low_dose_is_the_same_problem_scaled(inset):
     """1/100 of the dose with the noise in the same units: strength is noise-normalised, so x is the same."""
     A, w, gram, y = inset
-    full = pwls(A, y, w, quadratic(0.15), hu=HU, gram=gram, tolerance=0.02)
-    low = pwls(A, y, w / 100, quadratic(0.15), hu=HU, gram=gram.scaled(0.01), tolerance=0.02)
+    full = pwls(A, y, w, quadratic(0.15), mu_per_hu=HU, gram=gram, tolerance=0.02)
+    low = pwls(A, y, w / 100, quadratic(0.15), mu_per_hu=HU, gram=gram.scaled(0.01), tolerance=0.02)
     assert hu_rms(full.x, low.x) < 0.1
 
 
 def test_report_and_callback(inset, caplog):
     A, w, gram, y = inset
     seen = []
-    result = pwls(A, y, w, EDGE, hu=HU, gram=gram, callback=seen.append)
+    result = pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, callback=seen.append)
     assert [s["rmsd_hu"] for s in seen] == result.report["rmsd_hu"]
     assert result.report["gradient"][0] == pytest.approx(1.0)
     assert len(result.report["inner_iterations"]) == len(seen)
     assert result.report["strength"] == EDGE.strength
     with caplog.at_level("WARNING"):
-        short = pwls(A, y, w, EDGE, hu=HU, gram=gram, tolerance=1e-6, max_exact=1)
+        short = pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, tolerance=1e-6, max_exact=1)
     assert not short.report["converged"]
     assert "raise max_exact" in caplog.text
 
@@ -182,8 +182,8 @@ def test_from_the_sufficient_statistic(inset):
     """The problem of the model, without a projector, is close to the exact one."""
     A, w, gram, y = inset
     b = A.T(w * y)
-    model = solve_normal(b, gram.apply, gram, EDGE, hu=HU, spacing=A.grid.spacing, tolerance=0.05)
-    exact = pwls(A, y, w, EDGE, hu=HU, gram=gram, tolerance=0.05)
+    model = solve_normal(b, gram.apply, gram, EDGE, mu_per_hu=HU, spacing=A.grid.spacing, tolerance=0.05)
+    exact = pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, tolerance=0.05)
     assert hu_rms(model.x, exact.x) < 0.1 * hu_rms(exact.x, torch.zeros(()))
     assert model.report["converged"]
 
@@ -191,17 +191,17 @@ def test_from_the_sufficient_statistic(inset):
 def test_refusals(inset):
     A, w, gram, y = inset
     with pytest.raises(ValueError, match="y must have shape"):
-        pwls(A, y[:-1], w, EDGE, hu=HU, gram=gram)
+        pwls(A, y[:-1], w, EDGE, mu_per_hu=HU, gram=gram)
     with pytest.raises(TypeError, match="float"):
-        pwls(A, y.int(), w, EDGE, hu=HU, gram=gram)
+        pwls(A, y.int(), w, EDGE, mu_per_hu=HU, gram=gram)
     with pytest.raises(ValueError, match="weight 0"):
-        pwls(A, torch.full_like(y, torch.nan), w, EDGE, hu=HU, gram=gram)
+        pwls(A, torch.full_like(y, torch.nan), w, EDGE, mu_per_hu=HU, gram=gram)
     with pytest.raises(ValueError, match="tolerance"):
-        pwls(A, y, w, EDGE, hu=HU, gram=gram, tolerance=0.0)
+        pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, tolerance=0.0)
     with pytest.raises(ValueError, match="start"):
-        pwls(A, y, w, EDGE, hu=HU, gram=gram, start=torch.full(A.domain_shape, torch.nan))
+        pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, start=torch.full(A.domain_shape, torch.nan))
     with pytest.raises(ValueError, match="max_exact"):
-        pwls(A, y, w, EDGE, hu=HU, gram=gram, max_exact=0)
+        pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, max_exact=0)
 
 
 @pytest.mark.parametrize("value_hu", [1500.0, 8000.0])
@@ -212,7 +212,7 @@ def test_calcification_and_metal_at_the_border(inset, dense, value_hu):
     bright[1:3, :2, :2] = value_hu * HU
     y = y + A(bright)
     exact = reference(dense, A, w, y, EDGE, gram.information(HU))
-    result = pwls(A, y, w, EDGE, hu=HU, gram=gram, tolerance=0.2, max_exact=30)
+    result = pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, tolerance=0.2, max_exact=30)
     assert result.report["converged"]
     assert hu_rms(result.x, exact) < 1.0
 
@@ -227,8 +227,8 @@ def test_wrong_centre_is_solved_as_stated(inset):
     g = A.geometry
     other = replace(g, offset=(g.offset[0], g.offset[1] + g.pitch[1] / 2))
     y = Projector(other, A.grid, A.window)(tissue(A.grid))
-    result = pwls(A, y, w, EDGE, hu=HU, gram=gram, tolerance=0.1, max_exact=30)
+    result = pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, tolerance=0.1, max_exact=30)
     assert result.report["converged"]
     assert torch.isfinite(result.x).all()
-    shift = hu_rms(result.x, pwls(A, A(tissue(A.grid)), w, EDGE, hu=HU, gram=gram, tolerance=0.1).x)
+    shift = hu_rms(result.x, pwls(A, A(tissue(A.grid)), w, EDGE, mu_per_hu=HU, gram=gram, tolerance=0.1).x)
     assert 1.0 < shift < 200.0

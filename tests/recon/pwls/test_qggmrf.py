@@ -181,7 +181,7 @@ def test_refusals_of_binding():
         QGGMRF("strong", 1.0)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="information"):
         QGGMRF(1.0, 1.0).bind(0.0, (0.2,) * 3, HU)
-    with pytest.raises(ValueError, match="hu"):
+    with pytest.raises(ValueError, match="mu_per_hu"):
         QGGMRF(1.0, 1.0).bind(1.0, (0.2,) * 3, 0.0)
     with pytest.raises(ValueError, match="axes"):
         bound().value(torch.zeros(3, 3))

@@ -8,7 +8,7 @@ import torch
 
 from recon.pwls.surround import UnknownSurround, _joined_views
 from torchpcct import ConeBeam, Projector, VolumeGrid, full_turn
-from torchpcct.detector_window import shadow
+from torchpcct.detector_window import footprint
 
 GEOMETRY = ConeBeam(full_turn(360), 300.0, 550.0, 300, 8, (1.0, 0.9), detector="curved")
 GRID = VolumeGrid((8, 16, 16), 0.5, (0.0, 12.0, -15.0))
@@ -26,7 +26,7 @@ def lines():
 
 def test_nothing_is_left_of_a_uniform_inset(lines):
     """Every row: a path of 8 mm through 1 HU is 1.6e-4."""
-    window = shadow(GEOMETRY, GRID, margin=1)
+    window = footprint(GEOMETRY, GRID, margin=1)
     around = UnknownSurround(GEOMETRY, GRID, window, Projector(GEOMETRY, GRID, window))
     assert around.level(lines) == pytest.approx(0.02, abs=3 * HU)
     left = around.take_off(lines, 0.02)
@@ -37,7 +37,7 @@ def test_nothing_is_left_of_a_uniform_inset(lines):
 
 def test_what_the_inset_holds_stays_its_own(lines):
     """A ball in it: its readings are left, and nothing of it is taken for surround (once 12 % were)."""
-    window = shadow(GEOMETRY, GRID, margin=1)
+    window = footprint(GEOMETRY, GRID, margin=1)
     projector = Projector(GEOMETRY, GRID, window)
     z, y, x = np.meshgrid(*GRID.axes, indexing="ij")
     ball = torch.from_numpy(0.02 * (np.hypot(np.hypot(y - 12.0, x + 15.0), z) < 1.8)).float()
@@ -52,7 +52,7 @@ def test_what_the_inset_holds_stays_its_own(lines):
 def test_a_body_beyond_the_detector_is_refused(lines):
     """Its readings would be left in the inset's: 250 HU of a thorax."""
     narrow = ConeBeam(full_turn(360), 300.0, 550.0, 120, 8, (1.0, 0.9), detector="curved")
-    window = shadow(narrow, GRID, margin=1)
+    window = footprint(narrow, GRID, margin=1)
     around = UnknownSurround(narrow, GRID, window, Projector(narrow, GRID, window))
     with pytest.raises(ValueError, match=r"rows end inside the object.*outside="):
         around.level(lines[..., 90:-90].contiguous())

@@ -87,7 +87,7 @@ def test_finds_the_dense_minimum(scan, prior):
     A, y, w, matrix = scan
     bound = prior.bind(FieldModel(A, w).information(HU), A.grid.spacing, HU)
     exact = minimum(matrix, A, y, w, bound)
-    found = pwls(A, y, w, prior, hu=HU, tolerance=0.5)
+    found = pwls(A, y, w, prior, mu_per_hu=HU, tolerance=0.5)
     assert found.report["converged"]
     assert found.report["model"] == "gradient"
     assert hu_rms(found.x, exact) < 1.0
@@ -106,7 +106,7 @@ def test_every_pair_lowers_the_objective(scan):
     for start in (3000 * HU * noise, exact.float() + 5 * HU * noise, exact.float()):
         values = [energy(matrix, y, w, bound, start)]
         for pairs in range(2, 9):
-            x = pwls(A, y, w, bound, hu=HU, gram=model, start=start, tolerance=1e-9, max_exact=pairs).x
+            x = pwls(A, y, w, bound, mu_per_hu=HU, gram=model, start=start, tolerance=1e-9, max_exact=pairs).x
             values.append(energy(matrix, y, w, bound, x))
         slack = 1e-6 * energy(matrix, y, w, bound, torch.zeros(A.domain_shape))
         assert all(b <= a + slack for a, b in itertools.pairwise(values)), values
@@ -114,16 +114,16 @@ def test_every_pair_lowers_the_objective(scan):
 
 def test_batch_is_each_alone(scan):
     A, y, w, _ = scan
-    both = pwls(A, torch.stack([y, 0.5 * y]), w, EDGE, hu=HU, tolerance=0.3)
+    both = pwls(A, torch.stack([y, 0.5 * y]), w, EDGE, mu_per_hu=HU, tolerance=0.3)
     assert len(both.report["misfit"]) == 2
     for data, x in zip((y, 0.5 * y), both.x, strict=True):
-        assert hu_rms(x, pwls(A, data, w, EDGE, hu=HU, tolerance=0.3).x) < 1.0
+        assert hu_rms(x, pwls(A, data, w, EDGE, mu_per_hu=HU, tolerance=0.3).x) < 1.0
 
 
 def test_a_stop_that_was_not_reached_is_said(scan, caplog):
     A, y, w, _ = scan
     with caplog.at_level("WARNING"):
-        short = pwls(A, y, w, EDGE, hu=HU, max_exact=2)
+        short = pwls(A, y, w, EDGE, mu_per_hu=HU, max_exact=2)
     assert not short.report["converged"]
     assert "raise max_exact" in caplog.text
 
@@ -138,7 +138,7 @@ def test_voxels_that_some_views_miss_converge_last_and_that_is_said():
     matrix = A(torch.eye(n, dtype=torch.float64).reshape(n, *A.domain_shape)).reshape(n, -1).T
     bound = EDGE.bind(FieldModel(A, w).information(HU), A.grid.spacing, HU)
     exact = minimum(matrix, A, y, w, bound)
-    found = pwls(A, y, w, bound, hu=HU, tolerance=1.0)
+    found = pwls(A, y, w, bound, mu_per_hu=HU, tolerance=1.0)
     assert hu_rms(found.x[r < 11], exact[r < 11]) < 2.0
     assert found.report["rmsd_hu"][-1] > hu_rms(found.x, exact) / 3
 
@@ -148,7 +148,7 @@ def test_a_flat_prior_is_not_called_converged_before_it_is(scan):
     bound = FLAT.bind(FieldModel(A, w).information(HU), A.grid.spacing, HU)
     exact = minimum(matrix, A, y, w, bound)
     for pairs in (20, 60):
-        found = pwls(A, y, w, bound, hu=HU, tolerance=1.0, max_exact=pairs)
+        found = pwls(A, y, w, bound, mu_per_hu=HU, tolerance=1.0, max_exact=pairs)
         assert found.report["rmsd_hu"][-1] > hu_rms(found.x, exact) / 3
 
 
@@ -165,9 +165,9 @@ def flat_faces():
 def test_flat_faces_in_a_cone_beam_need_a_spectrum_of_their_own_slice(flat_faces, monkeypatch):
     A, y, w = flat_faces
     prior = QGGMRF(2.0, 4.0, relative=True)
-    many = pwls(A, y, w, prior, hu=HU, tolerance=0.1)
+    many = pwls(A, y, w, prior, mu_per_hu=HU, tolerance=0.1)
     monkeypatch.setattr(field_model, "FACTOR", math.inf)
-    one = pwls(A, y, w, prior, hu=HU, tolerance=0.1)
+    one = pwls(A, y, w, prior, mu_per_hu=HU, tolerance=0.1)
     assert many.report["converged"]
     assert one.report["converged"]
     assert many.report["exact_pairs"] < 0.6 * one.report["exact_pairs"]
@@ -181,9 +181,9 @@ def test_slices_beyond_the_rows_do_not_slow_the_rest_down(monkeypatch):
     y = A((0.02 * ((torch.hypot(y, x) < 8) & (z.abs() < 7))).float())
     w = 1e5 * torch.exp(-y)
     assert float((FieldModel(A, w).seen == 0).float().mean()) > 0.1
-    found = pwls(A, y, w, EDGE, hu=HU, tolerance=0.3)
+    found = pwls(A, y, w, EDGE, mu_per_hu=HU, tolerance=0.3)
     monkeypatch.setattr(field_model, "LEAST_MET", 1e-4)
-    slow = pwls(A, y, w, EDGE, hu=HU, tolerance=0.3, max_exact=2 * found.report["exact_pairs"])
+    slow = pwls(A, y, w, EDGE, mu_per_hu=HU, tolerance=0.3, max_exact=2 * found.report["exact_pairs"])
     assert found.report["converged"]
     assert not slow.report["converged"]
 
@@ -210,10 +210,10 @@ def test_model_is_chosen_by_the_grid_and_dropped_by_its_misfit():
     y = A(torch.full(A.domain_shape, 50 * HU))
     gram = Gram(A, w)
     prior = EDGE.bind(gram.information(HU), A.grid.spacing, HU)
-    right = pwls(A, y, w, prior, hu=HU, gram=gram, tolerance=0.05)
+    right = pwls(A, y, w, prior, mu_per_hu=HU, gram=gram, tolerance=0.05)
     assert right.report["model"] == "gram"
     assert right.report["model_misfit"] < 0.1
-    wrong = pwls(A, y, w, prior, hu=HU, gram=gram.scaled(20.0), tolerance=0.05)
+    wrong = pwls(A, y, w, prior, mu_per_hu=HU, gram=gram.scaled(20.0), tolerance=0.05)
     assert wrong.report["model_misfit"] > 1
     assert wrong.report["model"] == "gradient"
     assert wrong.report["converged"]
@@ -231,7 +231,7 @@ def test_memory_is_predicted_and_refused_before_anything_is_allocated(scan, monk
     A, y, w, _ = scan
     monkeypatch.setattr(Projector, "forward", lambda self, x: pytest.fail("projected"))
     with pytest.raises(ValueError, match=r"needs .* GiB, 0.00 GiB are available"):
-        pwls(A, y, w, EDGE, hu=HU, memory=1000)
+        pwls(A, y, w, EDGE, mu_per_hu=HU, memory=1000)
     big = Projector(ConeBeam(full_turn(4), 6000.0, 10000.0, 8, 8, 1.0), VolumeGrid((3000, 3000, 3000), 1e-3))
     with pytest.raises(ValueError, match="larger or fewer voxels"):
         pwls(big, torch.zeros(big.range_shape), torch.ones(big.range_shape), EDGE, memory=2**38)
@@ -278,6 +278,6 @@ def test_corners_do_not_hold_the_stop_and_are_reported():
     model = FieldModel(A, w)
     assert bool(model.determined[r < 12].all())
     assert not bool(model.determined[r > 15].any())
-    report = pwls(A, A((0.02 * (r < 10)).float()), w, EDGE, hu=HU, tolerance=1.0, gram=model).report
+    report = pwls(A, A((0.02 * (r < 10)).float()), w, EDGE, mu_per_hu=HU, tolerance=1.0, gram=model).report
     assert report["undetermined"] == pytest.approx(1 - float(model.determined.float().mean()))
     assert report["undetermined_rmsd_hu"] > 0

@@ -69,12 +69,13 @@ def report_values(low, high, exposures=(0.35, 2.0)):
 
 
 @pytest.mark.parametrize(
-    ("low", "high", "said"), [(5.8, 9.0, " reaches "), (2.0, 5.6, " does not reach "), (5.0, 6.0, " may or may not ")]
+    ("low", "high", "expected_text"),
+    [(5.8, 9.0, " reaches "), (2.0, 5.6, " does not reach "), (5.0, 6.0, " may or may not ")],
 )
-def test_the_answer_is_one_sentence_made_of_the_results(low, high, said):
+def test_the_answer_is_one_sentence_made_of_the_results(low, high, expected_text):
     data = report_values(low, high)
     text = answer(data)
-    assert said in text
+    assert expected_text in text
     assert len(re.findall(r"[.!?](?=\s|\*)", text)) == 1
     assert "MBIR's CNR of 1.00 [0.90, 1.10]" in text
     assert "the 1.91 of FBP" in text

@@ -23,13 +23,13 @@ def tiny(tmp_path_factory):
 def test_verdicts():
     assert verdict(4.0, 10.0, True, []) == "right"
     assert verdict(6.0, 10.0, True, []) == "SILENT"
-    assert verdict(6.0, 10.0, True, ["wrong centre"]) == "said"
+    assert verdict(6.0, 10.0, True, ["wrong centre"]) == "warned"
     assert verdict(1.0, 10.0, False, []) == "SILENT"
-    assert verdict(np.nan, 10.0, False, ["starved"]) == "said"
-    assert verdict(None, 10.0, True, ["refused"]) == "said"
+    assert verdict(np.nan, 10.0, False, ["starved"]) == "warned"
+    assert verdict(None, 10.0, True, ["refused"]) == "warned"
     assert verdict(6.0, 10.0, True, [], unseen="turned") == "unseen"
     assert verdict(4.0, 10.0, True, [], worse=1.1) == "SILENT"
-    assert verdict(4.0, 10.0, True, ["metal"], worse=1.1) == "said"
+    assert verdict(4.0, 10.0, True, ["metal"], worse=1.1) == "warned"
     assert verdict(4.0, 10.0, True, [], worse=1.04) == "right"
 
 
@@ -37,25 +37,25 @@ def test_a_mended_case_is_right_and_a_refused_one_said(tiny):
     rows = {r["case"]: r for r in tiny.measured.rows}
     assert rows["sound"]["error_hu"] == 0.0
     assert rows["dead-column"]["verdict"] == "right"
-    assert any("dead detector cells" in text for text in rows["dead-column"]["said"])
+    assert any("dead detector cells" in text for text in rows["dead-column"]["messages"])
     assert rows["three-views"]["refused"]
     assert rows["centre-2"]["error_hu"] > rows["centre-2"]["noise_hu"]
-    assert any("opposite rays disagree" in text for text in rows["centre-2"]["said"])
+    assert any("opposite rays disagree" in text for text in rows["centre-2"]["messages"])
 
 
 def test_a_whole_body(tiny):
     rows = {r["case"]: r for r in tiny.measured.rows}
     assert rows["body-sod"]["verdict"] == "unseen"
     assert rows["body-sod"]["error_hu"] > rows["body-sod"]["noise_hu"] > 20
-    assert rows["body-reversed"]["verdict"] == "said"
-    assert "columns counted the other way" in rows["body-reversed"]["said"][0]
+    assert rows["body-reversed"]["verdict"] == "warned"
+    assert "columns counted the other way" in rows["body-reversed"]["messages"][0]
     assert rows["body-not-square"]["refused"]
     assert "unseen 1" in tiny.report.text
 
 
 def test_metal_is_named_and_its_own_voxels_do_not_count(tiny):
     rows = {r["case"]: r for r in tiny.measured.rows}
-    assert any("metal" in text for text in rows["metal"]["said"])
+    assert any("metal" in text for text in rows["metal"]["messages"])
     # The rod reads 16 000 HU: counted, it would be an error of more than a thousand.
     assert rows["metal"]["error_hu"] < 2 * rows["sound"]["noise_hu"]
     assert rows["sound"]["soft_hu"] < rows["sound"]["truth_hu"] < 1.2 * rows["sound"]["noise_hu"] + 20

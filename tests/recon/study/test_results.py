@@ -31,13 +31,13 @@ def rendered(root, text):
     assert found["README.md"].endswith(f"\n{LAST}\n\nend\n")
     assert found["notebooks/RESULTS.md"].startswith("# R\n\n")
     assert found["notebooks/RESULTS.md"].endswith("\nmore\n")
-    said = found["notebooks/RESULTS.md"].splitlines()[2]
-    assert f"\n{said}\n" in found["README.md"]
-    return said
+    rendered_text = found["notebooks/RESULTS.md"].splitlines()[2]
+    assert f"\n{rendered_text}\n" in found["README.md"]
+    return rendered_text
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "expected_text"),
     [
         ("{{r: rows[m=a]/v | .1f}}× of {{r/report.json: n/k | }}", "1.2× of 200"),
         ("{{r: plaque, mbir, 2, CNR, small | .1f}}", "1.5"),
@@ -46,8 +46,8 @@ def rendered(root, text):
         ("{{r: n/k > 199 ? many | few}}, {{r: plaque, mbir, 2, CNR, small > 1.6 ? more | less}}", "many, less"),
     ],
 )
-def test_fields(root, text, said):
-    assert rendered(root, text) == said
+def test_fields(root, text, expected_text):
+    assert rendered(root, text) == expected_text
 
 
 @pytest.mark.parametrize(

@@ -125,13 +125,13 @@ def test_what_is_above_muscle_is_the_users_choice(dense):
 
 
 def test_bad_voxel_scenes_are_refused():
-    for dense, said in (
+    for dense, expected_text in (
         ("gold", "unknown dense 'gold': use one of bone, iodine, water"),
         (np.zeros((2, 2, 2)), r"dense needs the shape \(z, y, x\)"),
         (np.full(GRID.shape, 3), "dense must hold 0 bone, 1 iodine, 2 water"),
         (None, "dense must be one of bone, iodine, water, or a whole number"),
     ):
-        with pytest.raises((ValueError, TypeError), match=said):
+        with pytest.raises((ValueError, TypeError), match=expected_text):
             VoxelScene(np.zeros(GRID.shape), GRID, dense=dense)
     with pytest.raises(ValueError, match="give dense or tissues, not both"):
         VoxelScene(np.zeros(GRID.shape), GRID, dense="iodine", tissues=("air", "water"))

@@ -410,7 +410,7 @@ LAUGHS = "\n".join(["a0: &a0 [x, x]", *(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}']
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "expected_text"),
     [
         (LAUGHS, "stands for more than 1048576 values"),
         ("[" * 60 + "]" * 60, "nested more than 32 deep"),
@@ -422,13 +422,13 @@ LAUGHS = "\n".join(["a0: &a0 [x, x]", *(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}']
         (b"a: \xff\xfe".decode("latin-1"), None),
     ],
 )
-def test_yaml_of_users_is_bounded(tmp_path, text, said):
+def test_yaml_of_users_is_bounded(tmp_path, text, expected_text):
     """Twelve lines of aliases to aliases hung every reader, and a bad geometry ended in a traceback."""
     path = tmp_path / "a.yaml"
-    path.write_bytes(text.encode("latin-1" if said is None else "utf-8"))
+    path.write_bytes(text.encode("latin-1" if expected_text is None else "utf-8"))
     readers = [lambda: read_yaml(path, "a geometry"), lambda: open_scan(path), lambda: read_config(path)]
     for read in readers:
-        with pytest.raises(ValueError, match=f"a.yaml cannot be read as .*: .*{said or 'codec'}"):
+        with pytest.raises(ValueError, match=f"a.yaml cannot be read as .*: .*{expected_text or 'codec'}"):
             read()
     assert main(["reconstruct", str(tmp_path), "--geometry", str(path), "--out", str(tmp_path / "v.h5")]) == 2
 

@@ -11,7 +11,7 @@ from analytic import Ellipsoid, Gaussian, line_integrals, rasterize
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchpcct.detector_window import shadow
+from torchpcct.detector_window import footprint
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
 from torchpcct.projector import Projector
 
@@ -108,7 +108,7 @@ def test_small_inset_far_from_the_axis(spacing, center):
         for shift, value in (((2.0, 0.5, -0.4), 1.0), ((-2.0, -0.6, 0.5), -0.5))
     ]
     assert (
-        _error(geometry, grid, bodies, shadow(geometry, grid)) < 1.2e-2 * (spacing / 0.2) ** 2
+        _error(geometry, grid, bodies, footprint(geometry, grid)) < 1.2e-2 * (spacing / 0.2) ** 2
     )  # voxel blur of σ = 0.7 mm
 
 

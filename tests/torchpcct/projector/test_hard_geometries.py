@@ -11,7 +11,7 @@ import torch
 from analytic import Gaussian, line_integrals, rasterize
 from geometries import REGISTRY
 
-from torchpcct.detector_window import DetectorWindow, shadow
+from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
 from torchpcct.projector import Projector
 from torchpcct.projector.cpu import plane_passes
@@ -341,7 +341,7 @@ def test_bad_arguments_are_named():
 def test_memory_estimate_is_an_upper_bound_and_not_far_off(batch):
     geometry = ConeBeam(full_turn(60), 626.0, 1098.0, 400, 40, (0.5, 0.35), detector="curved")
     grid = VolumeGrid((56, 45, 45), 0.2)
-    A = Projector(geometry, grid, shadow(geometry, grid))
+    A = Projector(geometry, grid, footprint(geometry, grid))
     x = _random((batch, *A.domain_shape), torch.float32)
     A.T(A(x))
     peaks = []

@@ -7,7 +7,7 @@ import pytest
 import torch
 from analytic import Ellipsoid, Gaussian, line_integrals, rasterize
 
-from torchpcct.detector_window import shadow
+from torchpcct.detector_window import footprint
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
 from torchpcct.projector import Projector
 from torchpcct.projector.vectors import to_vectors
@@ -59,7 +59,7 @@ def test_moving_body(name, kind):
 def test_adjoint_with_motion_and_window(name, dtype, epsilon):
     geometry, grid = SCANS[name]
     motion = _path(grid.ndim)
-    window = shadow(geometry, grid, motion=motion)
+    window = footprint(geometry, grid, motion=motion)
     A = Projector(geometry, grid, window, motion)
     generator = torch.Generator().manual_seed(0)
     x, y = (torch.randn(shape, generator=generator, dtype=dtype) for shape in (A.domain_shape, A.range_shape))
@@ -73,7 +73,7 @@ def test_shadow_follows_the_motion(name):
     geometry, grid = SCANS[name]
     motion = _path(grid.ndim)
     x = torch.ones(grid.shape, dtype=torch.float64)
-    window = shadow(geometry, grid, motion=motion)
+    window = footprint(geometry, grid, motion=motion)
     whole, cropped = Projector(geometry, grid, motion=motion)(x), Projector(geometry, grid, window, motion)(x)
     torch.testing.assert_close(cropped.sum(), whole.sum(), rtol=1e-12, atol=0)
 
@@ -96,7 +96,7 @@ def test_refusals():
         with pytest.raises(ValueError, match=r"motion needs the shape \(6, 2\)"):
             Projector(geometry, grid, motion=motion)
         with pytest.raises(ValueError, match=r"motion needs the shape \(6, 2\)"):
-            shadow(geometry, grid, motion=motion)
+            footprint(geometry, grid, motion=motion)
     with pytest.raises(ValueError, match="not finite"):
         Projector(geometry, grid, motion=np.full((6, 2), np.nan))
     with pytest.raises(ValueError, match="lies inside the grid"):

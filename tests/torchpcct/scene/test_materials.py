@@ -189,12 +189,12 @@ def test_a_concentration_of_iodine_by_its_name():
     assert mixed.density_g_cm3 == pytest.approx(1.06 * (1 - 0.01 / 4.93) + 0.01)
     assert (mixed.hu(65.0) - blood.hu(65.0)) / 10 == pytest.approx(30.5, abs=0.5)
     assert material("hydroxyapatite 0 mg/ml in water").hu(65.0) == pytest.approx(0.0, abs=1e-9)
-    for name, said in (
+    for name, expected_text in (
         ("iodine 1e4 mg/ml in blood", r"must lie in \[0, 4930\] mg/ml of iodine"),
         ("iodine -1 mg/ml in blood", "must lie in"),
         ("iodine 1-1 mg/ml in blood", "concentration"),
         ("iodine 10 mg/ml in custard", "unknown material 'custard'"),
         ("iodine 10 mg in blood", "iodine 10 mg/ml in blood"),
     ):
-        with pytest.raises((ValueError, TypeError), match=said):
+        with pytest.raises((ValueError, TypeError), match=expected_text):
             material(name)

@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Triton twins of the CPU kernels for CUDA: the same weights, gathered on both sides, so without atomics.
+"""Triton counterparts of the CPU kernels for CUDA: the same weights, gathered on both sides, so without atomics.
 
 Forward: one program per (view, column), lanes along the rows; it walks the slabs. Adjoint: one program per slab and
 voxels along it, lanes along z (plane: along the slab); it walks the segments, finds by bisection the columns that

@@ -1,4 +1,5 @@
-"""The curve of the look: ``python -m train.looks WEIGHTS`` measures weights on held-out plaques, look by look.
+"""The curve of the fidelity: ``python -m train.fidelity WEIGHTS`` measures weights on held-out plaques, fidelity by
+fidelity.
 
 Figures are those of :meth:`train.objective.Objective.validate`; with a seed other than the run's the plaques took no
 part in choosing the checkpoint. Figures move by some 10 % from one seed's eight plaques to the next: compare weights on
@@ -19,7 +20,7 @@ from train.__main__ import build
 from train.config import TrainConfig, load_config, packaged_config
 from train.objective import Validation
 
-__all__ = ["looks_table", "main"]
+__all__ = ["fidelity_table", "main"]
 
 _COLUMNS = {
     "fat SD": "fat_hu", "RMSE": "rmse_hu", "slope": "slope", "SD": "sd_hu", "slope, lesion": "lesion_slope",
@@ -27,22 +28,22 @@ _COLUMNS = {
 }  # fmt: skip
 
 
-def looks_table(rows: Sequence[tuple[float, Validation]], exposures: Sequence[float]) -> str:
-    """Markdown: a row for every look, in every cell the figure at each of the exposures."""
-    head = ["look", *_COLUMNS, "score"]
+def fidelity_table(rows: Sequence[tuple[float, Validation]], exposures: Sequence[float]) -> str:
+    """Markdown: a row for every fidelity, in every cell the figure at each of the exposures."""
+    head = ["fidelity", *_COLUMNS, "score"]
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    for look, found in rows:
+    for fidelity, found in rows:
         cells = [" / ".join(f"{found.figures[f'{key}_{e:g}s']:.3g}" for e in exposures) for key in _COLUMNS.values()]
-        lines.append(f"| {look:g} | " + " | ".join(cells) + f" | {found.score:.3f} |")
+        lines.append(f"| {fidelity:g} | " + " | ".join(cells) + f" | {found.score:.3f} |")
     return "\n".join(lines)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
-    parser = argparse.ArgumentParser(prog="python -m train.looks", description=__doc__.split("\n\n")[0])
+    parser = argparse.ArgumentParser(prog="python -m train.fidelity", description=__doc__.split("\n\n")[0])
     parser.add_argument("weights", type=Path, help="weights of a run, such as runs/mine/weights.safetensors")
     parser.add_argument("--config", type=Path, metavar="FILE", help="of the run (default: train/configs/default.yaml)")
-    parser.add_argument("--looks", type=float, nargs="+", default=[0.0, 0.3, 0.5, 0.8, 1.0], metavar="L")
+    parser.add_argument("--fidelities", type=float, nargs="+", default=[0.0, 0.3, 0.5, 0.8, 1.0], metavar="L")
     parser.add_argument("--seeds", type=int, nargs="+", default=[5], metavar="N", help="of the plaques (default 5)")
     arguments = parser.parse_args(argv)
     logging.basicConfig(format="%(message)s")
@@ -52,10 +53,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         model.load_state_dict(read_tensors(arguments.weights, WEIGHTS_FORMAT)[0])
         model.eval().requires_grad_(False)
         for seed in arguments.seeds:
-            rows = [(look, objective.validate(model, data, seed, look)) for look in arguments.looks]
+            rows = [(fidelity, objective.validate(model, data, seed, fidelity)) for fidelity in arguments.fidelities]
             exposures = config.objective.validation_exposures_s
             print(f"Plaques of seed {seed}, {' / '.join(f'{e:g}' for e in exposures)} s, HU:\n")
-            print(looks_table(rows, exposures) + "\n", flush=True)
+            print(fidelity_table(rows, exposures) + "\n", flush=True)
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

@@ -1,17 +1,17 @@
-"""The curve of the look."""
+"""The curve of the fidelity."""
 
 import pytest
 from safetensors.torch import save_file
 
 from train.config import packaged_config
-from train.looks import looks_table, main
+from train.fidelity import fidelity_table, main
 from train.objective import Validation
 
 
-def test_a_row_for_every_look():
+def test_a_row_for_every_fidelity():
     names = ("fat_hu", "rmse_hu", "slope", "sd_hu", "lesion_slope", "lesion", "false_hu", "false_lesion_hu")
     figures = {f"{name}_{e:g}s": k + e for k, name in enumerate(names) for e in (0.35, 2.0)}
-    table = looks_table([(0.0, Validation(-5.0, figures)), (0.5, Validation(-4.0, figures))], (0.35, 2.0))
+    table = fidelity_table([(0.0, Validation(-5.0, figures)), (0.5, Validation(-4.0, figures))], (0.35, 2.0))
     lines = table.splitlines()
     assert len(lines) == 4
     assert lines[0].count("|") == lines[2].count("|") == 11

@@ -1,4 +1,4 @@
-"""Operators in the manners of other libraries, narrow dtypes, forks and the notice of compilation."""
+"""Operators as other libraries call them, narrow dtypes, forks and the notice of compilation."""
 
 import copy
 import logging
@@ -227,7 +227,7 @@ def test_a_word_while_kernels_compile(caplog):
             pass
 
     listener = next(k for k in event._registered["numba:compile"] if type(k).__name__ == "Announce")
-    type(listener).said = False
+    type(listener).announced = False
     with caplog.at_level(logging.WARNING):
         compiled("somebody.else")
         assert not caplog.records
