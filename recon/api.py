@@ -10,11 +10,11 @@ from typing import Any, overload
 
 import torch
 
-from recon.fbp.coverage import consistency_warnings, sampling_warnings, view_notes
-from recon.fbp.inset import InsetFbp
+from recon.analytic.coverage import consistency_warnings, sampling_warnings, view_notes
+from recon.analytic.inset import InsetFbp
+from recon.least_squares.inset_problem import reconstruct_pwls
 from recon.mbir.reconstruct import reconstruct_mbir
 from recon.metal import metal_warnings
-from recon.pwls.inset_problem import reconstruct_pwls
 from torchpcct.defects import dead_readings, repair_defects
 from torchpcct.geometry import VolumeGrid
 from torchpcct.reading_checks import reading_warnings
@@ -57,9 +57,9 @@ def reconstruct(
         grid: ``(z, y, x)`` grid inside the field of view; of a parallel or fan-beam scan ``(y, x)`` or, of several
             slices, ``(slices, y, x)``.
         method: ``"fbp"`` (FDK; option ``kernel``) or ``"pwls"`` (penalised weighted least squares with a q-GGMRF
-            prior, of an inset or a whole field; options of :func:`recon.pwls.inset_problem.reconstruct_pwls`; a volume
-            that did not converge carries ``warnings`` in its report) or ``"mbir"`` (unrolled steps with the learned
-            prior that ships with the package, of an inset or a whole field; options of
+            prior, of an inset or a whole field; options of :func:`recon.least_squares.inset_problem.reconstruct_pwls`;
+            a volume that did not converge carries ``warnings`` in its report) or ``"mbir"`` (unrolled steps with the
+            learned prior that ships with the package, of an inset or a whole field; options of
             :func:`recon.mbir.reconstruct.reconstruct_mbir`; what the training has not seen is named in ``warnings``).
         progress: called with the finished fraction, 0…1.
         device: where the returned volumes lie.
@@ -69,8 +69,8 @@ def reconstruct(
     interpolated before; the report's ``warnings`` say so, and what else the readings say against their description (an
     offset, saturation, transmissions, no light: :mod:`torchpcct.reading_checks`). Scans that contradict themselves or
     their description (centre, fan angles, steps between views, roll, rows that end inside the object, readings that are
-    no line integrals) are named there, too (:func:`recon.fbp.coverage.consistency_warnings`); PWLS and MBIR test what
-    they leave of the data besides. Metal is named (:mod:`recon.metal`), not corrected.
+    no line integrals) are named there, too (:func:`recon.analytic.coverage.consistency_warnings`); PWLS and MBIR test
+    what they leave of the data besides. Metal is named (:mod:`recon.metal`), not corrected.
 
     The number of threads does not change a bit of an inset's FBP and PWLS. FBP of whole rows and MBIR, where torch's
     matrix products and convolutions decide about the order of sums, agree within 0.01 HU.
@@ -134,7 +134,7 @@ def reconstruct(
 
 def _fbp(scans: Sequence[Scan], grid: VolumeGrid, progress: Progress | None, kernel: str = "standard") -> list[Volume]:
     if not isinstance(kernel, str):
-        raise TypeError(f"kernel must be one name, got {kernel!r}; recon.fbp.inset.InsetFbp takes several at once")
+        raise TypeError(f"kernel must be one name, got {kernel!r}; recon.analytic.inset.InsetFbp takes several at once")
     start = time.perf_counter()
     run = InsetFbp(scans[0], [grid], [kernel])
     warnings = [*run.warnings, *sampling_warnings(run.circle)]

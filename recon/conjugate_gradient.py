@@ -1,9 +1,9 @@
 """Conjugate gradients, the method by which everything quadratic in this package is solved.
 
-:func:`conjugate_gradient` is the linear one. The nonlinear ones of PWLS (:mod:`recon.pwls.model_solver` inside,
-:mod:`recon.pwls.pwls` outside) share :func:`dot` and :func:`per_volume` with it, not the recursion: their gradient is
-computed afresh in every step, their step length is searched for, and the next direction needs both gradients
-(Polak–Ribière) or the exact curvature.
+:func:`conjugate_gradient` is the linear one. The nonlinear ones of PWLS (:mod:`recon.least_squares.model_solver`
+inside, :mod:`recon.least_squares.pwls` outside) share :func:`dot` and :func:`per_volume` with it, not the recursion:
+their gradient is computed afresh in every step, their step length is searched for, and the next direction needs both
+gradients (Polak–Ribière) or the exact curvature.
 """
 
 from __future__ import annotations

@@ -11,8 +11,8 @@ import torch
 import recon
 import torchpcct.scanner
 from recon import fbp, pwls
-from recon.fbp.fbp import filter_sinogram, interleave
-from recon.pwls.qggmrf import QGGMRF
+from recon.analytic.fbp import filter_sinogram, interleave
+from recon.least_squares.qggmrf import QGGMRF
 from recon.study import registry
 from torchpcct import (
     ConeBeam,

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from recon.gram.gram import Gram
+from recon.least_squares.inset_problem import InsetProblem
 from recon.mbir.problem import NormalisedProblem
-from recon.pwls.inset_problem import InsetProblem
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scanner import presets

@@ -72,9 +72,7 @@ def write_api(folder):
         for module, own, others in sorted(modules, key=lambda m: m[0] != package):
             if module != package:
                 lines += [module, "-" * len(module), ""]
-            # A function may stand in the place of its package (recon.fbp): the module is then no entry of the index.
             lines += [f".. automodule:: {module}"]
-            lines += ["   :no-index:"] if module in ("recon.fbp", "recon.pwls") else []
             told = [name for name in own if name not in bare[module]]
             lines += [f"   :members: {', '.join(told)}", "   :undoc-members:", "   :show-inheritance:"] if told else []
             lines += ["", *(_constant(module, name) for name in own if name in bare[module])]

@@ -7,7 +7,7 @@ How much smoothing should the prior of PWLS (which weighs each reading by its ph
 import matplotlib.pyplot as plt
 
 import recon
-from recon.pwls.qggmrf import QGGMRF
+from recon.least_squares.qggmrf import QGGMRF
 from torchpcct import VolumeGrid, acquire
 from torchpcct.scanner import presets
 from torchpcct.scene.plaque import plaque_scene

@@ -33,13 +33,13 @@ def _plaque(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         if getattr(arguments, name) is not None:
             numbers(f"--{name}", getattr(arguments, name), 3, positive=name == "extent", unit="mm")
     from recon import reconstruct
+    from recon.least_squares.inset_problem import InsetProblem
     from recon.plaque.beside import fbp_deviations
     from recon.plaque.data import TissueData
     from recon.plaque.reading import read_plaque
     from recon.plaque.report import save, table
     from recon.plaque.start import require_within
     from recon.plaque.vessel_prior import VesselPrior
-    from recon.pwls.inset_problem import InsetProblem
     from recon.study.paper.plaque_scan import INSET_MM
     from torchpcct.scan import Scan
     from torchpcct.scene.plaque import PAPER_POSITION

@@ -235,11 +235,11 @@ def grid_of_scan(scan: Any, arguments: argparse.Namespace) -> VolumeGrid:
     """The grid that was asked for; else the plaque's inset for a windowed scan, the field of view for any other.
 
     Args:
-        scan: a scan, or the :class:`recon.fbp.slabs.ScanSlices` of one.
+        scan: a scan, or the :class:`recon.analytic.slabs.ScanSlices` of one.
     """
     import numpy as np
 
-    from recon.fbp.angular_weights import is_offset, view_steps
+    from recon.analytic.angular_weights import is_offset, view_steps
     from torchpcct.geometry import ConeBeam, ParallelBeam
     from torchpcct.vector_geometry import VectorGeometry
 
@@ -484,10 +484,10 @@ def _made(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _reconstruct_slabs(arguments: argparse.Namespace, options: dict[str, Any], progress: ProgressBars) -> None:
-    """``--memory``: slab by slab (:mod:`recon.fbp.slabs`)."""
+    """``--memory``: slab by slab (:mod:`recon.analytic.slabs`)."""
     import yaml
 
-    from recon.fbp.slabs import ScanSlices, plan_slabs, reconstruct_to
+    from recon.analytic.slabs import ScanSlices, plan_slabs, reconstruct_to
     from torchpcct.formats.volume_slabs import check_slab_name
 
     check_slab_name(arguments.out)

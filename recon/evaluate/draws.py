@@ -18,16 +18,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from recon.analytic.exact_noise import roi_covariance
+from recon.analytic.inset import InsetFbp
 from recon.evaluate.methods import Method, noise_of
 from recon.evaluate.response import response, statistic_covariance
 from recon.evaluate.store import Store
 from recon.evaluate.task import Facts, Task
-from recon.fbp.exact_noise import roi_covariance
-from recon.fbp.inset import InsetFbp
+from recon.least_squares.inset_problem import InsetProblem
+from recon.least_squares.pwls import solve_normal
+from recon.least_squares.qggmrf import DEFAULT_PRIOR
 from recon.mbir.mbir import Mbir
-from recon.pwls.inset_problem import InsetProblem
-from recon.pwls.pwls import solve_normal
-from recon.pwls.qggmrf import DEFAULT_PRIOR
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
 from torchpcct.volume import to_hu
@@ -41,7 +41,8 @@ _SIGMA_SEEDS = (900_001, 900_002)
 
 @dataclass(frozen=True, eq=False)
 class Functional:
-    """A mean over voxels, as :func:`recon.fbp.exact_noise.roi_covariance` takes it: weights ``grid.shape`` float64."""
+    """A mean over voxels, as :func:`recon.analytic.exact_noise.roi_covariance` takes it: weights ``grid.shape``
+    float64."""
 
     weights: Tensor
 

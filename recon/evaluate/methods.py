@@ -26,8 +26,8 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from recon.analytic.ramp import KERNELS
 from recon.evaluate.rivals import FILTERS, SMOOTHED_BY, flat_noise, tuned
-from recon.fbp.ramp import KERNELS
 from recon.mbir.mbir import Mbir
 from recon.mbir.network import bilateral_prior
 from recon.mbir.tissues import TissueMbir

@@ -16,8 +16,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.fbp.exact_noise import line_integral_variance
-from recon.pwls.inset_problem import InsetProblem
+from recon.analytic.exact_noise import line_integral_variance
+from recon.least_squares.inset_problem import InsetProblem
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
 
 __all__ = ["response", "statistic_covariance"]

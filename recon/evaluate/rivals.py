@@ -207,8 +207,8 @@ def bm4d(volume: Image, noise_hu: float, *, strength: float = 1.0, covariance: A
         noise_hu: standard deviation in flat tissue.
         strength: factor on the noise that it is told.
         covariance: of a voxel's noise with those around it, HU² or any multiple of it, the voxel itself in the middle;
-            odd numbers of voxels, at most the volume's (:func:`recon.fbp.exact_noise.voxel_covariance` gives FBP's).
-            None: white noise.
+            odd numbers of voxels, at most the volume's (:func:`recon.analytic.exact_noise.voxel_covariance` gives
+            FBP's). None: white noise.
 
     Raises:
         ImportError: the package is not installed, or does not run with this NumPy (4.2.5 needs less than 2.4).

@@ -27,9 +27,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from torch import Tensor
 
+from recon.analytic.exact_noise import line_integral_variance
 from recon.evaluate.sources import source_digest
 from recon.evaluate.store import Store
-from recon.fbp.exact_noise import line_integral_variance
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.acquisition.path_lengths import tissue_path_lengths
 from torchpcct.detector_window import DetectorWindow

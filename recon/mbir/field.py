@@ -32,14 +32,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from recon.least_squares.field_model import FieldModel
+from recon.least_squares.field_problem import FieldProblem, field_prior
+from recon.least_squares.memory import require_memory
+from recon.least_squares.pwls import pwls
+from recon.least_squares.qggmrf import QGGMRF
 from recon.mbir.mbir import Mbir, average_onto
 from recon.mbir.problem import NormalisedProblem
 from recon.mbir.unrolled import REFERENCE_SCALE_HU, Prior, low_residual
-from recon.pwls.field_model import FieldModel
-from recon.pwls.field_problem import FieldProblem, field_prior
-from recon.pwls.memory import require_memory
-from recon.pwls.pwls import pwls
-from recon.pwls.qggmrf import QGGMRF
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
 from torchpcct.volume import Volume, to_hu
@@ -72,7 +72,7 @@ class FieldGram:
 
     Attributes:
         ratio: s, ``(z, y, x)``.
-        determined: bool ``(z, y, x)``, see :class:`recon.pwls.field_model.FieldModel`.
+        determined: bool ``(z, y, x)``, see :class:`recon.least_squares.field_model.FieldModel`.
     """
 
     def __init__(self, problem: FieldProblem, weights: Sequence[Tensor], voxel_mm: float) -> None:
@@ -219,8 +219,8 @@ def reconstruct_field_mbir(
         90 % of the voxels), ``voxel_mm`` (of the grid that was worked on).
 
     Raises:
-        ValueError: see :class:`recon.pwls.field_problem.FieldProblem`; too little memory; voxels finer than what the
-            detector resolves.
+        ValueError: see :class:`recon.least_squares.field_problem.FieldProblem`; too little memory; voxels finer than
+            what the detector resolves.
     """
     began = time.perf_counter()
     flat = len(scans[0].geometry.shape) == 2

@@ -20,11 +20,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from recon.least_squares.inset_problem import InsetProblem
 from recon.mbir.network import NetworkConfig
 from recon.mbir.problem import NormalisedProblem
 from recon.mbir.unrolled import DEFAULT_FIDELITY, Unrolled, fidelity_frequency
 from recon.mbir.weights_io import digest, read_tensors
-from recon.pwls.inset_problem import InsetProblem
 from torchpcct.geometry import VolumeGrid
 from torchpcct.volume import from_hu, in_words, to_hu
 
@@ -122,7 +122,7 @@ class Mbir:
 
         Args:
             problem: of the scan, on voxels of ``voxel_mm``.
-            b: ``(batch, z, y, x)``, :meth:`recon.pwls.inset_problem.InsetProblem.statistic` of each scan.
+            b: ``(batch, z, y, x)``, :meth:`recon.least_squares.inset_problem.InsetProblem.statistic` of each scan.
             exposure_s: of the scans.
         """
         found = self.solved(problem, b, exposure_s)

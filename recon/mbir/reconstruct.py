@@ -9,13 +9,13 @@ from typing import Any
 
 import torch
 
+from recon.least_squares.field_problem import is_whole_field
+from recon.least_squares.inset_problem import InsetProblem
 from recon.mbir.field import reconstruct_field_mbir
 from recon.mbir.mbir import Mbir, average_onto, working_grid
 from recon.mbir.tissues import TissueMbir
 from recon.mbir.unrolled import low_residual
 from recon.plaque.vessel_prior import VesselPrior
-from recon.pwls.field_problem import is_whole_field
-from recon.pwls.inset_problem import InsetProblem
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
 from torchpcct.validate import renamed
@@ -69,8 +69,8 @@ def reconstruct_mbir(
         ``tissues`` what was read of them, under that name.
 
     Raises:
-        ValueError, TypeError: see :class:`recon.pwls.inset_problem.InsetProblem`; a problem that was made for another
-            grid; a fidelity outside of 0 … 1.
+        ValueError, TypeError: see :class:`recon.least_squares.inset_problem.InsetProblem`; a problem that was made for
+            another grid; a fidelity outside of 0 … 1.
         FileNotFoundError: the package has no weights.
     """
     start = time.perf_counter()

@@ -25,12 +25,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from recon.least_squares.inset_problem import InsetProblem
 from recon.mbir.mbir import Mbir, Solution
 from recon.mbir.problem import NormalisedProblem
 from recon.plaque.data import TissueData
 from recon.plaque.reading import PlaqueReading, read_plaque
 from recon.plaque.vessel_prior import VesselPrior
-from recon.pwls.inset_problem import InsetProblem
 from torchpcct.validate import numbers
 
 __all__ = ["TissueMbir", "tissue_image"]

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from recon.fbp.exact_noise import roi_adjoints
-from recon.fbp.inset import InsetFbp
+from recon.analytic.exact_noise import roi_adjoints
+from recon.analytic.inset import InsetFbp
 from recon.plaque.reading import core_regions
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.roi import RoiMean
@@ -21,7 +21,8 @@ __all__ = ["fbp_deviations"]
 def fbp_deviations(scan: Scan, grid: VolumeGrid, regions: Mapping[str, Any], kernel: str = "soft") -> dict[str, float]:
     """Standard deviation in HU of FBP's mean over each region, and of the contrast, of the noise alone.
 
-    One adjoint pass a region (:mod:`recon.fbp.exact_noise`), with the variance of the readings that is expected behind
+    One adjoint pass a region (:mod:`recon.analytic.exact_noise`), with the variance of the readings that is expected
+    behind
     the known surround: what the inset adds to the attenuation, a few per cent of the counts, is left out, and so is
     that the regions were found in the same noise.
 

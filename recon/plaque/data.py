@@ -13,8 +13,8 @@ from scipy import ndimage
 from torch import Tensor
 
 from recon.conjugate_gradient import conjugate_gradient
+from recon.least_squares.inset_problem import InsetProblem
 from recon.plaque.stationary import Spectrum, StationaryGram
-from recon.pwls.inset_problem import InsetProblem
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
 from torchpcct.validate import number
@@ -71,7 +71,7 @@ class TissueData:
         """From a scan and what all scans of its kind share.
 
         Raises:
-            ValueError: see :class:`recon.pwls.inset_problem.InsetProblem`.
+            ValueError: see :class:`recon.least_squares.inset_problem.InsetProblem`.
         """
         return cls.of_statistic(problem.statistic(scan).b, problem, scan.exposure_s or NOISE_FREE_EXPOSURE_S)
 
@@ -81,7 +81,7 @@ class TissueData:
 
         Args:
             b: AᵀW y with the background taken off, W that of the exposure.
-            problem: :class:`recon.pwls.inset_problem.InsetProblem`.
+            problem: :class:`recon.least_squares.inset_problem.InsetProblem`.
             exposure_s: of b, s.
         """
         gram, hu = problem.gram.scaled(exposure_s), problem.mu_ref / 1000.0

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 import recon
-from recon.pwls.inset_problem import InsetProblem
+from recon.least_squares.inset_problem import InsetProblem
 from recon.study.paper.plaque_scan import inset_grid
 from torchpcct import VolumeGrid
 from torchpcct.acquisition.acquire import acquire

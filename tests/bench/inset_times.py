@@ -22,9 +22,9 @@ import torch
 from rod_values import true_volume
 
 import recon
+from recon.least_squares.inset_problem import InsetProblem
 from recon.mbir.mbir import Mbir
 from recon.plaque import TissueData, read_plaque
-from recon.pwls.inset_problem import InsetProblem
 from recon.study.paper.plaque_scan import inset_grid
 from recon.study.study import environment
 from torchpcct import VolumeGrid, acquire

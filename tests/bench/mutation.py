@@ -37,18 +37,18 @@ class Fault(NamedTuple):
 _T = "tests/torchpcct/test_no_silent_errors.py::"
 _R = "tests/recon/test_no_silent_errors.py::"
 _C = "tests/recon/test_cli_refusals.py::"
-_FIELD, _WF = "recon/pwls/field_model.py", "tests/recon/pwls/test_whole_field.py::"
+_FIELD, _WF = "recon/least_squares/field_model.py", "tests/recon/least_squares/test_whole_field.py::"
 _D = "tests/torchpcct/test_defects.py::"
 _Q = "tests/torchpcct/metrics/test_residual_test.py::"
 _O = "tests/torchpcct/metrics/test_opposite_rays.py::"
 _OPP = "torchpcct/metrics/opposite_rays.py"
 _P = "tests/recon/evaluate/test_store.py::"
 _SAME = _P + "test_finished_pieces_are_used_again_by_the_same_settings_and_source_only"
-_W = "tests/recon/fbp/test_angular_weights.py"
+_W = "tests/recon/analytic/test_angular_weights.py"
 _N = "tests/torchpcct/metrics/test_cnr.py::"
 _G = "torchpcct/geometry.py"
 _L = "torchpcct/scanner/linearisation.py"
-_A = "recon/fbp/angular_weights.py"
+_A = "recon/analytic/angular_weights.py"
 _V = "torchpcct/vector_geometry.py"
 _VG = "tests/torchpcct/projector/test_vector_geometry.py::"
 _TURN = _VG + "test_roll_tilt_and_slant_turn_right_handed"
@@ -124,11 +124,11 @@ FAULTS = (
           _R + "test_views_that_lack_inside_of_the_scan_are_refused_or_named"),
     Fault("small gaps unnamed", _A, "        _LOG.warning(", "        _LOG.debug(",
           _R + "test_views_that_lack_inside_of_the_scan_are_refused_or_named"),
-    Fault("volume beside the rows", "recon/fbp/coverage.py", "if not by_some.any():", "if False:",
+    Fault("volume beside the rows", "recon/analytic/coverage.py", "if not by_some.any():", "if False:",
           _R + "test_fbp_of_a_tensor_refuses_a_grid_beyond_the_rows"),
-    Fault("interleave without offset", "recon/fbp/fbp.py", "if abs(quarters - 0.25) > 0.1:", "if False:",
+    Fault("interleave without offset", "recon/analytic/fbp.py", "if abs(quarters - 0.25) > 0.1:", "if False:",
           _R + "test_interleave_needs_a_quarter_column_opposite_rays_and_many_views"),
-    Fault("interleave an arc", "recon/fbp/fbp.py", "if span < 2.0 * math.pi:", "if False:",
+    Fault("interleave an arc", "recon/analytic/fbp.py", "if span < 2.0 * math.pi:", "if False:",
           _R + "test_interleave_needs_a_quarter_column_opposite_rays_and_many_views"),
     Fault("noise added, not in squares", "torchpcct/metrics/cnr.py", "noise = np.hypot(fg_noise, bg_noise)",
           "noise = fg_noise + bg_noise", _N + "test_definition_by_hand"),
@@ -194,8 +194,9 @@ FAULTS = (
     Fault("pieces written in place", "recon/evaluate/store.py",
           'with atomic_write(self.path(name + ".npz")) as part:', "for part in [path]:",
           _P + "test_kills_at_random_moments_lose_one_piece_at_most"),
-    Fault("a threshold that ignores the noise", "recon/pwls/qggmrf.py", "threshold=16.0, relative=True)",
-          "threshold=300.0)", "tests/recon/pwls/test_inset_problem.py::test_the_default_prior_follows_the_noise"),
+    Fault("a threshold that ignores the noise", "recon/least_squares/qggmrf.py", "threshold=16.0, relative=True)",
+          "threshold=300.0)",
+          "tests/recon/least_squares/test_inset_problem.py::test_the_default_prior_follows_the_noise"),
     Fault("any number of voxels", "recon/cli/scans.py", "MOST_VOXELS = 2**31", "MOST_VOXELS = 2**200",
           _C + "test_refusals_name_value_and_remedy_and_leave_nothing"),
     Fault("kept views are computed again", "torchpcct/acquisition/acquire.py", "values = keep(", "values = _computed(",
@@ -240,7 +241,7 @@ FAULTS = (
           _VG + "test_flips_and_shifts_are_those_of_the_readings"),
     Fault("a helix downwards", _V, "out[:, 0] = -height", "out[:, 0] = height",
           _VG + "test_a_helix_takes_the_native_passes"),
-    Fault("a far start keeps its rounding", "recon/pwls/pwls.py", "FAR_START = 2.0", "FAR_START = 1e9",
+    Fault("a far start keeps its rounding", "recon/least_squares/pwls.py", "FAR_START = 2.0", "FAR_START = 1e9",
           _F + "test_pwls_forgets_a_start_far_away"),
     Fault("bins of one spectrum pass", "torchpcct/spectral/model.py", "_ALIKE = 1e-7", "_ALIKE = -1.0",
           _F + "test_what_has_no_answer_is_refused"),
@@ -248,10 +249,10 @@ FAULTS = (
           _WF + "test_slices_beyond_the_rows_do_not_slow_the_rest_down"),
     Fault("one spectrum for all slices", _FIELD, "NODES, FACTOR = 5, 3.0", "NODES, FACTOR = 5, 1e30",
           _WF + "test_slices_share_the_field"),
-    Fault("an approach that gets faster", "recon/pwls/approach.py", "(6, 0.7)", "(4, 1.0)",
+    Fault("an approach that gets faster", "recon/least_squares/approach.py", "(6, 0.7)", "(4, 1.0)",
           _WF + "test_an_approach_that_gets_faster_is_seen"),
-    Fault("slow steps count once", "recon/pwls/pwls.py", "return d * (1 + q) / (1 - q)", "return d",
-          "tests/recon/pwls/test_pwls.py::test_distance_is_right_where_the_model_converges_slowly"),
+    Fault("slow steps count once", "recon/least_squares/pwls.py", "return d * (1 + q) / (1 - q)", "return d",
+          "tests/recon/least_squares/test_pwls.py::test_distance_is_right_where_the_model_converges_slowly"),
     Fault("indefinite frequencies pass", "recon/gram/positive_definite.py", "    run(damp, todo.size",
           "    _ = (damp, todo.size", "tests/recon/gram/test_gram.py::test_spectra_become_definite_whatever_they_are"),
     Fault("bowtie straight between its nodes", _FILTERS,
@@ -306,7 +307,7 @@ FAULTS = (
           "fidelities, solves[1]) if False else v", _WORD),
     Fault("the surround's zero is lost", _MB, "return to_hu(u * scale + problem.level, problem.mu_ref)",
           "return to_hu(u * scale + 1.02 * problem.level, problem.mu_ref)", _KEPT),
-    Fault("the surround's zero is another", "recon/pwls/inset_problem.py",
+    Fault("the surround's zero is another", "recon/least_squares/inset_problem.py",
           "self.level = float(static_fbp(self._background, scan.geometry, grid).mean())",
           "self.level = 1.02 * float(static_fbp(self._background, scan.geometry, grid).mean())",
           "tests/recon/mbir/test_mbir.py::test_noise_free_values_in_hu"),

@@ -28,11 +28,11 @@ from rod_values import ROD_HU
 from scipy import ndimage
 from scipy.stats import beta, chi2
 
-from recon.fbp.inset import InsetFbp
+from recon.analytic.inset import InsetFbp
+from recon.least_squares.inset_problem import InsetProblem
 from recon.mbir.mbir import Mbir
 from recon.plaque import TissueData, read_plaque
 from recon.plaque.reading import CERTAIN, read_regions
-from recon.pwls.inset_problem import InsetProblem
 from recon.study.paper.plaque_scan import inset_grid
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.files import atomic_write

@@ -22,13 +22,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from recon.analytic.fbp import fbp
 from recon.conjugate_gradient import dot
-from recon.fbp.fbp import fbp
 from recon.gram.gram import Gram
+from recon.least_squares.pwls import pwls
+from recon.least_squares.qggmrf import QGGMRF
 from recon.mbir.mbir import Mbir
 from recon.mbir.problem import NormalisedProblem
-from recon.pwls.pwls import pwls
-from recon.pwls.qggmrf import QGGMRF
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Projector, Scan, VolumeGrid, full_turn
 from torchpcct.detector_window import footprint
 from torchpcct.metrics.observer import hotelling_scores

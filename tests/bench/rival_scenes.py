@@ -19,10 +19,10 @@ from rod_values import ROD_HU
 from scipy import ndimage
 from torch import Tensor
 
+from recon.analytic.inset import InsetFbp
 from recon.evaluate.store import Store
 from recon.evaluate.vessels import Centreline, Vessel
-from recon.fbp.inset import InsetFbp
-from recon.pwls.inset_problem import InsetProblem
+from recon.least_squares.inset_problem import InsetProblem
 from recon.study.paper.plaque_scan import inset_grid
 from torchpcct import Projector, VolumeGrid
 from torchpcct.acquisition.acquire import acquire

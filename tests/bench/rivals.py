@@ -27,11 +27,11 @@ from rival_scenes import DIRECTIONS, KERNELS, Bench, Place
 from torch import Tensor
 
 import recon.evaluate
+from recon.analytic.exact_noise import voxel_covariance
+from recon.analytic.inset import InsetFbp
 from recon.evaluate.rivals import FILTERS, flat_noise
-from recon.fbp.exact_noise import voxel_covariance
-from recon.fbp.inset import InsetFbp
-from recon.pwls.pwls import solve_normal
-from recon.pwls.qggmrf import DEFAULT_PRIOR
+from recon.least_squares.pwls import solve_normal
+from recon.least_squares.qggmrf import DEFAULT_PRIOR
 from torchpcct.volume import to_hu
 
 HERE = Path(__file__).parent

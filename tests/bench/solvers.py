@@ -22,9 +22,9 @@ import torch
 from torch import Tensor
 
 from recon.gram.gram import Gram
-from recon.pwls.inset_problem import InsetProblem
-from recon.pwls.pwls import pwls
-from recon.pwls.qggmrf import DEFAULT_PRIOR
+from recon.least_squares.inset_problem import InsetProblem
+from recon.least_squares.pwls import pwls
+from recon.least_squares.qggmrf import DEFAULT_PRIOR
 from recon.study.paper.plaque_scan import inset_grid
 from torchpcct import Projector, acquire
 from torchpcct.detector_window import DetectorWindow

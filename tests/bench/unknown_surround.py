@@ -28,10 +28,10 @@ import torch
 from rod_values import ROD_HU
 from torch import Tensor
 
-from recon.fbp.fbp import fbp
+from recon.analytic.fbp import fbp
+from recon.least_squares.inset_problem import DEFAULT_PRIOR, InsetProblem
+from recon.least_squares.pwls import pwls
 from recon.mbir.mbir import Mbir
-from recon.pwls.inset_problem import DEFAULT_PRIOR, InsetProblem
-from recon.pwls.pwls import pwls
 from recon.study.paper.plaque_scan import inset_grid
 from torchpcct import Projector, VolumeGrid
 from torchpcct.acquisition.acquire import acquire

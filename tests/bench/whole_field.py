@@ -25,10 +25,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recon.pwls.field_model import FieldModel
-from recon.pwls.field_problem import FieldProblem, field_prior
-from recon.pwls.pwls import pwls
-from recon.pwls.qggmrf import QGGMRF
+from recon.least_squares.field_model import FieldModel
+from recon.least_squares.field_problem import FieldProblem, field_prior
+from recon.least_squares.pwls import pwls
+from recon.least_squares.qggmrf import QGGMRF
 from torchpcct import ConeBeam, ParallelBeam, Projector, Scan, VolumeGrid, full_turn
 
 MU = 0.02

@@ -3,7 +3,7 @@
 import pytest
 from small_scan import GRID, SCENE, SPECTRAL_GRID, scanner
 
-from recon.pwls.inset_problem import InsetProblem
+from recon.least_squares.inset_problem import InsetProblem
 from torchpcct import acquire
 from torchpcct.spectral import SpectralModel, decompose_scan, decompose_surround
 

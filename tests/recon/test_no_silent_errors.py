@@ -10,9 +10,9 @@ import torch
 from small_scan import CENTER, GRID, SCENE, scanner
 
 from recon import fbp, reconstruct
-from recon.fbp.angular_weights import angular_weights
-from recon.fbp.coverage import check_rows, consistency_warnings, sampling_warnings
-from recon.fbp.fbp import interleave
+from recon.analytic.angular_weights import angular_weights
+from recon.analytic.coverage import check_rows, consistency_warnings, sampling_warnings
+from recon.analytic.fbp import interleave
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, VolumeGrid, acquire, full_turn
 from torchpcct.scene import Body, EllipticCylinder, Scene
 

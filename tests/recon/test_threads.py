@@ -5,7 +5,7 @@ import torch
 from small_scan import GRID
 
 from recon import reconstruct
-from recon.fbp.fbp import fbp
+from recon.analytic.fbp import fbp
 from torchpcct import Projector
 from torchpcct.threads import get_num_threads, set_num_threads
 

@@ -13,7 +13,7 @@ from analytic import Ellipsoid, Gaussian, rasterize, vector_lines
 
 from recon import reconstruct
 from recon.cli import main
-from recon.pwls.field_problem import larger_grid
+from recon.least_squares.field_problem import larger_grid
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, VectorGeometry, Volume, VolumeGrid, full_turn
 from torchpcct.formats.geometry_yaml import geometry_of, geometry_values
 from torchpcct.formats.scans import open_scan

@@ -9,7 +9,7 @@ import torch
 
 import torchpcct
 from recon import reconstruct
-from recon.fbp.inset import InsetFbp
+from recon.analytic.inset import InsetFbp
 from torchpcct import ConeBeam, FanBeam, Scan, VectorGeometry, Volume, VolumeGrid, acquire, full_turn
 from torchpcct.files import seal
 from torchpcct.scanner import presets
@@ -178,7 +178,7 @@ def test_noise_falls_with_the_square_root_of_dose():
 
 
 def test_exact_roi_covariance_matches_monte_carlo():
-    from recon.fbp.exact_noise import roi_covariance
+    from recon.analytic.exact_noise import roi_covariance
     from torchpcct.metrics.roi import RoiMean, axial_grid
 
     clean = acquire(SCENE, scanner(120), region=REGION, duty=0.05, sub_rays=16)

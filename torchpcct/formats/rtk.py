@@ -26,7 +26,8 @@ _OURS = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 
 
 def read_rtk(path: str | os.PathLike[str], columns: int, rows: int, pitch: Any, origin: Any = None) -> VectorGeometry:
-    """The scan of :func:`read_rtk_vectors`, for ``Projector`` and ``recon.fbp.fbp.fbp``; its arguments and errors."""
+    """The scan of :func:`read_rtk_vectors`, for ``Projector`` and ``recon.analytic.fbp.fbp``; its arguments and
+    errors."""
     return VectorGeometry(read_rtk_vectors(path, columns, rows, pitch, origin), columns, rows)
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.fbp.fbp import fbp
+from recon.analytic.fbp import fbp
 from recon.study.bowtie.settings import DETECTORS
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.geometry import VolumeGrid

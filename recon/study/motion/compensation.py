@@ -8,10 +8,10 @@ from typing import Any
 
 from torch import Tensor
 
+from recon.analytic.inset import InsetFbp, view_motion
 from recon.evaluate.store import Pieces
-from recon.fbp.inset import InsetFbp, view_motion
+from recon.least_squares.inset_problem import InsetProblem, reconstruct_pwls
 from recon.mbir.mbir import Mbir
-from recon.pwls.inset_problem import InsetProblem, reconstruct_pwls
 from recon.study.motion.observed import Observed, Reference, observe
 from recon.study.motion.settings import Settings
 from recon.study.paper.plaque_scan import REFERENCE_KERNEL
@@ -32,7 +32,7 @@ def estimate_name(error: float | None) -> str:
 
 
 def reconstruct_fbp(scan: Scan, grid: VolumeGrid, motion: Any = None) -> Tensor:
-    """FBP with the study's kernel, ``(z, y, x)`` HU; ``motion``: of :class:`recon.fbp.inset.InsetFbp`."""
+    """FBP with the study's kernel, ``(z, y, x)`` HU; ``motion``: of :class:`recon.analytic.inset.InsetFbp`."""
     return InsetFbp(scan, [grid], [REFERENCE_KERNEL], motion=motion)(scan)[0][0]
 
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from recon.analytic.inset import view_motion
 from recon.evaluate.store import Pieces
-from recon.fbp.inset import view_motion
 from recon.study.motion.compensation import Key, compensate, reconstruct_fbp
 from recon.study.motion.observed import Observed, Reference, observe
 from recon.study.motion.settings import Settings

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.fbp.exact_noise import roi_adjoints
+from recon.analytic.exact_noise import roi_adjoints
 from recon.study.noise.settings import Settings
 from recon.study.paper.facts import FULL_VIEWS
 from recon.study.paper.plaque_scan import equal_dose, prepare

@@ -1,9 +1,9 @@
 """What a few noise realisations can and cannot establish about CNR tables.
 
 The ROI means of all settings (kernels × voxel sizes) of one realisation come from one scan, so they are jointly normal
-with a covariance that :mod:`recon.fbp.exact_noise` gives exactly. That makes three things computable: the truth (exact
-CNR of every setting), what an experiment of n realisations would report (drawn from the joint law), and how sure a
-measured table is (paired bootstrap over its realisations).
+with a covariance that :mod:`recon.analytic.exact_noise` gives exactly. That makes three things computable: the truth
+(exact CNR of every setting), what an experiment of n realisations would report (drawn from the joint law), and how sure
+a measured table is (paired bootstrap over its realisations).
 """
 
 from __future__ import annotations

@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from recon.analytic.exact_noise import roi_adjoints, roi_covariance
+from recon.analytic.inset import InsetFbp
 from recon.evaluate.store import Pieces
-from recon.fbp.exact_noise import roi_adjoints, roi_covariance
-from recon.fbp.inset import InsetFbp
 from recon.study.noise.equal_dose import equal_dose_rows
 from recon.study.noise.few_runs import Table, exact_table
 from recon.study.noise.placements import Placements, vary_placement

@@ -17,8 +17,8 @@ import torch
 from numpy.typing import NDArray
 from scipy import stats
 
-from recon.fbp.exact_noise import line_integral_variance, roi_adjoints
-from recon.fbp.inset import InsetFbp
+from recon.analytic.exact_noise import line_integral_variance, roi_adjoints
+from recon.analytic.inset import InsetFbp
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.placement import RoiPair
 from torchpcct.metrics.roi import RoiMean

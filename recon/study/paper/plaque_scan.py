@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from recon.analytic.inset import InsetFbp
 from recon.evaluate.store import Pieces
-from recon.fbp.inset import InsetFbp
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.placement import RoiPair, place_rois
@@ -71,7 +71,7 @@ def equal_dose(scanner: Scanner) -> float:
 
 @dataclass(frozen=True)
 class Functional:
-    """A linear functional of a volume, as :func:`recon.fbp.exact_noise.roi_covariance` takes ROI means.
+    """A linear functional of a volume, as :func:`recon.analytic.exact_noise.roi_covariance` takes ROI means.
 
     Args:
         weights: shape of the volume, float64.

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.fbp.inset import InsetFbp
+from recon.analytic.inset import InsetFbp
 from torchpcct import VolumeGrid, acquire
 from torchpcct.scanner import Scanner
 from torchpcct.scene import Body, EllipticCylinder, Scene

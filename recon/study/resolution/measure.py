@@ -14,9 +14,9 @@ import torch
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
+from recon.analytic.exact_noise import roi_covariance
+from recon.analytic.inset import InsetFbp
 from recon.evaluate.store import Pieces
-from recon.fbp.exact_noise import roi_covariance
-from recon.fbp.inset import InsetFbp
 from recon.study.paper.facts import FULL_VIEWS
 from recon.study.paper.measures import Truth
 from recon.study.paper.plaque_scan import (

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from recon.fbp.inset import InsetFbp
+from recon.analytic.inset import InsetFbp
 from recon.study.resolution.blur import FWHM_PER_SIGMA
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.geometry import VolumeGrid

@@ -26,7 +26,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recon.fbp.inset import InsetFbp
+from recon.analytic.inset import InsetFbp
 from recon.study.paper import facts as paper
 from recon.study.spectral.scan import SpectralScan
 from recon.study.spectral.settings import Settings

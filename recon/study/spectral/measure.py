@@ -23,10 +23,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from recon.analytic.exact_noise import functional_covariance
 from recon.evaluate.store import Pieces
-from recon.fbp.exact_noise import functional_covariance
-from recon.pwls.basis_problem import BasisProblem
-from recon.pwls.qggmrf import DEFAULT_PRIOR
+from recon.least_squares.basis_problem import BasisProblem
+from recon.least_squares.qggmrf import DEFAULT_PRIOR
 from recon.study.spectral.calibration import calibration_costs
 from recon.study.spectral.scan import SpectralScan, second_order_bound, starved_rays, water_hu
 from recon.study.spectral.settings import Settings

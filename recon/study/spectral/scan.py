@@ -13,8 +13,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from recon.analytic.inset import InsetFbp, static_fbp
 from recon.evaluate.store import Pieces
-from recon.fbp.inset import InsetFbp, static_fbp
 from recon.study.paper.plaque_scan import duty, inset_grid
 from recon.study.spectral.settings import Settings
 from torchpcct.acquisition.acquire import acquire

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from recon import reconstruct
+from recon.least_squares.field_problem import FieldProblem
 from recon.mbir.field import FieldGram, _turned, blockwise, trained_grid
 from recon.mbir.mbir import Mbir
 from recon.mbir.network import Network, NetworkConfig
 from recon.mbir.problem import NormalisedProblem, filtered
-from recon.pwls.field_problem import FieldProblem
 from torchpcct import ConeBeam, ParallelBeam, Projector, Scan, VolumeGrid, full_turn
 
 MU, HU = 0.02, 2e-5

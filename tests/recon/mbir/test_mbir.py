@@ -9,10 +9,10 @@ import torch
 from small_scan import CENTER, GRID
 
 from recon import reconstruct
+from recon.least_squares.inset_problem import InsetProblem
 from recon.mbir.mbir import Mbir, average_onto, working_grid
 from recon.mbir.network import NetworkConfig
 from recon.mbir.unrolled import Unrolled, low_residual
-from recon.pwls.inset_problem import InsetProblem
 from torchpcct import VolumeGrid
 
 

@@ -12,8 +12,8 @@ from inset_operators import HU, problem
 from scipy import ndimage
 from torch import nn
 
-from recon.fbp.backproject import backproject
-from recon.fbp.fbp import filter_windowed
+from recon.analytic.backproject import backproject
+from recon.analytic.fbp import filter_windowed
 from recon.gram.gram import Gram
 from recon.mbir.mbir import Mbir
 from recon.mbir.network import NetworkConfig

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from small_scan import GRID
 
-from recon.fbp.exact_noise import roi_covariance
-from recon.fbp.inset import InsetFbp
+from recon.analytic.exact_noise import roi_covariance
+from recon.analytic.inset import InsetFbp
 from recon.plaque.beside import fbp_deviations
 from torchpcct.metrics.roi import RoiMean
 

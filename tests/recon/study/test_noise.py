@@ -8,8 +8,8 @@ import pytest
 import torch
 from tiny_studies import assert_report_is_whole
 
-from recon.fbp.exact_noise import roi_adjoints, roi_covariance, voxel_covariance
-from recon.fbp.inset import InsetFbp
+from recon.analytic.exact_noise import roi_adjoints, roi_covariance, voxel_covariance
+from recon.analytic.inset import InsetFbp
 from recon.study import registry
 from recon.study.noise.claims import CLAIMS
 from recon.study.noise.few_runs import (

@@ -271,7 +271,7 @@ SMALL = ConeBeam(full_turn(360), 626.0, 1098.0, 1500, 4, (0.5, 0.35), detector="
 @pytest.mark.parametrize("voxel", [0.1, 0.4])
 def test_water_reads_zero(changes, voxel):
     """0 ± 1 HU with the paper's geometry, ± 2 HU when sod, sdd, pitch or offset change; every kernel, off centre."""
-    from recon.fbp.inset import InsetFbp
+    from recon.analytic.inset import InsetFbp
 
     system = presets.pcct(views=360).replace(geometry=replace(SMALL, **changes))
     scan = acquire(water_cylinder(200.0), system, duty=0.2, sub_rays=16)

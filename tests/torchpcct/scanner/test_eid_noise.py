@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from recon.fbp.exact_noise import line_integral_variance, roi_covariance
-from recon.fbp.inset import InsetFbp
+from recon.analytic.exact_noise import line_integral_variance, roi_covariance
+from recon.analytic.inset import InsetFbp
 from torchpcct import Scan, VolumeGrid, acquire
 from torchpcct.counting_noise import compound_poisson, normal, poisson
 from torchpcct.metrics.roi import RoiMean, axial_grid

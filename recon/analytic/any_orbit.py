@@ -1,0 +1,234 @@
+"""FBP of scans that are not quite circles: detectors that tilt, roll and jitter, sources that wobble, mirrored axes.
+
+Every view is resampled onto the upright flat detector of an ideal circle, seen from the view's own source: a projective
+map that keeps every line integral. What is left, the source's way off the circle, is a motion of the object, which the
+backprojection compensates view by view. Costs one interpolation; slower than a circular scan, and as general as
+filtered backprojection gets: an orbit that climbs (a helix) is refused.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from recon.analytic.backproject import check_data
+from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
+from torchpcct.validate import checked, whole
+from torchpcct.vector_geometry import VectorGeometry
+
+__all__ = ["IdealCircle", "Rebinned", "at_slices", "ideal_circle", "rebin_to_circle"]
+
+Floats = NDArray[np.float64]
+
+CLIMB = 0.05
+"""Way of the source along z that makes an orbit a helix, as a share of the height that the rows cover at the axis."""
+_TILTED_RAY = 1e-3
+
+
+class IdealCircle(NamedTuple):
+    """The ideal circle next to a scan, and the way there.
+
+    Attributes:
+        geometry: of the circle.
+        motion: displacement of the grid in every view, ``(views, 2)`` (y, x) or ``(views, 3)`` (z, y, x) mm, or None.
+        slices: heights of the slices of a parallel scan with rows in mm, else None.
+        rows: positions of the ideal rows in mm; of a detector without rows 0.
+        maps: ``(views, 3, 3)``: (column position, row position, 1) on the ideal detector in mm to homogeneous
+            (columns, rows, 1) from the centre of the actual one.
+    """
+
+    geometry: Geometry
+    motion: Floats | None
+    slices: Floats | None
+    rows: Floats
+    maps: Floats
+
+
+class Rebinned(NamedTuple):
+    """A scan on an ideal circle.
+
+    Attributes:
+        sinogram: ``(..., views, [rows,] columns)``, of parallel rays with rows ``(..., slices, views, columns)``.
+        geometry, motion, slices: of :class:`IdealCircle`.
+    """
+
+    sinogram: Tensor
+    geometry: Geometry
+    motion: Floats | None
+    slices: Floats | None = None
+
+
+@checked
+def ideal_circle(geometry: VectorGeometry) -> IdealCircle:
+    """The ideal circle about z that a scan of any flat detectors can be resampled onto.
+
+    Raises:
+        ValueError: an orbit that climbs, parallel rays that leave the plane, a detector before the axis.
+    """
+    work = _parallel if geometry.parallel else _divergent
+    found = work(geometry.poses, geometry.rows or 1, geometry.columns, geometry.rows is not None)
+    far = max(1.0, float(np.abs(geometry.vectors).max()))
+    still = found.motion is None or np.abs(found.motion).max() < 1e-9 * far
+    return found._replace(motion=None) if still else found
+
+
+@checked
+def rebin_to_circle(sinogram: Tensor, geometry: VectorGeometry) -> Rebinned:
+    """Resample a scan of any flat detectors onto an ideal circle about z.
+
+    Args:
+        sinogram: line integrals ``(..., *geometry.shape)``, float32 or float64.
+        geometry: of the scan.
+
+    Raises:
+        ValueError: a shape that does not fit; see :func:`ideal_circle`.
+        TypeError: data that are not float32 or float64 tensors.
+    """
+    check_data("sinogram", sinogram, geometry.shape)
+    circle: Any = ideal_circle(geometry)
+    flat = geometry.rows is None
+    out = _resampled(sinogram.unsqueeze(-2) if flat else sinogram, circle)
+    if flat:
+        out = out.squeeze(-2)
+    elif geometry.parallel:
+        out = out.transpose(-3, -2)
+    return Rebinned(out, circle.geometry, circle.motion, circle.slices)
+
+
+@checked
+def at_slices(s: Rebinned, grid: VolumeGrid) -> Tensor:
+    """Sinograms ``(..., z, views, columns)`` of a grid's slices, interpolated between the rows of parallel rays.
+
+    Raises:
+        ValueError: a grid without z axis, or beyond the rows.
+    """
+    assert s.slices is not None
+    if grid.ndim != 3:
+        raise ValueError(f"parallel rays with rows need a 3-D grid, got shape {grid.shape}")
+    place = np.interp(grid.axes[0], s.slices, np.arange(s.slices.size))
+    # The outermost rows reach half a row beyond their centres.
+    half = 0.5 * float(s.slices[1] - s.slices[0]) if s.slices.size > 1 else 0.0
+    if grid.axes[0][0] < s.slices[0] - half - 1e-6 or grid.axes[0][-1] > s.slices[-1] + half + 1e-6:
+        raise ValueError(f"the grid's slices must lie in the rows' {s.slices[0]:g} … {s.slices[-1]:g} mm")
+    below = np.minimum(place.astype(int), max(s.slices.size - 2, 0))
+    share = torch.from_numpy(place - below).to(s.sinogram)[:, None, None]
+    above = torch.from_numpy(np.minimum(below + 1, s.slices.size - 1))
+    return torch.lerp(s.sinogram[..., torch.from_numpy(below), :, :], s.sinogram[..., above, :, :], share)
+
+
+def _axis_of(low: float, high: float, pitch: float) -> tuple[int, float]:
+    """Number of cells of a pitch whose centres cover ``low … high``, and the middle."""
+    return whole("cells", math.ceil((high - low) / pitch - 1e-6) + 1), 0.5 * (low + high)
+
+
+def _divergent(poses: Floats, rows: int, columns: int, cone: bool) -> IdealCircle:
+    source, centre, across, up = poses.transpose(1, 0, 2)
+    beta = np.arctan2(source[:, 1], source[:, 0])
+    radial = np.stack([np.cos(beta), np.sin(beta), 0 * beta], 1)
+    tangent = np.stack([-np.sin(beta), np.cos(beta), 0 * beta], 1)
+    orbit = np.hypot(source[:, 0], source[:, 1])
+    sod, level = float(orbit.mean()), float(source[:, 2].mean())
+    depth = ((source - centre) * radial).sum(1)
+    if depth.min() <= 0:
+        raise ValueError(f"the detector of view {int(depth.argmin())} does not stand behind the axis")
+    sdd = float(depth.mean())
+    if sdd <= sod:
+        raise ValueError(f"the detectors stand {sdd:g} mm from the sources, which turn at {sod:g} mm: before the axis")
+    # Where the actual corners meet the ideal plane, seen from the actual source.
+    half = np.array([(a * (columns - 1) / 2, b * (rows - 1) / 2) for a in (-1, 1) for b in (-1, 1)])
+    corner = centre[:, None] + half[:, :1] * across[:, None] + half[:, 1:] * up[:, None] - source[:, None]
+    towards = -(corner * radial[:, None]).sum(-1)
+    if towards.min() <= 0:
+        raise ValueError("a detector reaches behind its source: are the vectors in the order source, centre, u, v?")
+    scale = sdd / towards
+    u, w = (corner * tangent[:, None]).sum(-1) * scale, corner[..., 2] * scale
+    middle = sdd / depth
+    pitch = float(np.median(np.linalg.norm(across, axis=1) * middle))
+    count, offset = _axis_of(float(u.min()), float(u.max()), pitch)
+    if cone:
+        row_pitch = float(np.median(np.linalg.norm(up, axis=1) * middle))
+        height = rows * row_pitch * sod / sdd
+        climb = float(np.ptp(source[:, 2]))
+        if climb > CLIMB * height:
+            raise ValueError(
+                f"the source climbs by {climb:.2f} mm, the rows cover {height:.2f} mm at the axis: filtered "
+                'backprojection of a helix is not provided. Use the method "pwls" (recon.pwls with '
+                "Projector(geometry, grid))"
+            )
+        number, middle_row = _axis_of(float(w.min()), float(w.max()), row_pitch)
+        geometry: Any = ConeBeam(beta, sod, sdd, count, number, (row_pitch, pitch), (middle_row, offset))
+        v = geometry.row_positions
+    else:
+        geometry, v = FanBeam(beta, sod, sdd, count, pitch, offset), np.zeros(1)
+    # source + k · ray = centre + a · across + b · up, where the ray goes to a place of the ideal detector.
+    upward = np.broadcast_to([0.0, 0.0, 1.0], radial.shape)
+    actual, wanted = np.stack([across, up, centre - source], -1), np.stack([tangent, upward, -sdd * radial], -1)
+    maps = np.linalg.solve(actual, wanted)
+    ends = np.array([(x, y, 1.0) for x in geometry.column_positions[[0, -1]] for y in v[[0, -1]]])
+    if (maps[:, 2] @ ends.T).min() <= 0:
+        raise ValueError("a detector stands almost edge on to its rays")
+    ideal = sod * radial + np.array([0.0, 0.0, level])
+    shift = (ideal - source)[:, ::-1]
+    shift[:, 0] -= level  # an orbit about another height is a grid that is lower by as much
+    return IdealCircle(geometry, np.ascontiguousarray(shift if cone else shift[:, 1:]), None, v, maps)
+
+
+def _parallel(poses: Floats, rows: int, columns: int, cone: bool) -> IdealCircle:
+    ray, centre, across, up = poses.transpose(1, 0, 2)
+    ray = ray / np.linalg.norm(ray, axis=1, keepdims=True)
+    if np.abs(ray[:, 2]).max() > _TILTED_RAY:
+        raise ValueError(
+            f"the rays leave the plane of rotation by up to {math.degrees(math.asin(np.abs(ray[:, 2]).max())):.2f}°: "
+            "slices cannot be reconstructed one by one. Filtered backprojection of tilted rays is not provided: use "
+            'the method "pwls" (recon.pwls with Projector(geometry, grid))'
+        )
+    beta = np.arctan2(-ray[:, 1], -ray[:, 0])
+    tangent = np.stack([-np.sin(beta), np.cos(beta), 0 * beta], 1)
+
+    def in_plane(x: Floats) -> Floats:
+        return np.stack([(x * tangent).sum(-1), x[..., 2]], -1)
+
+    c, a, b = in_plane(centre), in_plane(across), in_plane(up)
+    matrix = np.stack([a, b], -1)
+    half = np.array([(x * (columns - 1) / 2, y * (rows - 1) / 2) for x in (-1, 1) for y in (-1, 1)])
+    corner = c[:, None] + half[:, :1] * a[:, None] + half[:, 1:] * b[:, None]
+    pitch = float(np.median(np.linalg.norm(a, axis=1)))
+    count, offset = _axis_of(float(corner[..., 0].min()), float(corner[..., 0].max()), pitch)
+    geometry = ParallelBeam(beta, count, pitch, offset)
+    heights: Any = np.zeros(1)
+    if cone:
+        row_pitch = float(np.median(np.linalg.norm(b, axis=1)))
+        number, middle = _axis_of(float(corner[..., 1].min()), float(corner[..., 1].max()), row_pitch)
+        heights = (np.arange(number) - (number - 1) / 2) * row_pitch + middle
+    inverse = np.linalg.inv(matrix)
+    maps = np.zeros((len(poses), 3, 3))
+    maps[:, :2, :2], maps[:, :2, 2], maps[:, 2, 2] = inverse, -np.einsum("nij,nj->ni", inverse, c), 1.0
+    return IdealCircle(geometry, None, heights if cone else None, heights, maps)
+
+
+def _resampled(sinogram: Tensor, circle: IdealCircle) -> Tensor:
+    """``(..., views, rows, columns)`` on the ideal detector, view by view.
+
+    Cubic interpolation; beyond the edges the outermost reading is repeated.
+    """
+    rows, columns = sinogram.shape[-2:]
+    positions: Any = circle.geometry
+    u, v = positions.column_positions, circle.rows
+    place = np.stack([np.tile(u, v.size), np.repeat(v, u.size), np.ones(u.size * v.size)])
+    scale = np.array([[max((columns - 1) / 2, 0.5)], [max((rows - 1) / 2, 0.5)]])
+    out = []
+    for view, to_actual in enumerate(circle.maps):
+        at = to_actual @ place
+        grid = torch.from_numpy((at[:2] / at[2] / scale).T.reshape(1, v.size, u.size, 2)).to(sinogram)
+        flat = sinogram[..., view, :, :].reshape(1, -1, rows, columns)
+        if rows == 1:  # equal rows make a plane of a line
+            flat = flat.expand(-1, -1, 4, -1)
+            grid = torch.stack([grid[..., 0], torch.zeros_like(grid[..., 0])], -1)
+        one = torch.nn.functional.grid_sample(flat, grid, mode="bicubic", padding_mode="border", align_corners=True)
+        out.append(one.reshape(*sinogram.shape[:-3], v.size, u.size))
+    return torch.stack(out, -3)

@@ -1,0 +1,211 @@
+"""What a detector does not show: the short side of an offset one, and objects that reach beyond its edges.
+
+The ramp filter needs whole rows. Where a row ends inside the object, it is continued by the chords of a cylinder that
+fits its last readings in value and slope (Hsieh et al., Med. Phys. 31, 2385, 2004). Where the rows of an offset
+detector end early, redundancy weights have taken them to zero (Wang 2002), and zeros follow.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from recon.analytic.angular_weights import is_offset
+from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid
+from torchpcct.robust import MEDIAN_TO_SD
+from torchpcct.validate import checked
+
+__all__ = ["Rows", "continued", "cut_off", "ends_cut_off", "mirrored", "reach", "row_ends"]
+
+Floats = NDArray[np.float64]
+G = TypeVar("G", bound=Geometry)
+
+_CUT, _CUT_VIEWS = 0.03, 0.05
+"""Rows are cut off if their end exceeds a share of the highest line integral in more than a share of the views."""
+_CUT_RANGES = 40
+_LEFT_OUT = 0.1
+_WIDEST_RAD = math.radians(85.0)
+
+
+class Rows(NamedTuple):
+    """Rows with columns added on either side, and what belongs to them.
+
+    Attributes:
+        lines: ``(..., views, [rows,] columns)``.
+        geometry: of the wider detector.
+        weights: ``(views, 1)`` or ``(views, columns)`` angular weights.
+        added: columns added before the first one.
+    """
+
+    lines: Tensor
+    geometry: Any
+    weights: Floats
+    added: int
+
+
+@checked
+def reach(geometry: Any) -> Floats:
+    """Distance from the axis of the ray to every column centre, signed, ``(columns,)`` mm."""
+    if isinstance(geometry, ParallelBeam):
+        return np.asarray(geometry.column_positions)
+    return np.asarray(geometry.sod * np.sin(geometry.fan_angles))
+
+
+@checked
+def cut_off(lines: Tensor, geometry: Any, weights: Floats) -> tuple[bool, bool]:
+    """Whether the rows end inside the object, at the first and at the last column.
+
+    A side that the weights leave out (the short one of an offset detector) does not count.
+    """
+    means = lines.detach()
+    return ends_cut_off(*row_ends(means.mean(-2) if isinstance(geometry, ConeBeam) else means), geometry, weights)
+
+
+def row_ends(means: Tensor) -> tuple[float, Tensor, Tensor]:
+    """The highest of line integrals ``(..., views, columns)``, means over the rows, and what the rows end at."""
+    width = max(1, means.shape[-1] // 256)
+    return float(means.amax()), means[..., :width].mean(-1), means[..., -width:].mean(-1)
+
+
+def ends_cut_off(highest: float, first: Tensor, last: Tensor, geometry: Any, weights: Floats) -> tuple[bool, bool]:
+    """:func:`cut_off` of what :func:`row_ends` says of a scan."""
+    limit = _CUT * highest
+    order = torch.from_numpy(np.argsort(np.mod(geometry.angles, 2.0 * math.pi), kind="stable")).to(first.device)
+    found = [limit > 0 and _rises(end[..., order], limit) for end in (first, last)]
+    if _leaves_out_short_side(weights, geometry):
+        shown = weights.sum(0)
+        found = [found[0] and shown[0] > shown[-1], found[1] and shown[-1] > shown[0]]
+    return found[0], found[1]
+
+
+def _leaves_out_short_side(weights: Floats, geometry: Any) -> bool:
+    """Whether these are the weights of a full turn of an offset detector; a short scan needs both sides."""
+    if weights.shape[1] == 1 or not is_offset(geometry):
+        return False
+    ends = sorted((float(weights[:, 0].sum()), float(weights[:, -1].sum())))
+    return ends[0] < _LEFT_OUT * ends[1]
+
+
+def _rises(end: Tensor, limit: float) -> bool:
+    """Whether ``end (..., views)`` lies above a limit in more than :data:`_CUT_VIEWS` of the views, noise set aside.
+
+    An object is cut off over ranges of views; noise is not: means over a fortieth of the turn are compared, with a
+    margin of three of their standard errors.
+    """
+    series = end.reshape(-1, 1, end.shape[-1]).double()
+    width = max(1, series.shape[-1] // _CUT_RANGES)
+    smooth = torch.nn.functional.avg_pool1d(series, width, 1)
+    margin = 0.0
+    if series.shape[-1] > 2:
+        margin = 3.0 * float(series.diff(dim=-1).abs().median()) * MEDIAN_TO_SD / math.sqrt(2.0 * width)
+    return float((smooth > limit + margin).double().mean()) > _CUT_VIEWS
+
+
+def _wider(geometry: G, before: int, behind: int) -> G:
+    g: Any = geometry
+    cone = isinstance(g, ConeBeam)
+    pitch = g.pitch[1] if cone else g.pitch
+    shift = 0.5 * (behind - before) * pitch
+    offset = (g.offset[0], g.offset[1] + shift) if cone else g.offset + shift
+    changes: dict[str, Any] = {"columns": g.columns + before + behind, "offset": offset}
+    return replace(geometry, **changes)  # type: ignore[type-var]
+
+
+def _room(geometry: Any) -> tuple[int, int]:
+    """Columns that fit before the first and behind the last one, as many as the detector has at most."""
+    u, n = geometry.column_positions, geometry.columns
+    if isinstance(geometry, ParallelBeam):
+        return n, n
+    pitch = geometry.pitch[1] if isinstance(geometry, ConeBeam) else geometry.pitch
+    far = geometry.sdd * (_WIDEST_RAD if geometry.detector == "curved" else math.tan(_WIDEST_RAD))
+    return tuple(int(min(n, max(0.0, (far - abs(end)) / pitch - 1))) for end in (u[0], u[-1]))  # type: ignore[return-value]
+
+
+@checked
+def mirrored(rows: Rows, grid: VolumeGrid, travel: float = 0.0) -> Rows:
+    """The rows of an offset detector with zeros on the short side, where the grid needs them.
+
+    Filtered rows do not end with the readings: a voxel beyond the short side reads the filter's tail there.
+    """
+    g = rows.geometry
+    if not _leaves_out_short_side(rows.weights, g):
+        return rows
+    t = reach(g)
+    half_cell = 0.5 * (t[-1] - t[0]) / (t.size - 1)
+    if grid.in_plane_radius + travel <= min(-t[0], t[-1]) + half_cell:
+        return rows
+    pitch = g.pitch[1] if isinstance(g, ConeBeam) else g.pitch
+    missing = round(abs(g.column_positions[0] + g.column_positions[-1]) / pitch)
+    before, behind = (missing, 0) if t[-1] > -t[0] else (0, missing)
+    lines = torch.nn.functional.pad(rows.lines, (before, behind))
+    weights = np.pad(rows.weights, ((0, 0), (before, behind)))
+    return Rows(lines, _wider(g, before, behind), weights, rows.added + before)
+
+
+@checked
+def continued(rows: Rows, sides: tuple[bool, bool], outside: float) -> Rows:
+    """The rows continued on the sides where they are cut off.
+
+    Args:
+        rows: line integrals; gradients pass through the measured columns only.
+        sides: of :func:`cut_off`.
+        outside: attenuation in mm⁻¹ of the object beyond the edges.
+    """
+    g = rows.geometry
+    room = [space if side else 0 for space, side in zip(_room(g), sides, strict=True)]
+    if outside <= 0 or not any(room):
+        return rows
+    wide = _wider(g, *room)
+    t = reach(wide)
+    cone = isinstance(g, ConeBeam)
+    heights = g.row_positions if cone else np.zeros(1)
+    fit = max(4, min(32, g.columns // 20))
+    parts = [rows.lines]
+    for side, space in enumerate(room):
+        if not space:
+            continue
+        first = room[0]
+        near = slice(first, first + fit) if side == 0 else slice(first + g.columns - fit, first + g.columns)
+        far = slice(0, space) if side == 0 else slice(first + g.columns, None)
+        end = g.column_positions[0 if side == 0 else -1]
+        away = 1.0 if not cone else (g.sdd if g.detector == "curved" else math.hypot(g.sdd, end))
+        # A ray that climbs crosses an upright cylinder on a path longer by 1 / cos of its slope.
+        mu = outside * np.sqrt(1.0 + (heights / away) ** 2)
+        last = rows.lines[..., :fit] if side == 0 else rows.lines[..., -fit:]
+        part = _cylinder(last.detach(), t[near], t[far], mu if cone else mu[0])
+        parts.insert(0 if side == 0 else len(parts), part)
+    weights = rows.weights
+    if weights.shape[1] > 1:
+        weights = np.pad(weights, ((0, 0), tuple(room)), mode="edge")
+    return Rows(torch.cat(parts, -1), wide, weights, rows.added + room[0])
+
+
+def _cylinder(last: Tensor, near: Floats, far: Floats, mu: Any) -> Tensor:
+    """Chords at ``far`` of the cylinder that fits the readings ``last (..., [rows,] fit)`` at ``near`` best.
+
+    With the chord p = 2 μ √(R² − (t − t₀)²), p² / (4 μ²) + t² is a straight line in t: a linear fit. It is exact for
+    parallel rays, and for cylinders on the axis of a fan; a fan's rays see another t₀ each, a little.
+    """
+    number: dict[str, Any] = {"dtype": torch.float64, "device": last.device}
+    double = torch.as_tensor(2.0 * np.asarray(mu), **number)
+    double = double[:, None] if double.ndim else double
+    t, u = torch.as_tensor(near, **number), torch.as_tensor(far, **number)
+    line = (last.double().clamp(min=0) / double) ** 2 + t * t
+    centred = t - t.mean()
+    slope = (line * centred).sum(-1, keepdim=True) / (centred * centred).sum()
+    level = line.mean(-1, keepdim=True) - slope * t.mean()
+
+    def chord(at: Tensor) -> Tensor:
+        return double * (level + slope * at - at * at).clamp(min=0).sqrt()
+
+    # Rows that do end in air before the edge are not continued: the fit must meet the outermost readings.
+    end = torch.argsort((t - u.mean()).abs())[:3]
+    fitted = chord(t[end]).mean(-1, keepdim=True)
+    share = last.double()[..., end].mean(-1, keepdim=True) / fitted.clamp(min=torch.finfo(torch.float64).tiny)
+    return (chord(u) * share.clamp(0.0, 1.0)).to(last.dtype)

@@ -1,0 +1,316 @@
+"""Filtered backprojection for parallel, fan and cone beams (FDK), flat and curved detectors."""
+
+from __future__ import annotations
+
+import logging
+import math
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from recon.analytic.angular_weights import angular_weights, view_steps
+from recon.analytic.any_orbit import Rebinned, at_slices, rebin_to_circle
+from recon.analytic.backproject import BackprojectionPlan, backproject, check_data, data_shape
+from recon.analytic.coverage import check_rows, refuse_helix
+from recon.analytic.detector_edges import Rows, continued, cut_off, mirrored
+from recon.analytic.filter_plan import FilterPlan, kernel_names
+from recon.linear_operator import apply_linear
+from torchpcct.dead_cells import bridge
+from torchpcct.detector_window import DetectorWindow, footprint
+from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid, view_step
+from torchpcct.validate import checked, number, reals
+from torchpcct.vector_geometry import VectorGeometry
+
+__all__ = ["backproject", "fbp", "filter_sinogram", "filter_windowed", "interleave", "straightened_fbp"]
+
+_LOG = logging.getLogger(__name__)
+
+G = TypeVar("G", bound=Geometry)
+
+
+def _check_weights(weights: Any, geometry: Geometry, grid: VolumeGrid | None = None) -> NDArray[np.float64]:
+    if weights is None:
+        return angular_weights(geometry, grid)
+    w = reals("weights", weights)
+    if w.shape == (geometry.views,):
+        w = w[:, None]
+    if w.shape not in ((geometry.views, 1), (geometry.views, geometry.columns)):
+        raise ValueError(
+            f"weights must have the shape ({geometry.views},) or ({geometry.views}, {geometry.columns}), got {w.shape}"
+        )
+    return w
+
+
+def _filter(
+    data: Tensor, geometry: Geometry, kernel: Any, weights: Any, a: DetectorWindow, b: DetectorWindow
+) -> Tensor:
+    names, several = kernel_names(kernel)
+    plan = FilterPlan(geometry, names, _check_weights(weights, geometry), a, b)
+    flat = not isinstance(geometry, ConeBeam)
+    out = apply_linear(data.unsqueeze(-2) if flat else data, plan.forward, plan.transpose)
+    out = out.squeeze(-2) if flat else out
+    kernel_axis = -3 if flat else -4
+    return out.movedim(kernel_axis, 0) if several else out.squeeze(kernel_axis)
+
+
+@checked
+def filter_sinogram(
+    sinogram: Tensor,
+    geometry: Geometry,
+    kernel: str | Sequence[str] = "standard",
+    window: DetectorWindow | None = None,
+    *,
+    weights: Any = None,
+) -> Tensor:
+    """Weight and ramp-filter the rows of a scan: the first half of filtered backprojection.
+
+    The result carries the cosine, angular and redundancy weights, ready for :func:`backproject`.
+
+    Args:
+        sinogram: line integrals ``(..., views, [rows,] columns)``, float32 or float64. Data of another device are
+            filtered on the CPU and sent back.
+        geometry: parallel, fan or cone beam.
+        kernel: reconstruction kernel (:data:`recon.analytic.ramp.KERNELS`) or a sequence of them.
+        window: return only these readings of every view (rows and columns); default: all.
+        weights: angular weights ``(views,)`` or ``(views, columns)`` in rad that replace
+            :func:`recon.analytic.angular_weights.angular_weights`.
+
+    Returns:
+        ``(..., views, [rows,] columns)`` on the window, mm⁻¹; with a sequence of kernels a leading axis of kernels.
+        Differentiable to any order. Temporary memory is bounded by :data:`recon.analytic.filter_plan.CHUNK_BYTES` or
+        one view.
+
+    Raises:
+        ValueError: a wrong shape, an unknown kernel, a window beyond the detector, views that do not suffice.
+        TypeError: data that are not float32 or float64 tensors.
+    """
+    whole = DetectorWindow.full(geometry)
+    check_data("sinogram", sinogram, data_shape(geometry, whole))
+    return _filter(sinogram, geometry, kernel, weights, whole, whole if window is None else window)
+
+
+@checked
+def filter_windowed(
+    difference: Tensor,
+    geometry: Geometry,
+    window_in: DetectorWindow,
+    kernel: str | Sequence[str],
+    window_out: DetectorWindow,
+    *,
+    weights: Any = None,
+) -> Tensor:
+    """Like :func:`filter_sinogram`, for data that are zero outside a window.
+
+    Filtering is linear: after the scan of a background has been filtered once, the scan of a small inset or of other
+    noise in its footprint is filtered from that footprint alone. The result equals that of the whole rows to rounding.
+
+    Args:
+        difference: ``(..., views, [rows,] columns)`` on ``window_in``.
+        geometry: parallel, fan or cone beam.
+        window_in: where the data are; zero elsewhere.
+        kernel: reconstruction kernel or a sequence of them.
+        window_out: the readings to return; its rows must lie within those of ``window_in``.
+        weights: see :func:`filter_sinogram`.
+
+    Returns:
+        ``(..., views, [rows,] columns)`` on ``window_out``; with a sequence of kernels a leading axis of kernels.
+
+    Raises:
+        ValueError, TypeError: as :func:`filter_sinogram`.
+    """
+    check_data("difference", difference, data_shape(geometry, window_in))
+    return _filter(difference, geometry, kernel, weights, window_in, window_out)
+
+
+@checked
+def interleave(sinogram: Tensor, geometry: G) -> tuple[Tensor, G]:
+    """Spread the columns over a detector of half the pitch, for scans with a quarter-column offset.
+
+    The opposite ray of a detector shifted by a quarter column falls between two columns. Filtering every view on a
+    grid of half the pitch, zeros between the readings, reaches up to twice the Nyquist frequency of one view; what one
+    view aliases there, its opposite cancels. The windows of :mod:`recon.analytic.ramp` then refer to the doubled
+    Nyquist frequency. Without the offset nothing cancels: details near the isocentre come out aliased.
+
+    The opposite of a ray falls between two views. What is aliased cancels where neighbouring views shift the object by
+    less than half a column: within pitch / (2 · view step) of the axis (of the paper's scan 78 mm, of one with 120
+    views 5 mm). Beyond, the two rays see different places, and the aliased details remain; a warning is logged if this
+    radius is less than a quarter of the field of view.
+
+    Args:
+        sinogram: ``(..., columns)``.
+        geometry: parallel, fan or cone beam of a closed scan with an offset of about a quarter column.
+
+    Returns:
+        ``(..., 2 · columns)`` and its geometry, for :func:`fbp`.
+
+    Raises:
+        ValueError: a wrong shape; a scan that is not closed (half a turn suffices for parallel rays); columns without
+            the quarter offset (more than a tenth of a column from it).
+        TypeError: a wrong dtype.
+    """
+    check_data("sinogram", sinogram, data_shape(geometry, DetectorWindow.full(geometry)))
+    _check_opposites(geometry)
+    # the mean of a reading and a zero is half the reading
+    spread = torch.stack([2.0 * sinogram, torch.zeros_like(sinogram)], dim=-1).flatten(-2)
+    if isinstance(geometry, ConeBeam):
+        row, column = geometry.pitch
+        pitch: Any = (row, column / 2.0)
+        offset: Any = (geometry.offset[0], geometry.offset[1] + column / 4.0)
+    else:
+        g: Any = geometry
+        pitch, offset = g.pitch / 2.0, g.offset + g.pitch / 4.0
+    changes: dict[str, Any] = {"columns": 2 * geometry.columns, "pitch": pitch, "offset": offset}
+    return spread, replace(geometry, **changes)  # type: ignore[type-var]
+
+
+def _check_opposites(geometry: Any) -> None:
+    """Whether the opposite rays that :func:`interleave` relies on were measured, and fall between two columns."""
+    pitch, offset = geometry.pitch, geometry.offset
+    if isinstance(geometry, ConeBeam):
+        pitch, offset = pitch[1], offset[1]
+    quarters = (geometry.column_positions[0] / pitch) % 0.5
+    if abs(quarters - 0.25) > 0.1:
+        raise ValueError(
+            f"interleave needs columns a quarter pitch beside the axis, offset {offset:g} mm at a pitch of {pitch:g} "
+            "mm leaves opposite rays on one another: filter the sinogram as it is"
+        )
+    _, _, span = view_steps(geometry.angles)
+    if span < 2.0 * math.pi:
+        raise ValueError(
+            f"interleave needs the opposite of every ray, the views cover {math.degrees(span):.1f}° of 360°"
+        )
+    parallel = isinstance(geometry, ParallelBeam)
+    radius = pitch / (1.0 if parallel else geometry.magnification) / (2.0 * view_step(geometry.angles))
+    field = float(np.abs(geometry.column_positions).max()) if parallel else geometry.fov_radius
+    if radius < field / 4.0:
+        _LOG.warning(
+            "interleave: with %d views aliasing cancels only within %.1f mm of the axis: use more views, or filter the "
+            "sinogram as it is", geometry.views, radius,
+        )  # fmt: skip
+
+
+@checked
+def fbp(
+    sinogram: Tensor,
+    geometry: Geometry,
+    grid: VolumeGrid,
+    kernel: str | Sequence[str] = "standard",
+    window: DetectorWindow | None = None,
+    *,
+    weights: Any = None,
+    motion: Any = None,
+    outside: float | None = None,
+) -> Tensor:
+    """Filtered backprojection (Feldkamp, Davis and Kress, J. Opt. Soc. Am. A 1, 612, 1984, for a cone beam).
+
+    With ``motion`` each view's filtered data are backprojected along the rays that met the displaced object (Schäfer,
+    Borgert, Rasche and Grass, IEEE Trans. Med. Imaging 25, 895, 2006). That neglects how the motion changes the
+    density of the rays through the object, by (mm per rad of rotation) / sod: 0.1 % for a coronary artery.
+
+    A full turn of an offset detector (half fan) is weighted after Wang (Med. Phys. 29, 1634, 2002), and the grid may
+    reach as far as the long side. Where the rows end inside the object, they are continued by cylinders of ``outside``.
+
+    Args:
+        sinogram: line integrals ``(..., views, [rows,] columns)``, float32 or float64. NaN and Inf are dead readings:
+            they are bridged by their neighbours (:func:`torchpcct.dead_cells.bridge`) with a warning.
+        geometry: parallel, fan or cone beam; a closed circle, a short scan (at least π plus the fan angle), views in
+            any order, irregularly spaced or repeated; or a :class:`~torchpcct.vector_geometry.VectorGeometry` that is
+            nearly so (:mod:`recon.analytic.any_orbit`).
+        grid: voxels to reconstruct, 2-D for parallel and fan beams, 3-D for cone beams.
+        kernel: reconstruction kernel ``"soft"``, ``"standard"``, ``"detail"``, ``"bone"``, ``"ram-lak"``, or several.
+        window: readings to filter and backproject; default: the grid's footprint.
+        weights: angular weights that replace the automatic ones, see :func:`filter_sinogram`.
+        motion: displacement of everything in the scan in every view, see :func:`backproject`.
+        outside: attenuation in mm⁻¹ (unit of ``sinogram`` per mm) of the object beyond the detector's edges, e.g. that
+            of water; 0: there is none, rows that do not end in air are inconsistent. None: 0, with a warning if the
+            rows look cut off.
+
+    Returns:
+        ``(..., *grid.shape)`` mm⁻¹; with a sequence of kernels a leading axis of kernels. Differentiable to any order
+        (columns that were added beyond the edges count as constant).
+
+    Raises:
+        ValueError, TypeError: as :func:`filter_sinogram` and :func:`backproject`; views of which more than a quarter is
+            dead; a negative ``outside``.
+    """
+    if isinstance(geometry, VectorGeometry):
+        if window is not None:
+            raise ValueError("a window belongs to a circular scan: leave it out for a VectorGeometry")
+        straight = rebin_to_circle(sinogram, geometry if motion is None else geometry.moved(motion))
+        return straightened_fbp(straight, grid, kernel, weights=weights, outside=outside)
+    check_data("sinogram", sinogram, data_shape(geometry, DetectorWindow.full(geometry)))
+    refuse_helix(geometry, motion)
+    for text in check_rows(geometry, grid, motion):
+        _LOG.warning("%s", text)
+    repaired = _without_dead(sinogram, geometry)
+    rows = _completed(Rows(repaired, geometry, _check_weights(weights, geometry, grid), 0), grid, motion, outside)
+    window = _read_window(rows, grid, window, motion)
+    filtered = filter_sinogram(rows.lines, rows.geometry, kernel, window, weights=rows.weights)
+    plan = BackprojectionPlan(rows.geometry, grid, window, motion)
+    return apply_linear(filtered, plan.forward, plan.transpose)
+
+
+@checked
+def straightened_fbp(
+    straight: Rebinned, grid: VolumeGrid, kernel: str | Sequence[str], *, weights: Any = None, outside: float | None
+) -> Tensor:
+    """:func:`fbp` of a scan that was resampled onto an ideal circle."""
+    lines, plane = straight.sinogram, grid
+    if straight.slices is not None:
+        lines, plane = at_slices(straight, grid), grid.slice
+    return fbp(lines, straight.geometry, plane, kernel, weights=weights, motion=straight.motion, outside=outside)
+
+
+_SIDES = ("first", "last")
+
+
+def _transformed() -> bool:
+    """Whether values cannot be looked at: inside ``torch.func`` transforms the data may stand for a whole batch."""
+    return torch._C._functorch.maybe_current_level() is not None
+
+
+def _without_dead(sinogram: Tensor, geometry: Geometry) -> Tensor:
+    if _transformed() or not sinogram.numel() or all(map(math.isfinite, torch.aminmax(sinogram.detach()))):
+        return sinogram
+    dead = ~torch.isfinite(sinogram.detach())
+    warnings.warn(
+        f"{int(dead.sum())} of {dead.numel()} readings are NaN or Inf: they are taken for dead and bridged by their "
+        "neighbours",
+        UserWarning,
+        stacklevel=4,
+    )
+    return bridge(sinogram, dead, isinstance(geometry, ConeBeam))
+
+
+def _completed(rows: Rows, grid: VolumeGrid, motion: Any, outside: float | None) -> Rows:
+    """Rows that end inside the object continued, those of an offset detector mirrored."""
+    known = rows.lines.numel() > 0 and not _transformed()
+    if (outside is None or number("outside", outside, low=0.0, unit="mm⁻¹") > 0) and known:
+        sides = cut_off(rows.lines, rows.geometry, rows.weights)
+        if any(sides) and outside is None:
+            warnings.warn(
+                f"the rows end inside the object at the {' and the '.join(_SIDES[i] for i in (0, 1) if sides[i])} "
+                "column: CT numbers will be wrong, most near the edge of the field of view; pass outside= the "
+                "attenuation in mm⁻¹ of what lies beyond (0 to do without)",
+                UserWarning,
+                stacklevel=4,
+            )
+        rows = continued(rows, sides, outside or 0.0)
+    shift = 0.0 if motion is None else float(np.hypot(*np.asarray(motion, dtype=np.float64)[:, -2:].T).max())
+    return mirrored(rows, grid, shift)
+
+
+def _read_window(rows: Rows, grid: VolumeGrid, window: DetectorWindow | None, motion: Any) -> DetectorWindow:
+    """``window`` on the completed rows; None: the footprint of the grid."""
+    if window is not None:
+        return DetectorWindow(window.first_column + rows.added, window.columns, window.first_row, window.rows)
+    try:
+        return footprint(rows.geometry, grid, margin=1, motion=motion)
+    except ValueError:
+        return DetectorWindow.full(rows.geometry)  # a grid larger than the field of view: the backprojection decides

@@ -1,0 +1,198 @@
+"""Ramp filtering of detector rows, from one window of columns to another, and its exact transpose.
+
+Filtering is a linear convolution along the columns with the closed-form apodised kernel, so that the result does not
+depend on how it is computed: as a matrix product where few columns go in or out, by FFT otherwise.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from recon.analytic.ramp import fast_length, ramp_kernel
+from torchpcct.detector_window import DetectorWindow
+from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam
+from torchpcct.threads import run
+
+__all__ = ["CHUNK_BYTES", "FilterPlan"]
+
+#: Intermediate results of filtering are kept near this size; larger scans are processed in chunks of views.
+CHUNK_BYTES = 48 * 2**20
+#: Matrix products and FFTs per nanosecond on a common core, only used to choose the faster of the two.
+_GEMM_FLOPS, _FFT_FLOPS = 40.0, 4.0
+
+
+def _lookup(kernels: NDArray[np.float64], lag: NDArray[np.int64]) -> NDArray[np.float64]:
+    """``kernels[:, lag]``, zero where the lag lies beyond the samples (no data at that distance)."""
+    inside = lag < kernels.shape[1]
+    return np.where(inside, kernels[:, np.where(inside, lag, 0)], 0.0)
+
+
+@dataclass(frozen=True)
+class FilterPlan:
+    """Weights and kernels of one filtering task: ``(..., V, rows_in, width_in) → (..., K, V, rows_out, width_out)``.
+
+    Data of 2-D geometries have one row here.
+    """
+
+    geometry: Geometry
+    kernels: tuple[str, ...]
+    angular: NDArray[np.float64]
+    window_in: DetectorWindow
+    window_out: DetectorWindow
+    samples: NDArray[np.float64] = field(init=False)
+    cosine: NDArray[np.float64] = field(init=False)
+
+    def __post_init__(self) -> None:
+        g, a, b = self.geometry, self.window_in, self.window_out
+        rows = g.rows if isinstance(g, ConeBeam) else 1
+        for name, w in (("window_in", a), ("window_out", b)):
+            if w.views != g.views:
+                raise ValueError(f"{name} has {w.views} views, but the geometry has {g.views}")
+            if int(w.first_column.max()) + w.columns > g.columns or w.first_row + w.rows > rows:
+                raise ValueError(f"{name} reaches beyond the detector of {rows} rows × {g.columns} columns")
+        if b.first_row < a.first_row or b.first_row + b.rows > a.first_row + a.rows:
+            raise ValueError(
+                f"the window to fill has rows {b.first_row}…{b.first_row + b.rows - 1}, but the data only rows "
+                f"{a.first_row}…{a.first_row + a.rows - 1}: filtering needs every row that it returns"
+            )
+        if isinstance(g, ParallelBeam):
+            pitch, curved = g.pitch, False
+            cosine = np.ones((1, g.columns))
+        elif isinstance(g, FanBeam | ConeBeam):
+            column_pitch = g.pitch if isinstance(g, FanBeam) else g.pitch[1]
+            curved = g.detector == "curved"
+            pitch = column_pitch / g.sdd if curved else column_pitch * g.sod / g.sdd
+            u, v = g.column_positions, np.zeros(1)
+            if isinstance(g, ConeBeam):
+                v = g.row_positions[b.first_row : b.first_row + b.rows]
+            if curved:  # Kak & Slaney eq. 3.97: R′ = R · D · cos γ; one D goes into the distance weight D²/L²
+                cosine = np.cos(u / g.sdd) * (g.sdd / np.hypot(g.sdd, v))[:, None] / g.sod
+            else:
+                cosine = g.sdd / np.sqrt(g.sdd**2 + u**2 + v[:, None] ** 2)
+        else:
+            raise TypeError(f"geometry must be a ParallelBeam, FanBeam or ConeBeam, got {type(g).__name__}")
+        samples = np.stack([ramp_kernel(g.columns, pitch, k, equiangular=curved) * pitch for k in self.kernels])
+        object.__setattr__(self, "samples", samples)
+        object.__setattr__(self, "cosine", cosine)
+
+    @property
+    def _offset(self) -> NDArray[np.int64]:
+        """Position of the data of every view in a frame in which the results start at the same place."""
+        shift = self.window_in.first_column - self.window_out.first_column
+        return shift - shift.min()
+
+    @property
+    def _length(self) -> int:
+        """Width of that frame."""
+        return int(self._offset.max()) + self.window_in.columns
+
+    @property
+    def _fft_size(self) -> int:
+        return fast_length(self._length + self.window_out.columns - 1)
+
+    @property
+    def by_matrix(self) -> bool:
+        """Whether a matrix product is cheaper than FFTs."""
+        width, size, count = self.window_out.columns, self._fft_size, len(self.kernels)
+        gemm = 2.0 * self._length * width * count / _GEMM_FLOPS
+        fft = (1 + count) * 2.5 * size * math.log2(size) / _FFT_FLOPS
+        return gemm <= fft
+
+    @property
+    def chunk(self) -> int:
+        """Views whose intermediate results in float64 stay near :data:`CHUNK_BYTES`."""
+        width = self._length if self.by_matrix else self._length + 6 * self._fft_size
+        return max(1, min(self.window_in.views, CHUNK_BYTES // (8 * self.window_out.rows * width)))
+
+    def _responses(self, like: Tensor) -> Tensor:
+        """Matrices ``(K, length, width_out)``, or frequency responses ``(K, size // 2 + 1)``."""
+        low = int((self.window_in.first_column - self.window_out.first_column).min())
+        if self.by_matrix:
+            lag = np.arange(self._length)[:, None] + low - np.arange(self.window_out.columns)
+            return torch.from_numpy(_lookup(self.samples, np.abs(lag))).to(like)
+        size = self._fft_size
+        lag = np.arange(size)
+        lag = np.where(lag < size - (self._length - 1), lag, lag - size) - low
+        response = torch.from_numpy(np.fft.rfft(_lookup(self.samples, np.abs(lag))))
+        return response.to(dtype=torch.promote_types(like.dtype, torch.complex32), device=like.device)
+
+    def _weights(self, like: Tensor) -> list[Any]:
+        number = np.float64 if like.dtype == torch.float64 else np.float32
+        rows = np.broadcast_to(self.cosine, (self.window_out.rows, self.geometry.columns))
+        return [self.angular.astype(number), np.ascontiguousarray(rows, dtype=number)]
+
+    def forward(self, data: Tensor) -> Tensor:
+        """Weight and filter: ``(..., V, rows_in, width_in)`` to ``(..., K, V, rows_out, width_out)``."""
+        from recon.analytic.filter_kernels import align  # numba loads with its first use
+
+        a, b = self.window_in, self.window_out
+        lead = data.shape[:-3]
+        data = data.reshape(math.prod(lead), *data.shape[-3:])
+        out = data.new_empty((data.shape[0], len(self.kernels), a.views, b.rows, b.columns))
+        responses, (angular, cosine), offset = self._responses(data), self._weights(data), self._offset
+        r0, first, chunk = b.first_row - a.first_row, a.first_column, self.chunk
+        buffer = data.new_empty((chunk, b.rows, self._length))
+        for v0 in range(0, a.views, chunk):
+            v1 = min(v0 + chunk, a.views)
+            frame = buffer[: v1 - v0]
+            for source, target in zip(data, out, strict=True):
+                rows = source[v0:v1, r0 : r0 + b.rows]
+                views = angular[v0:v1], cosine, first[v0:v1], offset[v0:v1]
+                run(align, v1 - v0, rows.numpy(), *views, frame.numpy(), operations=frame[0].numel())
+                self._convolve(frame, responses, target[:, v0:v1])
+        return out.view(*lead, *out.shape[1:])
+
+    def _convolve(self, frame: Tensor, responses: Tensor, out: Tensor) -> None:
+        """``frame (v, R, length)`` into ``out (K, v, R, width_out)``."""
+        width = self.window_out.columns
+        if self.by_matrix:
+            for matrix, target in zip(responses, out, strict=True):
+                torch.mm(frame.view(-1, self._length), matrix, out=target.view(-1, width))
+            return
+        spectrum = torch.fft.rfft(frame, n=self._fft_size)
+        for response, target in zip(responses, out, strict=True):
+            target.copy_(torch.fft.irfft(spectrum * response, n=self._fft_size)[..., :width])
+
+    def transpose(self, gradient: Tensor) -> Tensor:
+        """Transpose of :meth:`forward`: ``(..., K, V, rows_out, width_out)`` to ``(..., V, rows_in, width_in)``."""
+        from recon.analytic.filter_kernels import unalign  # numba loads with its first use
+
+        a, b = self.window_in, self.window_out
+        lead = gradient.shape[:-4]
+        gradient = gradient.reshape(math.prod(lead), *gradient.shape[-4:])
+        out = gradient.new_zeros((gradient.shape[0], a.views, a.rows, a.columns))
+        responses, (angular, cosine), offset = self._responses(gradient), self._weights(gradient), self._offset
+        r0, first, chunk = b.first_row - a.first_row, a.first_column, self.chunk
+        for v0 in range(0, a.views, chunk):
+            v1 = min(v0 + chunk, a.views)
+            for source, target in zip(gradient, out, strict=True):
+                frame = self._correlate(source[:, v0:v1], responses)
+                rows = target[v0:v1, r0 : r0 + b.rows]
+                views = angular[v0:v1], cosine, first[v0:v1], offset[v0:v1]
+                run(unalign, v1 - v0, frame.numpy(), *views, rows.numpy(), operations=frame[0].numel())
+        return out.view(*lead, *out.shape[1:])
+
+    def _correlate(self, gradient: Tensor, responses: Tensor) -> Tensor:
+        """Transpose of :meth:`_convolve`: ``(K, v, R, width_out)`` to ``(v, R, length)``."""
+        if self.by_matrix:
+            return torch.einsum("kvrj,kij->vri", gradient, responses)
+        spectrum = torch.fft.rfft(gradient, n=self._fft_size)
+        total = (spectrum * responses[:, None, None, :].conj()).sum(dim=0)
+        return torch.fft.irfft(total, n=self._fft_size)[..., : self._length].contiguous()
+
+
+def kernel_names(kernel: str | Sequence[str]) -> tuple[tuple[str, ...], bool]:
+    """The kernels asked for and whether there were several."""
+    if isinstance(kernel, str):
+        return (kernel,), False
+    if not isinstance(kernel, Sequence) or len(kernel) == 0:
+        raise TypeError(f"kernel must be a name or a non-empty sequence of names, got {kernel!r}")
+    return tuple(kernel), True

@@ -1,0 +1,555 @@
+"""Volumes larger than memory: a scan is read, filtered and backprojected slab by slab along z, each written at once.
+
+Of a cone beam a slab needs the detector rows of its footprint, of a stack of parallel or fan-beam slices those slices.
+What decides about the whole (whether the rows end inside the object, how many readings are dead) is found in a first
+pass over the scan; every slab then gets the same bits as in one piece.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import hashlib
+import logging
+import math
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from recon.analytic.angular_weights import angular_weights
+from recon.analytic.backproject import BackprojectionPlan
+from recon.analytic.coverage import check_rows, consistency_warnings, sampling_warnings, view_notes
+from recon.analytic.detector_edges import Rows, continued, ends_cut_off, mirrored, row_ends
+from recon.analytic.fbp import filter_windowed
+from recon.api import reconstruct
+from recon.least_squares.memory import available_bytes, memory_bytes, pwls_bytes, resident_bytes
+from recon.metal import metal_warnings
+from torchpcct.dead_cells import MOST_DEAD
+from torchpcct.defects import Cells, cell_sums, dark_views, is_repaired, photon_and_light, repair_defects, wrong_cells
+from torchpcct.detector_window import DetectorWindow, footprint
+from torchpcct.formats.scans import adapted, open_scan, own_options
+from torchpcct.formats.volume_slabs import CHUNK, SlabFile, check_slab_name
+from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
+from torchpcct.projector import Projector
+from torchpcct.reading_checks import reading_warnings
+from torchpcct.scan import Scan
+from torchpcct.validate import checked, choice
+from torchpcct.volume import from_hu, to_hu
+
+__all__ = ["ScanSlices", "SlabPlan", "plan_slabs", "reconstruct_to"]
+
+_LOG = logging.getLogger(__name__)
+
+HALO = 8
+"""Rows read beside those that a slab needs: dead cells are found and bridged with their neighbours' help."""
+_RESERVE = 150 * 10**6
+"""Compiled kernels, and what filters work on (:data:`recon.analytic.filter_plan.CHUNK_BYTES`)."""
+_READINGS, _VOLUMES = 7, 4
+"""Arrays of the size of the readings and of a slab that live at once while either is prepared."""
+_LOOKED_AT = 32
+"""Rows in the middle whose readings are tested against their description, at most."""
+_STARVED = 0.5
+_RATE, _READ_RATE = 4e8, 1e8
+"""Voxel updates of the backprojection, and readings that are read and prepared, a second on one core."""
+
+
+class Part(NamedTuple):
+    """Some slices or rows of a scan.
+
+    Attributes:
+        scan: of a cone beam with :data:`HALO` rows more on either side.
+        own: where they stand in it.
+        zeros, replaced, dead: how many of their readings registered nothing, are such as no object can cause, and are
+            bridged by their neighbours.
+    """
+
+    scan: Scan
+    own: slice
+    zeros: int
+    replaced: int
+    dead: int
+
+
+class ScanSlices:
+    """A scan of which no more than some slices (of a cone beam: rows of the detector) are in memory at a time.
+
+    Args:
+        scan: a scan, or a file that is read in parts: ours, Data Exchange, a ``.yaml`` stack of ``.npy``, Zarr or TIFF.
+        options: of :func:`torchpcct.formats.scans.open_scan`.
+
+    Attributes:
+        geometry: of the whole scan.
+        count: its slices or rows.
+        counts: a tensor without contents, of the shape of the readings.
+        first: its first slices.
+
+    Raises:
+        ValueError: a scan that has to be read as a whole (a part of the detector, energy bins, a geometry view by view;
+            CatSim's and DICOM-CT-PD files).
+    """
+
+    window = None
+
+    def __init__(self, scan: Scan | str | os.PathLike[str], **options: Any) -> None:
+        takes = {"slices"} if isinstance(scan, Scan) else own_options(scan)
+        if "slices" not in takes:
+            raise ValueError(f"{scan} is no file that is read slice by slice: open_scan(…).save(…) makes an .h5 of it")
+        self.source, self.options = scan, options
+        self.cells: Cells | None = None
+        self.photon: float | None = None
+        self.first = self._open(0, 4)
+        # What the readers estimate from the readings must not differ from slab to slab.
+        info = self.first.info
+        if "gain" in takes and "signal_of_one_photon" in info:
+            self.options["gain"] = info["signal_of_one_photon"]
+            if not self.first.counting:
+                self.options["electronic_noise"] = self.first.electronic_noise
+        elif "photons" in takes and str(info.get("photons")).startswith("estimated"):
+            self.options["photons"] = float(self.first.air.flatten()[0])
+        self.unit, self.water = self.first.unit, self.first.linearisation.mu_ref
+        start, _, self.count = info["slices"]
+        g = self.first.geometry
+        self.geometry: Any = g.with_rows(-start, self.count) if isinstance(g, ConeBeam) else g
+        lead = () if g.has_rows else (self.count,)
+        self.counts = torch.empty((*lead, *self.geometry.shape), device="meta")
+
+    def _open(self, first: int, stop: int) -> Scan:
+        part = slice(first, stop)
+        if isinstance(self.source, Scan):
+            return adapted(self.source, slices=part, **self.options)
+        return open_scan(self.source, slices=part, **self.options)
+
+    def read(self, first: int, stop: int) -> Part:
+        """The slices ``first`` … ``stop - 1``, impossible readings replaced."""
+        axis, halo = (1, HALO) if self.geometry.has_rows else (0, 0)
+        low = max(first - halo, 0)
+        raw = self._open(low, min(stop + halo, self.count))
+        cells = (
+            None
+            if self.cells is None
+            else Cells(self.cells.views, *(c[low : low + raw.geometry.rows] for c in self.cells[1:]))
+        )
+        scan, own = repair_defects(raw, cells, self.photon)[0], slice(first - low, stop - low)
+        _give_back()
+        if halo and scan.dead is not None:
+            self._check_bridged(scan.dead, own, low)
+
+        def mine(values: Tensor) -> Tensor:
+            return values.narrow(axis, own.start, stop - first)
+
+        replaced = 0 if scan is raw else int(torch.ne(mine(scan.counts), mine(raw.counts)).sum())
+        dead = replaced + (0 if raw.dead is None else int(mine(raw.dead).sum()))
+        return Part(scan, own, int((mine(raw.counts) <= 0).sum()), replaced, dead)
+
+    def find_cells(self, step: int) -> None:
+        """Find the cells of a cone beam that are dead or of a wrong gain, by all rows, ``step`` rows at a time."""
+        g = self.geometry
+        if not g.has_rows or not is_repaired(self.first):
+            return
+        start = max((self.count - step) // 2, 0)
+        self.photon, light = photon_and_light(self._open(start, start + step))
+        lost, zeros = np.zeros(g.views, bool), np.zeros(g.views)
+        for _ in range(2):  # again, without the views that turn out to have no signal
+            parts, zeros[:] = [], 0.0
+            for first in range(0, self.count, step):
+                low = max(first - HALO, 0)
+                raw = self._open(low, min(first + step + HALO, self.count))
+                n = raw.counts.numpy()
+                sums = cell_sums(n, raw.air, np.zeros(g.views, np.int64), lost, light)
+                parts.append(sums[:, first - low : first - low + step])
+                zeros += (n[:, first - low : first - low + step] <= 0).sum((1, 2))
+                del raw, n
+            before, lost = lost, dark_views(zeros / (self.count * g.columns))
+            if (before == lost).all():
+                break
+        self.cells = wrong_cells(np.concatenate(parts, 1), lost, self.photon, light)
+
+    def _check_bridged(self, dead: Tensor, own: slice, low: int) -> None:
+        """Whether the neighbours that bridge dead cells were read."""
+        outer = float(dead.float().mean((1, 2)).max()) > MOST_DEAD
+        for side, rows in (
+            (low > 0, dead[:, : own.start + 1]),
+            (low + dead.shape[1] < self.count, dead[:, own.stop - 1 :]),
+        ):
+            lost = rows.all(1)  # and no live reading on one side, from which the row itself would be bridged
+            ends = (lost.cummin(-1).values | lost.flip(-1).cummin(-1).values.flip(-1)) if side else lost & False
+            outer = outer or bool(ends.any())
+        if outer:
+            raise ValueError(
+                f"too many readings are dead near row {low + own.start}: slabs read {HALO} rows beside their own, "
+                "which do not bridge them; reconstruct the whole volume at once"
+            )
+
+    def identity(self) -> str:
+        """A text that changes with the readings, as far as the file's size and date and the first rows tell."""
+        text = hashlib.sha256(self.first.counts.numpy().tobytes())
+        text.update(
+            repr(
+                (self.geometry._key(), self.count, self.unit, self.water, sorted(self.options.items(), key=str))
+            ).encode()
+        )
+        if not isinstance(self.source, Scan):
+            stat = Path(self.source).stat()
+            text.update(repr((stat.st_size, stat.st_mtime_ns)).encode())
+        return text.hexdigest()
+
+
+@dataclass(frozen=True)
+class SlabPlan:
+    """How a volume will be reconstructed in slabs.
+
+    Attributes:
+        slabs: first slice and the one after the last of each.
+        bands: of each, first and last + 1 of the detector rows (slices of a stack) that it needs.
+        memory: bytes that the process will hold at most.
+        read, written: bytes of float32 readings and voxels.
+        seconds: rough estimate, on one core; of FBP.
+    """
+
+    slabs: tuple[tuple[int, int], ...]
+    bands: tuple[tuple[int, int], ...]
+    memory: int
+    read: int
+    written: int
+    seconds: float
+
+    def __str__(self) -> str:
+        thick = max(stop - first for first, stop in self.slabs)
+        return (
+            f"{len(self.slabs)} slabs of up to {thick} slices, {self.memory / 1e9:.2f} GB of memory, reads "
+            f"{self.read / 1e9:.2f} GB, writes {self.written / 1e9:.2f} GB, about {self.seconds:.0f} s on one core"
+        )
+
+
+def _give_back() -> None:
+    """Let the system have the memory that was freed: the C library keeps it, up to several times what is in use."""
+    with contextlib.suppress(OSError, AttributeError, TypeError):  # another C library than GNU's
+        ctypes.CDLL(None).malloc_trim(0)
+
+
+class _Fbp:
+    """The FBP of a volume, of which slabs are made: the steps of :func:`recon.analytic.fbp.fbp`, with its results."""
+
+    def __init__(
+        self, geometry: Geometry, grid: VolumeGrid, kernel: str, sides: tuple[bool, bool], water: float
+    ) -> None:
+        self.geometry, self.grid, self.kernel, self.sides, self.water = geometry, grid, kernel, sides, water
+        self.cone = isinstance(geometry, ConeBeam)
+        self.plane = grid if self.cone else grid.slice
+        self.weights = angular_weights(geometry, self.plane)
+        wide = self.complete(torch.zeros(geometry.select([0]).shape)[..., :1, :].expand(*geometry.shape[:-2], 1, -1)
+                             if self.cone else torch.zeros(geometry.shape), self._rows(0, 1)).geometry  # fmt: skip
+        self.wide: Any = replace(wide, rows=geometry.rows, offset=(geometry.offset[0], wide.offset[1])) if isinstance(
+            geometry, ConeBeam) else wide  # fmt: skip
+        try:
+            self.window = footprint(self.wide, self.plane, margin=1)
+        except ValueError:
+            self.window = DetectorWindow.full(self.wide)
+        self.plan = BackprojectionPlan(self.wide, self.plane, self.window)
+
+    def _rows(self, first: int, stop: int) -> Any:
+        return self.geometry.with_rows(first, stop - first) if isinstance(self.geometry, ConeBeam) else self.geometry
+
+    def complete(self, lines: Tensor, geometry: Any) -> Rows:
+        rows = Rows(lines, geometry, self.weights, 0)
+        return mirrored(continued(rows, self.sides, self.water) if any(self.sides) else rows, self.plane)
+
+    def band(self, first: int, stop: int) -> tuple[int, int]:
+        """Detector rows, or slices, that the slices ``first`` … ``stop - 1`` of the volume need."""
+        if not self.cone:
+            return first, stop
+        low, high = self.plan.rows(first, stop)
+        return self.window.first_row + low, self.window.first_row + high
+
+    def needs(self, first: int, stop: int) -> int:
+        """Bytes at most while a slab is made."""
+        low, high = self.band(first, stop)
+        rows = high - low + (2 * HALO if self.cone else 0)
+        readings = 4 * rows * self.geometry.views * self.geometry.columns
+        wide = readings * self.wide.columns / self.geometry.columns
+        filtered = 4 * (high - low) * self.geometry.views * self.window.columns
+        slab = 4 * (stop - first) * math.prod(self.grid.shape[1:])
+        return int(max(_READINGS * readings, 2 * wide + filtered, filtered + slab, _VOLUMES * slab))
+
+    def __call__(self, source: ScanSlices, first: int, stop: int) -> Tensor:
+        """The slices ``first`` … ``stop - 1``, in the scan's unit."""
+        low, high = self.band(first, stop)
+        scan, own, *_ = source.read(low, high)
+        lines, geometry = scan.line_integrals(), scan.geometry
+        del scan
+        rows = self.complete(lines, geometry)
+        del lines
+        _give_back()
+        whole = DetectorWindow.full(self.wide)
+        if self.cone:
+            held, wanted = (
+                whole.with_rows(low - own.start, rows.lines.shape[-2]),
+                self.window.with_rows(low, high - low),
+            )
+            filtered = filter_windowed(rows.lines, self.wide, held, self.kernel, wanted, weights=rows.weights)
+            del rows
+            mu = self.plan.forward(filtered, (first, stop), low - self.window.first_row)
+        else:
+            filtered = filter_windowed(rows.lines, self.wide, whole, self.kernel, self.window, weights=rows.weights)
+            del rows
+            mu = self.plan.forward(filtered)
+        del filtered
+        _give_back()
+        return to_hu(mu, self.water).to(torch.float32)
+
+
+def _pwls_needs(geometry: Geometry, grid: VolumeGrid) -> Callable[[int, int], int]:
+    each = pwls_bytes(Projector(geometry, grid.slice), 1, torch.float32, torch.device("cpu"))
+
+    def needs(first: int, stop: int) -> int:
+        arrays = _READINGS * math.prod(geometry.shape) + _VOLUMES * math.prod(grid.shape[1:])
+        return each + 4 * (stop - first) * arrays
+
+    return needs
+
+
+@checked
+def plan_slabs(
+    geometry: Geometry,
+    grid: VolumeGrid,
+    memory: int | str | None = None,
+    method: str = "fbp",
+    *,
+    sides: tuple[bool, bool] = (False, False),
+    done: int = 0,
+) -> SlabPlan:
+    """Slabs in which a volume fits into memory.
+
+    Args:
+        geometry: of the whole scan: parallel, fan or cone beam.
+        grid: ``(z, y, x)``, of a stack ``(slices, y, x)``.
+        memory: bytes that the process may hold, with what it holds already, or a text such as "4GB"; None: what it
+            holds and what is free.
+        method: "fbp"; of stacks also "pwls".
+        sides: where the rows end inside the object and are continued (found before the first slab).
+        done: slices that are on the disk already.
+
+    Raises:
+        ValueError: a limit that is too small for the thinnest slab, with the smallest that is not; a grid, geometry or
+            method that slabs do not do.
+    """
+    _check(geometry, grid, method)
+    base = resident_bytes() + _RESERVE
+    limit = memory_bytes(memory) if memory is not None else resident_bytes() + available_bytes(torch.device("cpu"))
+    fbp = _Fbp(geometry, grid, "standard", sides, 0.02) if method == "fbp" else None
+    needs = fbp.needs if fbp is not None else _pwls_needs(geometry, grid)
+    total = grid.shape[0]
+
+    def cut(thick: int) -> Iterator[tuple[int, int]]:
+        return ((first, min(first + thick, total)) for first in range(done, total, thick))
+
+    def most(thick: int) -> int:
+        return base + max((needs(*slab) for slab in cut(thick)), default=0)
+
+    thick = max(total - done, 1)
+    while thick > 1 and most(thick) > limit:
+        thick = CHUNK * ((thick - 1) // CHUNK) if thick > CHUNK else thick - 1
+    if most(thick) > limit:
+        raise ValueError(
+            f"memory={memory if memory is not None else limit} is too little: one slice at a time needs "
+            f"{math.ceil(most(1) / 1e6)} MB ({base / 1e6:.0f} MB of them for the program itself): give memory="
+            f"{math.ceil(most(1) / 1e6)}MB or more, bin the readings, or take larger voxels"
+        )
+    slabs = tuple(cut(thick))
+    bands = tuple(slab if fbp is None else fbp.band(*slab) for slab in slabs)
+    row = 4 * geometry.views * geometry.columns
+    count = geometry.shape[1] if geometry.has_rows else total
+    read = row * (count + sum(high - low + (2 * HALO if geometry.has_rows else 0) for low, high in bands))
+    voxels = (total - done) * math.prod(grid.shape[1:])
+    seconds = voxels * geometry.views / _RATE + read / 4 / _READ_RATE
+    return SlabPlan(slabs, bands, most(thick), read, 4 * voxels, seconds)
+
+
+def _check(geometry: Geometry, grid: VolumeGrid, method: str) -> None:
+    choice("method", method, ("fbp", "pwls"))
+    if not isinstance(geometry, ParallelBeam | FanBeam | ConeBeam):
+        raise ValueError(
+            "slabs are of parallel, fan or cone beams on a circle: reconstruct a geometry view by view whole"
+        )
+    if grid.ndim != 3:
+        raise ValueError(f"grid must be a (z, y, x) VolumeGrid, got {grid!r}")
+    if method == "pwls" and geometry.has_rows:
+        raise ValueError(
+            'method "pwls" of a cone beam couples all slices: it needs the whole volume in memory; slabs are for '
+            '"fbp", and for stacks of parallel or fan-beam slices'
+        )
+
+
+@checked
+def reconstruct_to(
+    scan: Scan | str | Path | ScanSlices,
+    grid: VolumeGrid,
+    path: str | Path,
+    method: str = "fbp",
+    *,
+    memory: int | str | None = None,
+    kernel: str = "standard",
+    reader: Mapping[str, Any] | None = None,
+    progress: Callable[[float], None] | None = None,
+    **options: Any,
+) -> dict[str, Any]:
+    """Reconstruct a volume slab by slab into a file, within a limit of memory.
+
+    The same as :func:`recon.reconstruct` and :meth:`torchpcct.volume.Volume.save`, to the bit on one thread. FBP (FDK)
+    of parallel, fan and cone beams on a circle, PWLS of stacks of slices. If it is interrupted, the finished slabs
+    stay in ``path.unfinished``, and the same call goes on with them.
+
+    What is different: defects are looked for slab by slab, with :data:`HALO` rows on either side, so that one at the
+    limits of what is recognised may be judged otherwise; the readings are tested against their description
+    (:mod:`torchpcct.reading_checks`, :func:`recon.analytic.coverage.consistency_warnings`) in the middle rows or
+    slices, which the report's ``notes`` name; and what a file does not tell (its reading of one photon) is estimated
+    from its first slices.
+
+    Args:
+        scan: a file that is read slice by slice (:class:`ScanSlices`), or a scan in memory.
+        grid: ``(z, y, x)``, of a stack ``(slices, y, x)`` with all its slices.
+        path: ``.nii`` or ``.zarr`` (OME-Zarr 0.5; extra ``io``).
+        method: "fbp" or, of stacks, "pwls".
+        memory: see :func:`plan_slabs`; the plan is logged before the start.
+        kernel: of FBP.
+        reader: options of :func:`torchpcct.formats.scans.open_scan`.
+        progress: called with the finished fraction, 0…1.
+        options: of PWLS.
+
+    Returns:
+        The report: that of a volume, with the plan as ``slabs``, ``memory_bytes``; ``resumed_at``, the first slice of
+        this call; ``minimum``, ``maximum`` and ``mean`` of what it wrote.
+
+    Raises:
+        ValueError: a limit that is too small, naming the smallest that works; a scan, grid or method that cannot be
+            done in slabs; a starved scan; another ending.
+        WriteError: the target cannot be written (a full disk): the finished slabs stay.
+    """
+    check_slab_name(path)
+    source = scan if isinstance(scan, ScanSlices) else ScanSlices(scan, **dict(reader or {}))
+    g, start = source.geometry, time.perf_counter()
+    _check(g, grid, method)
+    if not g.has_rows and grid.shape[0] != source.count:
+        raise ValueError(f"this scan of {source.count} slices needs a grid of as many, got {grid.shape}")
+    plan = plan_slabs(g, grid, memory, method)
+    fixed = [*check_rows(g, grid), *sampling_warnings(g)] if method == "fbp" else []
+    key = hashlib.sha256(repr((source.identity(), grid, method, kernel, sorted(options.items()))).encode()).hexdigest()
+    thick = plan.slabs[0][1] - plan.slabs[0][0]
+    source.find_cells(max(high - low for low, high in plan.bands))
+    file = SlabFile(path, grid, source.unit, key, min(thick, CHUNK))
+    _LOG.info("%s", plan)
+    if "sides" not in file.notes:
+        try:
+            file.notes |= _survey(source, plan)
+        except BaseException:
+            file.discard()
+            raise
+    notes = file.notes
+    sides: Any = tuple(notes["sides"])
+    begun = file.done
+    if begun or any(sides):
+        plan = plan_slabs(g, grid, memory, method, sides=sides, done=begun)
+    run = _Fbp(g, grid, kernel, sides, source.water) if method == "fbp" else None
+    found: dict[str, float] = {}  # in the order of their appearance
+    low, high, total = math.inf, -math.inf, 0.0
+    for first, stop in plan.slabs:
+        if run is not None:
+            values = run(source, first, stop)
+            peak = float(values.max())
+            texts = metal_warnings(values) if source.unit == "HU" else []
+            if source.unit != "HU":
+                values = from_hu(values, source.water)
+        else:
+            part = _slices_of(grid, first, stop)
+            volume = reconstruct(source._open(first, stop), part, method, **options)
+            values, texts, peak = volume.data, volume.report["warnings"], 0.0
+        for text in texts:
+            found[text] = peak
+        low, high, total = (
+            min(low, float(values.min())),
+            max(high, float(values.max())),
+            total + float(values.sum(dtype=torch.float64)),
+        )
+        file.write(values.numpy())
+        del values
+        if progress is not None:
+            progress(stop / grid.shape[0])
+    metal = sorted((t for t in found if run is not None), key=lambda t: -found[t])[:1]  # that of the brightest slab
+    warnings = list(dict.fromkeys([*notes["warnings"], *fixed, *(metal if run is not None else found)]))
+    for text in warnings:
+        _LOG.warning("%s", text)
+    report = {
+        "method": method, **({"kernel": kernel} if run is not None else {}),
+        "seconds": round(time.perf_counter() - start, 3), "warnings": warnings,
+        "notes": [*notes["notes"], *(view_notes(g) if run is not None else [])],
+        "dead_readings": notes["dead_readings"],
+        "slabs": len(plan.slabs), "memory_bytes": plan.memory, "resumed_at": begun,
+        "minimum": low, "maximum": high, "mean": total / max((grid.shape[0] - begun) * math.prod(grid.shape[1:]), 1),
+    }  # fmt: skip
+    file.finish(report)
+    return report
+
+
+def _slices_of(grid: VolumeGrid, first: int, stop: int) -> VolumeGrid:
+    """The slices ``first`` … ``stop - 1`` of a ``(z, y, x)`` grid, at their places."""
+    z = grid.center[0] + (first + stop - grid.shape[0]) / 2 * grid.spacing[0]
+    return VolumeGrid((stop - first, *grid.shape[1:]), grid.spacing, (z, *grid.center[1:]))
+
+
+def _survey(source: ScanSlices, plan: SlabPlan) -> dict[str, Any]:
+    """What has to be known of all readings before the first slab, and what the middle ones say of the scan."""
+    g, cone = source.geometry, source.geometry.has_rows
+    step = max(high - low for low, high in plan.bands)
+    tally, rows = np.zeros(3, np.int64), torch.zeros(g.views, g.columns, dtype=torch.float64)
+    ends: list[tuple[float, Tensor, Tensor]] = []
+    for first in range(0, source.count, step):
+        scan, own, *numbers = source.read(first, min(first + step, source.count))
+        tally += numbers
+        lines = scan.line_integrals()[(slice(None), own) if cone else own]
+        del scan
+        if cone:
+            rows += lines.sum(1, dtype=torch.float64)
+        else:
+            ends.append(row_ends(lines))
+    readings, (zeros, replaced, dead) = source.counts.numel(), map(int, tally)
+    if zeros > _STARVED * readings:
+        raise ValueError(
+            f"{100 * zeros / readings:.0f} % of the readings are zero: too few photons for a line-integral method; "
+            "raise the exposure or bin the readings"
+        )
+    if cone:
+        ends = [row_ends((rows / source.count).float()[None])]
+    highest, first_column, last_column = zip(*ends, strict=True)
+    sides = ends_cut_off(max(highest), torch.cat(first_column), torch.cat(last_column), g, angular_weights(g))
+    return {"sides": sides, "dead_readings": dead, **_looked_at(source, plan, replaced, sides)}
+
+
+def _looked_at(source: ScanSlices, plan: SlabPlan, replaced: int, sides: tuple[bool, bool]) -> dict[str, Any]:
+    g, cone = source.geometry, source.geometry.has_rows
+    most = min(_LOOKED_AT, max(high - low for low, high in plan.bands), source.count)
+    if cone:  # about the plane of the orbit
+        first = int(np.clip(round(-g.row_positions[0] / g.pitch[0]) - most // 2, 0, source.count - most))
+    else:
+        most -= 1 - most % 2
+        first = source.count // 2 - most // 2
+    scan = source.read(first, first + most).scan
+    flat = VolumeGrid((scan.counts.shape[0], 1, 1), 1.0)
+    texts = [*reading_warnings(scan), *consistency_warnings(scan, flat)]
+    if replaced:
+        share = 100 * replaced / source.counts.numel()
+        texts.insert(
+            0,
+            f"{replaced} readings are such as no object can cause (dead cells, wrong gains, lost readings): "
+            f"{share:.2g} % of the readings were interpolated from their neighbours",
+        )
+    if any(sides) and not any("inside the object" in text for text in texts):
+        texts.append("the rows end inside the object above or below the middle: what lies beyond is continued as water")
+    what = f"{'rows' if cone else 'slices'} {first} … {first + most - 1} of {source.count}"
+    return {"warnings": texts, "notes": [f"readings, rotation axis and edges were tested in {what}"]}

@@ -1,0 +1,226 @@
+"""A model of AᵀWA for whole fields of view, of any geometry, made from a few exact projection pairs.
+
+    AᵀWA ≈ Σ_c D s_c F⁻¹ K_c F s_c D,        D² = AᵀW 1 at each voxel that enough rays meet, Σ_c s_c² = 1,
+
+K_c the spectrum of the impulse response in the middle of slice c, s_c the share of a slice in it (Fessler and Booth
+1999, IEEE Trans. Image Process. 8:688, with one K). It is too rough to solve with, because the weights of the
+rays change over the field; with the prior's own spectrum beside K it preconditions conjugate gradients on exact pairs,
+which need neither its accuracy nor the memory of :class:`recon.gram.gram.Gram`.
+
+One K is enough in a plane and for parallel rays. A circular orbit of a cone beam does not: its middle slice has all
+frequencies, but 36 mm off it, 400 mm from the source, frequencies (f_r, f_z) with f_r < 0.09 f_z are seen by no ray
+(Tuy 1983, SIAM J. Appl. Math. 43:546). A preconditioner that takes them for well seen hardly moves flat faces there.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from recon.gram.gram import check_weights, information_at_reference
+from recon.least_squares.model_solver import mean_share
+from recon.least_squares.qggmrf import BoundPrior
+
+__all__ = ["FieldModel", "GradientStep"]
+
+# Smallest eigenvalue of K, as a share of the median one: between the views' directions it is 0 or, cut off, negative.
+LEAST = 0.02
+# Slices that have a K of their own, if waves along z are seen in the outermost of them by this factor less than in the
+# middle.
+NODES, FACTOR = 5, 3.0
+# Voxels that fewer rays meet than this share of those through the middle are not determined by the data. (A ring beyond
+# the field of view, seen by three quarters of the views, converged a hundred pairs later than all within.)
+DETERMINED = 0.9
+# Voxels that fewer rays meet are scaled as if it were this share, of the same mean weight: scaled by themselves, slices
+# beyond the rows of a cone beam hang on the prior alone and spoil the condition number.
+LEAST_MET = 0.5
+
+
+class FieldModel:
+    """Diagonal and circulant model of x ↦ AᵀW A x.
+
+    Args:
+        projector: A, with ``A.T``, ``domain_shape``, ``range_shape`` and ``grid``; nothing else is asked of it.
+        weights: W, inverse variances of the line integrals, ``range_shape``, finite and ≥ 0.
+
+    Attributes:
+        seen: AᵀW 1, ``domain_shape``: 0 where no ray of positive weight passes.
+        scale: D².
+        spectrum: K in the middle, ``rfftn`` layout, > 0.
+        determined: bool, ``domain_shape``: voxels that (nearly) all views see. Beyond, in the corners of a grid that is
+            wider than the field of view and in slices that some views miss, directions are left to the prior alone.
+
+    Raises:
+        ValueError, TypeError: weights as :class:`recon.gram.gram.Gram` refuses them, or a grid that no ray meets.
+    """
+
+    def __init__(self, projector: Any, weights: Tensor) -> None:
+        check_weights(weights, tuple(projector.range_shape))
+        self.grid = projector.grid
+        self.seen: Tensor = projector.T(weights)
+        if not bool((self.seen > 0).any()):
+            raise ValueError("no ray of positive weight meets the grid: check its centre, in mm, and the geometry")
+        self.at = _central(self.seen)
+        met = projector.T((weights > 0).to(weights.dtype))
+        met = met / met[self.at]
+        self.determined: Tensor = met >= DETERMINED
+        unseen = LEAST_MET * self.seen[self.determined].median()
+        self.scale = torch.where(met > 0, self.seen * (LEAST_MET / met).clamp_min(1.0), unseen)
+        # One impulse after the other: a batch would need twice the memory.
+        self._response = lambda impulse: projector.T(weights * projector(impulse))
+        column = torch.zeros_like(self.seen)
+        # What a wave that is constant along z sees.
+        column[..., self.at[-2], self.at[-1]] = 1.0
+        column = self._response(column)
+        self._column = column if self.grid.ndim == 3 else column[None]
+        self.spectrum = self._spectrum(self.at)
+
+    def _spectrum(self, at: tuple[int, ...]) -> Tensor:
+        impulse = torch.zeros_like(self.seen)
+        impulse[at] = 1.0
+        return _periodic(self._response(impulse) / self.seen[at], at)
+
+    @cached_property
+    def nodes(self) -> list[tuple[Tensor, Tensor]]:
+        """K_c and s_c, ``(z, 1, 1)``, of slices between the first and the last that is determined in the middle.
+
+        Where one K will do, it alone, with the share 1. A volume costs two projection pairs to find out, and two more
+        for the other slices, when this is first asked for.
+        """
+        alone = [(self.spectrum, torch.ones_like(self.spectrum.flatten()[0]))]
+        if self.grid.ndim < 3:
+            return alone
+        column = self.determined[:, self.at[1], self.at[2]].nonzero().flatten()
+        first, last = int(column[0]), int(column[-1])
+        # In the middle of equal parts: the response of an end slice is cut off.
+        slices = [first + round((k + 0.5) / NODES * (last - first)) for k in range(NODES)]
+        slices[NODES // 2] = self.at[0]
+        if any(b - a < 2 for a, b in itertools.pairwise(slices)):
+            return alone
+        outer = [self._spectrum((z, *self.at[1:])) for z in (slices[0], slices[-1])]
+        if min(float((k / self.spectrum)[:, 0, 0].log().mean()) for k in outer) > -math.log(FACTOR):
+            return alone
+        inner = [self.spectrum if z == self.at[0] else self._spectrum((z, *self.at[1:])) for z in slices[1:-1]]
+        return list(zip([outer[0], *inner, outer[1]], _shares(slices, self.seen), strict=True))
+
+    def information(self, mu_per_hu: float, spacing: tuple[float, ...] | None = None) -> float:
+        """The data's information at 0.5 lp/mm in the middle of the grid, see :meth:`recon.gram.gram.Gram.information`.
+
+        Args:
+            mu_per_hu: 1 HU in mm⁻¹.
+            spacing: as if the voxels had this size in mm; None: their own.
+        """
+        rolled = torch.roll(self._column, [-k for k in self.at[-2:]], (-2, -1))
+        # Slices that the rays do not meet say nothing.
+        kept = rolled[rolled[..., 0, 0] > 0]
+        return information_at_reference(
+            torch.fft.rfft2(kept).real, (rolled.shape[-2], rolled.shape[-1]), spacing or self.grid.spacing, mu_per_hu
+        )
+
+    def scaled(self, factor: float) -> FieldModel:
+        """The model of ``factor`` · W."""
+        other = object.__new__(FieldModel)
+        other.grid, other.at, other.spectrum = self.grid, self.at, self.spectrum
+        other.determined, other.nodes = self.determined, self.nodes
+        other.seen, other.scale = self.seen * factor, self.scale * factor
+        other._column = self._column * factor
+        return other
+
+
+class GradientStep:
+    """Steps of preconditioned conjugate gradients: −Σ_c D⁻¹ s_c F⁻¹ (K_c + η_c R)⁻¹ F s_c D⁻¹ times the gradient.
+
+    Args:
+        nodes: K_c, ``rfftn`` layout of the grid, > 0, with s_c, which broadcast to the grid.
+        prior: its curvature at gradient 0 is R.
+        x: volumes ``(batch, *shape)``; only their shape, dtype and device matter.
+        scale: D² > 0, the shape of the grid; None: 1.
+    """
+
+    def __init__(
+        self,
+        nodes: Sequence[tuple[Tensor, Tensor]],
+        prior: BoundPrior,
+        x: Tensor,
+        scale: Tensor | None = None,
+    ) -> None:
+        self.prior = prior
+        self._grid = tuple(x.shape[-len(prior.spacing) :])
+        self._prior = prior.spectrum(self._grid).to(x)
+        self._steps, self._share = 0, 1.0
+        self._scale: Tensor | None = None
+        inverse = torch.ones((), dtype=x.dtype, device=x.device)
+        if scale is not None:
+            self._scale, inverse = scale.to(x).rsqrt(), scale.to(x).reciprocal()
+        # In units of D² the prior weighs more where fewer rays pass: η_c is its mean over the slices of c.
+        self._nodes = [(k.to(x), s.to(x), _mean(inverse, s.to(x))) for k, s in nodes]
+
+    @classmethod
+    def of(cls, model: FieldModel, prior: BoundPrior, x: Tensor) -> GradientStep:
+        """For a whole field."""
+        return cls(model.nodes, prior, x, model.scale)
+
+    def step(self, x: Tensor, data_gradient: Tensor) -> tuple[Tensor, int]:
+        """The direction of descent, ``(batch, *shape)``, and 0: no iteration of a model."""
+        g = data_gradient + self.prior.gradient(x)
+        axes = tuple(range(-len(self._grid), 0))
+        g = g if self._scale is None else g * self._scale
+        if self._steps & (self._steps - 1) == 0:  # after 0, 1, 2, 4, 8 … steps: by then x hardly changes
+            self._share = mean_share(self.prior, x)
+        self._steps += 1
+        step = torch.zeros_like(g)
+        for data, share, weight in self._nodes:
+            part = torch.fft.rfftn(g * share, dim=axes).div_(data + self._share * weight * self._prior)
+            step -= share * torch.fft.irfftn(part, s=self._grid, dim=axes)
+        return (step if self._scale is None else step * self._scale), 0
+
+
+def _mean(inverse: Tensor, share: Tensor) -> float:
+    """Mean of 1 / D² over the slices of a node."""
+    value, weight = torch.broadcast_tensors(inverse, share.square())
+    return float((value * weight).sum(dtype=torch.float64) / weight.sum(dtype=torch.float64))
+
+
+def _shares(slices: Sequence[int], like: Tensor) -> list[Tensor]:
+    """s_c of every slice, ``(z, 1, 1)``: between two nodes cosine and sine, so that their squares add to 1."""
+    z = torch.arange(len(like), dtype=torch.float64, device=like.device)
+    found = []
+    for k, node in enumerate(slices):
+        share = torch.ones_like(z)
+        if k > 0:
+            share = torch.where(z < node, (z - slices[k - 1]) / (node - slices[k - 1]), share)
+        if k + 1 < len(slices):
+            share = torch.where(z > node, (slices[k + 1] - z) / (slices[k + 1] - node), share)
+        found.append((share.clamp(0.0, 1.0) * (math.pi / 2)).sin().to(like).reshape(-1, 1, 1))
+    return found
+
+
+def _central(seen: Tensor) -> tuple[int, ...]:
+    """The voxel next to the middle of the grid that at least half the median information of seen voxels reaches."""
+    enough = seen >= 0.5 * seen[seen > 0].median()
+    distance = torch.zeros((), device=seen.device)
+    for axis, n in enumerate(seen.shape):
+        along = (torch.arange(n, device=seen.device) - (n - 1) / 2).square()
+        distance = distance + along.reshape(-1, *[1] * (seen.dim() - 1 - axis))
+    flat = int(torch.where(enough, distance, torch.full_like(distance, math.inf)).argmin())
+    place = []
+    for n in reversed(seen.shape):
+        flat, k = divmod(flat, n)
+        place.append(k)
+    return tuple(reversed(place))
+
+
+def _periodic(response: Tensor, at: tuple[int, ...]) -> Tensor:
+    """Eigenvalues of the circulant matrix next to the response at ``at`` (T. Chan 1988), ``rfftn`` layout, > 0."""
+    for axis, (n, k) in enumerate(zip(response.shape, at, strict=True)):
+        lag = (torch.arange(n, device=response.device) - k).abs().to(response)
+        response = response * (1 - lag / n).reshape(-1, *[1] * (response.dim() - 1 - axis))
+    response = torch.roll(response, [-k for k in at], tuple(range(response.dim())))
+    spectrum = torch.fft.rfftn(response).real
+    return spectrum.clamp_min(LEAST * float(spectrum.median().clamp_min(1e-6 * float(spectrum.max()))))

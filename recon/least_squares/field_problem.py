@@ -1,0 +1,294 @@
+"""A scan of any scanner and the whole field that its rays cross: data, weights, grid; PWLS from the scan to HU.
+
+Everything that the rays meet must lie in the grid. If readings that miss the grid see something, the problem is solved
+on a larger one (``work``), and the part that was asked for is cut out.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Unpack
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from recon.analytic.coverage import check_rows
+from recon.analytic.fbp import fbp
+from recon.least_squares.pwls import PwlsOptions, pwls
+from recon.least_squares.qggmrf import DEFAULT_PRIOR, QGGMRF
+from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid
+from torchpcct.projector import Projector
+from torchpcct.scan import Scan
+from torchpcct.vector_geometry import VectorGeometry
+from torchpcct.volume import Volume, in_words, to_hu
+
+if TYPE_CHECKING:
+    from torchpcct.metrics.residual_test import ResidualTest
+
+__all__ = ["FieldProblem", "field_prior", "is_whole_field", "reconstruct_field", "unfinished"]
+
+_LOG = logging.getLogger(__name__)
+
+REFERENCE_VOXEL_MM = 0.25
+# Distance from the minimum, beyond the field of view, from which it is named.
+UNDETERMINED_HU = 10.0
+# Readings that miss the grid see something if the mean of a patch of so many cells each way is above this line integral
+# (half a millimetre of water) and this share of the mean of the readings that meet it.
+PATCH = 8
+SEES_SOMETHING = (0.01, 0.03)
+
+
+def field_prior(voxel_mm: float, dimensions: int = 3) -> QGGMRF:
+    """The default prior of a whole field: the curvatures of data and prior are equal at 0.19 line pairs per voxel.
+
+    A picture of an object twice as large on voxels twice as large looks the same, from micro-CT to a clinical scanner.
+    At 0.25 mm it is :data:`recon.least_squares.qggmrf.DEFAULT_PRIOR`, whose threshold follows the noise.
+
+    Args:
+        voxel_mm: in-plane voxel size.
+        dimensions: of the volume.
+    """
+    ratio = voxel_mm / REFERENCE_VOXEL_MM
+    # The threshold counts in (λ mm³)^(−1/2). With all lengths times m, and the information at 0.5 lp/mm divided by m⁴
+    # (of a plane m³), gradients are divided by m.
+    return replace(
+        DEFAULT_PRIOR,
+        strength=DEFAULT_PRIOR.strength * ratio**3,
+        threshold=DEFAULT_PRIOR.threshold * ratio ** (-dimensions / 2),
+    )
+
+
+def is_whole_field(scan: Scan, grid: VolumeGrid) -> bool:
+    """Whether PWLS treats the grid as the whole field: always but for an inset of a cone beam."""
+    geometry = scan.geometry
+    if scan.surround is not None:
+        return False
+    if not isinstance(geometry, ConeBeam):
+        return True  # an inset of a scan given view by view is solved on all that its rays cross
+    edges = zip(grid.extent[1:], grid.center[1:], strict=True)
+    return all(extent / 2 - abs(center) >= geometry.fov_radius / math.sqrt(2) for extent, center in edges)
+
+
+class FieldProblem:
+    """What scans of one geometry share on one grid.
+
+    Args:
+        scan: without a known surround; counting, or energy integrating with ``quantum``. Its own readings, smoothed,
+            give the weights (:meth:`torchpcct.Scan.weights`): dead readings weigh nothing.
+        grid: ``(z, y, x)``; of a parallel or fan beam ``(y, x)`` or ``(slices, y, x)``.
+
+    Attributes:
+        work: the grid that is solved for, 2-D for parallel and fan beams; it holds ``grid``.
+        projector: of ``work``.
+
+    Raises:
+        ValueError: a spectral scan, a grid that does not fit the scan.
+    """
+
+    def __init__(self, scan: Scan, grid: VolumeGrid) -> None:
+        geometry = scan.geometry
+        self.plane = len(geometry.shape) == 2
+        if not self.plane and scan.counts.ndim != 3:
+            raise ValueError("PWLS in HU needs a counting-mode scan; decompose or sum the energy bins before")
+        if self.plane and tuple(grid.shape[:-2]) != tuple(scan.counts.shape[:-2]):
+            wanted = (*scan.counts.shape[:-2], "y", "x")
+            raise ValueError(f"this scan needs a grid of the shape {wanted} (slices first), got {grid.shape}")
+        self.warnings = check_rows(geometry, grid)
+        self.grid, self.geometry, self.mu_ref = grid, geometry, scan.linearisation.mu_ref
+        self.unit = scan.unit
+        self._asked = grid.slice if self.plane else grid
+        self.work = self._asked
+        self.projector = Projector(geometry, self.work)
+        lines = scan.line_integrals()
+        if self._misses(lines, scan.dead):
+            self.work = larger_grid(self._asked, geometry)
+            self.projector = Projector(geometry, self.work)
+
+    def _misses(self, lines: Tensor, dead: Tensor | None) -> bool:
+        """Whether readings that do not meet the grid see something."""
+        met = self.projector(torch.ones(self.projector.domain_shape)) > 0
+        known = torch.ones_like(lines, dtype=torch.bool) if dead is None else ~dead
+        if not bool((known & met).any()):
+            return False
+        level = max(SEES_SOMETHING[0], SEES_SOMETHING[1] * float(lines[known & met].mean()))
+        outside = (known & ~met).to(lines)
+        # Means over patches: one that lies beside the body is enough, noise is not.
+        size = [min(PATCH, n) for n in lines.shape[-2:]]
+        seen, count = (
+            F.avg_pool2d(v.reshape(-1, 1, *lines.shape[-2:]), size, size) for v in (lines * outside, outside)
+        )
+        return bool((seen > level * count).logical_and_(count >= 0.25).any())
+
+    def slices(self, scan: Scan) -> list[tuple[Tensor, Tensor]]:
+        """Line integrals and weights, ``projector.range_shape``, of each slice; of a cone beam one.
+
+        Raises:
+            ValueError: a scan of another geometry.
+        """
+        if scan.geometry != self.geometry:
+            raise ValueError("this scan has another geometry than the one the problem was made for")
+        y, w = scan.line_integrals(), scan.weights()
+        n = len(self.geometry.shape)
+        pairs = zip(y.reshape(-1, *y.shape[-n:]), w.reshape(-1, *w.shape[-n:]), strict=True)
+        return [(a, b.contiguous()) for a, b in pairs]
+
+    def start(self, lines: Tensor) -> Tensor | None:
+        """FBP on ``work`` as the first volume: low frequencies are right, and PWLS needs half of the projections.
+
+        None where FBP refuses the geometry (views that do not suffice).
+        """
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)
+                found = fbp(lines, self.geometry, self.work, "soft", outside=self.mu_ref)
+        except ValueError:
+            return None
+        return torch.nan_to_num(found, nan=0.0, posinf=0.0, neginf=0.0).clamp_min(0.0)
+
+    def cut(self, volume: Tensor) -> Tensor:
+        """The part of ``(..., *work.shape)`` that was asked for."""
+        for axis, (whole, part) in enumerate(zip(self.work.axes, self._asked.axes, strict=True)):
+            first = round((part[0] - whole[0]) / self.work.spacing[axis])
+            volume = volume.narrow(axis - self.work.ndim, first, len(part))
+        return volume
+
+    def hu(self, volumes: Sequence[Tensor]) -> Tensor:
+        """HU on ``grid`` of the volumes in mm⁻¹ of all slices."""
+        parts = torch.stack([self.cut(v) for v in volumes])
+        return to_hu(parts.reshape(self.grid.shape), self.mu_ref)
+
+    def residual_test(self, y: Tensor, w: Tensor, x: Tensor) -> ResidualTest:
+        """Whether a volume ``work.shape`` in mm⁻¹ explains the readings of one slice."""
+        from torchpcct.metrics.residual_test import residual_test  # loads scipy.stats
+
+        fitted = self.projector(x.to(y))
+        rows = (lambda v: v.unsqueeze(-2)) if self.plane else (lambda v: v)
+        return residual_test(rows(y - fitted), rows(w), rows(fitted), unknowns=self.work.voxels)
+
+
+def larger_grid(grid: VolumeGrid, geometry: Any) -> VolumeGrid:
+    """The grid with as many voxels more on each side as it takes to hold all that the rays cross.
+
+    Args:
+        grid: ``(y, x)`` or ``(z, y, x)``.
+        geometry: of the scan.
+
+    Raises:
+        TypeError: an unknown geometry.
+    """
+    bottom = top = 0.0
+    if isinstance(geometry, ParallelBeam):
+        edge = float(np.abs(geometry.column_positions).max()) + geometry.pitch / 2
+    elif isinstance(geometry, (FanBeam, ConeBeam)):
+        edge = geometry.sod * math.sin(min(float(np.abs(geometry.fan_angles).max()), math.pi / 2))
+        if isinstance(geometry, ConeBeam):
+            rows = float(np.abs(geometry.row_positions).max()) + geometry.pitch[0] / 2
+            top = rows * (geometry.sod + edge) / geometry.sdd
+            bottom = -top
+    elif isinstance(geometry, VectorGeometry):
+        distance, height, climb = geometry.border_rays()
+        edge = float(distance.max())
+        rise = np.abs(climb) * np.sqrt(edge**2 - distance**2)
+        bottom, top = float((height - rise).min()), float((height + rise).max())
+    else:
+        raise TypeError(f"unknown geometry {type(geometry).__name__}")
+    reach = [(bottom, top), (-edge, edge), (-edge, edge)][-grid.ndim :]
+    shape, center = [], []
+    for n, h, c, (first, last) in zip(grid.shape, grid.spacing, grid.center, reach, strict=True):
+        low, high = (max(math.ceil(r / h - n / 2 - 1e-6), 0) for r in (c - first, last - c))
+        shape.append(n + low + high)
+        center.append(c + (high - low) * h / 2)
+    return VolumeGrid(tuple(shape), grid.spacing, tuple(center))
+
+
+def reconstruct_field(
+    scans: Sequence[Scan],
+    grid: VolumeGrid,
+    *,
+    progress: Callable[[float], None] | None = None,
+    prior: QGGMRF | None = None,
+    **options: Unpack[PwlsOptions],
+) -> list[Volume]:
+    """PWLS of whole fields, slice by slice for parallel and fan beams, from FBP as the first volume.
+
+    Args:
+        scans: of one geometry.
+        grid: see :class:`FieldProblem`.
+        progress: called with the finished fraction.
+        prior: None: :func:`field_prior` of the grid.
+        options: of :func:`recon.least_squares.pwls.pwls`; ``tolerance`` is 1 HU unless given.
+
+    Returns:
+        Volumes in HU. Report: that of :func:`recon.least_squares.pwls.pwls` (of several slices the sum of
+        ``exact_pairs`` and ``seconds``, the worst of the rest), ``chi2``, ``residual_p``, ``warnings``.
+
+    Raises:
+        ValueError, TypeError: see :class:`FieldProblem` and :func:`recon.least_squares.pwls.pwls`.
+    """
+    began = time.perf_counter()
+    options = {"tolerance": 1.0, **options}
+    problem = FieldProblem(scans[0], grid)
+    prior = prior or field_prior(grid.spacing[-1], problem.work.ndim)
+    volumes = []
+    for i, scan in enumerate(scans):
+        slices = problem.slices(scan)
+        results, tests = [], []
+        for k, (y, w) in enumerate(slices):
+            result = pwls(
+                problem.projector, y, w, prior, mu_per_hu=problem.mu_ref / 1000.0, start=problem.start(y), **options,
+            )  # fmt: skip
+            results.append(result)
+            if not scan.noise_free:
+                tests.append(problem.residual_test(y, w, result.x))
+            if progress is not None:
+                progress((i + (k + 1) / len(slices)) / len(scans))
+        report = joined([dict(r.report) for r in results])
+        report["seconds"] = round(time.perf_counter() - began, 3)
+        found = list(problem.warnings)
+        if not report["converged"]:
+            found.append(unfinished(report, problem.unit, problem.mu_ref))
+            warnings.warn(found[-1], RuntimeWarning, stacklevel=2)
+        if report["undetermined_rmsd_hu"] > UNDETERMINED_HU:
+            found.append(
+                f"{100 * report['undetermined']:.0f} % of the voxels are missed by some views (corners beyond the "
+                "field of view, outer slices): there the volume is "
+                f"{in_words(report['undetermined_rmsd_hu'], problem.unit, problem.mu_ref)} from the minimum"
+            )
+        found += sorted({text for test in tests for text in test.findings})
+        if tests:
+            report["chi2"] = sum(t.chi2 for t in tests) / len(tests)
+            names = tests[0].p_values
+            report["residual_p"] = {name: min(t.p_values.get(name, 1.0) for t in tests) for name in names}
+        for text in found:
+            _LOG.warning("%s", text)
+        report["work_grid"] = problem.work.shape
+        data = problem.hu([r.x for r in results]).to(torch.float32)
+        volumes.append(Volume(data, grid, {**report, "warnings": found}))
+        began = time.perf_counter()
+    return volumes
+
+
+def joined(reports: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """One report of several slices: counts are added, the worst slice speaks for the rest."""
+    worst = dict(max(reports, key=lambda r: (not r["converged"], r["rmsd_hu"][-1] if r["rmsd_hu"] else 0.0)))
+    if len(reports) > 1:
+        worst["exact_pairs"] = sum(r["exact_pairs"] for r in reports)
+        worst["misfit"] = [m for r in reports for m in r["misfit"]]
+        worst["slices"] = len(reports)
+    return worst
+
+
+def unfinished(report: dict[str, Any], unit: str = "HU", mu_water: float = 0.02) -> str:
+    """Says how far from the minimum a volume is that did not converge."""
+    left, asked = (in_words(v, unit, mu_water) for v in (report["rmsd_hu"][-1], report["tolerance_hu"]))
+    return (
+        f"PWLS stopped {left} from the minimum after {report['exact_pairs']} projection pairs (tolerance {asked}): "
+        "raise max_exact, or strengthen the prior"
+    )

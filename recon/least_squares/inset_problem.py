@@ -1,0 +1,313 @@
+"""Model-based reconstruction of a small inset: crop to its footprint, take the background off, solve PWLS, give HU."""
+
+from __future__ import annotations
+
+import copy
+import logging
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Unpack
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from recon.analytic.coverage import check_rows
+from recon.analytic.inset import require_inside, require_same_surround, static_fbp
+from recon.gram.gram import Gram
+from recon.least_squares.field_model import FieldModel
+from recon.least_squares.field_problem import is_whole_field, reconstruct_field, unfinished
+from recon.least_squares.pwls import PwlsOptions, data_model, pwls
+from recon.least_squares.qggmrf import DEFAULT_PRIOR, QGGMRF
+from recon.least_squares.surround import UnknownSurround
+from torchpcct.detector_window import DetectorWindow, footprint
+from torchpcct.geometry import VolumeGrid
+from torchpcct.projector import Projector
+from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
+from torchpcct.volume import Volume, to_hu
+
+__all__ = ["InsetProblem", "Statistic", "reconstruct_pwls"]
+
+if TYPE_CHECKING:
+    from torchpcct.metrics.residual_test import ResidualTest
+
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Statistic:
+    """All that a scan says about an inset, given the weights W.
+
+    Args:
+        b: AᵀW y, ``grid.shape``, y with the background taken off.
+        energy: yᵀW y.
+        readings: number of readings in the inset's footprint.
+    """
+
+    b: Tensor
+    energy: float
+    readings: int
+
+
+class InsetProblem:
+    """What all realisations of one scan on one grid share: projector, weights, Gram, background.
+
+    Args:
+        scan: a counting-mode scan of the family; its noise does not matter. A scan of the whole detector without a
+            known surround serves too: what lies around the grid is then found from its own readings, scan by scan
+            (:mod:`recon.least_squares.surround`). Of a grid that holds the whole field of view see
+            :class:`recon.least_squares.field_problem.FieldProblem`.
+        grid: ``(z, y, x)`` grid that holds everything the background does not.
+        nodes: of the Gram operator. Linear in position (5) is enough for solvers: what the model lacks, the exact
+            pairs repair, and each step costs half of that with 9.
+        motion: displacement of the inset in every view, ``(views, 3)`` z, y, x mm
+            (:func:`recon.analytic.inset.view_motion`); None: at rest. The background stands still; it is taken off
+            before, so that only what moves is projected. The Gram is that of a grid at rest with the weights that the
+            moving one meets; exact pairs use the moving projector.
+
+    The weights are the inverse variances of the line integrals expected from the BACKGROUND: weights from the noisy
+    readings themselves would bias the result, and a small inset changes the counts behind it by a few per cent only.
+
+    Attributes:
+        weights: on ``window``, at 1 s, of line integrals in mm⁻¹ · mm.
+        model: of AᵀWA at 1 s, :func:`recon.least_squares.pwls.data_model`.
+
+    Raises:
+        ValueError: a grid outside the field of view or the scan's region; a spectral or energy-integrating scan.
+    """
+
+    def __init__(self, scan: Scan, grid: VolumeGrid, nodes: int = 5, *, motion: Any = None) -> None:
+        if scan.counts.ndim != 3:
+            raise ValueError("PWLS in HU needs a counting-mode scan; decompose or sum the energy bins before")
+        if not scan.counting:
+            raise ValueError("PWLS and MBIR weigh readings as photon counts; use fbp for an energy-integrating scan")
+        self.grid, self.geometry = grid, scan.geometry
+        self.outer = scan.window or DetectorWindow.full(scan.geometry)
+        check_rows(scan.geometry, grid, motion)
+        self.mu_ref = scan.linearisation.mu_ref
+        self._nodes = nodes
+        self._around: UnknownSurround | None = None
+        self._background: Tensor | None = None
+        self.model: Gram | FieldModel
+        exposure = scan.exposure_s or NOISE_FREE_EXPOSURE_S
+        if scan.surround is None:
+            self._start_unknown(scan, exposure, motion)
+            return
+        require_inside(footprint(scan.geometry, grid, margin=1), self.outer)
+        self._background = scan.surround_line_integrals()
+        # The background's own value inside the inset, from the same data by FBP.
+        self.level = float(static_fbp(self._background, scan.geometry, grid).mean())
+        polychromatic = scan.air.log() - scan.surround.log()
+        slope = scan.linearisation.slope(polychromatic)
+        # Per second of exposure: the Gram of one exposure serves all by a factor.
+        self._cell_weights = scan.surround / slope.square() / exposure
+        self._place(motion)
+
+    def _start_unknown(self, scan: Scan, exposure: float, motion: Any) -> None:
+        """Weights from the smoothed readings themselves; what surrounds the inset is found scan by scan."""
+        if is_whole_field(scan, self.grid):
+            raise ValueError(
+                "the grid holds the whole field of view: use recon.least_squares.field_problem.FieldProblem"
+            )
+        if motion is not None:
+            raise ValueError("motion compensation needs the surround at rest: acquire the scan with region=")
+        geometry, grid = self.geometry, self.grid
+        self.window = footprint(geometry, grid, margin=1)
+        self.weights = self.outer.crop(scan.weights(), self.window) / exposure
+        self.projector = Projector(geometry, grid, self.window)
+        self.model = data_model(self.projector, self.weights, nodes=self._nodes)
+        self._around = UnknownSurround(geometry, grid, self.window, self.projector)
+        self.level = self._around.level(scan.line_integrals())
+
+    def _place(self, motion: Any) -> None:
+        geometry, grid = self.geometry, self.grid
+        self.window = footprint(geometry, grid, margin=1, motion=motion)
+        self.weights = self.window.take(self._cell_weights).contiguous()
+        self.projector = Projector(geometry, grid, self.window, motion)
+        if motion is None:
+            self.model = Gram(self.projector, self.weights, nodes=self._nodes)
+            return
+        # A displaced grid sees its voxels as the grid at rest does, a magnification of 0.3 % apart, but through the
+        # weights of where it is.
+        still = footprint(geometry, grid, margin=1)
+        first = np.clip(self.window.first_column, 0, geometry.columns - still.columns)
+        along = DetectorWindow(first, still.columns, still.first_row, still.rows)
+        weights = along.take(self._cell_weights).contiguous()
+        self.model = Gram(Projector(geometry, grid, still), weights, nodes=self._nodes)
+
+    @property
+    def background(self) -> Tensor:
+        """Line integrals of the known surround, ``(rows, columns)``.
+
+        Raises:
+            ValueError: nobody knows it.
+        """
+        if self._background is None:
+            raise ValueError("the surround of this scan is not known: acquire it with region=")
+        return self._background
+
+    @property
+    def gram(self) -> Gram:
+        """The FFT model of AᵀWA at 1 s.
+
+        Raises:
+            ValueError: the grid is no inset, so there is none: PWLS alone can do without.
+        """
+        if not isinstance(self.model, Gram):
+            raise ValueError(
+                "the grid takes more than half of the detector's columns, too much for the FFT model of a small inset: "
+                'use method="pwls", or a smaller grid'
+            )
+        return self.model
+
+    def with_motion(self, motion: Any) -> InsetProblem:
+        """The same problem for another displacement of the inset (None: at rest); the background is kept.
+
+        Args:
+            motion: as for :class:`InsetProblem`.
+        """
+        other = copy.copy(self)
+        other._place(motion)
+        return other
+
+    def data(self, scan: Scan) -> Tensor:
+        """Line integrals of a scan on the grid's footprint, background taken off, ``(views, rows, columns)``."""
+        if (scan.window or DetectorWindow.full(scan.geometry)) != self.outer or scan.geometry != self.geometry:
+            raise ValueError("this scan has another geometry or window than the one the problem was made for")
+        if self._around is not None:
+            return self._around.take_off(scan.line_integrals(), self.level)
+        if self._background is None:
+            return self.outer.crop(scan.line_integrals(), self.window)
+        require_same_surround(scan, self._background)
+        # Only what the inset shadows is taken the logarithm of; the bridge over dead readings needs their neighbours.
+        near = scan if scan.dead is not None or scan.window is None else scan.crop(self.window)
+        lines = near.line_integrals()
+        if near is scan:
+            lines = self.outer.crop(lines, self.window)
+        return lines - self.window.take(self._background)
+
+    def statistic(self, scan: Scan, data: Tensor | None = None) -> Statistic:
+        """What the solvers need of a scan, with the weights of its exposure (noise free: of 1 s).
+
+        Args:
+            scan: of the family.
+            data: its :meth:`data`, where it is at hand already.
+        """
+        y = self.data(scan) if data is None else data
+        weighted = self.weights * (scan.exposure_s or NOISE_FREE_EXPOSURE_S) * y
+        energy = float((weighted * y).sum((-1, -2), dtype=torch.float64).sum())
+        return Statistic(self.projector.T(weighted), energy, y.numel())
+
+    def residual_test(self, scan: Scan, volume: Tensor, data: Tensor | None = None) -> ResidualTest:
+        """Whether a volume ``(z, y, x)`` in HU explains a noisy scan, by one projection of it.
+
+        The variances are those of the counts that the volume itself predicts. ``data`` is :meth:`data` of the scan,
+        where it is at hand already. Raises ``ValueError`` for a noise-free scan, which no statistic describes.
+        """
+        from torchpcct.metrics.residual_test import residual_test  # loads scipy.stats
+
+        if scan.noise_free:
+            raise ValueError("the residual of a noise-free scan is not noise: test a noisy one")
+        x = (volume / 1000.0 + 1.0) * self.mu_ref - self.level
+        fitted = self.projector(x.to(torch.float32))
+        weights = self.weights * self.exposure([scan]) * torch.exp(-fitted)
+        y = self.data(scan) if data is None else data
+        return residual_test(y - fitted, weights, fitted, unknowns=self.grid.voxels)
+
+    @staticmethod
+    def exposure(scans: Sequence[Scan]) -> float:
+        """The one exposure of several scans, in s; 1 for noise-free ones.
+
+        Raises:
+            ValueError: they have several.
+        """
+        exposures = {s.exposure_s or NOISE_FREE_EXPOSURE_S for s in scans}
+        if len(exposures) != 1:
+            raise ValueError(f"the scans of one batch must have one exposure, got {sorted(exposures)} s")
+        return float(exposures.pop())
+
+    def solve(
+        self, scans: Sequence[Scan], prior: QGGMRF, data: Sequence[Tensor] | None = None, **options: Unpack[PwlsOptions]
+    ) -> tuple[Tensor, dict[str, Any]]:
+        """PWLS of several realisations of one exposure: ``(scans, z, y, x)`` HU, and the solver's report.
+
+        ``data`` are :meth:`data` of the scans, where they are at hand already.
+        """
+        exposure = self.exposure(scans)
+        lines = [self.data(s) for s in scans] if data is None else list(data)
+        result = pwls(
+            self.projector, torch.stack(lines), self.weights * exposure, prior, mu_per_hu=self.mu_ref / 1000.0,
+            gram=self.model.scaled(exposure), **options,
+        )  # fmt: skip
+        return to_hu(result.x + self.level, self.mu_ref), dict(result.report)
+
+
+def _tested(problem: InsetProblem, scan: Scan, data: Tensor, volume: Volume) -> Volume:
+    """The volume with what its residual says; findings are logged as warnings, too."""
+    found = problem.residual_test(scan, volume.data, data)
+    for text in found.findings:
+        _LOG.warning("%s", text)
+    tested = {
+        "chi2": found.chi2,
+        "residual_p": dict(found.p_values),
+        "warnings": [*volume.report["warnings"], *found.findings],
+    }
+    return replace(volume, report={**volume.report, **tested})
+
+
+def reconstruct_pwls(
+    scans: Sequence[Scan],
+    grid: VolumeGrid,
+    *,
+    progress: Callable[[float], None] | None = None,
+    prior: QGGMRF | None = None,
+    problem: InsetProblem | None = None,
+    batch: int = 1,
+    **options: Unpack[PwlsOptions],
+) -> list[Volume]:
+    """PWLS with a q-GGMRF prior, to convergence: of an inset, or of a whole field of view
+    (:func:`recon.least_squares.field_problem.reconstruct_field`, for every scan of a parallel or fan beam).
+
+    Args:
+        scans: realisations of one scan at one exposure.
+        grid: the inset, or the field.
+        progress: called with the finished fraction.
+        prior: None: :data:`recon.least_squares.qggmrf.DEFAULT_PRIOR`; of a whole field
+            :func:`recon.least_squares.field_problem.field_prior`.
+        problem: kept from an earlier call with the same scan and grid; None: made here.
+        batch: volumes solved at a time; they iterate until the slowest has converged.
+        options: of :func:`recon.least_squares.pwls.pwls`; ``tolerance`` is 1 HU unless given.
+
+    Returns:
+        Volumes in HU with the solver's report; of noisy scans also ``chi2`` (weighted squared residual per reading),
+        ``residual_p`` and ``warnings`` of :func:`torchpcct.metrics.residual_test.residual_test`: a volume that does not
+        explain its data (wrong centre, drifting gain, metal or a body beyond the grid) is not given out without a word.
+        A volume whose iteration did not reach ``tolerance`` says so in ``warnings``, too, and a :class:`RuntimeWarning`
+        is given.
+
+    Raises:
+        ValueError, TypeError: see :class:`InsetProblem` and :func:`recon.least_squares.pwls.pwls`.
+    """
+    if problem is None and is_whole_field(scans[0], grid):
+        return reconstruct_field(scans, grid, progress=progress, prior=prior, **options)
+    start = time.perf_counter()
+    options = {"tolerance": 1.0, **options}
+    problem = problem or InsetProblem(scans[0], grid)
+    volumes: list[Volume] = []
+    for i in range(0, len(scans), batch):
+        part = scans[i : i + batch]
+        data = [problem.data(s) for s in part]
+        found, report = problem.solve(part, prior or DEFAULT_PRIOR, data, **options)
+        open_ends = [] if report["converged"] else [unfinished(report)]
+        for text in open_ends:
+            warnings.warn(text, RuntimeWarning, stacklevel=2)
+        report["seconds"] = round((time.perf_counter() - start) / len(part), 3)
+        for scan, lines, values in zip(part, data, found, strict=True):
+            volume = Volume(values.to(torch.float32), grid, {**report, "warnings": open_ends})
+            volumes.append(volume if scan.noise_free else _tested(problem, scan, lines, volume))
+        start = time.perf_counter()
+        if progress is not None:
+            progress(min(i + batch, len(scans)) / len(scans))
+    return volumes

@@ -1,0 +1,117 @@
+"""What a reconstruction will need, before it allocates anything."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from recon.gram.impulse_response import slice_reach
+from torchpcct.geometry import Geometry, VolumeGrid
+from torchpcct.validate import whole
+
+__all__ = ["available_bytes", "gram_bytes", "memory_bytes", "pwls_bytes", "require_memory", "resident_bytes"]
+
+# Arrays of one volume's size that live at once: statistic, volume, gradients, two steps with their images, the prior's
+# and the transform's temporaries, the spectra of a whole field.
+VOLUMES = 21
+# Arrays of the data's size besides the arguments: weighted data, projection, their product.
+SINOGRAMS = 3
+
+
+def available_bytes(device: torch.device) -> int:
+    """Memory that can still be allocated: of the device, of the container, or of the machine."""
+    if device.type == "cuda":
+        return int(torch.cuda.mem_get_info(device)[0])
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        free = next(1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
+    except (OSError, StopIteration):  # no Linux
+        free = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else 2**62
+    try:
+        most = Path("/sys/fs/cgroup/memory.max").read_text().strip()
+        used = int(Path("/sys/fs/cgroup/memory.current").read_text())
+        free = free if most == "max" else min(free, int(most) - used)
+    except (OSError, ValueError):  # no container
+        pass
+    return free
+
+
+def resident_bytes() -> int:
+    """Memory that this process holds now; 0 where the system does not say."""
+    try:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, ValueError, AttributeError):
+        return 0
+
+
+_UNITS = {"": 1, "B": 1, **{f"{p}{b}": k**n for n, p in enumerate("KMGT", 1) for b, k in (("B", 1000), ("IB", 1024))}}
+
+
+def memory_bytes(value: int | str) -> int:
+    """A limit of memory in bytes: a whole number, or a text such as ``4GB`` (10⁹) or ``4 GiB`` (2³⁰).
+
+    Raises:
+        ValueError: no such text, or 0. TypeError: neither text nor whole number.
+    """
+    if not isinstance(value, str):
+        return whole("memory", value)
+    text = value.strip().upper()
+    digits = text.rstrip("KMGTIB ")
+    try:
+        found = int(float(digits) * _UNITS[text[len(digits) :].strip()])
+    except (ValueError, KeyError, OverflowError):
+        found = 0
+    if found < 1:
+        raise ValueError(f"memory must be bytes or a text like 4GB or 500MiB, got {value!r}")
+    return found
+
+
+def pwls_bytes(A: Any, batch: int, dtype: torch.dtype, device: torch.device) -> int:
+    """Largest memory that :func:`recon.least_squares.pwls.pwls` needs besides its arguments.
+
+    Args:
+        A: the exact operator; one without ``memory_estimate`` counts as if it needed nothing itself.
+        batch: volumes at a time.
+        dtype: of the data.
+        device: where the data lie.
+    """
+    volume, data = torch.Size(A.domain_shape).numel(), torch.Size(A.range_shape).numel()
+    item = dtype.itemsize * max(batch, 1)
+    estimate = getattr(A, "memory_estimate", None)
+    inside = estimate(max(batch, 1), dtype, device) - item * (volume + data) if estimate is not None else 0
+    return int(inside + item * (VOLUMES * volume + SINOGRAMS * data))
+
+
+def require_memory(A: Any, y: Tensor, memory: int | None) -> None:
+    """Refuse data ``(..., *A.range_shape)`` whose reconstruction does not fit into ``memory`` bytes.
+
+    Args:
+        A: the exact operator.
+        y: the data.
+        memory: None: what is available.
+
+    Raises:
+        ValueError: too little; the message names both figures and what to change.
+    """
+    if memory is not None:
+        whole("memory", memory)
+    batch = y.numel() // max(torch.Size(A.range_shape).numel(), 1)
+    need = pwls_bytes(A, batch, y.dtype, y.device)
+    free = available_bytes(y.device) if memory is None else memory
+    if need > free:
+        raise ValueError(
+            f"PWLS of {batch} volume(s) {tuple(A.domain_shape)} from data {tuple(A.range_shape)} needs "
+            f"{need / 2**30:.2f} GiB, {free / 2**30:.2f} GiB are available: take larger or fewer voxels, float32, "
+            "fewer volumes at a time, or bin the readings"
+        )
+
+
+def gram_bytes(geometry: Geometry, grid: VolumeGrid, itemsize: int, nodes: int = 9) -> int:
+    """Bytes of the impulse responses that :class:`recon.gram.gram.Gram` is fitted to."""
+    slices = grid.shape[0] if grid.ndim == 3 else 1
+    bands = 2 * slice_reach(geometry, grid) + 1
+    return nodes * bands * slices * (2 * grid.shape[-2] - 1) * (2 * grid.shape[-1] - 1) * itemsize

@@ -1,0 +1,408 @@
+"""Penalised weighted least squares, to the minimum itself: of a small inset, or of a whole field of view.
+
+    Φ(x) = ½ ‖y − A x‖²_W + R(x)
+
+One outer iteration: a step is proposed, one exact projection pair (A, Aᵀ) measures what it does, it is made conjugate
+to the step before, and a majorising line search from 0 sets its length (flexible conjugate gradients, Notay 2000, SIAM
+J. Sci. Comput. 22:1444; Huber's parabolas for R). So Φ falls in every iteration, whoever proposes the step, and the
+result is the minimum of Φ itself, not of a model. Two proposers:
+
+* Inset: the FFT model of AᵀWA (:class:`recon.gram.gram.Gram`) solves for what is left (defect correction). Its misfit
+  is measured with the first exact pair; a model that does not fit loses its place to
+* the preconditioned gradient (:class:`recon.least_squares.field_model.GradientStep`), for whole fields from the start:
+  there a projection pair costs no more than the model would, and the weights change too much over the field.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypedDict
+
+import torch
+from torch import Tensor
+
+from recon.conjugate_gradient import dot, per_volume
+from recon.gram.gram import Gram, check_weights
+from recon.least_squares.approach import Approach
+from recon.least_squares.field_model import FieldModel, GradientStep
+from recon.least_squares.memory import gram_bytes, require_memory
+from recon.least_squares.model_solver import ModelSolver, line_search
+from recon.least_squares.qggmrf import QGGMRF, BoundPrior
+from recon.linear_operator import NormalOperator
+from torchpcct.detector_window import footprint
+from torchpcct.validate import checked, number, renamed, whole
+
+__all__ = ["PwlsOptions", "PwlsResult", "data_model", "pwls", "solve_normal", "weighted_data"]
+
+_LOG = logging.getLogger(__name__)
+
+# Relative error of the FFT model on the first step beyond which it no longer leads the iteration.
+MISFIT_LIMIT = 0.5
+# A model whose proposals do not halve in so many pairs has no place either.
+PATIENCE = 4
+# Largest ratio of two steps of the FFT model that is believed when what follows them is added up.
+SLOWEST = 0.9
+# The gradient is followed by recurrence and measured afresh after so many pairs: rounding adds up.
+REFRESH = 25
+# Rounding does not fall with the gradient: after a start whose data gradient is so many times that of 0, and where the
+# FFT model sees nothing but rounding, it is measured afresh before the minimum counts as reached.
+FAR_START = 2.0
+# A grid that takes a larger share of the detector's columns is a whole field, not an inset.
+INSET_SHARE = 0.5
+# An FFT model that needs more is not built.
+GRAM_BYTES = 2**29
+
+
+@dataclass(frozen=True)
+class PwlsResult:
+    """A reconstruction and its certificate.
+
+    Args:
+        x: ``(..., *grid.shape)`` mm⁻¹.
+        report: ``exact_pairs`` (A and Aᵀ applied together), ``inner_iterations`` (of the FFT model, one entry per
+            outer iteration), ``gradient`` (norm of the exact gradient of Φ over that of the zero volume, worst volume
+            of the batch, one entry per outer iteration), ``rmsd_hu`` (root mean square distance to the minimum in HU,
+            worst volume, one entry per outer iteration: as the FFT model sees it from the exact gradient and its
+            steps shrink (``ahead``); for a whole field extrapolated from the latest steps, over the voxels that
+            the data determine: ``recon.least_squares.field_model.FieldModel.determined``), ``undetermined`` (share of
+            the other voxels), ``undetermined_rmsd_hu`` (the same estimate over them), ``converged``, ``tolerance_hu``,
+            ``model`` ("gram" or "gradient": who proposed the last step), ``model_misfit`` (of the FFT model on the
+            first step, None without one), ``misfit`` (weighted squared residual per reading of positive weight, one
+            entry per volume: about 1 for the right weights and many more readings than unknowns; from
+            :func:`solve_normal`, which does not know the data, None), ``seconds``, and the prior (``strength``,
+            ``lambda``, ``threshold_hu_per_mm``, ``p``, ``q``).
+    """
+
+    x: Tensor
+    report: Mapping[str, Any] = field(default_factory=dict)
+
+
+class PwlsOptions(TypedDict, total=False):
+    """Options of :func:`pwls` that whoever calls it for a scan hands on; each is described there."""
+
+    tolerance: float
+    max_exact: int
+    memory: int | None
+    callback: Callable[[dict[str, Any]], None] | None
+
+
+@checked
+def pwls(
+    A: Any,
+    y: Tensor,
+    weights: Tensor,
+    prior: QGGMRF | BoundPrior,
+    *,
+    mu_per_hu: float = 2e-5,
+    gram: NormalOperator | FieldModel | None = None,
+    start: Tensor | None = None,
+    tolerance: float = 0.2,
+    max_exact: int = 200,
+    memory: int | None = None,
+    callback: Callable[[dict[str, Any]], None] | None = None,
+    hu: float | None = None,
+) -> PwlsResult:
+    """Minimise ½‖y − A x‖²_W + R(x), in 2-D and 3-D, for an inset or a whole field of view.
+
+    Args:
+        A: the exact operator (:class:`torchpcct.projector.Projector`, or any other with ``A.T``, ``domain_shape``,
+            ``range_shape`` and ``grid``).
+        y: line integrals ``(..., *A.range_shape)`` float32 or float64, of all that lies in the beam: whatever the grid
+            does not hold must have been taken off. Readings of weight 0 may hold anything. Leading dimensions are
+            independent noise realisations.
+        weights: W, ``A.range_shape``: expected inverse variances of y (from smooth expected counts: weights taken
+            from the noisy counts themselves bias the result).
+        prior: a prior in noise-normalised units, or one that is bound already.
+        mu_per_hu: 1 HU in mm⁻¹ (μ of water / 1000); default: water at about 64 keV.
+        gram: model of AᵀWA with these weights (:class:`recon.gram.gram.Gram` or
+            :class:`recon.least_squares.field_model.FieldModel`, kept from an earlier call); default:
+            :func:`data_model`.
+        start: first volume ``(..., *grid.shape)`` mm⁻¹, default 0. It costs one exact pair and does not change the
+            result; the volume returned has no larger Φ.
+        tolerance: stop when the volume is this close to the minimum: root mean square, in HU (see ``rmsd_hu``), where
+            the data determine it; corners that some views miss hang on the prior and converge last. float32 may leave
+            5e-4 of the volume's noise (``tests/bench/precision.md``).
+        max_exact: largest number of exact pairs; if it is reached, the report says ``converged: False`` and a
+            warning is logged.
+        memory: bytes that may be used besides the arguments; default: what the machine has left. The need is
+            predicted before anything is allocated.
+        callback: called before each outer iteration with a dict of ``outer``, ``exact_pairs``, ``gradient``,
+            ``rmsd_hu`` and ``x``, the volumes so far ``(batch, *grid.shape)``, not to be changed.
+        hu: the former name of ``mu_per_hu``.
+
+    Returns:
+        The volume in the dtype of y, and the report.
+
+    Raises:
+        ValueError: shapes that do not fit, data that are not finite, weights that are negative or all 0,
+            a tolerance ≤ 0, too little memory.
+        TypeError: data or weights that are not float tensors.
+    """
+    if hu is not None:
+        mu_per_hu = renamed("hu", "mu_per_hu", hu)
+    started = time.perf_counter()
+    check_weights(weights, A.range_shape)
+    known = weights > 0
+    check_data(y, tuple(A.range_shape))
+    require_memory(A, y, memory)
+    weighted = weighted_data(y, tuple(A.range_shape), known, lambda v: weights.to(v.dtype) * v)
+    w = weights.to(weighted.dtype)
+    model = data_model(A, weights) if gram is None else gram
+
+    def exact(x: Tensor) -> Tensor:
+        out: Tensor = A.T(w * A(x))
+        return out
+
+    axes = len(A.range_shape)
+    energy = dot(weighted, torch.where(known, y, torch.zeros_like(y)), axes)
+    result, change = _solve(
+        A.T(weighted), exact, model, prior, mu_per_hu=mu_per_hu, spacing=A.grid.spacing, start=start,
+        tolerance=tolerance, max_exact=max_exact, callback=callback,
+    )  # fmt: skip
+    misfit = (energy.reshape(-1) + 2 * change).clamp_min(0) / int(known.sum())
+    return PwlsResult(result.x, {**result.report, "misfit": misfit.tolist(), "seconds": time.perf_counter() - started})
+
+
+@checked
+def data_model(A: Any, weights: Tensor, nodes: int = 9) -> Gram | FieldModel:
+    """The model of AᵀWA that suits the grid: FFT with position-dependent kernels for an inset, else the field's.
+
+    Args:
+        A: the exact operator.
+        weights: W, ``A.range_shape``.
+        nodes: of the FFT model.
+
+    Raises:
+        ValueError, TypeError: weights that :class:`recon.gram.gram.Gram` refuses.
+    """
+    geometry = getattr(A, "geometry", None)
+    inset = False
+    if geometry is not None and gram_bytes(geometry, A.grid, weights.element_size(), nodes) <= GRAM_BYTES:
+        try:
+            inset = footprint(geometry, A.grid).columns <= INSET_SHARE * geometry.columns
+        except ValueError:  # the grid reaches beyond the field of view
+            inset = False
+    return Gram(A, weights, nodes) if inset else FieldModel(A, weights)
+
+
+def check_data(y: Any, shape: tuple[int, ...]) -> None:
+    """Refuse data that are no float tensor (TypeError) or not ``(..., *shape)`` (ValueError)."""
+    if not isinstance(y, Tensor) or y.dtype not in (torch.float32, torch.float64):
+        raise TypeError(f"y must be a float32 or float64 tensor, got {getattr(y, 'dtype', type(y).__name__)}")
+    if tuple(y.shape[-len(shape) :]) != shape:
+        raise ValueError(f"y must have shape (..., {', '.join(map(str, shape))}), got {tuple(y.shape)}")
+
+
+@checked
+def weighted_data(y: Any, shape: tuple[int, ...], known: Tensor, weigh: Callable[[Tensor], Tensor]) -> Tensor:
+    """W y of data ``(..., *shape)``, where readings that are not ``known`` count as 0 and may hold anything.
+
+    Raises:
+        TypeError: no float tensor.
+        ValueError: another shape, or readings of positive weight that are not finite.
+    """
+    check_data(y, shape)
+    weighted = weigh(torch.where(known, y, torch.zeros((), dtype=y.dtype, device=y.device)))
+    if not torch.isfinite(weighted).all():
+        raise ValueError("y holds NaN or Inf in readings of positive weight: give these readings the weight 0")
+    return weighted
+
+
+@checked
+def solve_normal(
+    b: Tensor,
+    exact: Callable[[Tensor], Tensor],
+    gram: Any,
+    prior: QGGMRF | BoundPrior,
+    *,
+    mu_per_hu: float,
+    spacing: tuple[float, ...],
+    channels: bool = False,
+    start: Tensor | None = None,
+    tolerance: float = 0.2,
+    max_exact: int = 200,
+    callback: Callable[[dict[str, Any]], None] | None = None,
+) -> PwlsResult:
+    """The same from the sufficient statistic b = AᵀW y: minimise ½ xᵀHx − bᵀx + R(x).
+
+    Args:
+        b: ``(..., [channels,] *grid.shape)``.
+        exact: x ↦ H x = AᵀWA x; ``gram.apply`` itself solves the model's problem.
+        gram: the model of H: ``apply(x)``, ``periodic_spectrum()`` and, for a :class:`QGGMRF`,
+            ``information(mu_per_hu)``; or a :class:`recon.least_squares.field_model.FieldModel`.
+        spacing: voxel size per axis in mm.
+        channels: whether the volumes have an axis of channels, which the prior joins and ``gram`` treats alike.
+        prior, mu_per_hu, start, tolerance, max_exact, callback: see :func:`pwls`.
+    """
+    return _solve(
+        b, exact, gram, prior, mu_per_hu=mu_per_hu, spacing=spacing, channels=channels, start=start,
+        tolerance=tolerance, max_exact=max_exact, callback=callback,
+    )[0]  # fmt: skip
+
+
+def _solve(
+    b: Tensor,
+    exact: Callable[[Tensor], Tensor],
+    gram: Any,
+    prior: QGGMRF | BoundPrior,
+    *,
+    mu_per_hu: float,
+    spacing: tuple[float, ...],
+    channels: bool = False,
+    start: Tensor | None,
+    tolerance: float,
+    max_exact: int,
+    callback: Callable[[dict[str, Any]], None] | None,
+) -> tuple[PwlsResult, Tensor]:
+    """:func:`solve_normal`, and ½ xᵀHx − bᵀx of each volume, ``(batch,)`` float64."""
+    started = time.perf_counter()
+    axes = len(spacing) + channels
+    shape = b.shape[-axes:]
+    number("tolerance", tolerance, positive=True, unit="HU")
+    whole("max_exact", max_exact)
+    if start is not None and tuple(start.shape[-axes:]) != tuple(shape):
+        raise ValueError(f"start must have shape (..., {', '.join(map(str, shape))}), got {tuple(start.shape)}")
+    bound = (
+        prior.bind(gram.information(mu_per_hu), spacing, mu_per_hu, channels) if isinstance(prior, QGGMRF) else prior
+    )
+    lead = b.shape[:-axes]
+    b = b.reshape(-1, *shape)
+    proposer: ModelSolver | GradientStep
+    proposer = GradientStep.of(gram, bound, b) if isinstance(gram, FieldModel) else ModelSolver(gram, bound, b)
+    reference = dot(b, b, axes).sqrt().clamp_min(torch.finfo(b.dtype).tiny)
+
+    pairs = 0
+    if start is None:
+        x = torch.zeros_like(b)
+        data_gradient = -b
+    else:
+        if not torch.isfinite(start).all():
+            raise ValueError("start holds NaN or Inf")
+        x = start.to(b).expand(*lead, *shape).reshape(b.shape).clone()
+        data_gradient = exact(x) - b
+        pairs += 1
+    far = bool((dot(data_gradient, data_gradient, axes).sqrt() > FAR_START * reference).any())
+    afresh = False
+    inner: list[int] = []
+    gradients: list[float] = []
+    distances: list[float] = []
+    proposals: list[float] = []
+    determined = (
+        gram.determined if isinstance(gram, FieldModel) else torch.ones(shape[-len(spacing) :], dtype=torch.bool)
+    )
+    approach, beyond = Approach(x, determined), Approach(x, ~determined)
+    misfit: float | None = None
+    previous: tuple[Tensor, Tensor] | None = None
+    converged = b.shape[0] == 0
+    while not converged:
+        step, count = proposer.step(x, data_gradient)
+        inner.append(count)
+        gradient = data_gradient + bound.gradient(x)
+        gradients.append(float((dot(gradient, gradient, axes).sqrt() / reference).max()))
+        proposed = float((dot(step, step, axes) / step[0].numel()).sqrt().max()) / mu_per_hu
+        proposals.append(proposed)
+        by_model = isinstance(proposer, ModelSolver)
+        distances.append(
+            ahead(proposals) if by_model else approach.remaining() / mu_per_hu if approach.known else proposed
+        )
+        if callback is not None:
+            callback({
+                "outer": len(inner), "exact_pairs": pairs, "gradient": gradients[-1], "rmsd_hu": distances[-1], "x": x,
+            })  # fmt: skip
+        converged = distances[-1] <= tolerance and (by_model or approach.known or proposed == 0.0)
+        rounded = by_model and count == 0 and previous is not None
+        if converged and (far or rounded) and not afresh and pairs < max_exact:
+            data_gradient = exact(x) - b
+            pairs += 1
+            afresh, converged = True, False
+            previous, approach = None, Approach(x, determined)
+            proposer = ModelSolver(gram, bound, b) if by_model else proposer  # its sense of rounding, too
+            continue
+        if converged or pairs >= max_exact:
+            break
+        curved = exact(step)
+        pairs += 1
+        if by_model and misfit is None:
+            misfit = _misfit(gram, step, curved, axes)
+        if by_model and (misfit > MISFIT_LIMIT or _stalled(proposals)):  # type: ignore[operator]
+            proposer = GradientStep([(gram.periodic_spectrum(), torch.ones(()))], bound, b)
+        if previous is not None:
+            step, curved = _conjugate(x, step, curved, previous, bound)
+        # From 0: there a majorising search cannot end above where it began.
+        alpha = per_volume(line_search(bound, x, step, curved, data_gradient, start=0.0, most=12, tolerance=1e-3), x)
+        x = x + alpha * step
+        data_gradient = data_gradient + alpha * curved
+        approach.add(x)
+        beyond.add(x)
+        previous = (step, curved)
+        if pairs % REFRESH == 0 and pairs < max_exact:
+            data_gradient = exact(x) - b
+            pairs += 1
+    if not converged:
+        _LOG.warning(
+            "PWLS stopped after %d exact pairs, %.3g HU from the minimum (tolerance %.3g HU): raise max_exact",
+            pairs, distances[-1], tolerance,
+        )  # fmt: skip
+    report = {
+        "method": "pwls",
+        "exact_pairs": pairs,
+        "inner_iterations": inner,
+        "gradient": gradients,
+        "rmsd_hu": distances,
+        "converged": converged,
+        "undetermined": 1.0 - float(determined.double().mean()),
+        "undetermined_rmsd_hu": beyond.remaining() / mu_per_hu,
+        "tolerance_hu": tolerance,
+        "model": "gram" if isinstance(proposer, ModelSolver) else "gradient",
+        "model_misfit": misfit,
+        "misfit": None,
+        "strength": prior.strength if isinstance(prior, QGGMRF) else None,
+        "lambda": bound.lam,
+        "threshold_hu_per_mm": bound.threshold,
+        "p": bound.p,
+        "q": bound.q,
+        "seconds": time.perf_counter() - started,
+    }
+    return PwlsResult(x.reshape(*lead, *shape), report), 0.5 * dot(x, data_gradient - b, axes)
+
+
+def _misfit(gram: NormalOperator, step: Tensor, curved: Tensor, axes: int) -> float:
+    """Relative error of the model on a step whose exact image is known, worst volume."""
+    error = gram.apply(step) - curved
+    size = dot(curved, curved, axes).clamp_min(torch.finfo(torch.float64).tiny)
+    return float((dot(error, error, axes) / size).sqrt().max())
+
+
+def ahead(proposals: Sequence[float]) -> float:
+    """How far the minimum still is if the steps that the FFT model proposes go on to shrink as the last one did.
+
+    If each is q times the one before, d (1 + q + q² …) is ahead; but a model that shrinks its steps slowly takes them
+    too short, so what follows the last step counts twice. On insets with q from 0.02 to 0.45 the result was 0.8 to 1.25
+    times the true distance; d alone was up to 2.2 times too short.
+
+    Args:
+        proposals: lengths of the proposed steps.
+    """
+    d = proposals[-1]
+    q = min(d / proposals[-2], SLOWEST) if len(proposals) > 1 and proposals[-2] > 0 else 0.0
+    return d * (1 + q) / (1 - q)
+
+
+def _stalled(proposals: list[float]) -> bool:
+    return len(proposals) > PATIENCE and proposals[-1] > 0.5 * proposals[-1 - PATIENCE]
+
+
+def _conjugate(
+    x: Tensor, step: Tensor, curved: Tensor, previous: tuple[Tensor, Tensor], bound: BoundPrior
+) -> tuple[Tensor, Tensor]:
+    """Make ``step`` conjugate to the previous one under the exact Hessian; costs no projection."""
+    old, old_curved = previous
+    _, old_prior = bound.along(x, old, old)
+    _, mixed_prior = bound.along(x, step, old)
+    down = dot(old, old_curved, bound.axes) + old_prior
+    beta = -(dot(step, old_curved, bound.axes) + mixed_prior) / down.clamp_min(torch.finfo(torch.float64).tiny)
+    beta = per_volume(torch.where(down > 0, beta, torch.zeros_like(beta)), step)
+    return step + beta * old, curved + beta * old_curved

@@ -1,0 +1,92 @@
+"""Model-based reconstruction of an inset from a scan: units, convergence, batches, refusals."""
+
+from dataclasses import replace
+
+import pytest
+from small_scan import GRID
+
+from recon import reconstruct
+from recon.least_squares.inset_problem import InsetProblem
+from recon.least_squares.qggmrf import QGGMRF
+from torchpcct import VolumeGrid
+
+WEAK = QGGMRF(strength=1e-3, threshold=300.0)
+
+
+def inner(volume):
+    """Means in the ball's middle and in the fat beside it."""
+    return float(volume[3:5, 8:10, 8:10].mean()), float(volume[3:5, :2, :2].mean())
+
+
+def test_noise_free_values_in_hu(clean, problem):
+    volume = reconstruct(clean, GRID, "pwls", prior=WEAK, problem=problem)
+    ball, fat = inner(volume.data)
+    reference = inner(reconstruct(clean, GRID, "fbp", kernel="soft").data)
+    assert fat == pytest.approx(reference[1], abs=3)
+    assert ball == pytest.approx(97.0, abs=8)  # of the transmitted spectrum, see the paper's target of 100
+    assert volume.report["converged"]
+    assert volume.report["rmsd_hu"][-1] <= volume.report["tolerance_hu"]
+    assert volume.report["exact_pairs"] >= 1
+
+
+def test_batch_equals_single(clean, problem):
+    scans = [clean.with_noise(2.0, s) for s in range(2)]
+    options = {"prior": WEAK, "problem": problem, "tolerance": 0.02, "max_exact": 30}
+    together = reconstruct(scans, GRID, "pwls", **options)
+    assert len(together) == 2
+    for scan, volume in zip(scans, together, strict=True):
+        alone = reconstruct(scan, GRID, "pwls", **options)
+        assert float((alone.data - volume.data).square().mean().sqrt()) < 0.1
+
+
+def test_prior_lowers_the_noise(clean, problem):
+    """Noise (noisy − noise free) inside the inset: below that of the standard kernel, and falling with the strength."""
+    noisy = clean.with_noise(0.35, 5)
+
+    def noise(method, **options):
+        difference = reconstruct(noisy, GRID, method, **options).data - reconstruct(clean, GRID, method, **options).data
+        return float(difference[2:-2, 4:-4, 4:-4].std())
+
+    fbp = noise("fbp", kernel="standard")
+    strong, stronger = (noise("pwls", prior=QGGMRF(s, 300.0), problem=problem) for s in (0.5, 4.0))
+    assert stronger < strong < fbp
+
+
+def test_an_unfinished_iteration_warns_on_the_volume(clean, problem):
+    with pytest.warns(RuntimeWarning, match="raise max_exact"):
+        volume = reconstruct(clean, GRID, "pwls", prior=WEAK, problem=problem, tolerance=1e-9, max_exact=1)
+    assert "raise max_exact" in volume.report["warnings"][0]
+    assert reconstruct(clean, GRID, "pwls", prior=WEAK, problem=problem).report["warnings"] == []
+
+
+def test_refusals(clean):
+    whole = replace(clean, geometry=clean.geometry, window=clean.window)
+    with pytest.raises(ValueError, match="one exposure"):
+        InsetProblem(clean, GRID).solve([clean.with_noise(1.0, 0), clean.with_noise(2.0, 0)], WEAK)
+    spectral = replace(whole, counts=clean.counts[None], air=clean.air[None], surround=clean.surround[None])
+    with pytest.raises(ValueError, match="photon counts"):
+        InsetProblem(replace(clean, counting=False), GRID)
+    with pytest.raises(ValueError, match="counting-mode"):
+        reconstruct(spectral, GRID, "pwls")
+    with pytest.raises(ValueError, match="region"):
+        reconstruct(clean, VolumeGrid((8, 18, 18), 0.4, (0.0, 0.0, 60.0)), "pwls")
+
+
+def test_progress_reaches_one(clean, problem):
+    seen: list[float] = []
+    reconstruct(
+        [clean.with_noise(2.0, s) for s in range(3)], GRID, "pwls", prior=WEAK, problem=problem, batch=2,
+        progress=seen.append,
+    )  # fmt: skip
+    assert seen == [pytest.approx(2 / 3), 1.0]
+
+
+def test_the_default_prior_follows_the_noise(clean, problem):
+    """A hundredth of the dose: 10 times the noise; a threshold in HU/mm would let single voxels pass as edges (21)."""
+    found, thresholds = {}, {}
+    for exposure in (2.0, 0.02):
+        volume = reconstruct(clean.with_noise(exposure, 0), GRID, "pwls", problem=problem, tolerance=3.0)
+        found[exposure] = float((volume.data - volume.data.mean()).std())
+        thresholds[exposure] = volume.report["threshold_hu_per_mm"]
+    assert thresholds[0.02] == pytest.approx(10 * thresholds[2.0], rel=1e-3)
+    assert found[0.02] < 14 * found[2.0]

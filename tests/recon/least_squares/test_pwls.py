@@ -1,0 +1,234 @@
+"""PWLS against dense float64 solutions, and its hard cases."""
+
+import math
+
+import pytest
+import torch
+from inset_operators import HU, matrix, problem, tissue
+
+from recon.gram.gram import Gram
+from recon.least_squares.pwls import pwls, solve_normal
+from recon.least_squares.qggmrf import QGGMRF, quadratic
+
+EDGE = QGGMRF(0.15, 100.0)
+
+
+@pytest.fixture(scope="module")
+def inset():
+    A, w = problem(views=120, shape=(4, 9, 9), rows=6)
+    gram = Gram(A, w)
+    return A, w, gram, noisy(A, w)
+
+
+def noisy(A, w, seed=0, batch=()):
+    clean = A(tissue(A.grid)).expand(*batch, *A.range_shape)
+    return clean + torch.randn(clean.shape, generator=torch.Generator().manual_seed(seed)) / w.clamp_min(1e-3).sqrt()
+
+
+def hu_rms(a, b):
+    return float((a.double() - b.double()).square().mean().sqrt()) / HU
+
+
+@pytest.fixture(scope="module")
+def dense(inset):
+    """A as a float64 matrix, ``(readings, voxels)``."""
+    A = inset[0]
+    n = math.prod(A.domain_shape)
+    return A(torch.eye(n, dtype=torch.float64).reshape(n, *A.domain_shape)).reshape(n, -1).T
+
+
+def reference(dense, A, w, y, prior, information):
+    """The minimum with dense float64 matrices: majorise and minimise until the steps are below 1e-7 HU."""
+    shape = A.domain_shape
+    weights = w.double().flatten()
+    data = torch.where(w > 0, y, torch.zeros(())).double().flatten()
+    H, b = dense.T @ (weights[:, None] * dense), dense.T @ (weights * data)
+    bound = prior.bind(information, A.grid.spacing, HU)
+    x = torch.zeros_like(b)
+    for _ in range(400):
+        R = matrix(lambda v, at=x: bound.majorizer(at.reshape(1, *shape).expand(len(v), *shape), v), shape)
+        new = torch.linalg.solve(H + R, b)
+        done = float((new - x).abs().max()) < 1e-7 * HU
+        x = new
+        if done:
+            break
+    assert done
+    return x.reshape(shape)
+
+
+@pytest.mark.parametrize("prior", [QGGMRF(0.3, 4.0, relative=True), quadratic(0.01)], ids=["edge-preserving", "weak"])
+def test_distance_is_right_where_the_model_converges_slowly(prior):
+    """A shift-invariant model of few views: each step is a fifth or half of the one before."""
+    A, w = problem(views=60, shape=(6, 21, 21), rows=8)
+    y = noisy(A, w)
+    gram = Gram(A, w, nodes=1)
+    bound = prior.bind(gram.information(HU), A.grid.spacing, HU)
+    exact = pwls(A, y.double(), w.double(), bound, mu_per_hu=HU, gram=Gram(A, w.double(), nodes=1), tolerance=1e-3).x
+    for tolerance in (2.0, 0.2):
+        found = pwls(A, y, w, bound, mu_per_hu=HU, gram=gram, tolerance=tolerance)
+        assert found.report["model"] == "gram"
+        true = hu_rms(found.x, exact)
+        assert true < tolerance
+        assert 0.8 * true < found.report["rmsd_hu"][-1] < 1.5 * true
+
+
+@pytest.mark.parametrize("prior", [quadratic(0.15), EDGE, QGGMRF(0.5, 30.0, 2.0, 1.2, 6)])
+def test_exact_minimum_within_three_pairs(inset, dense, prior):
+    A, w, gram, y = inset
+    x = reference(dense, A, w, y, prior, gram.information(HU))
+    result = pwls(A, y, w, prior, mu_per_hu=HU, gram=gram, max_exact=3, tolerance=0.5)
+    assert hu_rms(result.x, x) < 1.0
+    report = result.report
+    assert report["converged"]
+    assert report["exact_pairs"] <= 3
+    tight = pwls(A, y, w, prior, mu_per_hu=HU, gram=gram, tolerance=0.02)
+    assert hu_rms(tight.x, x) < 0.05
+    # The reported distance is honest.
+    assert hu_rms(result.x, x) < 3 * report["rmsd_hu"][-1] + 0.02
+    assert tight.report["gradient"][-1] < 1e-4
+
+
+def test_double_precision_converges_further(inset, dense):
+    A, w, gram, y = inset
+    x = reference(dense, A, w, y, EDGE, gram.information(HU))
+    result = pwls(A, y.double(), w.double(), EDGE, mu_per_hu=HU, gram=gram, tolerance=1e-5, max_exact=40)
+    assert result.x.dtype == torch.float64
+    assert hu_rms(result.x, x) < 1e-4
+
+
+@pytest.mark.parametrize("start", ["noise", "10^4 HU"])
+def test_any_start_gives_the_same_volume(inset, start):
+    A, w, gram, y = inset
+    first = torch.full(A.domain_shape, 1e4 * HU)
+    if start == "noise":
+        first = torch.randn(A.domain_shape, generator=torch.Generator().manual_seed(2)) * 1000 * HU
+    plain = pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, tolerance=0.05)
+    other = pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, tolerance=0.05, start=first, max_exact=30)
+    assert other.report["converged"]
+    assert hu_rms(plain.x, other.x) < 0.15
+
+
+def test_batch_of_realisations(inset):
+    A, w, gram, _ = inset
+    y = noisy(A, w, 7, (2, 2))
+    result = pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, tolerance=0.05)
+    assert result.x.shape == (2, 2, *A.domain_shape)
+    alone = pwls(A, y[1, 0], w, EDGE, mu_per_hu=HU, gram=gram, tolerance=0.05)
+    assert hu_rms(result.x[1, 0], alone.x) < 0.1
+    assert pwls(A, y[:0], w, EDGE, mu_per_hu=HU, gram=gram).x.shape == (0, 2, *A.domain_shape)
+
+
+def masked(w, case):
+    gen = torch.Generator().manual_seed(11)
+    w = w.clone()
+    if case == "dead columns":
+        w[:, :, 3] = 0
+        w[:, :, 8:10] = 0
+    elif case == "missing views":
+        w[30:60] = 0
+    elif case == "nearly zero":
+        w[torch.rand(w.shape, generator=gen) < 0.3] *= 1e-8
+    else:
+        w[torch.rand(w.shape, generator=gen) < case] = 0
+    return w
+
+
+@pytest.mark.parametrize("case", [0.001, 0.05, 0.5, "dead columns", "missing views", "nearly zero"])
+def test_lost_readings(inset, dense, case):
+    """Readings of weight 0 may hold anything; the minimum of the remaining ones is found."""
+    A, full, _, y = inset
+    w = masked(full, case)
+    y = torch.where(w > 0, y, torch.full((), torch.nan))
+    gram = Gram(A, w)
+    x = reference(dense, A, w, y, EDGE, gram.information(HU))
+    result = pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, tolerance=0.1, max_exact=30)
+    assert result.report["converged"]
+    assert hu_rms(result.x, x) < 1.0
+
+
+def test_a_gram_of_other_weights_only_costs_pairs(inset):
+    A, w, gram, y = inset
+    lost = masked(w, 0.05)
+    prior = EDGE.bind(gram.information(HU), A.grid.spacing, HU)
+    right = pwls(A, y, lost, prior, mu_per_hu=HU, tolerance=0.05, max_exact=30)
+    wrong = pwls(A, y, lost, prior, mu_per_hu=HU, gram=gram, tolerance=0.05, max_exact=30)
+    assert wrong.report["converged"]
+    assert hu_rms(right.x, wrong.x) < 0.2
+
+
+def test_low_dose_is_the_same_problem_scaled(inset):
+    """1/100 of the dose with the noise in the same units: strength is noise-normalised, so x is the same."""
+    A, w, gram, y = inset
+    full = pwls(A, y, w, quadratic(0.15), mu_per_hu=HU, gram=gram, tolerance=0.02)
+    low = pwls(A, y, w / 100, quadratic(0.15), mu_per_hu=HU, gram=gram.scaled(0.01), tolerance=0.02)
+    assert hu_rms(full.x, low.x) < 0.1
+
+
+def test_report_and_callback(inset, caplog):
+    A, w, gram, y = inset
+    seen = []
+    result = pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, callback=seen.append)
+    assert [s["rmsd_hu"] for s in seen] == result.report["rmsd_hu"]
+    assert result.report["gradient"][0] == pytest.approx(1.0)
+    assert len(result.report["inner_iterations"]) == len(seen)
+    assert result.report["strength"] == EDGE.strength
+    with caplog.at_level("WARNING"):
+        short = pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, tolerance=1e-6, max_exact=1)
+    assert not short.report["converged"]
+    assert "raise max_exact" in caplog.text
+
+
+def test_from_the_sufficient_statistic(inset):
+    """The problem of the model, without a projector, is close to the exact one."""
+    A, w, gram, y = inset
+    b = A.T(w * y)
+    model = solve_normal(b, gram.apply, gram, EDGE, mu_per_hu=HU, spacing=A.grid.spacing, tolerance=0.05)
+    exact = pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, tolerance=0.05)
+    assert hu_rms(model.x, exact.x) < 0.1 * hu_rms(exact.x, torch.zeros(()))
+    assert model.report["converged"]
+
+
+def test_refusals(inset):
+    A, w, gram, y = inset
+    with pytest.raises(ValueError, match="y must have shape"):
+        pwls(A, y[:-1], w, EDGE, mu_per_hu=HU, gram=gram)
+    with pytest.raises(TypeError, match="float"):
+        pwls(A, y.int(), w, EDGE, mu_per_hu=HU, gram=gram)
+    with pytest.raises(ValueError, match="weight 0"):
+        pwls(A, torch.full_like(y, torch.nan), w, EDGE, mu_per_hu=HU, gram=gram)
+    with pytest.raises(ValueError, match="tolerance"):
+        pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, tolerance=0.0)
+    with pytest.raises(ValueError, match="start"):
+        pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, start=torch.full(A.domain_shape, torch.nan))
+    with pytest.raises(ValueError, match="max_exact"):
+        pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, max_exact=0)
+
+
+@pytest.mark.parametrize("value_hu", [1500.0, 8000.0])
+def test_calcification_and_metal_at_the_border(inset, dense, value_hu):
+    """Bright voxels in a corner of the inset, half of them cut off by it."""
+    A, w, gram, y = inset
+    bright = torch.zeros(A.domain_shape)
+    bright[1:3, :2, :2] = value_hu * HU
+    y = y + A(bright)
+    exact = reference(dense, A, w, y, EDGE, gram.information(HU))
+    result = pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, tolerance=0.2, max_exact=30)
+    assert result.report["converged"]
+    assert hu_rms(result.x, exact) < 1.0
+
+
+def test_wrong_centre_is_solved_as_stated(inset):
+    """Data of a detector shifted by half a column: the solver finds the minimum of the problem it was given."""
+    from dataclasses import replace
+
+    from torchpcct import Projector
+
+    A, w, gram, _ = inset
+    g = A.geometry
+    other = replace(g, offset=(g.offset[0], g.offset[1] + g.pitch[1] / 2))
+    y = Projector(other, A.grid, A.window)(tissue(A.grid))
+    result = pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, tolerance=0.1, max_exact=30)
+    assert result.report["converged"]
+    assert torch.isfinite(result.x).all()
+    shift = hu_rms(result.x, pwls(A, A(tissue(A.grid)), w, EDGE, mu_per_hu=HU, gram=gram, tolerance=0.1).x)
+    assert 1.0 < shift < 200.0

@@ -1,0 +1,283 @@
+"""PWLS of whole fields of view: dense float64 minima, monotony, honest stops, the choice of the model, memory."""
+
+import itertools
+import math
+
+import pytest
+import torch
+from inset_operators import HU, problem
+
+from recon.gram.gram import Gram
+from recon.least_squares import field_model
+from recon.least_squares.approach import Approach
+from recon.least_squares.field_model import FieldModel
+from recon.least_squares.pwls import data_model, pwls
+from recon.least_squares.qggmrf import QGGMRF, quadratic
+from torchpcct import ConeBeam, FanBeam, ParallelBeam, Projector, VolumeGrid, full_turn
+from torchpcct.vector_geometry import VectorGeometry
+
+EDGE = QGGMRF(0.3, 4.0, relative=True)
+# Nearly flat where noise makes gradients of thousands of HU/mm: converges slowly.
+FLAT = QGGMRF(0.3, 300.0)
+SCANS = {
+    # A dead column runs through all views.
+    "parallel": (ParallelBeam(torch.arange(40).numpy() * math.pi / 40, 26, 1.0), VolumeGrid((18, 18), 1.0)),
+    "short fan": (FanBeam(full_turn(60)[:36], 90.0, 150.0, 48, 1.0), VolumeGrid((20, 22), 1.0, (1.0, -0.5))),
+    "cone": (ConeBeam(full_turn(40), 60.0, 100.0, 30, 14, 1.2), VolumeGrid((5, 12, 12), 1.2)),
+}
+
+
+@pytest.fixture(scope="module", params=list(SCANS))
+def scan(request):
+    """A, noisy data, weights that change by an order of magnitude, the float64 matrix."""
+    geometry, grid = SCANS[request.param]
+    A = Projector(geometry, grid)
+    r = [torch.from_numpy(a) for a in grid.axes]
+    y, x = torch.meshgrid(r[-2], r[-1], indexing="ij")
+    body = 0.02 * (torch.hypot(y, x) < 0.4 * grid.extent[-1]) + 0.02 * (torch.hypot(y - 2, x + 3) < 2)
+    truth = body.expand(grid.shape).float()
+    lines = A(truth)
+    w = 4e4 * torch.exp(-4 * lines / lines.max())
+    if request.param == "parallel":
+        w[:, 9] = 0
+    data = lines + torch.randn(lines.shape, generator=torch.Generator().manual_seed(3)) / w.clamp_min(1).sqrt()
+    n = math.prod(A.domain_shape)
+    matrix = A(torch.eye(n, dtype=torch.float64).reshape(n, *A.domain_shape)).reshape(n, -1).T
+    return A, data, w, matrix
+
+
+def test_voxels_too_large_for_the_reference_frequency():
+    """Voxels of 2 mm do not hold 0.5 lp/mm: their information is read off where they do (once it was negative)."""
+    geometry = FanBeam(full_turn(120), 600.0, 1000.0, 150, 500.0 / 150)
+    weights = torch.full(geometry.shape, 1e5)
+    small, large = (
+        FieldModel(Projector(geometry, VolumeGrid((n, n), 200.0 / n)), weights).information(HU) for n in (96, 64)
+    )
+    assert 0.5 < small / large < 1.0
+
+
+def minimum(matrix, A, y, w, bound):
+    """With dense float64 matrices: majorise and minimise until the steps are below 1e-6 HU."""
+    weights = w.double().flatten()
+    H, b = matrix.T @ (weights[:, None] * matrix), matrix.T @ (weights * y.double().flatten())
+    shape, n = A.domain_shape, len(b)
+    unit = torch.eye(n, dtype=torch.float64).reshape(n, *shape)
+    x = torch.zeros_like(b)
+    for _ in range(300):
+        R = bound.majorizer(x.reshape(1, *shape).expand(n, *shape), unit).reshape(n, n)
+        new = torch.linalg.solve(H + R, b)
+        done = float((new - x).abs().max()) < 1e-6 * HU
+        x = new
+        if done:
+            return x.reshape(shape)
+    raise AssertionError("the reference did not converge")
+
+
+def energy(matrix, y, w, bound, x):
+    residual = y.double().flatten() - matrix @ x.double().flatten()
+    return float(0.5 * (w.double().flatten() * residual.square()).sum() + bound.value(x.double()))
+
+
+def hu_rms(a, b):
+    return float((a.double() - b.double()).square().mean().sqrt()) / HU
+
+
+@pytest.mark.parametrize("prior", [quadratic(0.3), EDGE], ids=["quadratic", "edge-preserving"])
+def test_finds_the_dense_minimum(scan, prior):
+    A, y, w, matrix = scan
+    bound = prior.bind(FieldModel(A, w).information(HU), A.grid.spacing, HU)
+    exact = minimum(matrix, A, y, w, bound)
+    found = pwls(A, y, w, prior, mu_per_hu=HU, tolerance=0.5)
+    assert found.report["converged"]
+    assert found.report["model"] == "gradient"
+    assert hu_rms(found.x, exact) < 1.0
+    assert hu_rms(found.x, exact) < 3 * found.report["rmsd_hu"][-1]
+    residual = (w * (y - A(found.x)).square()).sum() / (w > 0).sum()
+    assert found.report["misfit"] == [pytest.approx(float(residual), rel=1e-3)]
+
+
+def test_every_pair_lowers_the_objective(scan):
+    """From a start that is far, from one that is near, and from the minimum itself."""
+    A, y, w, matrix = scan
+    bound = EDGE.bind(FieldModel(A, w).information(HU), A.grid.spacing, HU)
+    exact = minimum(matrix, A, y, w, bound)
+    noise = torch.randn(A.domain_shape, generator=torch.Generator().manual_seed(1))
+    model = FieldModel(A, w)
+    for start in (3000 * HU * noise, exact.float() + 5 * HU * noise, exact.float()):
+        values = [energy(matrix, y, w, bound, start)]
+        for pairs in range(2, 9):
+            x = pwls(A, y, w, bound, mu_per_hu=HU, gram=model, start=start, tolerance=1e-9, max_exact=pairs).x
+            values.append(energy(matrix, y, w, bound, x))
+        slack = 1e-6 * energy(matrix, y, w, bound, torch.zeros(A.domain_shape))
+        assert all(b <= a + slack for a, b in itertools.pairwise(values)), values
+
+
+def test_batch_is_each_alone(scan):
+    A, y, w, _ = scan
+    both = pwls(A, torch.stack([y, 0.5 * y]), w, EDGE, mu_per_hu=HU, tolerance=0.3)
+    assert len(both.report["misfit"]) == 2
+    for data, x in zip((y, 0.5 * y), both.x, strict=True):
+        assert hu_rms(x, pwls(A, data, w, EDGE, mu_per_hu=HU, tolerance=0.3).x) < 1.0
+
+
+def test_a_stop_that_was_not_reached_is_said(scan, caplog):
+    A, y, w, _ = scan
+    with caplog.at_level("WARNING"):
+        short = pwls(A, y, w, EDGE, mu_per_hu=HU, max_exact=2)
+    assert not short.report["converged"]
+    assert "raise max_exact" in caplog.text
+
+
+def test_voxels_that_some_views_miss_converge_last_and_that_is_said():
+    """Corners beyond the field of view hang on the prior alone; inside, the volume is at the minimum long before."""
+    A = Projector(ParallelBeam(torch.arange(40).numpy() * math.pi / 40, 26, 1.0), VolumeGrid((24, 24), 1.0))
+    r = torch.hypot(*torch.meshgrid(*[torch.from_numpy(a) for a in A.grid.axes], indexing="ij"))
+    y = A((0.02 * (r < 10)).float())
+    w = 4e4 * torch.exp(-4 * y / y.max())
+    n = math.prod(A.domain_shape)
+    matrix = A(torch.eye(n, dtype=torch.float64).reshape(n, *A.domain_shape)).reshape(n, -1).T
+    bound = EDGE.bind(FieldModel(A, w).information(HU), A.grid.spacing, HU)
+    exact = minimum(matrix, A, y, w, bound)
+    found = pwls(A, y, w, bound, mu_per_hu=HU, tolerance=1.0)
+    assert hu_rms(found.x[r < 11], exact[r < 11]) < 2.0
+    assert found.report["rmsd_hu"][-1] > hu_rms(found.x, exact) / 3
+
+
+def test_a_flat_prior_is_not_called_converged_before_it_is(scan):
+    A, y, w, matrix = scan
+    bound = FLAT.bind(FieldModel(A, w).information(HU), A.grid.spacing, HU)
+    exact = minimum(matrix, A, y, w, bound)
+    for pairs in (20, 60):
+        found = pwls(A, y, w, bound, mu_per_hu=HU, tolerance=1.0, max_exact=pairs)
+        assert found.report["rmsd_hu"][-1] > hu_rms(found.x, exact) / 3
+
+
+@pytest.fixture(scope="module")
+def flat_faces():
+    """A disc across the axis of a cone beam: off the middle slice no ray runs along its faces."""
+    A = Projector(ConeBeam(full_turn(48), 100.0, 160.0, 48, 48, 1.2), VolumeGrid((24, 24, 24), 1.1))
+    z, y, x = torch.meshgrid(*[torch.from_numpy(a) for a in A.grid.axes], indexing="ij")
+    lines = A((0.02 * ((torch.hypot(y, x) < 10) & (z.abs() < 8))).float())
+    w = 1e5 * torch.exp(-lines)
+    return A, lines + torch.randn(lines.shape, generator=torch.Generator().manual_seed(0)) / w.sqrt(), w
+
+
+def test_flat_faces_in_a_cone_beam_need_a_spectrum_of_their_own_slice(flat_faces, monkeypatch):
+    A, y, w = flat_faces
+    prior = QGGMRF(2.0, 4.0, relative=True)
+    many = pwls(A, y, w, prior, mu_per_hu=HU, tolerance=0.1)
+    monkeypatch.setattr(field_model, "FACTOR", math.inf)
+    one = pwls(A, y, w, prior, mu_per_hu=HU, tolerance=0.1)
+    assert many.report["converged"]
+    assert one.report["converged"]
+    assert many.report["exact_pairs"] < 0.6 * one.report["exact_pairs"]
+    assert hu_rms(many.x, one.x) < 0.5
+
+
+def test_slices_beyond_the_rows_do_not_slow_the_rest_down(monkeypatch):
+    """A grid that is half again as high as what all views see, as many scans are reconstructed."""
+    A = Projector(ConeBeam(full_turn(48), 100.0, 160.0, 40, 28, 1.2), VolumeGrid((30, 20, 20), 1.1))
+    z, y, x = torch.meshgrid(*[torch.from_numpy(a) for a in A.grid.axes], indexing="ij")
+    y = A((0.02 * ((torch.hypot(y, x) < 8) & (z.abs() < 7))).float())
+    w = 1e5 * torch.exp(-y)
+    assert float((FieldModel(A, w).seen == 0).float().mean()) > 0.1
+    found = pwls(A, y, w, EDGE, mu_per_hu=HU, tolerance=0.3)
+    monkeypatch.setattr(field_model, "LEAST_MET", 1e-4)
+    slow = pwls(A, y, w, EDGE, mu_per_hu=HU, tolerance=0.3, max_exact=2 * found.report["exact_pairs"])
+    assert found.report["converged"]
+    assert not slow.report["converged"]
+
+
+def test_slices_share_the_field(flat_faces):
+    A, _, w = flat_faces
+    model = FieldModel(A, w)
+    assert len(model.nodes) == field_model.NODES
+    assert float(sum(s.square() for _, s in model.nodes).sub(1).abs().max()) < 1e-6
+    # By symmetry the slices above the middle see what those below see; the further out, the less along z.
+    along = [float(k[:, 0, 0].log().mean()) for k, _ in model.nodes]
+    assert along == pytest.approx(along[::-1], abs=0.1)
+    assert along[0] < along[1] < along[2]
+    parallel = VectorGeometry.of(ConeBeam(full_turn(48), 1e5, 1.6e5, 48, 48, 1.2))
+    A = Projector(parallel, A.grid)
+    assert len(FieldModel(A, torch.ones(A.range_shape)).nodes) == 1
+
+
+def test_model_is_chosen_by_the_grid_and_dropped_by_its_misfit():
+    A, w = problem(views=120, shape=(4, 9, 9), rows=6)
+    assert isinstance(data_model(A, w), Gram)
+    whole = Projector(*SCANS["cone"])
+    assert isinstance(data_model(whole, torch.ones(whole.range_shape)), FieldModel)
+    y = A(torch.full(A.domain_shape, 50 * HU))
+    gram = Gram(A, w)
+    prior = EDGE.bind(gram.information(HU), A.grid.spacing, HU)
+    right = pwls(A, y, w, prior, mu_per_hu=HU, gram=gram, tolerance=0.05)
+    assert right.report["model"] == "gram"
+    assert right.report["model_misfit"] < 0.1
+    wrong = pwls(A, y, w, prior, mu_per_hu=HU, gram=gram.scaled(20.0), tolerance=0.05)
+    assert wrong.report["model_misfit"] > 1
+    assert wrong.report["model"] == "gradient"
+    assert wrong.report["converged"]
+    assert hu_rms(right.x, wrong.x) < 0.2
+
+
+def test_information_is_that_of_the_fft_model():
+    A, w = problem(views=120, shape=(6, 21, 21), rows=8)
+    gram, field = Gram(A, w), FieldModel(A, w)
+    assert field.information(HU) == pytest.approx(gram.information(HU), rel=0.15)
+    assert field.scaled(3.0).information(HU) == pytest.approx(3 * field.information(HU), rel=1e-6)
+
+
+def test_memory_is_predicted_and_refused_before_anything_is_allocated(scan, monkeypatch):
+    A, y, w, _ = scan
+    monkeypatch.setattr(Projector, "forward", lambda self, x: pytest.fail("projected"))
+    with pytest.raises(ValueError, match=r"needs .* GiB, 0.00 GiB are available"):
+        pwls(A, y, w, EDGE, mu_per_hu=HU, memory=1000)
+    big = Projector(ConeBeam(full_turn(4), 6000.0, 10000.0, 8, 8, 1.0), VolumeGrid((3000, 3000, 3000), 1e-3))
+    with pytest.raises(ValueError, match="larger or fewer voxels"):
+        pwls(big, torch.zeros(big.range_shape), torch.ones(big.range_shape), EDGE, memory=2**38)
+
+
+def test_rays_that_miss_the_grid_are_refused():
+    A = Projector(ParallelBeam([0.0, 1.0], 8, 1.0, 500.0), VolumeGrid((4, 4), 1.0))
+    with pytest.raises(ValueError, match="no ray of positive weight"):
+        pwls(A, torch.zeros(A.range_shape), torch.ones(A.range_shape), EDGE)
+
+
+def test_the_distance_to_the_limit_of_a_geometric_approach():
+    """Known exactly: x_k = 1 − 0.9ᵏ is 0.9ᵏ from its limit; an estimate may be high, by what the lag costs, not low."""
+    where = torch.arange(500) < 400
+    start = torch.zeros(2, 500)
+    seen, beyond = Approach(start, where), Approach(start, ~where)
+    scale = torch.tensor([[1.0], [0.5]])
+    for k in range(1, 61):
+        x = scale * torch.full((2, 500), 1 - 0.9**k)
+        x[:, ~where] *= 7
+        for approach in (seen, beyond):
+            approach.add(x)
+        if k >= 24:
+            for approach, most in ((seen, 1.0), (beyond, 7.0)):
+                assert most * 0.9**k <= approach.remaining() <= 6 * most * 0.9**k
+    assert not Approach(start).known
+    assert Approach(start, torch.zeros(500, dtype=torch.bool)).remaining() == 0.0
+
+
+def test_an_approach_that_gets_faster_is_seen():
+    """As conjugate gradients often do; by the last quarter of the way alone it would be 26 and 62 times too long."""
+    approach = Approach(torch.ones(1, 500, dtype=torch.float64))
+    for k in range(1, 61):
+        left = math.exp(-((k / 12) ** 1.5))
+        approach.add(torch.full((1, 500), left, dtype=torch.float64))
+        if k >= 20:
+            assert left <= approach.remaining() <= 13 * left
+
+
+def test_corners_do_not_hold_the_stop_and_are_reported():
+    A = Projector(ParallelBeam(torch.arange(40).numpy() * math.pi / 40, 26, 1.0), VolumeGrid((26, 26), 1.0))
+    r = torch.hypot(*torch.meshgrid(*[torch.from_numpy(a) for a in A.grid.axes], indexing="ij"))
+    w = 4e4 * torch.ones(A.range_shape)
+    model = FieldModel(A, w)
+    assert bool(model.determined[r < 12].all())
+    assert not bool(model.determined[r > 15].any())
+    report = pwls(A, A((0.02 * (r < 10)).float()), w, EDGE, mu_per_hu=HU, tolerance=1.0, gram=model).report
+    assert report["undetermined"] == pytest.approx(1 - float(model.determined.float().mean()))
+    assert report["undetermined_rmsd_hu"] > 0
