@@ -90,7 +90,7 @@ def evaluate(
         tasks: names of ready ones, YAML files, :class:`recon.evaluate.Task` objects; one or a list.
         methods: names, functions of ``(scan, grid)`` that give a volume in HU, :class:`recon.evaluate.Method` objects,
             :func:`recon.evaluate.denoiser` of a function of an image; one or a list.
-        exposures_s: of the scans in s; None: those of each task.
+        exposures_s: of the scans in s, one or a list; None: those of each task.
         n: realisations of each, at least 8.
         seed: of the first.
         folder: where scans and finished pieces are kept; the same call goes on after an interruption, and a second one
@@ -112,7 +112,9 @@ def evaluate(
         twice = {name for name in names if names.count(name) > 1}
         if twice:
             raise ValueError(f"{kind}: {', '.join(sorted(twice))} given twice; give one of them another name")
-    exposures = None if exposures_s is None else tuple(numbers("exposures_s", exposures_s, positive=True, unit="s"))
+    exposures = (
+        None if exposures_s is None else tuple(numbers("exposures_s", _listed(exposures_s), positive=True, unit="s"))
+    )
     if folder is None:
         with TemporaryDirectory() as kept:
             return evaluate(
@@ -134,7 +136,7 @@ def evaluate(
 
 
 def _listed(what: Any) -> Sequence[Any]:
-    return list(what) if isinstance(what, list | tuple) else [what]
+    return list(what) if isinstance(what, list | tuple | np.ndarray) else [what]
 
 
 def _pairs(draws: Draws, exposure_s: float, k: range) -> list[Any]:
@@ -308,7 +310,7 @@ def export_scans(
         ValueError, TypeError: as of :func:`evaluate`.
     """
     n, seed = whole("n", n, LEAST), whole("seed", seed, 0)
-    exposures = None if exposures_s is None else numbers("exposures_s", exposures_s, positive=True, unit="s")
+    exposures = None if exposures_s is None else numbers("exposures_s", _listed(exposures_s), positive=True, unit="s")
     written = []
     for task in map(read_task, _listed(tasks)):
         with TemporaryDirectory() as kept:
