@@ -16,7 +16,7 @@ from torchpcct.files import require_writable
 
 __all__ = ["outcomes"]
 
-_MODULES = {"scikit-image": "skimage", "pyyaml": "yaml"}
+_MODULES = {"scikit-image": "skimage", "pyyaml": "yaml", "markdown-it-py": "markdown_it"}
 """Modules of packages with another name."""
 _EXTRAS = ("io", "train", "completion", "rivals", "interop")
 _AGAIN = "install torchpcct again, in its folder: pip install --force-reinstall --no-deps ."

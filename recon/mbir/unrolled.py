@@ -103,6 +103,7 @@ class Unrolled(nn.Module):
         steps: int | None = None,
         final_data_consistency: bool = True,
         prior: Prior | None = None,
+        cut_overshoot: bool = True,
         solves: tuple[int, int] | None = None,
     ) -> Tensor:
         """The reconstruction ``(batch, z, y, x)`` in noise units (times ``problem.scale_hu``: HU above background).
@@ -115,6 +116,7 @@ class Unrolled(nn.Module):
             final_data_consistency: whether that step is taken; without it the network's last volume is the result.
             prior: in the place of the network: block by block (:mod:`recon.mbir.field`), or for comparisons
                 (:func:`recon.mbir.network.bilateral_prior`).
+            cut_overshoot: whether :func:`limited` is applied, if the network has a filtered view.
             solves: conjugate gradients of start and data consistency; None: those of an inset's model.
         """
         scale = problem.scale_hu
@@ -139,7 +141,7 @@ class Unrolled(nn.Module):
             if callback is not None:
                 callback(k + 1, v)
         u = consistent(problem, spectrum, v, fidelities, solves[1]) if final_data_consistency else v
-        return u if smoothed is None else limited(u, smoothed, noise)
+        return limited(u, smoothed, noise) if smoothed is not None and cut_overshoot else u
 
 
 def start(problem: NormalisedProblem, spectrum: Tensor, iterations: int = _SOLVES[0]) -> Tensor:

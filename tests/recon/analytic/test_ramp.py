@@ -95,7 +95,7 @@ def test_fast_length(n):
 
 
 def test_bad_kernels_name_the_options():
-    with pytest.raises(ValueError, match=r"unknown kernel 'sharp'.*'soft', 'standard', 'detail', 'bone', 'ram-lak'"):
+    with pytest.raises(ValueError, match=r"unknown kernel 'sharp': use one of soft, standard, detail, bone, ram-lak"):
         ramp_kernel(3, 1.0, "sharp")
     with pytest.raises(TypeError, match=r"kernel must be a text, got 3 \(int\)"):
         apodization(3, 0.5)  # type: ignore[arg-type]
