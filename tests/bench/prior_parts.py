@@ -174,8 +174,8 @@ def main() -> None:
         )
         text = (
             f"0.35 / 2.0 s; means over four held-out vessels and {DRAWS} noise draws. Undershoot: the darkest fat "
-            "beside the vessel without noise, against the truth. Constant added: change of the volume, HU rms, beside the "
-            f"{MOVED_HU:g} HU that were added to the inset.{trainings if a.train else ''}\n\n{table(results)}\n"
+            "beside the vessel without noise, against the truth. Constant added: change of the volume, HU rms, beside "
+            f"the {MOVED_HU:g} HU that were added to the inset.{trainings if a.train else ''}\n\n{table(results)}\n"
         )
         (HERE / "prior_parts.md").write_text(f"# What each part of the prior brings\n\n{text}", encoding="utf-8")
         plain = {"steps": a.train, "draws": DRAWS, "results": results}
