@@ -49,7 +49,7 @@ copybutton_prompt_text = r">>> |\.\.\. |\$ "
 copybutton_prompt_is_regexp = True
 
 nitpick_ignore_regex = [  # what other packages and private bases are; no inventory of theirs is downloaded
-    ("py:.*", r"(numpy|torch|collections|typing|matplotlib|argparse|pathlib|enum|np|nn)\..*"),
+    ("py:.*", r"(numpy|torch|collections|concurrent|typing|matplotlib|argparse|pathlib|enum|np|nn)\..*"),
     ("py:.*", r"(.*\.)?_\w+"),
     ("py:(class|exc)", r"(optional|Module|Exception|Tensor|ndarray|\w+Error|(nbclient|scipy)\..*)"),
 ]  # fmt: skip

@@ -97,7 +97,7 @@ def write_cli(path):
     from recon.cli import _parser
     from train.__main__ import _parser as training
 
-    parser, commands = _parser()
+    parser, commands, _ = _parser()
     shown = {c.dest: c.help for c in commands._choices_actions}
     lines = ["# Command line", "", "Written from the parsers: what `--help` prints.", "", _help(parser)]
     for name, command in commands.choices.items():
@@ -118,20 +118,25 @@ def write_results(folder):
         title, _, text = report.read_text(encoding="utf-8").partition("\n")
         shown = sorted(p.name for p in report.parent.glob("*.png") if f"({p.name})" not in text)
         pictures = [f"![{p}](../../{name}/{p})\n" for p in shown]
-        text = text.replace("(phantom.png)", "(../../phantom/phantom.png)")
+        text = re.sub(r"\]\((\w+\.png)\)", rf"](../../{name}/\1)", text)
         _write(folder / f"{name}.md", _linked("\n".join([f"# {name}: {title[2:]}", *pictures, text]), ""))
     toctree = "\n".join(["", "```{toctree}", ":hidden:", *(f"reports/{name}" for name in names), "```", ""])
     _write(
         folder.parent / "results.md",
         _linked((notebooks / "RESULTS.md").read_text(encoding="utf-8"), "reports/") + toctree,
     )
-    for name, path in (("card", "recon/mbir/weights/card.md"), ("size", "train/size.md")):
+    weights = "recon/mbir/weights"
+    for name, path in (
+        ("card", f"{weights}/card.md"),
+        ("training", f"{weights}/training.md"),
+        ("size", "train/size.md"),
+    ):
         _write(folder / f"{name}.txt", _linked((ROOT / path).read_text(encoding="utf-8"), ""))
 
 
 def _linked(text, to):
     text = re.sub(r"\]\((\w+)/report\.md\)", rf"]({to}\1.md)", text)
-    return re.sub(r"\[([^\]]*)\]\([^)]*(?:causes|size)\.md\)", r"`\1`", text)
+    return re.sub(r"\[([^\]]*)\]\([^)]*(?:causes|size|training|RESULTS)\.md\)", r"`\1`", text)
 
 
 def _write(path, text):

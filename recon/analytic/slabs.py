@@ -64,7 +64,7 @@ class Part(NamedTuple):
     """Some slices or rows of a scan.
 
     Attributes:
-        scan: of a cone beam with :data:`HALO` rows more on either side.
+        scan: of a cone beam with ``HALO`` rows more on either side.
         own: where they stand in it.
         zeros, replaced, dead: how many of their readings registered nothing, are such as no object can cause, and are
             bridged by their neighbours.
@@ -406,7 +406,7 @@ def reconstruct_to(
     of parallel, fan and cone beams on a circle, PWLS of stacks of slices. If it is interrupted, the finished slabs
     stay in ``path.unfinished``, and the same call goes on with them.
 
-    What is different: defects are looked for slab by slab, with :data:`HALO` rows on either side, so that one at the
+    What is different: defects are looked for slab by slab, with ``HALO`` rows on either side, so that one at the
     limits of what is recognised may be judged otherwise; the readings are tested against their description
     (:mod:`torchpcct.reading_checks`, :func:`recon.analytic.coverage.consistency_warnings`) in the middle rows or
     slices, which the report's ``notes`` name; and what a file does not tell (its reading of one photon) is estimated

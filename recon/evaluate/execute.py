@@ -410,7 +410,7 @@ def run(
         LeftOut: jobs whose workers, or whose disks, failed three times; all others are done.
         Unportable: a job that cannot be pickled.
         ConnectionError: the scheduler is gone.
-        what a job's function raises; those that are done are kept.
+        Exception: whatever a job's function raises; those that are done are kept.
     """
     if isinstance(executor, Plan):
         raise Planned(_table(jobs))

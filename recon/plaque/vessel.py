@@ -88,7 +88,7 @@ class Drawing:
     """A vessel drawn on its voxels.
 
     Attributes:
-        soft: ``(n,)`` HU above fat, outlines of :data:`SOFT`; shares: ``(3, n)`` outer, inner, lumen, likewise.
+        soft: ``(n,)`` HU above fat, outlines of ``SOFT``; shares: ``(3, n)`` outer, inner, lumen, likewise.
         image: ``(n,)`` HU above fat, as the operator takes it.
         jacobian: ``(n, parameters)`` float32, of ``image``, HU per unit; None where it was not asked for.
         lumen_distance, inner_distance: ``(n,)`` mm, negative inside.
