@@ -2,8 +2,9 @@
 
 A method's name says all:
 
-* ``fbp:KERNEL``, ``pwls``, ``mbir``; ``mbir:fidelity=1``, ``mbir:weights=mine.safetensors``, ``mbir:tissues``, and
-  ``mbir:prior=bilateral``, the same data steps with the bilateral filter that the network is given and no network;
+* ``fbp:KERNEL``, ``pwls``, ``mbir``; ``mbir:fidelity=1``, ``mbir:weights=mine.safetensors``, ``mbir:tissues``,
+  ``mbir:outlines=no`` without a vessel's outlines, and ``mbir:prior=bilateral``, the same data steps with the bilateral
+  filter that the network is given and no network; options are separated by commas;
 * ``FILTER@BASE``: a filter of :mod:`recon.evaluate.rivals` after a linear method, ``bilateral@fbp:detail``;
 * ``package.module:function``: a function of ``(scan, grid)`` that gives a volume in HU; with ``@BASE`` a denoiser, a
   function of ``(volume)`` or ``(volume, sigma)`` in HU, tensors ``(z, y, x)`` float32;
@@ -30,6 +31,7 @@ from recon.analytic.ramp import KERNELS
 from recon.evaluate.rivals import FILTERS, SMOOTHED_BY, flat_noise, tuned
 from recon.mbir.mbir import Mbir
 from recon.mbir.network import bilateral_prior
+from recon.mbir.outlines import OutlineMbir
 from recon.mbir.tissues import TissueMbir
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
@@ -211,16 +213,21 @@ def _mbir(spec: str, rest: str) -> Method:
     for part in filter(None, rest.split(",")):
         key, _, value = part.partition("=")
         key = renamed("mbir:look", "mbir:fidelity", "fidelity") if key == "look" else key
-        given[choice("option of mbir", key, ("weights", "fidelity", "tissues", "prior"))] = value
+        given[choice("option of mbir", key, ("weights", "fidelity", "tissues", "outlines", "prior"))] = value
     network = Mbir.load(given.get("weights"))
     if "fidelity" in given:
         network = network.with_fidelity(number("fidelity", float(given["fidelity"]), low=0.0, high=1.0))
     if "prior" in given:
         choice("prior of mbir", given["prior"], ("bilateral",))
         network = Mbir(network.model, network.fidelity, prior=bilateral_prior)
+    outlines = choice("outlines of mbir", given.get("outlines", "yes"), ("yes", "no")) == "yes"
     if "tissues" in given:
+        if not outlines:
+            raise ValueError("tissues of mbir are drawn within outlines: leave out outlines=no")
         fitted = TissueMbir(network)
         return Method(spec, lambda draw: draw.mbir(fitted), key=network.weights_sha256)
+    if outlines:
+        network = OutlineMbir(network)
     return Method(spec, lambda draw: draw.mbir(network), key=network.weights_sha256, network=network)
 
 

@@ -13,6 +13,7 @@ from recon.least_squares.field_problem import is_whole_field
 from recon.least_squares.inset_problem import InsetProblem
 from recon.mbir.field import reconstruct_field_mbir
 from recon.mbir.mbir import Mbir, average_onto, working_grid
+from recon.mbir.outlines import OutlineMbir
 from recon.mbir.tissues import TissueMbir
 from recon.mbir.unrolled import low_residual
 from recon.plaque.vessel_prior import VesselPrior
@@ -36,6 +37,7 @@ def reconstruct_mbir(
     batch: int = 4,
     fidelity: float | None = None,
     noise_map: bool = False,
+    outlines: bool = True,
     tissues: bool = False,
     point: Any = None,
     vessel_prior: VesselPrior | None = None,
@@ -53,20 +55,23 @@ def reconstruct_mbir(
         fidelity: 0, quiet images for viewing, … 1, for measuring: more of the contrast, at more noise
             (:mod:`recon.mbir.unrolled`); None: that of ``network``, which is 0.5 unless it was loaded with another.
         noise_map: add an estimate of each voxel's standard deviation, ``report["noise_sd_hu"]``.
-        tissues: fit the tissues of a contrast-enhanced vessel first, and let the network reconstruct what they leave
-            (:mod:`recon.mbir.tissues`): sharp outlines, and a core at full contrast where the data prove one; a
-            few seconds a volume longer. Where no vessel is found, or its tissues do not explain the data, the volume
-            is the one without, with a warning.
+        outlines: where an inset holds a contrast-enhanced vessel, fit its outlines first, and let the network
+            reconstruct what they leave (:mod:`recon.mbir.outlines`); two seconds a volume longer. Where no vessel is
+            found, or its outlines do not explain the data, the volume is the one without; the report says why.
+        tissues: draw the tissues' values and a core as well (:mod:`recon.mbir.tissues`), at full contrast where the
+            data prove it; a few seconds a volume longer. Where they do not explain the data, the volume is the one
+            without, with a warning.
         point: ``(z, y, x)`` mm where a reader sees the plaque, for ``tissues``; None: in the largest vessel.
-        vessel_prior: what ``tissues`` believes of the vessel's tissues before the data; None: a coronary artery.
+        vessel_prior: what is believed of the vessel's tissues before the data; None: a coronary artery.
         look: the former name of ``fidelity``.
 
     Returns:
         Volumes in HU. Report: ``iterations``, ``fidelity``, ``residual`` (what is left of the data at the low
         frequencies that are the data's own, over what there was, :func:`recon.mbir.unrolled.low_residual`), ``chi2``
         (weighted squared residual per reading), ``weights_sha256``, of noisy scans ``residual_p``
-        (:mod:`torchpcct.metrics.residual_test`: does the volume explain its data?), ``warnings``, ``seconds``; with
-        ``tissues`` what was read of them, under that name.
+        (:mod:`torchpcct.metrics.residual_test`: does the volume explain its data?), ``warnings``, ``seconds``; of
+        insets ``outlines``: whether a vessel was drawn, or why not; with ``tissues`` what was read of them, under that
+        name.
 
     Raises:
         ValueError, TypeError: see :class:`recon.least_squares.inset_problem.InsetProblem`; a problem that was made for
@@ -81,15 +86,17 @@ def reconstruct_mbir(
         network = network.with_fidelity(fidelity)
     if point is not None and not tissues:
         raise ValueError("point says where a plaque is: give it with tissues=True")
-    if vessel_prior is not None and not tissues:
-        raise ValueError("vessel_prior says what a vessel is made of: give it with tissues=True")
-    if tissues:
-        network = TissueMbir(network, point, vessel_prior=vessel_prior)
+    if vessel_prior is not None and not (outlines or tissues):
+        raise ValueError("vessel_prior says what a vessel is made of: give it with outlines=True or tissues=True")
     if problem is None and is_whole_field(scans[0], grid):
         for name, asked in (("noise_map", noise_map), ("tissues", tissues)):
             if asked:
                 raise ValueError(f"{name} needs the FFT model of a small inset: ask for a smaller grid")
         return reconstruct_field_mbir(scans, grid, network=network, progress=progress)
+    if tissues:
+        network = TissueMbir(network, point, vessel_prior=vessel_prior)
+    elif outlines:
+        network = OutlineMbir(network, vessel_prior)
     work = working_grid(grid, network.voxel_mm)
     problem = problem or InsetProblem(scans[0], work)
     if problem.grid != work:

@@ -1,20 +1,19 @@
 """MBIR with the tissues of a vessel: what a tissue is made of is pooled over the tissue, not over a neighbourhood.
 
-The vessel's outlines and tissue values are fitted to the data (:mod:`recon.plaque`), with a plaque's core and without.
-With P the probability that the core is there, and x₀ the plain reconstruction, the tissues' image is
+As :mod:`recon.mbir.outlines`, and beside the outlines the tissue values and a plaque's core are fitted to the data
+(:mod:`recon.plaque`), with a core and without. With P the probability that the core is there, and x₀ the plain
+reconstruction, the drawn image is
 
     T = P · (with the core) + (1 − P) · (without it, but in its fibrous layer x₀)
 
-and the network reconstructs what T leaves of the data: u = T + MBIR(β − H T). So outlines are sharp, and a proven core
-has its full contrast. The less a core is proven, the more the plain reconstruction stands in the layer; in between the
-contrast is shrunk, as a mean over two explanations is. What the model does not have (a branch, muscle, texture) comes
-from the data as ever, and the low frequencies are the data's own in both parts.
+So a proven core has its full contrast. The less a core is proven, the more the plain reconstruction stands in the
+layer; in between the contrast is shrunk, as a mean over two explanations is.
 
 Other shares than P trade one thing for another, as 48 draws at 0.35 and 2.0 s have shown. A core that is always drawn
 has the least error where there is none, and up to 45 % more noise of the contrast. P² has up to 11 % less noise of the
 contrast than P, but 16 to 29 % more error where there is no core. P has the least error inside the vessel, or nearly.
 
-A vessel that the model does not fit (its residual exceeds what noise leaves) is left to the plain reconstruction.
+Where the tissues do not explain the data (their residual exceeds what noise leaves), the outlines alone are tried.
 """
 
 from __future__ import annotations
@@ -26,8 +25,8 @@ import torch
 from torch import Tensor
 
 from recon.least_squares.inset_problem import InsetProblem
-from recon.mbir.mbir import Mbir, Solution
-from recon.mbir.problem import NormalisedProblem
+from recon.mbir.mbir import Mbir
+from recon.mbir.outlines import Drawn, OutlineMbir
 from recon.plaque.data import TissueData
 from recon.plaque.reading import PlaqueReading, read_plaque
 from recon.plaque.vessel_prior import VesselPrior
@@ -36,10 +35,8 @@ from torchpcct.validate import numbers
 __all__ = ["TissueMbir", "tissue_image"]
 
 
-class TissueMbir(Mbir):
-    """:class:`recon.mbir.mbir.Mbir` with tissues.
-
-    Not differentiable: the fit of the tissues is not unrolled.
+class TissueMbir(OutlineMbir):
+    """:class:`recon.mbir.outlines.OutlineMbir` with the tissues' values and a plaque's core drawn as well.
 
     Args:
         network: gives weights, fidelity and parts.
@@ -54,49 +51,28 @@ class TissueMbir(Mbir):
     def __init__(
         self, network: Mbir, point: Any = None, seed: int = 0, vessel_prior: VesselPrior | None = None
     ) -> None:
-        super().__init__(network.model, network.fidelity, **network.parts)
+        super().__init__(network, vessel_prior)
         self.point = None if point is None else numbers("point", point, 3, unit="mm")
-        self.seed, self.vessel_prior = seed, vessel_prior
+        self.seed = seed
 
-    @torch.no_grad()
-    def solved(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> Solution:
-        """See :meth:`recon.mbir.mbir.Mbir.solved`; the notes hold ``tissues``: what was read, or why not."""
-        plain = super().solved(problem, b, exposure_s)
-        normal, u = plain.normal, plain.u.clone()
-        volumes = self.in_hu(problem, u, normal)
-        notes: list[dict[str, Any]] = []
-        for k in range(b.shape[0]):
-            try:
-                data = TissueData.of_statistic(b[k], problem, exposure_s)
-                reading = read_plaque(data, self.point, vessel_prior=self.vessel_prior, seed=self.seed)
-            except ValueError as error:
-                notes.append(_unused(f"no tissues were fitted: {error}"))
-                continue
-            if reading.warnings:
-                notes.append(_unused(f"the fitted tissues were not used: {reading.warnings[0]}"))
-                continue
-            it = slice(k, k + 1)
-            one = replace(normal, beta=normal.beta[it], scale_hu=normal.scale_hu[it], factor=normal.factor[it])
-            u[k] = self.around(problem, one, tissue_image(reading, volumes[k], reading.presence))
-            notes.append({"tissues": {"used": True, "presence": reading.presence, "chi2": reading.chi2,
-                                      "calcifications": reading.calcifications}})  # fmt: skip
-        return Solution(normal, u, notes)
+    def drawn(self, problem: InsetProblem, b: Tensor, exposure_s: float, plain: Tensor) -> Drawn:
+        """See :meth:`recon.mbir.outlines.OutlineMbir.drawn`; the note holds ``tissues``: what was read, or why not."""
+        try:
+            data = TissueData.of_statistic(b.detach(), problem, exposure_s)
+            reading = read_plaque(data, self.point, vessel_prior=self.vessel_prior, seed=self.seed)
+        except ValueError as error:
+            return self._without(problem, b, exposure_s, plain, f"no tissues were fitted: {error}")
+        if reading.warnings:
+            why = f"the fitted tissues were not used: {reading.warnings[0]}"
+            return self._without(problem, b, exposure_s, plain, why)
+        read = {"used": True, "presence": reading.presence, "chi2": reading.chi2,
+                "calcifications": reading.calcifications}  # fmt: skip
+        return Drawn(tissue_image(reading, plain, reading.presence), {"tissues": read})
 
-    def around(self, problem: InsetProblem, normal: NormalisedProblem, image: Tensor) -> Tensor:
-        """An image and what the network makes of the data that it leaves, in noise units.
-
-        Args:
-            problem: of the scan.
-            normal: of one volume.
-            image: ``(z, y, x)`` HU.
-        """
-        drawn = self.in_noise_units(problem, image[None], normal)
-        left = replace(normal, beta=normal.beta - normal.apply(drawn))
-        return (drawn + self.model(left, self.fidelity, **self.parts))[0]
-
-
-def _unused(why: str) -> dict[str, Any]:
-    return {"tissues": {"used": False, "why": why}, "warnings": [f"{why}; this is the reconstruction without them"]}
+    def _without(self, problem: InsetProblem, b: Tensor, exposure_s: float, plain: Tensor, why: str) -> Drawn:
+        found = super().drawn(problem, b, exposure_s, plain)
+        said = {"tissues": {"used": False, "why": why}, "warnings": [f"{why}; this is the reconstruction without them"]}
+        return replace(found, note=found.note | said)
 
 
 def tissue_image(reading: PlaqueReading, plain: Tensor, share: float) -> Tensor:

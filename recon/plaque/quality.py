@@ -17,7 +17,7 @@ from recon.conjugate_gradient import conjugate_gradient
 from recon.plaque.data import TissueData
 from recon.plaque.vessel import FAT, FIBROUS, Fit, Vessel
 
-__all__ = ["Leftover", "Texture", "beside", "leftover", "misfit", "texture"]
+__all__ = ["Leftover", "Texture", "beside", "leftover", "misfit", "scores_of", "texture"]
 
 Floats = NDArray[np.float64]
 
@@ -141,6 +141,20 @@ def beside(data: TissueData, vessel: Vessel, fit: Fit) -> Tensor | None:
     return mask * found[0]
 
 
+def scores_of(vessel: Vessel, fit: Fit, explained: Tensor | float = 0.0) -> Floats:
+    """How far each place stands out of what a fit leaves of the data, ``grid.shape`` standard deviations of the noise.
+
+    0 at the vessel's ends: where a vessel ends is no part of what is read of it.
+
+    Args:
+        vessel, fit: see :class:`recon.plaque.vessel.Vessel`.
+        explained: ``grid.shape`` HU⁻¹, G times what is known beside the fit.
+    """
+    scores = vessel.data.scores(residual_of(vessel, fit) - explained, _BODY_MM)
+    scores[tuple(vessel.index[~_between_ends(vessel)].T)] = 0.0
+    return scores
+
+
 def leftover(vessel: Vessel, fit: Fit) -> Leftover:
     """Look through the whole volume for what the tissues do not explain: a second vessel, a branch, a stent, muscle.
 
@@ -148,15 +162,15 @@ def leftover(vessel: Vessel, fit: Fit) -> Leftover:
     lies beside it; a bright neighbour still bends the fit, whose plaque bodies then stand in for it.
     """
     data, grid = vessel.data, vessel.grid
-    left = residual_of(vessel, fit)
-    scores = data.scores(left, _BODY_MM)
-    scores[tuple(vessel.index[~_between_ends(vessel)].T)] = 0.0
+    scores = scores_of(vessel, fit)
     place = np.unravel_index(int(np.argmax(np.abs(scores))), scores.shape)
     score = float(abs(scores[place]))
     inside = vessel.lookup[place]
     z, y, x = (float(axis[k]) for axis, k in zip(grid.axes, place, strict=True))
     beside = bool(inside < 0 or fit.drawing.shares[0][inside] < 0.5)
-    return Leftover(score, float(data.pilot(left)[place]) if score > STRIKING else 0.0, (z, y, x), beside)
+    return Leftover(
+        score, float(data.pilot(residual_of(vessel, fit))[place]) if score > STRIKING else 0.0, (z, y, x), beside
+    )
 
 
 def misfit(vessel: Vessel, fit: Fit) -> tuple[float, float]:

@@ -23,7 +23,7 @@ from recon.plaque.vessel_prior import VesselPrior
 from torchpcct.geometry import VolumeGrid
 from torchpcct.validate import checked, number, numbers, whole
 
-__all__ = ["CERTAIN", "PlaqueReading", "core_regions", "read_plaque", "read_regions"]
+__all__ = ["CERTAIN", "PlaqueReading", "core_regions", "drawn_image", "drawn_layer", "read_plaque", "read_regions"]
 
 Floats = NDArray[np.float64]
 
@@ -358,8 +358,8 @@ def _read(
             return both
     reading = PlaqueReading(
         vessel.grid, presence, more if other_core is None else other_core["probability"], calcifications, figures, {},
-        given, _regions(vessel, fit, space, shares, calcifications), _image(vessel, fit), _image(vessel, plain),
-        _on_grid(vessel, _layer(plain)), square, spread, left, tau.sd_hu, tau.high_hu,
+        given, _regions(vessel, fit, space, shares, calcifications), drawn_image(vessel, fit),
+        drawn_image(vessel, plain), drawn_layer(vessel, plain), square, spread, left, tau.sd_hu, tau.high_hu,
         {"particles": particles, "seed": seed, "log_evidence": cloud.log_evidence, "log_evidence_first": first,
          "point": prior_of_core.point, "vessel_prior": asdict(vessel.prior),
          "source": vessel.data.source, "voxels": len(vessel.index),
@@ -447,13 +447,14 @@ def _regions(
     return found
 
 
-def _layer(fit: Fit) -> Floats:
-    """``(n,)`` share of each voxel in the fibrous layer, less its bodies."""
+def drawn_layer(vessel: Vessel, fit: Fit) -> NDArray[np.float32]:
+    """``grid.shape`` share of each voxel in the fibrous layer, less its bodies."""
     _, inner, lumen = fit.drawing.shares
     share: Floats = np.clip(inner - lumen, 0.0, 1.0) * np.clip(1.0 - fit.bodies.sum(0), 0.0, 1.0)
-    return share
+    return _on_grid(vessel, share)
 
 
-def _image(vessel: Vessel, fit: Fit) -> NDArray[np.float32]:
+def drawn_image(vessel: Vessel, fit: Fit) -> NDArray[np.float32]:
+    """``grid.shape`` HU, a fitted vessel as means over the voxels."""
     fat = fit.parameters[FAT]
     return _on_grid(vessel, fat + vessel.voxel_means(fit.drawing.soft), fat)
