@@ -85,7 +85,7 @@ def _value(path: Path, place: str) -> Any:
         data = _parsed(path, path.stat().st_mtime_ns)
     except OSError as error:
         raise ValueError(f"cannot read {path}: {error.strerror}") from None
-    parts = [part.strip() for part in place.split(",")]
+    parts = [part.strip() for part in place.split(", ")]
     if "/" in place or len(parts) != len(_RECORD):
         return lookup(data, place)
     wanted = ",".join(f"{key}={part}" for key, part in zip(_RECORD, parts, strict=True))

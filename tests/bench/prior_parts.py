@@ -30,6 +30,7 @@ from torch import Tensor
 
 from recon.mbir.mbir import Mbir
 from recon.mbir.network import bilateral_prior
+from recon.mbir.outlines import OutlineMbir
 
 HERE = Path(__file__).parent
 DEFAULT = HERE.parents[1] / "train" / "configs" / "default.yaml"
@@ -57,11 +58,15 @@ def _one_orientation(network: Mbir) -> Mbir:
 
 
 USES: dict[str, Callable[[Mbir], Mbir]] = {
-    "as it ships": lambda n: n,
-    "overshoot beside edges not cut off": lambda n: Mbir(n.model, cut_overshoot=False),
-    "one orientation instead of eight": _one_orientation,
-    "without data consistency at the end": lambda n: Mbir(n.model, final_data_consistency=False),
-    "the filtered view alone, no network": lambda n: Mbir(n.model, prior=bilateral_prior),
+    "as it ships, around a vessel's outlines": OutlineMbir,
+    "outlines, and the filtered view in place of the network": lambda n: OutlineMbir(
+        Mbir(n.model, prior=bilateral_prior)
+    ),
+    "without outlines": lambda n: n,
+    "without outlines, overshoot beside edges not cut off": lambda n: Mbir(n.model, cut_overshoot=False),
+    "without outlines, one orientation instead of eight": _one_orientation,
+    "without outlines and data consistency at the end": lambda n: Mbir(n.model, final_data_consistency=False),
+    "without outlines, the filtered view alone, no network": lambda n: Mbir(n.model, prior=bilateral_prior),
     "the linear start alone": lambda n: Mbir(n.model, steps=0),
 }
 
