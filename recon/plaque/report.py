@@ -80,7 +80,7 @@ def table(reading: PlaqueReading, others: Mapping[str, Any] | None = None, devia
         ]
     lines += [
         "",
-        f"Read from a {reading.info['source']}. Residual: {reading.chi2:.3f} ± {reading.chi2_sd:.3f} of what noise "
+        f"Residual: {reading.chi2:.3f} ± {reading.chi2_sd:.3f} of what noise "
         f"leaves. Texture of 0.3 mm: {reading.texture_hu:.0f} HU, at most {reading.texture_high_hu:.0f} HU (95 %). "
         "Believed before the data: "
         + ", ".join("{} {:g} ± {:g} HU".format(n, *reading.info["vessel_prior"][n]) for n in ("wall", "fibrous"))
