@@ -12,7 +12,7 @@ import torch
 
 from recon.analytic.coverage import consistency_warnings, sampling_warnings, view_notes
 from recon.analytic.inset import InsetFbp
-from recon.least_squares.inset_problem import reconstruct_pwls
+from recon.least_squares.reconstruct import reconstruct_pwls
 from recon.mbir.reconstruct import reconstruct_mbir
 from recon.metal import metal_warnings
 from torchpcct.defects import dead_readings, repair_defects
@@ -57,7 +57,7 @@ def reconstruct(
         grid: ``(z, y, x)`` grid inside the field of view; of a parallel or fan-beam scan ``(y, x)`` or, of several
             slices, ``(slices, y, x)``.
         method: ``"fbp"`` (FDK; option ``kernel``) or ``"pwls"`` (penalised weighted least squares with a q-GGMRF
-            prior, of an inset or a whole field; options of :func:`recon.least_squares.inset_problem.reconstruct_pwls`;
+            prior, of an inset or a whole field; options of :func:`recon.least_squares.reconstruct.reconstruct_pwls`;
             a volume that did not converge carries ``warnings`` in its report) or ``"mbir"`` (unrolled steps with the
             learned prior that ships with the package, of an inset or a whole field; options of
             :func:`recon.mbir.reconstruct.reconstruct_mbir`; what the training has not seen is named in ``warnings``).

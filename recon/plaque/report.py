@@ -146,7 +146,7 @@ def save(
         "explained": reading.explained,
         "mean_contrast_hu": reading.mean_contrast,
         "calcifications": reading.calcifications,
-        "figures": {n: e.as_dict() for n, e in reading.figures.items()},
+        "figures": {n: asdict(e) for n, e in reading.figures.items()},
         "refused": dict(reading.refused),
         "same_regions": {name: reading.read(volume) for name, volume in (others or {}).items()},
         "same_regions_sd": {name: dict(v) for name, v in (deviations or {}).items()},
