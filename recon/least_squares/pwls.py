@@ -140,6 +140,16 @@ def pwls(
         ValueError: shapes that do not fit, data that are not finite, weights that are negative or all 0,
             a tolerance ≤ 0, too little memory.
         TypeError: data or weights that are not float tensors.
+
+    Example:
+        >>> import numpy as np, torch
+        >>> from recon.least_squares.qggmrf import DEFAULT_PRIOR
+        >>> from torchpcct import ParallelBeam, Projector, VolumeGrid
+        >>> A = Projector(ParallelBeam(np.arange(30) * np.pi / 30, 24, 1.0), VolumeGrid((16, 16), 1.0))
+        >>> lines = A(torch.full(A.domain_shape, 0.02))
+        >>> found = pwls(A, lines, torch.full(A.range_shape, 1e4), DEFAULT_PRIOR, tolerance=1.0)
+        >>> found.report["converged"], round(float(found.x.mean()), 3)
+        (True, 0.02)
     """
     if hu is not None:
         mu_per_hu = renamed("hu", "mu_per_hu", hu)
