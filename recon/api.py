@@ -66,11 +66,15 @@ def require_light(zero_fraction: float) -> None:
 
 
 @overload
-def reconstruct(scan: Scan, grid: VolumeGrid, method: str = ..., **options: Unpack[MethodOptions]) -> Volume: ...
+def reconstruct(
+    scan: Scan, grid: VolumeGrid, method: str = ..., *, progress: Callable[[float], None] | None = ...,
+    device: str | torch.device = ..., **options: Unpack[MethodOptions],
+) -> Volume: ...  # fmt: skip
 @overload
 def reconstruct(
-    scan: Sequence[Scan], grid: VolumeGrid, method: str = ..., **options: Unpack[MethodOptions]
-) -> list[Volume]: ...
+    scan: Sequence[Scan], grid: VolumeGrid, method: str = ..., *, progress: Callable[[float], None] | None = ...,
+    device: str | torch.device = ..., **options: Unpack[MethodOptions],
+) -> list[Volume]: ...  # fmt: skip
 
 
 @checked
@@ -139,8 +143,8 @@ def reconstruct(
     scans = [s for s, _ in whole]
     for text in {text for _, texts in whole for text in texts}:
         _LOG.warning("%s", text)
-    run: Callable[..., list[Volume]] = {"fbp": _fbp, "pwls": reconstruct_pwls, "mbir": reconstruct_mbir}[method]
-    volumes = run(scans, grid, progress=progress, **options)
+    methods: dict[str, Any] = {"fbp": _fbp, "pwls": reconstruct_pwls, "mbir": reconstruct_mbir}
+    volumes: list[Volume] = methods[method](scans, grid, progress=progress, **options)
     # MBIR says itself what lies beyond its training.
     metal = [
         [] if method == "mbir" or s.unit != "HU" else metal_warnings(v.data)

@@ -27,7 +27,7 @@ from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid, vie
 from torchpcct.validate import checked, number, reals
 from torchpcct.vector_geometry import VectorGeometry
 
-__all__ = ["Fbp", "backproject", "fbp", "filter_sinogram", "filter_windowed", "interleave", "straightened_fbp"]
+__all__ = ["Fbp", "backproject", "fbp", "filter_sinogram", "filter_windowed", "interleave", "rebinned_fbp"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -251,8 +251,8 @@ def fbp(
     if isinstance(geometry, VectorGeometry):
         if window is not None:
             raise ValueError("a window belongs to a circular scan: leave it out for a VectorGeometry")
-        straight = rebin_to_circle(sinogram, geometry if motion is None else geometry.moved(motion))
-        return straightened_fbp(straight, grid, kernel, weights=weights, outside=outside)
+        rebinned = rebin_to_circle(sinogram, geometry if motion is None else geometry.moved(motion))
+        return rebinned_fbp(rebinned, grid, kernel, weights=weights, outside=outside)
     check_data("sinogram", sinogram, data_shape(geometry, DetectorWindow.full(geometry)))
     refuse_helix(geometry, motion)
     for text in check_rows(geometry, grid, motion):
@@ -266,14 +266,14 @@ def fbp(
 
 
 @checked
-def straightened_fbp(
-    straight: Rebinned, grid: VolumeGrid, kernel: str | Sequence[str], *, weights: Any = None, outside: float | None
+def rebinned_fbp(
+    rebinned: Rebinned, grid: VolumeGrid, kernel: str | Sequence[str], *, weights: Any = None, outside: float | None
 ) -> Tensor:
     """:func:`fbp` of a scan that was resampled onto an ideal circle."""
-    lines, plane = straight.sinogram, grid
-    if straight.slices is not None:
-        lines, plane = at_slices(straight, grid), grid.slice
-    return fbp(lines, straight.geometry, plane, kernel, weights=weights, motion=straight.motion, outside=outside)
+    lines, plane = rebinned.sinogram, grid
+    if rebinned.slices is not None:
+        lines, plane = at_slices(rebinned, grid), grid.slice
+    return fbp(lines, rebinned.geometry, plane, kernel, weights=weights, motion=rebinned.motion, outside=outside)
 
 
 class Fbp(nn.Module):

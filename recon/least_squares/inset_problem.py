@@ -179,7 +179,7 @@ class InsetProblem:
         if self._background is None:
             return self.outer.crop(scan.line_integrals(), self.window)
         require_same_surround(scan, self._background)
-        # Only what the inset shadows is taken the logarithm of; the bridge over dead readings needs their neighbours.
+        # The logarithm is taken of the footprint alone; the bridge over dead readings needs their neighbours.
         near = scan if scan.dead is not None or scan.window is None else scan.crop(self.window)
         lines = near.line_integrals()
         if near is scan:
