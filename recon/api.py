@@ -6,13 +6,14 @@ import logging
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, overload
+from typing import TYPE_CHECKING, Any, Unpack, overload
 
 import torch
 
 from recon.analytic.coverage import consistency_warnings, sampling_warnings, view_notes
 from recon.analytic.inset import InsetFbp
-from recon.least_squares.inset_problem import reconstruct_pwls
+from recon.least_squares.pwls import PwlsOptions
+from recon.least_squares.reconstruct import reconstruct_pwls
 from recon.mbir.reconstruct import reconstruct_mbir
 from recon.metal import metal_warnings
 from torchpcct.defects import dead_readings, repair_defects
@@ -22,22 +23,58 @@ from torchpcct.scan import Scan
 from torchpcct.validate import checked, choice
 from torchpcct.volume import Volume, from_hu
 
-__all__ = ["METHODS", "reconstruct"]
+if TYPE_CHECKING:
+    from recon.least_squares.inset_problem import InsetProblem
+    from recon.least_squares.qggmrf import QGGMRF
+    from recon.mbir.mbir import Mbir
+    from recon.plaque.vessel_prior import VesselPrior
+
+__all__ = ["METHODS", "MethodOptions", "reconstruct", "require_light"]
 
 METHODS: tuple[str, ...] = ("fbp", "pwls", "mbir")
 
 _LOG = logging.getLogger(__name__)
 
-Progress = Callable[[float], None]
-
 # More zero counts than this, and the logarithm no longer describes the data: FBP and PWLS would be guesswork.
 _STARVED = 0.5
 
 
+class MethodOptions(PwlsOptions, total=False):
+    """Options of :func:`reconstruct`: ``kernel`` of FBP, ``prior`` of PWLS, ``problem`` and ``batch`` of PWLS and MBIR,
+    the rest of MBIR. Each is described where its method is; that of another method is a ``TypeError``."""
+
+    kernel: str
+    prior: QGGMRF | None
+    problem: InsetProblem | None
+    batch: int
+    network: Mbir | None
+    fidelity: float | None
+    noise_map: bool
+    tissues: bool
+    point: Any
+    vessel_prior: VesselPrior | None
+    look: float | None
+
+
+def require_light(zero_fraction: float) -> None:
+    """Refuse a scan of which more than half the readings are zero (ValueError)."""
+    if zero_fraction > _STARVED:
+        raise ValueError(
+            f"{100 * zero_fraction:.0f} % of the readings are zero: too few photons for a line-integral method; "
+            "raise the exposure or bin the readings"
+        )
+
+
 @overload
-def reconstruct(scan: Scan, grid: VolumeGrid, method: str = ..., **options: Any) -> Volume: ...
+def reconstruct(
+    scan: Scan, grid: VolumeGrid, method: str = ..., *, progress: Callable[[float], None] | None = ...,
+    device: str | torch.device = ..., **options: Unpack[MethodOptions],
+) -> Volume: ...  # fmt: skip
 @overload
-def reconstruct(scan: Sequence[Scan], grid: VolumeGrid, method: str = ..., **options: Any) -> list[Volume]: ...
+def reconstruct(
+    scan: Sequence[Scan], grid: VolumeGrid, method: str = ..., *, progress: Callable[[float], None] | None = ...,
+    device: str | torch.device = ..., **options: Unpack[MethodOptions],
+) -> list[Volume]: ...  # fmt: skip
 
 
 @checked
@@ -48,7 +85,7 @@ def reconstruct(
     *,
     progress: Callable[[float], None] | None = None,
     device: str | torch.device = "cpu",
-    **options: Any,
+    **options: Unpack[MethodOptions],
 ) -> Volume | list[Volume]:
     """Reconstruct a scan on a grid, in HU (water reads 0).
 
@@ -57,13 +94,13 @@ def reconstruct(
         grid: ``(z, y, x)`` grid inside the field of view; of a parallel or fan-beam scan ``(y, x)`` or, of several
             slices, ``(slices, y, x)``.
         method: ``"fbp"`` (FDK; option ``kernel``) or ``"pwls"`` (penalised weighted least squares with a q-GGMRF
-            prior, of an inset or a whole field; options of :func:`recon.least_squares.inset_problem.reconstruct_pwls`;
+            prior, of an inset or a whole field; options of :func:`recon.least_squares.reconstruct.reconstruct_pwls`;
             a volume that did not converge carries ``warnings`` in its report) or ``"mbir"`` (unrolled steps with the
             learned prior that ships with the package, of an inset or a whole field; options of
             :func:`recon.mbir.reconstruct.reconstruct_mbir`; what the training has not seen is named in ``warnings``).
         progress: called with the finished fraction, 0…1.
         device: where the returned volumes lie.
-        options: of the method.
+        options: of the method (:class:`MethodOptions`).
 
     Readings that no object can cause (dead or hot cells, dead views, lost readings: :mod:`torchpcct.defects`) are
     interpolated before; the report's ``warnings`` say so, and what else the readings say against their description (an
@@ -83,6 +120,16 @@ def reconstruct(
     Raises:
         ValueError: an unknown method, kernel or option value, a grid outside the field of view, a starved scan.
         TypeError: ``scan`` is no :class:`torchpcct.Scan`, or an option does not exist.
+
+    Example:
+        >>> import numpy as np, torch
+        >>> from torchpcct import ParallelBeam, Projector, Scan, VolumeGrid
+        >>> geometry, grid = ParallelBeam(np.arange(60) * np.pi / 60, 48, 1.0), VolumeGrid((32, 32), 1.0)
+        >>> water = torch.zeros(grid.shape).index_put([torch.tensor([16])], torch.tensor(0.02))
+        >>> scan = Scan.from_line_integrals(Projector(geometry, grid)(water), geometry, photons=1e6, mu_water=0.02)
+        >>> volume = reconstruct(scan, grid, "fbp", kernel="soft")
+        >>> volume.data.shape, volume.unit, volume.report["kernel"]
+        (torch.Size([32, 32]), 'HU', 'soft')
     """
     scans = [scan] if isinstance(scan, Scan) else list(scan) if isinstance(scan, Sequence) else []
     if not scans or not all(isinstance(s, Scan) for s in scans):
@@ -90,22 +137,14 @@ def reconstruct(
     if not isinstance(grid, VolumeGrid) or (grid.ndim != 3 and scans[0].geometry.has_rows):
         raise ValueError(f"grid must be a (z, y, x) VolumeGrid, got {grid!r}")
     for s in scans:
-        if s.zero_fraction > _STARVED:
-            raise ValueError(
-                f"{100 * s.zero_fraction:.0f} % of the readings are zero: too few photons for a line-integral method; "
-                "raise the exposure or bin the readings"
-            )
+        require_light(s.zero_fraction)
     choice("method", method, METHODS)
     whole = [(s, [*texts, *reading_warnings(s)]) for s, texts in map(repair_defects, scans)]
     scans = [s for s, _ in whole]
     for text in {text for _, texts in whole for text in texts}:
         _LOG.warning("%s", text)
-    if method == "fbp":
-        volumes = _fbp(scans, grid, progress, **options)
-    elif method == "mbir":
-        volumes = reconstruct_mbir(scans, grid, progress=progress, **options)
-    else:
-        volumes = reconstruct_pwls(scans, grid, progress=progress, **options)
+    methods: dict[str, Any] = {"fbp": _fbp, "pwls": reconstruct_pwls, "mbir": reconstruct_mbir}
+    volumes: list[Volume] = methods[method](scans, grid, progress=progress, **options)
     # MBIR says itself what lies beyond its training.
     metal = [
         [] if method == "mbir" or s.unit != "HU" else metal_warnings(v.data)
@@ -132,7 +171,9 @@ def reconstruct(
     return volumes[0] if isinstance(scan, Scan) else volumes
 
 
-def _fbp(scans: Sequence[Scan], grid: VolumeGrid, progress: Progress | None, kernel: str = "standard") -> list[Volume]:
+def _fbp(
+    scans: Sequence[Scan], grid: VolumeGrid, *, progress: Callable[[float], None] | None, kernel: str = "standard"
+) -> list[Volume]:
     if not isinstance(kernel, str):
         raise TypeError(f"kernel must be one name, got {kernel!r}; recon.analytic.inset.InsetFbp takes several at once")
     start = time.perf_counter()

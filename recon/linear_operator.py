@@ -1,5 +1,5 @@
-"""Linear operators: what a data term is to solvers, one autograd function for all that are given with their exact
-transpose, and separable filters."""
+"""Linear operators: what a data term is to solvers, and one autograd function for all that are given with their exact
+transpose."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
-__all__ = ["NormalOperator", "apply_linear", "gaussian_kernel", "separable_filter"]
+__all__ = ["NormalOperator", "apply_linear"]
 
 Linear = Callable[[Tensor], Tensor]
 
@@ -31,7 +30,7 @@ class NormalOperator(Protocol):
         ...
 
     def information(self, mu_per_hu: float) -> float:
-        """On a wave of 0.5 lp/mm, 1/(HU² mm³) (2-D: mm²); ``hu`` is 1 HU in mm⁻¹."""
+        """On a wave of 0.5 lp/mm, 1/(HU² mm³) (2-D: mm²); ``mu_per_hu`` is 1 HU in mm⁻¹."""
         ...
 
 
@@ -64,26 +63,3 @@ class _Linear(torch.autograd.Function):
 def apply_linear(x: Tensor, forward: Linear, transpose: Linear) -> Tensor:
     """``forward(x)`` with gradients of any order; both maps take and keep leading batch dimensions."""
     return _Linear.apply(x, forward, transpose)
-
-
-def gaussian_kernel(sd: float, reach: int, like: Tensor) -> Tensor:
-    """``exp(−k² / 2 sd²)`` for k = −reach … reach, in the dtype and on the device of ``like``; not normalised."""
-    at = torch.arange(-reach, reach + 1, dtype=like.dtype, device=like.device)
-    return torch.exp(-0.5 * (at / sd) ** 2)
-
-
-def separable_filter(v: Tensor, kernel: Tensor, edges: str) -> Tensor:
-    """Volumes ``(batch, z, y, x)`` convolved with one kernel of odd length along every axis.
-
-    Args:
-        v: volumes.
-        kernel: ``(2 · reach + 1,)``.
-        edges: ``"replicate"`` (repeat the last voxel) or ``"constant"`` (0 beyond it).
-    """
-    out, reach = v[:, None], len(kernel) // 2
-    for axis in (0, 1, 2):
-        shape, pad = [1] * 5, [0] * 6
-        shape[2 + axis] = len(kernel)
-        pad[4 - 2 * axis] = pad[5 - 2 * axis] = reach
-        out = F.conv3d(F.pad(out, pad, mode=edges), kernel.reshape(shape))
-    return out[:, 0]

@@ -216,30 +216,9 @@ def _add_view(
 
 @njit(**_OPTIONS)
 def backproject_3d(
-    begin,
-    end,
-    kind,
-    data,
-    cosines,
-    sines,
-    shifts,
-    starts,
-    x,
-    y,
-    z,
-    sod,
-    sdd,
-    scale,
-    row_scale,
-    row_start,
-    atan,
-    first_row,
-    bottom,
-    top,
-    tile_y,
-    tile_x,
-    out,
-):
+    begin, end, kind, data, cosines, sines, shifts, starts, x, y, z, sod, sdd, scale, row_scale, row_start, atan,
+    first_row, bottom, top, tile_y, tile_x, out,
+):  # fmt: skip
     """``data (B, V, rows, columns)`` into ``out (B, Z, Y, X)``, tile by tile of ``tile_y × tile_x`` voxel columns.
 
     ``z`` may be some slices of a volume that reaches from ``bottom`` to ``top``, and ``data`` the rows from
@@ -273,22 +252,9 @@ def backproject_3d(
         lower, upper = np.empty(padded, np.int32), np.empty(padded, data.dtype)
         for v in range(views):
             _positions_3d(
-                kind,
-                px,
-                py,
-                cosines[v],
-                sines[v],
-                shifts[v, 0],
-                shifts[v, 1],
-                sod,
-                sdd,
-                scale,
-                starts[v],
-                atan,
-                index,
-                weight,
-                height,
-            )
+                kind, px, py, cosines[v], sines[v], shifts[v, 0], shifts[v, 1], sod, sdd, scale, starts[v], atan,
+                index, weight, height,
+            )  # fmt: skip
             lift = shifts[v, 2]
             for k in range(nz):
                 heights[k] = number(z[k] + lift)
@@ -354,22 +320,9 @@ def spread_3d(
             for ix in range(nx):
                 line[ix] = y[iy]
             _positions_3d(
-                kind,
-                x,
-                line,
-                cosines[v],
-                sines[v],
-                shifts[v, 0],
-                shifts[v, 1],
-                sod,
-                sdd,
-                scale,
-                starts[v],
-                atan,
-                index,
-                weight,
-                height,
-            )
+                kind, x, line, cosines[v], sines[v], shifts[v, 0], shifts[v, 1], sod, sdd, scale, starts[v], atan,
+                index, weight, height,
+            )  # fmt: skip
             for ix in range(nx):
                 position = min(max(index[ix], 0.0), last)
                 left = np.uint64(int(position))

@@ -92,7 +92,10 @@ class RoiAdjoints:
 
         Arguments and errors as :meth:`covariance`.
         """
-        variance = line_integral_variance(clean.crop(self.window), exposure_s)
+        return self.covariance_of(line_integral_variance(clean.crop(self.window), exposure_s))
+
+    def covariance_of(self, variance: Tensor) -> NDArray[np.float64]:
+        """The same from the variances of the line integrals on ``window``, ``(views, rows, columns)``."""
         rows = self.matrix.view(-1, variance.shape[0], variance[0].numel())
         total = np.zeros((rows.shape[0], rows.shape[0]))
         for view in range(rows.shape[1]):  # one view in float64 at a time: no copy of all vectors

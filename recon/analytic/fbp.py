@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from recon.analytic.angular_weights import angular_weights, view_steps
 from recon.analytic.any_orbit import Rebinned, at_slices, rebin_to_circle
@@ -27,7 +27,7 @@ from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid, vie
 from torchpcct.validate import checked, number, reals
 from torchpcct.vector_geometry import VectorGeometry
 
-__all__ = ["backproject", "fbp", "filter_sinogram", "filter_windowed", "interleave", "straightened_fbp"]
+__all__ = ["Fbp", "backproject", "fbp", "filter_sinogram", "filter_windowed", "interleave", "rebinned_fbp"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -238,12 +238,21 @@ def fbp(
     Raises:
         ValueError, TypeError: as :func:`filter_sinogram` and :func:`backproject`; views of which more than a quarter is
             dead; a negative ``outside``.
+
+    Example:
+        >>> import numpy as np, torch
+        >>> from torchpcct import ParallelBeam, VolumeGrid
+        >>> geometry = ParallelBeam(np.arange(90) * np.pi / 90, 64, 1.0)
+        >>> chords = 0.04 * np.sqrt(np.clip(20.0**2 - geometry.column_positions**2, 0.0, None))  # of a disc of water
+        >>> image = fbp(torch.from_numpy(np.tile(chords, (90, 1))), geometry, VolumeGrid((33, 33), 1.0), "soft")
+        >>> round(float(image[12:21, 12:21].mean()), 3)
+        0.02
     """
     if isinstance(geometry, VectorGeometry):
         if window is not None:
             raise ValueError("a window belongs to a circular scan: leave it out for a VectorGeometry")
-        straight = rebin_to_circle(sinogram, geometry if motion is None else geometry.moved(motion))
-        return straightened_fbp(straight, grid, kernel, weights=weights, outside=outside)
+        rebinned = rebin_to_circle(sinogram, geometry if motion is None else geometry.moved(motion))
+        return rebinned_fbp(rebinned, grid, kernel, weights=weights, outside=outside)
     check_data("sinogram", sinogram, data_shape(geometry, DetectorWindow.full(geometry)))
     refuse_helix(geometry, motion)
     for text in check_rows(geometry, grid, motion):
@@ -257,14 +266,39 @@ def fbp(
 
 
 @checked
-def straightened_fbp(
-    straight: Rebinned, grid: VolumeGrid, kernel: str | Sequence[str], *, weights: Any = None, outside: float | None
+def rebinned_fbp(
+    rebinned: Rebinned, grid: VolumeGrid, kernel: str | Sequence[str], *, weights: Any = None, outside: float | None
 ) -> Tensor:
     """:func:`fbp` of a scan that was resampled onto an ideal circle."""
-    lines, plane = straight.sinogram, grid
-    if straight.slices is not None:
-        lines, plane = at_slices(straight, grid), grid.slice
-    return fbp(lines, straight.geometry, plane, kernel, weights=weights, motion=straight.motion, outside=outside)
+    lines, plane = rebinned.sinogram, grid
+    if rebinned.slices is not None:
+        lines, plane = at_slices(rebinned, grid), grid.slice
+    return fbp(lines, rebinned.geometry, plane, kernel, weights=weights, motion=rebinned.motion, outside=outside)
+
+
+class Fbp(nn.Module):
+    """:func:`fbp` of one geometry on one grid as a layer of a network, without parameters.
+
+    Shape:
+        ``(..., views, [rows,] columns)`` → ``(..., *grid.shape)``: axes of batch and channel go through. float32 or
+        float64; float16 and bfloat16, as autocast leaves them, are computed and returned in float32.
+
+    Args:
+        geometry: parallel, fan or cone beam.
+        grid: ``(y, x)`` or ``(z, y, x)``.
+        kernel: reconstruction kernel.
+    """
+
+    def __init__(self, geometry: Geometry, grid: VolumeGrid, kernel: str = "standard") -> None:
+        super().__init__()
+        self.geometry, self.grid, self.kernel = geometry, grid, kernel
+
+    def forward(self, sinogram: Tensor) -> Tensor:
+        narrow = isinstance(sinogram, Tensor) and sinogram.dtype in (torch.float16, torch.bfloat16)
+        return fbp(sinogram.float() if narrow else sinogram, self.geometry, self.grid, self.kernel)
+
+    def extra_repr(self) -> str:
+        return f"{type(self.geometry).__name__}, {self.geometry.shape} -> {self.grid.shape}, {self.kernel}"
 
 
 _SIDES = ("first", "last")

@@ -20,7 +20,7 @@ from recon.analytic.angular_weights import angular_weights
 from recon.analytic.any_orbit import Rebinned, ideal_circle, rebin_to_circle
 from recon.analytic.backproject import backproject
 from recon.analytic.coverage import check_rows
-from recon.analytic.fbp import filter_sinogram, filter_windowed, straightened_fbp
+from recon.analytic.fbp import filter_sinogram, filter_windowed, rebinned_fbp
 from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import ConeBeam, Geometry, VolumeGrid
 from torchpcct.scan import Scan
@@ -214,7 +214,7 @@ class InsetFbp:
         """
         g, part = self.geometry, self.footprint
         if self.window is None or self._lines is None:
-            return self._whole(self._straight(lines), outside)
+            return self._whole(self._rebinned(lines), outside)
         channels = tuple(self._lines.shape[:-2])
         if lines.ndim < 3 or tuple(lines.shape[lines.ndim - 3 - len(channels) : -3]) != channels:
             raise ValueError(f"lines must have the channels {channels} before the views, got {tuple(lines.shape)}")
@@ -226,14 +226,14 @@ class InsetFbp:
         moving = [backproject(filtered, g, grid, part, motion=self.motion) for grid in self.grids]
         return [self._over_batch(rest, m) + m for rest, m in zip(self._rest, moving, strict=True)]
 
-    def _straight(self, lines: Tensor) -> Rebinned:
+    def _rebinned(self, lines: Tensor) -> Rebinned:
         if isinstance(self.geometry, VectorGeometry):
             return rebin_to_circle(lines, self.geometry)
         return Rebinned(lines, self.geometry, None)
 
-    def _whole(self, straight: Rebinned, outside: float | None) -> list[Tensor]:
+    def _whole(self, rebinned: Rebinned, outside: float | None) -> list[Tensor]:
         grids = self.grids if self.geometry.has_rows else [grid.slice for grid in self.grids]
-        return [straightened_fbp(straight, grid, self.kernels, outside=outside) for grid in grids]
+        return [rebinned_fbp(rebinned, grid, self.kernels, outside=outside) for grid in grids]
 
     @staticmethod
     def _over_batch(surround: Tensor, like: Tensor) -> Tensor:
@@ -251,5 +251,5 @@ class InsetFbp:
         lines, water = scan.line_integrals(), self.linearisation.mu_ref
         if self.window is not None:
             return [to_hu(v, water) for v in self.images(lines)]
-        straight = self._straight(lines)
-        return [to_hu(v, water) for v in self._whole(straight, water)]
+        rebinned = self._rebinned(lines)
+        return [to_hu(v, water) for v in self._whole(rebinned, water)]

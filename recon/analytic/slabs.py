@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypedDict, Unpack
 
 import numpy as np
 import torch
@@ -28,8 +28,9 @@ from recon.analytic.backproject import BackprojectionPlan
 from recon.analytic.coverage import check_rows, consistency_warnings, sampling_warnings, view_notes
 from recon.analytic.detector_edges import Rows, continued, ends_cut_off, mirrored, row_ends
 from recon.analytic.fbp import filter_windowed
-from recon.api import reconstruct
+from recon.api import reconstruct, require_light
 from recon.least_squares.memory import available_bytes, memory_bytes, pwls_bytes, resident_bytes
+from recon.least_squares.qggmrf import QGGMRF
 from recon.metal import metal_warnings
 from torchpcct.dead_cells import MOST_DEAD
 from torchpcct.defects import Cells, cell_sums, dark_views, is_repaired, photon_and_light, repair_defects, wrong_cells
@@ -55,9 +56,16 @@ _READINGS, _VOLUMES = 7, 4
 """Arrays of the size of the readings and of a slab that live at once while either is prepared."""
 _LOOKED_AT = 32
 """Rows in the middle whose readings are tested against their description, at most."""
-_STARVED = 0.5
 _RATE, _READ_RATE = 4e8, 1e8
 """Voxel updates of the backprojection, and readings that are read and prepared, a second on one core."""
+
+
+class StackOptions(TypedDict, total=False):
+    """Options of PWLS, see :func:`recon.least_squares.reconstruct.reconstruct_pwls`."""
+
+    prior: QGGMRF | None
+    tolerance: float
+    max_exact: int
 
 
 class Part(NamedTuple):
@@ -398,7 +406,7 @@ def reconstruct_to(
     kernel: str = "standard",
     reader: Mapping[str, Any] | None = None,
     progress: Callable[[float], None] | None = None,
-    **options: Any,
+    **options: Unpack[StackOptions],
 ) -> dict[str, Any]:
     """Reconstruct a volume slab by slab into a file, within a limit of memory.
 
@@ -421,7 +429,7 @@ def reconstruct_to(
         kernel: of FBP.
         reader: options of :func:`torchpcct.formats.scans.open_scan`.
         progress: called with the finished fraction, 0…1.
-        options: of PWLS.
+        options: of PWLS (:class:`StackOptions`).
 
     Returns:
         The report: that of a volume, with the plan as ``slabs``, ``memory_bytes``; ``resumed_at``, the first slice of
@@ -518,12 +526,8 @@ def _survey(source: ScanSlices, plan: SlabPlan) -> dict[str, Any]:
             rows += lines.sum(1, dtype=torch.float64)
         else:
             ends.append(row_ends(lines))
-    readings, (zeros, replaced, dead) = source.counts.numel(), map(int, tally)
-    if zeros > _STARVED * readings:
-        raise ValueError(
-            f"{100 * zeros / readings:.0f} % of the readings are zero: too few photons for a line-integral method; "
-            "raise the exposure or bin the readings"
-        )
+    zeros, replaced, dead = map(int, tally)
+    require_light(zeros / source.counts.numel())
     if cone:
         ends = [row_ends((rows / source.count).float()[None])]
     highest, first_column, last_column = zip(*ends, strict=True)

@@ -11,16 +11,16 @@ from recon.cli.parsing import (
     SCAN_ENDINGS,
     Commands,
     add_force,
+    add_options,
     as_json,
     check_ending,
     check_output,
-    examples,
+    command,
     is_picture,
     length_of,
     without_ending,
 )
 from torchpcct.files import atomic_write
-from torchpcct.validate import number
 
 if TYPE_CHECKING:
     from recon.study.study import ProgressBars
@@ -94,24 +94,24 @@ def _info(arguments: argparse.Namespace, progress: ProgressBars) -> None:
 
 
 def add_info(commands: Commands) -> None:
-    parser = commands.add_parser("info", help="what a scan or volume file holds", description="What a file holds.")
-    parser.set_defaults(run=_info, device="cpu", no_progress=True, verbose=False)
-    examples(parser, "torchpcct info scan.h5", "torchpcct info volume.nii.gz --json")
-    parser.add_argument("file", type=Path, metavar="FILE", help="scan or volume")
-    parser.add_argument("--json", action="store_true", help="everything, as JSON")
+    parser = command(
+        commands, "info", _info, "what a scan or volume file holds", "What a file holds.",
+        "torchpcct info scan.h5", "torchpcct info volume.nii.gz --json",
+    )  # fmt: skip
+    add_options(parser, ("file", Path, "FILE", "scan or volume"), ("--json", bool, None, "everything, as JSON"))
 
 
 def _view(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     files, page = arguments.files, arguments.html is not None
     if not page and len(files) > 1:
         raise ValueError("several volumes are shown in a page for the browser: add --html FILE")
+    if page and arguments.out is not None:
+        raise ValueError("--html FILE or --out PATH: a page or a picture, one at a time")
     if page and (arguments.slice is not None or arguments.plane != "z"):
         raise ValueError("--slice and --plane belong to a picture (--out); a page of --html shows all of them")
     arguments.out = arguments.html or arguments.out or Path(f"{without_ending(files[0])}.png")
     check_ending(arguments.out, (".html", ".htm") if page else _PICTURE_ENDINGS)
     check_output(arguments, _is_page if page else is_picture, *files)
-    if arguments.window is not None:
-        number("--window", arguments.window, positive=True)
     for file in files:
         if file.exists() and not _is_volume(file):
             raise ValueError(f"{file} is a scan, no volume: torchpcct reconstruct it first, info says what it holds")
@@ -181,26 +181,26 @@ def _grey_scale(values: Any, level: float | None, window: float | None) -> tuple
 
 
 def add_view(commands: Commands) -> None:
-    parser = commands.add_parser(
-        "view", help="volumes in a page for the browser, or a slice as a picture",
-        description="Draw a slice of a volume, or, with --html, make a page that shows volumes side by side in any "
+    parser = command(
+        commands, "view", _view, "volumes in a page for the browser, or a slice as a picture",
+        "Draw a slice of a volume, or, with --html, make a page that shows volumes side by side in any "
         "browser: three planes, wheel through the slices, window by dragging, one cursor in all volumes, values and "
         "ROIs. The page is one file and needs no network.",
-    )  # fmt: skip
-    parser.set_defaults(run=_view, device="cpu", no_progress=True, verbose=False)
-    examples(
-        parser, "torchpcct view fbp.nii.gz mbir.nii.gz --level 150 --window 600 --html view.html",
+        "torchpcct view fbp.nii.gz mbir.nii.gz --level 150 --window 600 --html view.html",
         "torchpcct view mbir.nii.gz --plane x --slice 18 --out sagittal.png",
     )  # fmt: skip
-    parser.add_argument(
-        "files", type=Path, nargs="+", metavar="VOLUME", help=".nii, .nii.gz, .mha, .h5, .dcm or a DICOM folder"
+    add_options(
+        parser,
+        ("files", Path, "VOLUME", ".nii, .nii.gz, .mha, .h5, .dcm or a DICOM folder", {"nargs": "+"}),
+        ("--html", Path, "FILE", "page to write (.html), of one volume or several"),
+        ("--out", Path, "PATH", "picture: .png, .pdf or .svg (default VOLUME.png)"),
+        ("--level", float, None, "centre of the grey scale (default 40 HU, mm⁻¹: of the values)"),
+        ("--window", float, None, "its width (default 400 HU, mm⁻¹: of the values)", {"limits": {"positive": True}}),
     )
-    to = parser.add_mutually_exclusive_group()
-    to.add_argument("--html", type=Path, metavar="FILE", help="page to write (.html), of one volume or several")
-    to.add_argument("--out", type=Path, metavar="PATH", help="picture: .png, .pdf or .svg (default VOLUME.png)")
     add_force(parser)
-    parser.add_argument("--level", type=float, help="centre of the grey scale (default 40 HU, mm⁻¹: of the values)")
-    parser.add_argument("--window", type=float, help="its width (default 400 HU, mm⁻¹: of the values)")
-    picture = parser.add_argument_group("the picture")
-    picture.add_argument("--plane", choices=("z", "y", "x"), default="z", help="axis across the slice (default z)")
-    picture.add_argument("--slice", type=int, metavar="K", help="index along it (default: the middle)")
+    add_options(
+        parser,
+        ("--plane", str, None, "axis across the slice (default z)", {"choices": ("z", "y", "x"), "default": "z"}),
+        ("--slice", int, "K", "index along it (default: the middle)"),
+        group="the picture",
+    )

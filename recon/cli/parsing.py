@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from torchpcct.files import WriteError, atomic_write, require_folder, require_writable
-from torchpcct.validate import meant
+from torchpcct.validate import meant, number, numbers, whole
 
 __all__ = [
     "SCAN_ENDINGS",
@@ -24,9 +24,11 @@ __all__ = [
     "Parser",
     "add_execution",
     "add_force",
+    "add_options",
     "as_json",
     "as_options",
     "check_ending",
+    "check_limits",
     "check_output",
     "check_results",
     "command",
@@ -47,7 +49,8 @@ Commands = Any
 """What ``add_subparsers`` gives; argparse does not publish its type."""
 
 
-_COMMON = "common options"
+_COMMON, _SEED = "common options", {"low": 0}
+_FORCE = "replace a file that another command or software has made"
 
 
 class _Help(argparse.HelpFormatter):
@@ -65,12 +68,14 @@ class Parser(argparse.ArgumentParser):
 
     Attributes:
         listing: what stands in the help in place of argparse's list of commands.
+        limits: of the values of options, see :func:`add_options`.
     """
 
     listing = ""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(formatter_class=_Help, **options)
+        self.limits: dict[str, dict[str, Any]] = {}
 
     def error(self, message: str) -> NoReturn:
         """Say it with the nearest command, option or value, and exit with status 2."""
@@ -106,33 +111,74 @@ def examples(parser: argparse.ArgumentParser, *lines: str, before: str = "") -> 
     parser.epilog = before + f"{word}:\n" + "".join(f"  {line}\n" for line in lines)
 
 
+def add_options(parser: Parser, *rows: tuple[Any, ...], group: str = "") -> None:
+    """Declare options from a table, with the limits that :func:`check_limits` holds their values to.
+
+    Args:
+        parser: of the command.
+        rows: flags (without dashes: an argument), type (``bool``: a switch), metavar or None, help, and, where there is
+            more to say, a mapping of ``limits`` (of :func:`torchpcct.validate.number`, for several values of each; of
+            whole numbers only ``low``) and of what ``add_argument`` takes.
+        group: title of the group in the help; "": with the others.
+    """
+    to = parser.add_argument_group(group) if group else parser
+    for flag, kind, metavar, text, *more in rows:
+        keys: dict[str, Any] = dict(more[0]) if more else {}
+        limits = keys.pop("limits", None)
+        keys |= {"action": "store_true"} if kind is bool else {"type": kind, "metavar": metavar}
+        action = to.add_argument(*flag.split(), help=text, **keys)
+        if limits is not None:
+            parser.limits[action.dest] = limits
+
+
+def check_limits(arguments: argparse.Namespace, parser: Parser) -> None:
+    """Refuse values beyond the limits of their options (ValueError), before a command does anything."""
+    for name, limits in parser.limits.items():
+        value, flag = getattr(arguments, name), f"--{name.replace('_', '-')}"
+        if isinstance(value, int):
+            whole(flag, value, **limits)
+        elif isinstance(value, float):
+            number(flag, value, **limits)
+        elif value is not None:
+            numbers(flag, value, **limits)
+
+
 def command(
     commands: Commands,
     name: str,
-    run: Callable[..., None],
+    run: Callable[..., Any],
     help: str,
     description: str,
-    out: str,
-    *,
+    *lines: str,
+    out: str = "",
+    before: str = "",
     required: bool = False,
     seed: int | None = 0,
-) -> argparse.ArgumentParser:
-    """A command with the options of all commands.
+) -> Parser:
+    """A command with its examples and, if it makes files, with the options of all that do.
 
     Args:
-        out: help of ``--out``; required: whether it has no default.
+        lines: example commands; before: what stands before them.
+        out: help of ``--out``; "": the command has none of the common options. required: ``--out`` has no default.
         seed: default of ``--seed``; None: the configuration's.
     """
-    parser: argparse.ArgumentParser = commands.add_parser(name, help=help, description=description)
+    parser: Parser = commands.add_parser(name, help=help, description=description)
+    examples(parser, *lines, before=before)
+    if not out:
+        parser.set_defaults(run=run, device="cpu", no_progress=True, verbose=False)
+        return parser
     parser.set_defaults(run=run)
     default = "the configuration's, or 0" if seed is None else f"{seed}"
-    parser.add_argument("--out", type=Path, metavar="PATH", help=out, required=required)
-    common = parser.add_argument_group(_COMMON)
-    common.add_argument("--seed", type=int, default=seed, help=f"first seed of the noise, ≥ 0 (default {default})")
-    common.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where volumes are kept (default cpu)")
-    add_force(common)
-    common.add_argument("--no-progress", action="store_true", help="no progress bars")
-    common.add_argument("-v", "--verbose", action="store_true", help="log what the library does")
+    add_options(parser, ("--out", Path, "PATH", out, {"required": required}))
+    add_options(
+        parser,
+        ("--seed", int, None, f"first seed of the noise, ≥ 0 (default {default})", {"default": seed, "limits": _SEED}),
+        ("--device", str, None, "where volumes are kept (default cpu)", {"choices": ("cpu", "cuda"), "default": "cpu"}),
+        ("--force", bool, None, _FORCE),
+        ("--no-progress", bool, None, "no progress bars"),
+        ("-v --verbose", bool, None, "log what the library does"),
+        group=_COMMON,
+    )
     return parser
 
 
@@ -226,19 +272,18 @@ def tell(arguments: argparse.Namespace, short: str, config: dict[str, Any], **su
     print(text if arguments.json else f"{file}: {short}")
 
 
-def add_execution(parser: argparse.ArgumentParser) -> None:
-    """Where jobs are run, for :func:`executing`."""
-    group = parser.add_argument_group("several processes or machines")
-    group.add_argument("--workers", type=int, metavar="N", help="processes of this machine (default: this one alone)")
-    group.add_argument(
-        "--scheduler",
-        metavar="ADDRESS",
-        default=os.environ.get("DASK_SCHEDULER_ADDRESS"),
-        help="of Dask: tcp://HOST:PORT or its scheduler file (default: $DASK_SCHEDULER_ADDRESS); extra: cluster",
-    )
-    group.add_argument("--threads", type=int, metavar="K", help="of each worker (default: cores / N; of Dask 1)")
-    if not any(action.dest == "dry_run" for action in parser._actions):
-        group.add_argument("--dry-run", action="store_true", help="list the jobs, their time and memory; run none")
+def add_execution(parser: Parser, dry_run: bool = True) -> None:
+    """Where jobs are run, for :func:`executing`; ``dry_run``: False of a command that has this option already."""
+    scheduler = os.environ.get("DASK_SCHEDULER_ADDRESS")
+    add_options(
+        parser,
+        ("--workers", int, "N", "processes of this machine (default: this one alone)"),
+        ("--scheduler", str, "ADDRESS", "of Dask: tcp://HOST:PORT or its scheduler file (default: "
+         "$DASK_SCHEDULER_ADDRESS); extra: cluster", {"default": scheduler}),
+        ("--threads", int, "K", "of each worker (default: cores / N; of Dask 1)"),
+        *([("--dry-run", bool, None, "list the jobs, their time and memory; run none")] if dry_run else []),
+        group="several processes or machines",
+    )  # fmt: skip
 
 
 @contextmanager
@@ -274,7 +319,7 @@ def executing(arguments: argparse.Namespace, out: Path) -> Iterator[Any]:
 
 def add_force(parser: argparse._ActionsContainer) -> None:
     """The option ``--force`` of a command that writes."""
-    parser.add_argument("--force", action="store_true", help="replace a file that another command or software has made")
+    parser.add_argument("--force", action="store_true", help=_FORCE)
 
 
 def check_output(

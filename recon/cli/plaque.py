@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 # What loads torch or numba is imported by the command: help and refusals come at once.
-from recon.cli.parsing import Commands, check_results, command, examples
+from recon.cli.parsing import Commands, add_options, check_results, command
 from torchpcct import VolumeGrid
-from torchpcct.validate import number, numbers, whole
 
 if TYPE_CHECKING:
     from recon.study.study import ProgressBars
@@ -25,13 +24,6 @@ def _plaque(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     folder = arguments.out or Path("out") / "plaque"
     names = ("report.md", "report.json", "tissues.nii.gz", "image.nii.gz", "plaque.png")
     check_results(arguments, folder, lambda report: "presence" in report, *names)
-    voxel = number("--voxel", arguments.voxel, positive=True, unit="mm")
-    number("--point-sd", arguments.point_sd, positive=True, unit="mm")
-    whole("--particles", arguments.particles, 50)
-    whole("--seed", arguments.seed, 0)
-    for name in ("point", "center", "extent"):
-        if getattr(arguments, name) is not None:
-            numbers(f"--{name}", getattr(arguments, name), 3, positive=name == "extent", unit="mm")
     from recon import reconstruct
     from recon.least_squares.inset_problem import InsetProblem
     from recon.plaque.beside import fbp_deviations
@@ -45,8 +37,8 @@ def _plaque(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     from torchpcct.scene.plaque import PAPER_POSITION
 
     believed = VesselPrior(tuple(arguments.wall or VesselPrior.wall), tuple(arguments.fibrous or VesselPrior.fibrous))
-    shape = tuple(math.ceil(e / voxel - 1e-6) for e in arguments.extent or INSET_MM)
-    grid = VolumeGrid(shape, voxel, tuple(arguments.center or PAPER_POSITION[::-1]))
+    shape = tuple(math.ceil(e / arguments.voxel - 1e-6) for e in arguments.extent or INSET_MM)
+    grid = VolumeGrid(shape, arguments.voxel, tuple(arguments.center or PAPER_POSITION[::-1]))
     if arguments.point is not None:
         require_within(arguments.point, grid)
     scan = Scan.load(arguments.scan)
@@ -77,20 +69,22 @@ def add_plaque(commands: Commands) -> None:
         commands, "plaque", _plaque, "read a vessel's tissues: values, outlines and plaque bodies with intervals",
         "Fit a contrast-enhanced vessel's tissues to a scan: outlines of lumen and outer wall, tissue values, plaque "
         "bodies with the probability that they are there; beside each figure what FBP reads over the same regions.",
-        "folder for report.md, report.json, tissues.nii.gz, image.nii.gz and plaque.png (default out/plaque)",
+        "torchpcct plaque plaque.h5 --beside mbir --out reading",
+        out="folder for report.md, report.json, tissues.nii.gz, image.nii.gz and plaque.png (default out/plaque)",
     )  # fmt: skip
-    examples(parser, "torchpcct plaque plaque.h5 --beside mbir --out reading")
-    parser.add_argument("scan", type=Path, metavar="SCAN", help="scan file written by simulate")
+    length, place = {"positive": True, "unit": "mm"}, {"nargs": 3, "limits": {"unit": "mm"}}
+    believed = "its value before the data (default: what is usual; the report says it)"
     axes = ("Z", "Y", "X")
-    parser.add_argument("--point", type=float, nargs=3, metavar=axes, help="where a reader sees the plaque, mm")
-    parser.add_argument("--point-sd", type=float, default=0.4, metavar="MM", help="its error (default 0.4)")
-    parser.add_argument("--particles", type=int, default=300, metavar="N", help="shapes followed (default 300)")
-    for tissue in ("wall", "fibrous"):
-        parser.add_argument(
-            f"--{tissue}", type=float, nargs=2, metavar=("HU", "SD"),
-            help="its value before the data (default: what is usual; the report says it)",
-        )  # fmt: skip
-    parser.add_argument("--beside", nargs="*", default=[], choices=("pwls", "mbir"), help="also read these")
-    parser.add_argument("--voxel", type=float, default=0.2, metavar="MM", help="voxel size (default 0.2)")
-    parser.add_argument("--center", type=float, nargs=3, metavar=axes, help="centre in mm (default: the plaque)")
-    parser.add_argument("--extent", type=float, nargs=3, metavar=axes, help="edge lengths in mm (default: the inset)")
+    add_options(
+        parser,
+        ("scan", Path, "SCAN", "scan file written by simulate"),
+        ("--point", float, axes, "where a reader sees the plaque, mm", place),
+        ("--point-sd", float, "MM", "its error (default 0.4)", {"default": 0.4, "limits": length}),
+        ("--particles", int, "N", "shapes followed (default 300)", {"default": 300, "limits": {"low": 50}}),
+        ("--wall", float, ("HU", "SD"), believed, {"nargs": 2}),
+        ("--fibrous", float, ("HU", "SD"), believed, {"nargs": 2}),
+        ("--beside", str, None, "also read these", {"nargs": "*", "default": [], "choices": ("pwls", "mbir")}),
+        ("--voxel", float, "MM", "voxel size (default 0.2)", {"default": 0.2, "limits": length}),
+        ("--center", float, axes, "centre in mm (default: the plaque)", place),
+        ("--extent", float, axes, "edge lengths in mm (default: the inset)", {"nargs": 3, "limits": length}),
+    )

@@ -15,12 +15,13 @@ from typing import TYPE_CHECKING, Any
 from recon.cli.parsing import (
     SCAN_ENDINGS,
     Commands,
+    Parser,
     add_execution,
+    add_options,
     as_json,
     check_ending,
     check_output,
     command,
-    examples,
     executing,
     length_of,
     tell,
@@ -29,7 +30,7 @@ from recon.cli.parsing import (
 from torchpcct import VolumeGrid
 from torchpcct.files import VERSION, WriteError, fingerprint, is_own_hdf5, require_writable
 from torchpcct.formats.volume_files import check_target, is_own_volume
-from torchpcct.validate import choice, number, numbers, whole
+from torchpcct.validate import choice
 
 if TYPE_CHECKING:
     from recon.study.study import ProgressBars
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
 __all__ = ["add_lower_dose", "add_reconstruct", "add_show_config", "add_simulate", "grid_of_scan"]
 
 _PAPER_VIEWS = 1968
+_LENGTH = {"positive": True, "unit": "mm"}
 MOST_VOXELS = 2**31
 """Of a volume, 8 GiB: what is asked for beyond is a slip of the voxel size."""
 _NO_SIZE = " (the file does not know their size: --pitch MM)"
@@ -76,12 +78,6 @@ def _paper(arguments: argparse.Namespace) -> SimulationConfig:
 def _simulate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     check_ending(arguments.out, SCAN_ENDINGS)
     check_output(arguments, _is_scan, arguments.config, beside=True)
-    if arguments.seed is not None:
-        whole("--seed", arguments.seed, low=0)
-    if arguments.views is not None:
-        whole("--views", arguments.views)
-    if arguments.exposure is not None:
-        number("--exposure", arguments.exposure, positive=True, unit="s")
     if arguments.config is not None and not arguments.config.exists():
         raise FileNotFoundError(f"{arguments.config} does not exist: torchpcct show-config prints an example")
     from torchpcct.acquisition.acquire import acquire, plan
@@ -137,29 +133,29 @@ def _dense(shares: dict[str, float]) -> str:
     return f"above muscle, scanned (scene.dense): {listed}"
 
 
+_OUTPUT = (
+    ("--dry-run", bool, None, "print the plan, memory and time; compute nothing"),
+    ("--json", bool, None, "print the whole summary as JSON"),
+)
+
+
 def add_simulate(commands: Commands) -> None:
     parser = command(
         commands, "simulate", _simulate, "simulate a scan to an HDF5 file",
         "Simulate a scan of any scene (--config, see show-config) or, without one, of the paper's plaque by the "
         "deep-silicon PCCT, and write it to HDF5, with what was done beside (.json, .yaml).",
-        "HDF5 file to write", required=True, seed=None,
-    )  # fmt: skip
-    examples(
-        parser, "torchpcct simulate --exposure 2 --out plaque.h5",
+        "torchpcct simulate --exposure 2 --out plaque.h5",
         "torchpcct show-config > scene.yaml; torchpcct simulate --config scene.yaml --out scan.h5",
+        out="HDF5 file to write", required=True, seed=None,
     )  # fmt: skip
-    parser.add_argument("--config", type=Path, metavar="YAML", help="scene, scanner and exposure")
-    parser.add_argument("--exposure", type=float, metavar="S", help="exposure in s (default: noise free)")
-    parser.add_argument("--views", type=int, help=f"views per rotation of the plaque scan (default {_PAPER_VIEWS})")
-    parser.add_argument(
-        "--whole", action="store_true", help="keep the whole detector, not only the plaque's surroundings"
+    add_options(
+        parser,
+        ("--config", Path, "YAML", "scene, scanner and exposure"),
+        ("--exposure", float, "S", "exposure in s (default: noise free)", {"limits": {"positive": True, "unit": "s"}}),
+        ("--views", int, None, f"views per rotation of the plaque scan (default {_PAPER_VIEWS})", {"limits": {}}),
+        ("--whole", bool, None, "keep the whole detector, not only the plaque's surroundings"),
+        *_OUTPUT,
     )
-    _add_output(parser)
-
-
-def _add_output(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--dry-run", action="store_true", help="print the plan, memory and time; compute nothing")
-    parser.add_argument("--json", action="store_true", help="print the whole summary as JSON")
 
 
 def _show_config(arguments: argparse.Namespace, progress: ProgressBars) -> None:
@@ -170,51 +166,38 @@ def _show_config(arguments: argparse.Namespace, progress: ProgressBars) -> None:
 
 
 def add_show_config(commands: Commands) -> None:
-    parser = commands.add_parser(
-        "show-config", help="print a full example for simulate --config, or of a .yaml stack",
-        description="Print a full YAML example: for simulate --config, or, with --stack, of a stack of projections.",
+    parser = command(
+        commands, "show-config", _show_config, "print a full example for simulate --config, or of a .yaml stack",
+        "Print a full YAML example: for simulate --config, or, with --stack, of a stack of projections.",
+        "torchpcct show-config > scene.yaml", "torchpcct show-config --stack > projections.yaml",
     )  # fmt: skip
-    examples(parser, "torchpcct show-config > scene.yaml", "torchpcct show-config --stack > projections.yaml")
-    parser.add_argument("--stack", action="store_true", help="the file beside TIFF or NumPy projections")
-    parser.set_defaults(run=_show_config, device="cpu", no_progress=True, verbose=False)
+    add_options(parser, ("--stack", bool, None, "the file beside TIFF or NumPy projections"))
 
 
 # --- reconstruct --------------------------------------------------------------------------------------------------
 
 
-def _add_reader_options(parser: argparse._ActionsContainer, number: str | None = None) -> None:
-    """What a file may not know of its scan, see :func:`_reader_options`; ``number`` of files as of argparse."""
-    parser.add_argument(
-        "scan",
-        type=Path,
-        nargs=number,
-        metavar="SCAN",
-        help=".h5 (ours or Data Exchange), .yaml stack, CatSim, DICOM-CT-PD folder",
-    )
-    parser = parser.add_argument_group("what the file does not know of its scan")
-    parser.add_argument(
-        "--geometry",
-        type=Path,
-        metavar="YAML",
-        help="geometry of files that do not hold it; kind: vectors, rtk, or with pose: in place of the file's own",
-    )
-    parser.add_argument("--mu-water", type=float, metavar="MM⁻¹", help="attenuation of water: result in HU")
-    parser.add_argument("--axis", type=float, metavar="COLUMN", help="that the rotation axis projects onto")
-    parser.add_argument(
-        "--pitch", type=float, metavar="MM", help="cell width of parallel beams (of files that do not know it)"
-    )
-    parser.add_argument(
-        "--photons", type=float, metavar="N", help="of an unattenuated reading, of scans given as line integrals"
-    )
-    parser.add_argument("--slices", metavar="A:B", help="slices of parallel and fan beams, or rows of a cone, to read")
+def _add_reader_options(parser: Parser, many: bool = False) -> None:
+    """The scan, or many of them, and what its file may not know, see :func:`_reader_options`."""
+    nargs = {"nargs": "+"} if many else {}
+    add_options(parser, ("scan", Path, "SCAN", ".h5 (ours or Data Exchange), .yaml stack, CatSim, DICOM-CT-PD folder",
+                         nargs))  # fmt: skip
+    add_options(
+        parser,
+        ("--geometry", Path, "YAML", "geometry of files that do not hold it; kind: vectors, rtk, or with pose: in "
+         "place of the file's own"),
+        ("--mu-water", float, "MM⁻¹", "attenuation of water: result in HU"),
+        ("--axis", float, "COLUMN", "that the rotation axis projects onto"),
+        ("--pitch", float, "MM", "cell width of parallel beams (of files that do not know it)"),
+        ("--photons", float, "N", "of an unattenuated reading, of scans given as line integrals"),
+        ("--slices", str, "A:B", "slices of parallel and fan beams, or rows of a cone, to read"),
+        group="what the file does not know of its scan",
+    )  # fmt: skip
 
 
 def _reader_options(arguments: argparse.Namespace) -> dict[str, Any]:
-    options: dict[str, Any] = {}
-    for name in ("axis", "pitch", "mu_water", "photons"):
-        value = getattr(arguments, name)
-        if value is not None:
-            options[name] = value
+    given = {name: getattr(arguments, name) for name in ("axis", "pitch", "mu_water", "photons")}
+    options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     if arguments.slices is not None:
         try:
             first, last = (int(part) if part else None for part in arguments.slices.split(":"))
@@ -400,14 +383,10 @@ def _reconstruct_scan(arguments: argparse.Namespace, progress: ProgressBars) -> 
         arguments.out = Path(f"{without_ending(arguments.scan)}_{arguments.method}.nii{'' if slabs else '.gz'}")
     check_target(arguments.out)
     check_output(arguments, is_own_volume, arguments.scan, arguments.geometry, beside=True)
-    if arguments.voxel is not None:
-        number("--voxel", arguments.voxel, positive=True, unit="mm")
-    for name, limits in (("extent", {"positive": True}), ("center", {})):
+    for name in ("extent", "center"):
         given = getattr(arguments, name)
-        if given is not None:
-            if len(given) not in (2, 3):
-                raise ValueError(f"--{name} takes three numbers, Z Y X, of slices two, Y X; got {len(given)}")
-            numbers(f"--{name}", given, unit="mm", **limits)
+        if given is not None and len(given) not in (2, 3):
+            raise ValueError(f"--{name} takes three numbers, Z Y X, of slices two, Y X; got {len(given)}")
     if arguments.voxel is not None and not slabs:
         _require_voxels(tuple(math.ceil(e / arguments.voxel) for e in arguments.extent or (1.0, 1.0, 1.0)))
     if not arguments.scan.exists():
@@ -540,63 +519,49 @@ def add_reconstruct(commands: Commands) -> None:
         commands, "reconstruct", _reconstruct, "reconstruct a scan file to a volume",
         "Reconstruct a scan, ours or a foreign one, and write the volume, with what was done beside (.json, .yaml). "
         "Many scans go into a folder, each SCAN_METHOD.nii.gz.",
-        "folder of many scans; of one, volume to write: .nii, .nii.gz, .mha, .h5, .zarr, or no ending for DICOM "
-        "(default SCAN_METHOD.nii.gz)",
-    )  # fmt: skip
-    examples(
-        parser, "torchpcct reconstruct tooth.h5 --find-axis --out tooth.nii.gz",
+        "torchpcct reconstruct tooth.h5 --find-axis --out tooth.nii.gz",
         "torchpcct reconstruct scan.h5 --method mbir --fidelity 1 --out mbir.nii.gz",
         "torchpcct reconstruct scans/*.h5 --out volumes --workers 4",
+        out="folder of many scans; of one, volume to write: .nii, .nii.gz, .mha, .h5, .zarr, or no ending for DICOM "
+        "(default SCAN_METHOD.nii.gz)",
     )  # fmt: skip
-    axes = ("Z", "Y", "X")
-    how = parser.add_argument_group("method")
-    how.add_argument("--method", default="fbp", help="fbp, pwls or mbir (default fbp)")
-    how.add_argument("--kernel", help="FBP kernel: soft, standard, detail, bone, ram-lak")
-    how.add_argument(
-        "--fidelity",
-        "--look",
-        type=float,
-        metavar="F",
-        help="of MBIR: 0, quiet … 1, more contrast and noise (default 0.5)",
-    )
-    how.add_argument("--tissues", action="store_true", help="MBIR with the tissues of the vessel in the inset")
-    how.add_argument("--weights", type=Path, metavar="FILE", help="of MBIR: your own (default: those that ship)")
-    how.add_argument("--point", type=float, nargs=3, metavar=axes, help="where a reader sees its plaque, mm")
-    where = parser.add_argument_group("voxels")
-    where.add_argument("--voxel", type=float, metavar="MM", help="voxel size (default: the detector's; inset: 0.25)")
     own = "of a scan of slices Y X alone"
-    where.add_argument(
-        "--center", type=_length, nargs="+", metavar="MM", help=f"centre, Z Y X (default: axis or plaque); {own}"
+    add_options(
+        parser,
+        ("--method", str, None, "fbp, pwls or mbir (default fbp)", {"default": "fbp"}),
+        ("--kernel", str, None, "FBP kernel: soft, standard, detail, bone, ram-lak"),
+        ("--fidelity --look", float, "F", "of MBIR: 0, quiet … 1, more contrast and noise (default 0.5)"),
+        ("--tissues", bool, None, "MBIR with the tissues of the vessel in the inset"),
+        ("--weights", Path, "FILE", "of MBIR: your own (default: those that ship)"),
+        ("--point", float, ("Z", "Y", "X"), "where a reader sees its plaque, mm", {"nargs": 3}),
+        group="method",
     )
-    where.add_argument(
-        "--extent", type=_length, nargs="+", metavar="MM", help=f"edge lengths, Z Y X (default: what is seen); {own}"
+    add_options(
+        parser,
+        ("--voxel", float, "MM", "voxel size (default: the detector's; inset: 0.25)", {"limits": _LENGTH}),
+        ("--center", _length, "MM", f"centre, Z Y X (default: axis or plaque); {own}",
+         {"nargs": "+", "limits": {"unit": "mm"}}),
+        ("--extent", _length, "MM", f"edge lengths, Z Y X (default: what is seen); {own}",
+         {"nargs": "+", "limits": _LENGTH}),
+        ("--memory", str, "SIZE", "limit, e.g. 4GB, for volumes larger than memory: slab by slab to .nii or .zarr "
+         "(default SCAN_METHOD.nii); what was interrupted goes on"),
+        group="voxels",
+    )  # fmt: skip
+    _add_reader_options(parser, many=True)
+    add_options(
+        parser,
+        ("--find-axis", bool, None, "find the rotation axis: of a full turn, or half a turn of parallel rays"),
+        ("--clean", bool, None, "take out stripes and outliers (parallel and fan beams)"),
+        group="corrections of the scan",
     )
-    _add_reader_options(parser, "+")
-    repair_defects = parser.add_argument_group("corrections of the scan")
-    repair_defects.add_argument(
-        "--find-axis",
-        action="store_true",
-        help="find the rotation axis: of a full turn, or half a turn of parallel rays",
-    )
-    repair_defects.add_argument(
-        "--clean", action="store_true", help="take out stripes and outliers (parallel and fan beams)"
-    )
-    where.add_argument(
-        "--memory",
-        metavar="SIZE",
-        help="limit, e.g. 4GB, for volumes larger than memory: slab by slab to .nii or .zarr (default "
-        "SCAN_METHOD.nii); what was interrupted goes on",
-    )
-    _add_output(parser)
-    add_execution(parser)
+    add_options(parser, *_OUTPUT)
+    add_execution(parser, dry_run=False)
 
 
 # --- lower-dose ---------------------------------------------------------------------------------------------------
 
 
 def _lower_dose(arguments: argparse.Namespace, progress: ProgressBars) -> None:
-    number("--fraction", arguments.fraction, positive=True, high=1.0)
-    whole("--seed", arguments.seed, low=0)
     if arguments.out is None:
         arguments.out = Path(f"{without_ending(arguments.scan)}_{arguments.fraction:g}.h5")
     check_ending(arguments.out, SCAN_ENDINGS)
@@ -619,9 +584,13 @@ def add_lower_dose(commands: Commands) -> None:
         "Write a scan, ours or a foreign one, as it would have been at a fraction of its dose, noise included. Photon "
         "counts are thinned, which is exact; other readings get the right mean and variance. Refused where the number "
         "of photons is not known.",
-        "HDF5 file to write (default SCAN_FRACTION.h5)",
+        "torchpcct lower-dose scan.h5 --fraction 0.25 --out quarter.h5",
+        out="HDF5 file to write (default SCAN_FRACTION.h5)",
     )  # fmt: skip
-    examples(parser, "torchpcct lower-dose scan.h5 --fraction 0.25 --out quarter.h5")
     _add_reader_options(parser)
-    parser.add_argument("--fraction", type=float, required=True, metavar="F", help="of the dose, 0 < F ≤ 1")
-    parser.add_argument("--json", action="store_true", help="print the whole summary as JSON")
+    limits = {"positive": True, "high": 1.0}
+    add_options(
+        parser,
+        ("--fraction", float, "F", "of the dose, 0 < F ≤ 1", {"required": True, "limits": limits}),
+        ("--json", bool, None, "print the whole summary as JSON"),
+    )

@@ -47,37 +47,6 @@ def banded_add(begin, end, kernel, x, scale, out):
                             to[i] += scale * (upper[i].conjugate() * above[i])
 
 
-@njit(nogil=True, cache=True)
-def banded_cholesky(begin, end, kernel, least, lower, definite):
-    """L with L Lᴴ = K for every frequency, and whether K is positive definite there.
-
-    Args:
-        kernel: ``(reach + 1, nz, frequencies)`` complex128 lower bands.
-        least: smallest pivot that counts as positive, as a share of the main diagonal.
-        lower: like kernel; filled up to the first pivot that fails.
-        definite: ``(frequencies,)`` bool.
-    """
-    bands, nz, _ = kernel.shape
-    for f in range(begin, end):
-        good = True
-        for j in range(nz):
-            for b in range(min(bands, nz - j)):
-                value = kernel[b, j, f]
-                for i in range(max(0, j + b - bands + 1), j):
-                    value -= lower[j + b - i, i, f] * lower[j - i, i, f].conjugate()
-                if b == 0:
-                    diagonal = kernel[0, j, f].real
-                    if not (diagonal > 0.0 and value.real > least * diagonal):
-                        good = False
-                        break
-                    lower[0, j, f] = math.sqrt(value.real)
-                else:
-                    lower[b, j, f] = value / lower[0, j, f].real
-            if not good:
-                break
-        definite[f] = good
-
-
 @njit(inline="always")
 def _first_failure(matrix, least, lower):
     """Slice at which the banded Cholesky factorisation meets a pivot ≤ least · diagonal; −1 if none."""
@@ -95,6 +64,20 @@ def _first_failure(matrix, least, lower):
             else:
                 lower[b, j] = value / lower[0, j].real
     return -1
+
+
+@njit(nogil=True, cache=True)
+def banded_cholesky(begin, end, kernel, least, lower, definite):
+    """L with L Lᴴ = K for every frequency, and whether K is positive definite there.
+
+    Args:
+        kernel: ``(reach + 1, nz, frequencies)`` complex128 lower bands.
+        least: smallest pivot that counts as positive, as a share of the main diagonal.
+        lower: like kernel; filled up to the first pivot that fails.
+        definite: ``(frequencies,)`` bool.
+    """
+    for f in range(begin, end):
+        definite[f] = _first_failure(kernel[:, :, f], least, lower[:, :, f]) < 0
 
 
 @njit(nogil=True, cache=True)

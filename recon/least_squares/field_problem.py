@@ -1,4 +1,4 @@
-"""A scan of any scanner and the whole field that its rays cross: data, weights, grid; PWLS from the scan to HU.
+"""A scan of any scanner and the whole field that its rays cross: data, weights, grid, PWLS.
 
 Everything that the rays meet must lie in the grid. If readings that miss the grid see something, the problem is solved
 on a larger one (``work``), and the part that was asked for is cut out.
@@ -6,13 +6,11 @@ on a larger one (``work``), and the part that was asked for is cut out.
 
 from __future__ import annotations
 
-import logging
 import math
-import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -27,14 +25,12 @@ from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid
 from torchpcct.projector import Projector
 from torchpcct.scan import Scan
 from torchpcct.vector_geometry import VectorGeometry
-from torchpcct.volume import Volume, in_words, to_hu
+from torchpcct.volume import in_words, to_hu
 
 if TYPE_CHECKING:
     from torchpcct.metrics.residual_test import ResidualTest
 
-__all__ = ["FieldProblem", "field_prior", "is_whole_field", "reconstruct_field", "unfinished"]
-
-_LOG = logging.getLogger(__name__)
+__all__ = ["FieldProblem", "Problem", "Solution", "field_prior", "is_whole_field"]
 
 REFERENCE_VOXEL_MM = 0.25
 # Distance from the minimum, beyond the field of view, from which it is named.
@@ -74,6 +70,47 @@ def is_whole_field(scan: Scan, grid: VolumeGrid) -> bool:
         return True  # an inset of a scan given view by view is solved on all that its rays cross
     edges = zip(grid.extent[1:], grid.center[1:], strict=True)
     return all(extent / 2 - abs(center) >= geometry.fov_radius / math.sqrt(2) for extent, center in edges)
+
+
+class Solution(NamedTuple):
+    """What PWLS makes of a scan.
+
+    Attributes:
+        volume: ``grid.shape`` float32 HU.
+        report: of :func:`recon.least_squares.pwls.pwls`; of several slices the sum of ``exact_pairs``, the worst of the
+            rest.
+        findings: what is to be said of it.
+        tests: what is left of the data, slice by slice; none of a noise-free scan.
+    """
+
+    volume: Tensor
+    report: dict[str, Any]
+    findings: list[str]
+    tests: Sequence[ResidualTest]
+
+
+class Problem(Protocol):
+    """What all scans of a kind share on one grid, as :func:`recon.least_squares.reconstruct.reconstruct_pwls` takes it:
+    :class:`FieldProblem`, :class:`recon.least_squares.inset_problem.InsetProblem`.
+
+    Attributes:
+        warnings: what is to be said of all volumes.
+        unit, mu_ref: of the scans.
+        prior: the one that suits.
+    """
+
+    warnings: list[str]
+    unit: str
+    mu_ref: float
+
+    @property
+    def prior(self) -> QGGMRF: ...
+
+    def solutions(
+        self, scans: Sequence[Scan], prior: QGGMRF, options: PwlsOptions, advance: Callable[[float], None]
+    ) -> Iterator[Solution]:
+        """The volumes of ``scans`` in their order; ``advance`` is told the finished share of them, 0…1."""
+        ...
 
 
 class FieldProblem:
@@ -164,6 +201,35 @@ class FieldProblem:
         parts = torch.stack([self.cut(v) for v in volumes])
         return to_hu(parts.reshape(self.grid.shape), self.mu_ref)
 
+    @property
+    def prior(self) -> QGGMRF:
+        """The one that suits the voxels, :func:`field_prior`."""
+        return field_prior(self.grid.spacing[-1], self.work.ndim)
+
+    def solutions(
+        self, scans: Sequence[Scan], prior: QGGMRF, options: PwlsOptions, advance: Callable[[float], None]
+    ) -> Iterator[Solution]:
+        """PWLS of every scan, slice by slice, from FBP as the first volume; see :class:`Problem`."""
+        hu = self.mu_ref / 1000.0
+        for i, scan in enumerate(scans):
+            slices = self.slices(scan)
+            results, tests = [], []
+            for k, (y, w) in enumerate(slices):
+                results.append(pwls(self.projector, y, w, prior, mu_per_hu=hu, start=self.start(y), **options))
+                if not scan.noise_free:
+                    tests.append(self.residual_test(y, w, results[-1].x))
+                advance((i + (k + 1) / len(slices)) / len(scans))
+            report = {**joined([dict(r.report) for r in results]), "work_grid": self.work.shape}
+            found = []
+            if report["undetermined_rmsd_hu"] > UNDETERMINED_HU:
+                found.append(
+                    f"{100 * report['undetermined']:.0f} % of the voxels are missed by some views (corners beyond the "
+                    "field of view, outer slices): there the volume is "
+                    f"{in_words(report['undetermined_rmsd_hu'], self.unit, self.mu_ref)} from the minimum"
+                )
+            found += sorted({text for test in tests for text in test.findings})
+            yield Solution(self.hu([r.x for r in results]).to(torch.float32), report, found, tests)
+
     def residual_test(self, y: Tensor, w: Tensor, x: Tensor) -> ResidualTest:
         """Whether a volume ``work.shape`` in mm⁻¹ explains the readings of one slice."""
         from torchpcct.metrics.residual_test import residual_test  # loads scipy.stats
@@ -208,73 +274,6 @@ def larger_grid(grid: VolumeGrid, geometry: Any) -> VolumeGrid:
     return VolumeGrid(tuple(shape), grid.spacing, tuple(center))
 
 
-def reconstruct_field(
-    scans: Sequence[Scan],
-    grid: VolumeGrid,
-    *,
-    progress: Callable[[float], None] | None = None,
-    prior: QGGMRF | None = None,
-    **options: Unpack[PwlsOptions],
-) -> list[Volume]:
-    """PWLS of whole fields, slice by slice for parallel and fan beams, from FBP as the first volume.
-
-    Args:
-        scans: of one geometry.
-        grid: see :class:`FieldProblem`.
-        progress: called with the finished fraction.
-        prior: None: :func:`field_prior` of the grid.
-        options: of :func:`recon.least_squares.pwls.pwls`; ``tolerance`` is 1 HU unless given.
-
-    Returns:
-        Volumes in HU. Report: that of :func:`recon.least_squares.pwls.pwls` (of several slices the sum of
-        ``exact_pairs`` and ``seconds``, the worst of the rest), ``chi2``, ``residual_p``, ``warnings``.
-
-    Raises:
-        ValueError, TypeError: see :class:`FieldProblem` and :func:`recon.least_squares.pwls.pwls`.
-    """
-    began = time.perf_counter()
-    options = {"tolerance": 1.0, **options}
-    problem = FieldProblem(scans[0], grid)
-    prior = prior or field_prior(grid.spacing[-1], problem.work.ndim)
-    volumes = []
-    for i, scan in enumerate(scans):
-        slices = problem.slices(scan)
-        results, tests = [], []
-        for k, (y, w) in enumerate(slices):
-            result = pwls(
-                problem.projector, y, w, prior, mu_per_hu=problem.mu_ref / 1000.0, start=problem.start(y), **options,
-            )  # fmt: skip
-            results.append(result)
-            if not scan.noise_free:
-                tests.append(problem.residual_test(y, w, result.x))
-            if progress is not None:
-                progress((i + (k + 1) / len(slices)) / len(scans))
-        report = joined([dict(r.report) for r in results])
-        report["seconds"] = round(time.perf_counter() - began, 3)
-        found = list(problem.warnings)
-        if not report["converged"]:
-            found.append(unfinished(report, problem.unit, problem.mu_ref))
-            warnings.warn(found[-1], RuntimeWarning, stacklevel=2)
-        if report["undetermined_rmsd_hu"] > UNDETERMINED_HU:
-            found.append(
-                f"{100 * report['undetermined']:.0f} % of the voxels are missed by some views (corners beyond the "
-                "field of view, outer slices): there the volume is "
-                f"{in_words(report['undetermined_rmsd_hu'], problem.unit, problem.mu_ref)} from the minimum"
-            )
-        found += sorted({text for test in tests for text in test.findings})
-        if tests:
-            report["chi2"] = sum(t.chi2 for t in tests) / len(tests)
-            names = tests[0].p_values
-            report["residual_p"] = {name: min(t.p_values.get(name, 1.0) for t in tests) for name in names}
-        for text in found:
-            _LOG.warning("%s", text)
-        report["work_grid"] = problem.work.shape
-        data = problem.hu([r.x for r in results]).to(torch.float32)
-        volumes.append(Volume(data, grid, {**report, "warnings": found}))
-        began = time.perf_counter()
-    return volumes
-
-
 def joined(reports: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """One report of several slices: counts are added, the worst slice speaks for the rest."""
     worst = dict(max(reports, key=lambda r: (not r["converged"], r["rmsd_hu"][-1] if r["rmsd_hu"] else 0.0)))
@@ -283,12 +282,3 @@ def joined(reports: Sequence[dict[str, Any]]) -> dict[str, Any]:
         worst["misfit"] = [m for r in reports for m in r["misfit"]]
         worst["slices"] = len(reports)
     return worst
-
-
-def unfinished(report: dict[str, Any], unit: str = "HU", mu_water: float = 0.02) -> str:
-    """Says how far from the minimum a volume is that did not converge."""
-    left, asked = (in_words(v, unit, mu_water) for v in (report["rmsd_hu"][-1], report["tolerance_hu"]))
-    return (
-        f"PWLS stopped {left} from the minimum after {report['exact_pairs']} projection pairs (tolerance {asked}): "
-        "raise max_exact, or strengthen the prior"
-    )

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import copy
-import logging
-import time
-import warnings
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
@@ -18,7 +15,7 @@ from recon.analytic.coverage import check_rows
 from recon.analytic.inset import require_inside, require_same_surround, static_fbp
 from recon.gram.gram import Gram
 from recon.least_squares.field_model import FieldModel
-from recon.least_squares.field_problem import is_whole_field, reconstruct_field, unfinished
+from recon.least_squares.field_problem import Solution, is_whole_field
 from recon.least_squares.pwls import PwlsOptions, data_model, pwls
 from recon.least_squares.qggmrf import DEFAULT_PRIOR, QGGMRF
 from recon.least_squares.surround import UnknownSurround
@@ -26,14 +23,12 @@ from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import VolumeGrid
 from torchpcct.projector import Projector
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
-from torchpcct.volume import Volume, to_hu
+from torchpcct.volume import to_hu
 
-__all__ = ["InsetProblem", "Statistic", "reconstruct_pwls"]
+__all__ = ["InsetProblem", "Statistic"]
 
 if TYPE_CHECKING:
     from torchpcct.metrics.residual_test import ResidualTest
-
-_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -78,6 +73,8 @@ class InsetProblem:
         ValueError: a grid outside the field of view or the scan's region; a spectral or energy-integrating scan.
     """
 
+    prior = DEFAULT_PRIOR
+
     def __init__(self, scan: Scan, grid: VolumeGrid, nodes: int = 5, *, motion: Any = None) -> None:
         if scan.counts.ndim != 3:
             raise ValueError("PWLS in HU needs a counting-mode scan; decompose or sum the energy bins before")
@@ -86,7 +83,8 @@ class InsetProblem:
         self.grid, self.geometry = grid, scan.geometry
         self.outer = scan.window or DetectorWindow.full(scan.geometry)
         check_rows(scan.geometry, grid, motion)
-        self.mu_ref = scan.linearisation.mu_ref
+        self.mu_ref, self.unit = scan.linearisation.mu_ref, scan.unit
+        self.warnings: list[str] = []
         self._nodes = nodes
         self._around: UnknownSurround | None = None
         self._background: Tensor | None = None
@@ -181,7 +179,7 @@ class InsetProblem:
         if self._background is None:
             return self.outer.crop(scan.line_integrals(), self.window)
         require_same_surround(scan, self._background)
-        # Only what the inset shadows is taken the logarithm of; the bridge over dead readings needs their neighbours.
+        # The logarithm is taken of the footprint alone; the bridge over dead readings needs their neighbours.
         near = scan if scan.dead is not None or scan.window is None else scan.crop(self.window)
         lines = near.line_integrals()
         if near is scan:
@@ -243,71 +241,13 @@ class InsetProblem:
         )  # fmt: skip
         return to_hu(result.x + self.level, self.mu_ref), dict(result.report)
 
-
-def _tested(problem: InsetProblem, scan: Scan, data: Tensor, volume: Volume) -> Volume:
-    """The volume with what its residual says; findings are logged as warnings, too."""
-    found = problem.residual_test(scan, volume.data, data)
-    for text in found.findings:
-        _LOG.warning("%s", text)
-    tested = {
-        "chi2": found.chi2,
-        "residual_p": dict(found.p_values),
-        "warnings": [*volume.report["warnings"], *found.findings],
-    }
-    return replace(volume, report={**volume.report, **tested})
-
-
-def reconstruct_pwls(
-    scans: Sequence[Scan],
-    grid: VolumeGrid,
-    *,
-    progress: Callable[[float], None] | None = None,
-    prior: QGGMRF | None = None,
-    problem: InsetProblem | None = None,
-    batch: int = 1,
-    **options: Unpack[PwlsOptions],
-) -> list[Volume]:
-    """PWLS with a q-GGMRF prior, to convergence: of an inset, or of a whole field of view
-    (:func:`recon.least_squares.field_problem.reconstruct_field`, for every scan of a parallel or fan beam).
-
-    Args:
-        scans: realisations of one scan at one exposure.
-        grid: the inset, or the field.
-        progress: called with the finished fraction.
-        prior: None: :data:`recon.least_squares.qggmrf.DEFAULT_PRIOR`; of a whole field
-            :func:`recon.least_squares.field_problem.field_prior`.
-        problem: kept from an earlier call with the same scan and grid; None: made here.
-        batch: volumes solved at a time; they iterate until the slowest has converged.
-        options: of :func:`recon.least_squares.pwls.pwls`; ``tolerance`` is 1 HU unless given.
-
-    Returns:
-        Volumes in HU with the solver's report; of noisy scans also ``chi2`` (weighted squared residual per reading),
-        ``residual_p`` and ``warnings`` of :func:`torchpcct.metrics.residual_test.residual_test`: a volume that does not
-        explain its data (wrong centre, drifting gain, metal or a body beyond the grid) is not given out without a word.
-        A volume whose iteration did not reach ``tolerance`` says so in ``warnings``, too, and a :class:`RuntimeWarning`
-        is given.
-
-    Raises:
-        ValueError, TypeError: see :class:`InsetProblem` and :func:`recon.least_squares.pwls.pwls`.
-    """
-    if problem is None and is_whole_field(scans[0], grid):
-        return reconstruct_field(scans, grid, progress=progress, prior=prior, **options)
-    start = time.perf_counter()
-    options = {"tolerance": 1.0, **options}
-    problem = problem or InsetProblem(scans[0], grid)
-    volumes: list[Volume] = []
-    for i in range(0, len(scans), batch):
-        part = scans[i : i + batch]
-        data = [problem.data(s) for s in part]
-        found, report = problem.solve(part, prior or DEFAULT_PRIOR, data, **options)
-        open_ends = [] if report["converged"] else [unfinished(report)]
-        for text in open_ends:
-            warnings.warn(text, RuntimeWarning, stacklevel=2)
-        report["seconds"] = round((time.perf_counter() - start) / len(part), 3)
-        for scan, lines, values in zip(part, data, found, strict=True):
-            volume = Volume(values.to(torch.float32), grid, {**report, "warnings": open_ends})
-            volumes.append(volume if scan.noise_free else _tested(problem, scan, lines, volume))
-        start = time.perf_counter()
-        if progress is not None:
-            progress(min(i + batch, len(scans)) / len(scans))
-    return volumes
+    def solutions(
+        self, scans: Sequence[Scan], prior: QGGMRF, options: PwlsOptions, advance: Callable[[float], None]
+    ) -> Iterator[Solution]:
+        """PWLS of all scans together; see :class:`recon.least_squares.field_problem.Problem`."""
+        data = [self.data(s) for s in scans]
+        found, report = self.solve(scans, prior, data, **options)
+        for scan, lines, values in zip(scans, data, found.to(torch.float32), strict=True):
+            tests = [] if scan.noise_free else [self.residual_test(scan, values, lines)]
+            yield Solution(values, report, [text for test in tests for text in test.findings], tests)
+        advance(1.0)

@@ -72,7 +72,7 @@ class PwlsResult:
             ``model`` ("gram" or "gradient": who proposed the last step), ``model_misfit`` (of the FFT model on the
             first step, None without one), ``misfit`` (weighted squared residual per reading of positive weight, one
             entry per volume: about 1 for the right weights and many more readings than unknowns; from
-            :func:`solve_normal`, which does not know the data, None), ``seconds``, and the prior (``strength``,
+            :func:`solve_normal`, unless it is told of the data, None), ``seconds``, and the prior (``strength``,
             ``lambda``, ``threshold_hu_per_mm``, ``p``, ``q``).
     """
 
@@ -140,6 +140,16 @@ def pwls(
         ValueError: shapes that do not fit, data that are not finite, weights that are negative or all 0,
             a tolerance ≤ 0, too little memory.
         TypeError: data or weights that are not float tensors.
+
+    Example:
+        >>> import numpy as np, torch
+        >>> from recon.least_squares.qggmrf import DEFAULT_PRIOR
+        >>> from torchpcct import ParallelBeam, Projector, VolumeGrid
+        >>> A = Projector(ParallelBeam(np.arange(30) * np.pi / 30, 24, 1.0), VolumeGrid((16, 16), 1.0))
+        >>> lines = A(torch.full(A.domain_shape, 0.02))
+        >>> found = pwls(A, lines, torch.full(A.range_shape, 1e4), DEFAULT_PRIOR, tolerance=1.0)
+        >>> found.report["converged"], round(float(found.x.mean()), 3)
+        (True, 0.02)
     """
     if hu is not None:
         mu_per_hu = renamed("hu", "mu_per_hu", hu)
@@ -158,12 +168,11 @@ def pwls(
 
     axes = len(A.range_shape)
     energy = dot(weighted, torch.where(known, y, torch.zeros_like(y)), axes)
-    result, change = _solve(
+    result = solve_normal(
         A.T(weighted), exact, model, prior, mu_per_hu=mu_per_hu, spacing=A.grid.spacing, start=start,
-        tolerance=tolerance, max_exact=max_exact, callback=callback,
+        tolerance=tolerance, max_exact=max_exact, callback=callback, data=(energy.reshape(-1), int(known.sum())),
     )  # fmt: skip
-    misfit = (energy.reshape(-1) + 2 * change).clamp_min(0) / int(known.sum())
-    return PwlsResult(result.x, {**result.report, "misfit": misfit.tolist(), "seconds": time.perf_counter() - started})
+    return PwlsResult(result.x, {**result.report, "seconds": time.perf_counter() - started})
 
 
 @checked
@@ -225,6 +234,7 @@ def solve_normal(
     tolerance: float = 0.2,
     max_exact: int = 200,
     callback: Callable[[dict[str, Any]], None] | None = None,
+    data: tuple[Tensor, int] | None = None,
 ) -> PwlsResult:
     """The same from the sufficient statistic b = AᵀW y: minimise ½ xᵀHx − bᵀx + R(x).
 
@@ -235,29 +245,9 @@ def solve_normal(
             ``information(mu_per_hu)``; or a :class:`recon.least_squares.field_model.FieldModel`.
         spacing: voxel size per axis in mm.
         channels: whether the volumes have an axis of channels, which the prior joins and ``gram`` treats alike.
+        data: yᵀW y of each volume, ``(batch,)``, and the number of readings of positive weight, for ``misfit``.
         prior, mu_per_hu, start, tolerance, max_exact, callback: see :func:`pwls`.
     """
-    return _solve(
-        b, exact, gram, prior, mu_per_hu=mu_per_hu, spacing=spacing, channels=channels, start=start,
-        tolerance=tolerance, max_exact=max_exact, callback=callback,
-    )[0]  # fmt: skip
-
-
-def _solve(
-    b: Tensor,
-    exact: Callable[[Tensor], Tensor],
-    gram: Any,
-    prior: QGGMRF | BoundPrior,
-    *,
-    mu_per_hu: float,
-    spacing: tuple[float, ...],
-    channels: bool = False,
-    start: Tensor | None,
-    tolerance: float,
-    max_exact: int,
-    callback: Callable[[dict[str, Any]], None] | None,
-) -> tuple[PwlsResult, Tensor]:
-    """:func:`solve_normal`, and ½ xᵀHx − bᵀx of each volume, ``(batch,)`` float64."""
     started = time.perf_counter()
     axes = len(spacing) + channels
     shape = b.shape[-axes:]
@@ -346,6 +336,8 @@ def _solve(
             "PWLS stopped after %d exact pairs, %.3g HU from the minimum (tolerance %.3g HU): raise max_exact",
             pairs, distances[-1], tolerance,
         )  # fmt: skip
+    change = 0.5 * dot(x, data_gradient - b, axes)  # ½ xᵀHx − bᵀx
+    misfits = None if data is None else ((data[0] + 2 * change).clamp_min(0) / data[1]).tolist()
     report = {
         "method": "pwls",
         "exact_pairs": pairs,
@@ -358,7 +350,7 @@ def _solve(
         "tolerance_hu": tolerance,
         "model": "gram" if isinstance(proposer, ModelSolver) else "gradient",
         "model_misfit": misfit,
-        "misfit": None,
+        "misfit": misfits,
         "strength": prior.strength if isinstance(prior, QGGMRF) else None,
         "lambda": bound.lam,
         "threshold_hu_per_mm": bound.threshold,
@@ -366,7 +358,7 @@ def _solve(
         "q": bound.q,
         "seconds": time.perf_counter() - started,
     }
-    return PwlsResult(x.reshape(*lead, *shape), report), 0.5 * dot(x, data_gradient - b, axes)
+    return PwlsResult(x.reshape(*lead, *shape), report)
 
 
 def _misfit(gram: NormalOperator, step: Tensor, curved: Tensor, axes: int) -> float:

@@ -261,8 +261,7 @@ class BoundPrior:
 
         a, b = self._volumes(x), self._volumes(direction)
         out = np.empty_like(a)
-        kernel: Any = kernels.majorize_channels if self.channels else kernels.majorize
-        self._by_rows(kernel, a, b, *self._tables(a.dtype, both=True), out)
+        self._by_rows(kernels.majorize, a, b, *self._tables(a.dtype, both=True), out)
         return torch.from_numpy(out).reshape(x.shape)
 
     def _fused_along(self, x: Tensor, direction: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
@@ -270,8 +269,7 @@ class BoundPrior:
 
         a, v, u = self._volumes(x), self._volumes(direction), self._volumes(other)
         rows = np.empty((a.shape[0], *a.shape[-3:-1], 2))
-        kernel: Any = kernels.along_channels if self.channels else kernels.along
-        self._by_rows(kernel, a, u, v, *self._tables(a.dtype, both=False), rows)
+        self._by_rows(kernels.along, a, u, v, *self._tables(a.dtype, both=False), rows)
         sums = torch.from_numpy(rows.sum(axis=(1, 2))).reshape(*x.shape[: x.dim() - self.axes], 2)
         return sums[..., 0], sums[..., 1]
 
@@ -280,9 +278,9 @@ class BoundPrior:
         run(kernel, rows, x, *rest, operations=4 * len(self.offsets) * x.size // rows)
 
     def _volumes(self, x: Tensor) -> NDArray[Any]:
-        """``(batch, [channels,] nz, ny, nx)`` contiguous."""
+        """``(batch, channels, nz, ny, nx)`` contiguous."""
         n = len(self.spacing)
-        shape = (*x.shape[-self.axes : -n], *(1,) * (3 - n), *x.shape[-n:])
+        shape = (x.shape[-self.axes] if self.channels else 1, *(1,) * (3 - n), *x.shape[-n:])
         return x.detach().reshape(-1, *shape).contiguous().numpy()
 
     def _tables(self, dtype: Any, both: bool) -> tuple[Any, ...]:

@@ -1,13 +1,12 @@
 """CPU kernels of the q-GGMRF: the passes of :class:`recon.least_squares.qggmrf.BoundPrior`, fused over all neighbours.
 
 The curvature formula is that of ``BoundPrior.curvature``, to which the tests compare these kernels. Rows of voxels are
-independent of each other in every pass, so results do not depend on the number of threads;
-``begin … end`` of ``batch · nz · ny`` are worked on. Inner loops run over slices
-with unsigned indices and without branches (one loop for each kind of potential), so that they vectorise.
+independent of each other in every pass, so results do not depend on the number of threads; ``begin … end`` of
+``batch · nz · ny`` are worked on. Inner loops run over slices with unsigned indices and without branches (one loop for
+each kind of potential), so that they vectorise.
 
-Several channels have passes of their own, with the same formula: the curvature of the length of the channels'
-difference is written to a buffer first and serves them all. In one pass for any number of channels a single one took
-5 to 14 % longer.
+Of several channels the curvature of the length of their difference is written to a buffer first and serves them all; a
+single one, which would take 5 to 14 % longer that way, does without.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-__all__ = ["along", "along_channels", "majorize", "majorize_channels"]
+__all__ = ["along", "majorize"]
 
 _FLAGS = {"contract", "reassoc", "arcp", "nsz"}
 # Kernels that allocate nothing need no reference counts, which took a fifth of the time: one for every row's slice.
@@ -92,69 +91,6 @@ def _two_sums(x0, x1, u0, u1, v0, v1, scale, kind, form):
     return a, b
 
 
-@njit(**_VIEWS_ONLY)
-def majorize(begin, end, x, v, steps, scales, factors, kind, form, out):
-    """out = Σ_neighbours factor · ρ'(t)/t · (v_j − v_k), t = scale · (x_j − x_k).
-
-    Args:
-        x, v: ``(batch, nz, ny, nx)`` contiguous.
-        steps: ``(neighbours, 3)`` int64, ALL neighbours (both signs).
-        scales, factors: ``(neighbours,)`` in the dtype of x: 1 / (mu_per_hu d) and λ V ω / (mu_per_hu d)².
-        kind: 0 quadratic, 1 p = 2 and q = 1 (no powers), 2 general.
-        form: ``(5,)`` in the dtype of x: 1 / T, p − q, q / p, p − 2, ε / T.
-        out: like x.
-    """
-    _, nz, ny, nx = x.shape
-    for row in range(begin, end):
-        n = row // (nz * ny)
-        z = (row // ny) % nz
-        y = row % ny
-        to = out[n, z, y]
-        to[:] = 0
-        for k in range(steps.shape[0]):
-            z1, y1, dx = z + steps[k, 0], y + steps[k, 1], steps[k, 2]
-            if z1 < 0 or z1 >= nz or y1 < 0 or y1 >= ny:
-                continue
-            low, high = max(0, -dx), nx - max(0, dx)
-            _add_pull(
-                x[n, z, y, low:high], x[n, z1, y1, low + dx : high + dx],
-                v[n, z, y, low:high], v[n, z1, y1, low + dx : high + dx],
-                scales[k], factors[k], kind, form, to[low:high],
-            )  # fmt: skip
-
-
-@njit(**_VIEWS_ONLY)
-def along(begin, end, x, u, v, steps, scales, factors, kind, form, out):
-    """Row sums of the two inner products ⟨v, M(x) x⟩ and ⟨v, M(x) u⟩, M the matrix of :func:`majorize`.
-
-    Args:
-        steps, scales, factors: HALF of the neighbours.
-        out: ``(batch, nz, ny, 2)`` float64.
-        x, u, v, kind, form: as in :func:`majorize`.
-    """
-    _, nz, ny, nx = x.shape
-    for row in range(begin, end):
-        n = row // (nz * ny)
-        z = (row // ny) % nz
-        y = row % ny
-        first = second = 0.0
-        for k in range(steps.shape[0]):
-            z1, y1, dx = z + steps[k, 0], y + steps[k, 1], steps[k, 2]
-            if z1 < 0 or z1 >= nz or y1 < 0 or y1 >= ny:
-                continue
-            low, high = max(0, -dx), nx - max(0, dx)
-            a, b = _two_sums(
-                x[n, z, y, low:high], x[n, z1, y1, low + dx : high + dx],
-                u[n, z, y, low:high], u[n, z1, y1, low + dx : high + dx],
-                v[n, z, y, low:high], v[n, z1, y1, low + dx : high + dx],
-                scales[k], kind, form,
-            )  # fmt: skip
-            first += factors[k] * a
-            second += factors[k] * b
-        out[n, z, y, 0] = first
-        out[n, z, y, 1] = second
-
-
 @njit(inline="always")
 def _curvatures(x0, x1, scale, factor, kind, form, out):
     """out = factor · ρ'(t)/t for every voxel of a row, t = scale · |x0 − x1|; x0, x1 ``(channels, n)``."""
@@ -181,12 +117,10 @@ def _curvatures(x0, x1, scale, factor, kind, form, out):
 
 
 @njit(**_VIEWS_ONLY)
-def _majorize_channels(begin, end, x, v, steps, scales, factors, kind, form, out, work):
+def _majorize(begin, end, x, v, steps, scales, factors, kind, form, out, work):
     _, channels, nz, ny, nx = x.shape
     for row in range(begin, end):
-        n = row // (nz * ny)
-        z = (row // ny) % nz
-        y = row % ny
+        n, z, y = row // (nz * ny), (row // ny) % nz, row % ny
         for c in range(channels):
             out[n, c, z, y, :] = 0
         for k in range(steps.shape[0]):
@@ -194,6 +128,13 @@ def _majorize_channels(begin, end, x, v, steps, scales, factors, kind, form, out
             if z1 < 0 or z1 >= nz or y1 < 0 or y1 >= ny:
                 continue
             low, high = max(0, -dx), nx - max(0, dx)
+            if channels == 1:
+                _add_pull(
+                    x[n, 0, z, y, low:high], x[n, 0, z1, y1, low + dx : high + dx],
+                    v[n, 0, z, y, low:high], v[n, 0, z1, y1, low + dx : high + dx],
+                    scales[k], factors[k], kind, form, out[n, 0, z, y, low:high],
+                )  # fmt: skip
+                continue
             w = work[low:high]
             _curvatures(
                 x[n, :, z, y, low:high], x[n, :, z1, y1, low + dx : high + dx], scales[k], factors[k], kind, form, w
@@ -206,24 +147,42 @@ def _majorize_channels(begin, end, x, v, steps, scales, factors, kind, form, out
 
 
 @njit(nogil=True, cache=True, fastmath=_FLAGS, error_model="numpy")
-def majorize_channels(begin, end, x, v, steps, scales, factors, kind, form, out):
-    """:func:`majorize` for x, v and out ``(batch, channels, nz, ny, nx)``; ``|x_j − x_k|`` in t, over the channels."""
-    _majorize_channels(begin, end, x, v, steps, scales, factors, kind, form, out, np.empty(x.shape[-1], x.dtype))
+def majorize(begin, end, x, v, steps, scales, factors, kind, form, out):
+    """out = Σ_neighbours factor · ρ'(t)/t · (v_j − v_k), t = scale · |x_j − x_k|, the length over the channels.
+
+    Args:
+        x, v: ``(batch, channels, nz, ny, nx)`` contiguous.
+        steps: ``(neighbours, 3)`` int64, ALL neighbours (both signs).
+        scales, factors: ``(neighbours,)`` in the dtype of x: 1 / (mu_per_hu d) and λ V ω / (mu_per_hu d)².
+        kind: 0 quadratic, 1 p = 2 and q = 1 (no powers), 2 general.
+        form: ``(5,)`` in the dtype of x: 1 / T, p − q, q / p, p − 2, ε / T.
+        out: like x.
+    """
+    _majorize(begin, end, x, v, steps, scales, factors, kind, form, out, np.empty(x.shape[-1], x.dtype))
 
 
 @njit(**_VIEWS_ONLY)
-def _along_channels(begin, end, x, u, v, steps, scales, factors, kind, form, out, work):
+def _along(begin, end, x, u, v, steps, scales, factors, kind, form, out, work):
     _, channels, nz, ny, nx = x.shape
+    one = form[0] / form[0]
     for row in range(begin, end):
-        n = row // (nz * ny)
-        z = (row // ny) % nz
-        y = row % ny
+        n, z, y = row // (nz * ny), (row // ny) % nz, row % ny
         first = second = 0.0
         for k in range(steps.shape[0]):
             z1, y1, dx = z + steps[k, 0], y + steps[k, 1], steps[k, 2]
             if z1 < 0 or z1 >= nz or y1 < 0 or y1 >= ny:
                 continue
             low, high = max(0, -dx), nx - max(0, dx)
+            if channels == 1:
+                a, b = _two_sums(
+                    x[n, 0, z, y, low:high], x[n, 0, z1, y1, low + dx : high + dx],
+                    u[n, 0, z, y, low:high], u[n, 0, z1, y1, low + dx : high + dx],
+                    v[n, 0, z, y, low:high], v[n, 0, z1, y1, low + dx : high + dx],
+                    scales[k], kind, form,
+                )  # fmt: skip
+                first += factors[k] * a
+                second += factors[k] * b
+                continue
             w = work[low:high]
             _curvatures(
                 x[n, :, z, y, low:high], x[n, :, z1, y1, low + dx : high + dx], scales[k], factors[k], kind, form, w
@@ -232,7 +191,7 @@ def _along_channels(begin, end, x, u, v, steps, scales, factors, kind, form, out
                 x0, x1 = x[n, c, z, y, low:high], x[n, c, z1, y1, low + dx : high + dx]
                 u0, u1 = u[n, c, z, y, low:high], u[n, c, z1, y1, low + dx : high + dx]
                 v0, v1 = v[n, c, z, y, low:high], v[n, c, z1, y1, low + dx : high + dx]
-                a = b = form[0] - form[0]
+                a = b = one - one
                 for j in range(high - low):
                     i = np.uint64(j)
                     pull = w[i] * (v0[i] - v1[i])
@@ -245,6 +204,12 @@ def _along_channels(begin, end, x, u, v, steps, scales, factors, kind, form, out
 
 
 @njit(nogil=True, cache=True, fastmath=_FLAGS, error_model="numpy")
-def along_channels(begin, end, x, u, v, steps, scales, factors, kind, form, out):
-    """:func:`along` for x, u and v ``(batch, channels, nz, ny, nx)``, M the matrix of :func:`majorize_channels`."""
-    _along_channels(begin, end, x, u, v, steps, scales, factors, kind, form, out, np.empty(x.shape[-1], x.dtype))
+def along(begin, end, x, u, v, steps, scales, factors, kind, form, out):
+    """Row sums of the two inner products ⟨v, M(x) x⟩ and ⟨v, M(x) u⟩, M the matrix of :func:`majorize`.
+
+    Args:
+        steps, scales, factors: HALF of the neighbours.
+        out: ``(batch, nz, ny, 2)`` float64.
+        x, u, v, kind, form: as in :func:`majorize`.
+    """
+    _along(begin, end, x, u, v, steps, scales, factors, kind, form, out, np.empty(x.shape[-1], x.dtype))

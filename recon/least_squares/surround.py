@@ -59,7 +59,7 @@ class UnknownSurround:
         self._first, self._second = (_Field(geometry, grid, mm) for mm in (COARSE_MM, SECOND * COARSE_MM))
         self.coarse = self._first.grid
         self._left = Projector(self._second.inner, self.coarse)
-        self._shadow = Projector(geometry, self.coarse, window)
+        self._around = Projector(geometry, self.coarse, window)
         self._last: tuple[bytes, Tensor] | None = None
 
     def volume(self, lines: Tensor) -> Tensor:
@@ -114,7 +114,7 @@ class UnknownSurround:
         """
         volume = self.volume(lines)
         kept = self._all.crop(lines, self.window)
-        return kept - self._shadow(volume) + self.projector(self.inside(volume) - level)
+        return kept - self._around(volume) + self.projector(self.inside(volume) - level)
 
 
 class _Field:

@@ -4,7 +4,7 @@ Opt-in: for a contrast-enhanced vessel with a plaque, not for looking at images.
 over all of the tissue instead of over a small ROI, and its uncertainty holds that of the outlines.
 
 :mod:`~recon.plaque.reading` does all of it (:func:`~recon.plaque.reading.read_plaque`). Below it, in the order of the
-data: :mod:`~recon.plaque.data` and :mod:`~recon.plaque.stationary` (statistic and operator, of a scan or of a volume),
+data: :mod:`~recon.plaque.data` (statistic and operator of a scan),
 :mod:`~recon.plaque.start` and :mod:`~recon.plaque.centreline` (where the vessel is), :mod:`~recon.plaque.vessel_prior`,
 :mod:`~recon.plaque.outline` and :mod:`~recon.plaque.vessel` (its model and fit), :mod:`~recon.plaque.core` and
 :mod:`~recon.plaque.particles` (plaque bodies), :mod:`~recon.plaque.figures` (draws of what is reported),

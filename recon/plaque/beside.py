@@ -6,8 +6,6 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
 from recon.analytic.exact_noise import roi_adjoints
 from recon.analytic.inset import InsetFbp
 from recon.plaque.reading import core_regions
@@ -22,9 +20,8 @@ def fbp_deviations(scan: Scan, grid: VolumeGrid, regions: Mapping[str, Any], ker
     """Standard deviation in HU of FBP's mean over each region, and of the contrast, of the noise alone.
 
     One adjoint pass a region (:mod:`recon.analytic.exact_noise`), with the variance of the readings that is expected
-    behind
-    the known surround: what the inset adds to the attenuation, a few per cent of the counts, is left out, and so is
-    that the regions were found in the same noise.
+    behind the known surround: what the inset adds to the attenuation, a few per cent of the counts, is left out, and so
+    is that the regions were found in the same noise.
 
     Args:
         scan: windowed, its surround known, noisy or noise free (then of the exposure its readings stand for).
@@ -48,11 +45,7 @@ def fbp_deviations(scan: Scan, grid: VolumeGrid, regions: Mapping[str, Any], ker
     found: dict[str, float] = {}
     for names in groups:
         adjoints = roi_adjoints(scan, fbp, [[RoiMean(grid, grid, masks[n]) for n in names]])
-        noise = adjoints.window.take(variance)
-        covariance = np.zeros((len(names), len(names)))
-        for view in range(len(noise)):
-            h = adjoints.vectors[0][0][:, view].flatten(1).double()
-            covariance += ((h * noise[view].flatten().double()) @ h.T).numpy()
+        covariance = adjoints.covariance_of(adjoints.window.take(variance))
         found |= {n: math.sqrt(covariance[k, k]) for k, n in enumerate(names)}
         if len(names) == 2:
             found["contrast"] = math.sqrt(covariance[0, 0] + covariance[1, 1] - 2.0 * covariance[0, 1])

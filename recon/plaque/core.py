@@ -17,7 +17,7 @@ from scipy.linalg import solve_triangular
 
 from recon.plaque.kernels import core_fractions, sharpened
 from recon.plaque.local_gram import LocalGram
-from recon.plaque.vessel import BLUR, BLUR_UNIT, Fit, Vessel
+from recon.plaque.vessel import BLUR, BLUR_UNIT, EXCESS, Fit, Vessel
 from torchpcct.threads import run
 
 __all__ = ["CorePrior", "CoreSpace", "Evidence"]
@@ -206,7 +206,7 @@ class CoreSpace:
     def evidence(self, shares: NDArray[np.float32]) -> Evidence:
         """Of bodies ``(m, n)``."""
         image = np.empty(shares.shape[::-1], np.float32)
-        sharpened(np.ascontiguousarray(shares.T), self.neighbours, self.vessel.excess, image)
+        sharpened(np.ascontiguousarray(shares.T), self.neighbours, EXCESS, image)
         own = self.gram.energies(image.T)
         touched = np.flatnonzero(image.any(1))
         near = image[touched].T

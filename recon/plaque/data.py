@@ -1,4 +1,4 @@
-"""What the reader is given, in HU: the statistic b = Gx + noise and the operator G, from a scan or from a volume."""
+"""What the reader is given of a scan, in HU: the statistic b = Gx + noise and the operator G."""
 
 from __future__ import annotations
 
@@ -14,17 +14,14 @@ from torch import Tensor
 
 from recon.conjugate_gradient import conjugate_gradient
 from recon.least_squares.inset_problem import InsetProblem
-from recon.plaque.stationary import Spectrum, StationaryGram
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
 from torchpcct.validate import number
 
-__all__ = ["BOX", "TissueData"]
+__all__ = ["TissueData"]
 
 Floats = NDArray[np.float64]
 
-BOX = 1 / 12
-"""Variance of a voxel's box, in squared voxels."""
 _PILOT_SD_MM = 0.25
 _PILOT_STEPS = 4
 _PILOT_FLOOR = 0.02
@@ -39,16 +36,11 @@ class TissueData:
         gram: G up to ``scale``, with ``apply``, ``lag_kernels``, ``polynomials``, ``periodic_spectrum`` and ``grid``
             (:class:`recon.gram.gram.Gram`).
         scale: G in HU⁻² is ``scale`` times ``gram``.
-        source: what the data are, for the report.
-        averaged: variance that G averages a value with, in squared voxels: :data:`BOX` where it takes it for that of a
-            whole voxel, as a projector does; 0 of values at centres; −:data:`BOX` where it takes means over voxels.
     """
 
     b: Tensor
     gram: Any
     scale: float
-    source: str = "scan"
-    averaged: float = BOX
 
     def __post_init__(self) -> None:
         if self.gram.grid.ndim != 3 or tuple(self.b.shape) != tuple(self.gram.grid.shape):
@@ -88,29 +80,6 @@ class TissueData:
         # Attenuation above the background is hu · x + shift.
         shift = torch.full(tuple(gram.grid.shape), problem.mu_ref - problem.level, dtype=gram.dtype)
         return cls((b.to(gram.dtype) - gram.apply(shift)) * hu, gram, hu * hu)
-
-    @classmethod
-    def of_volume(
-        cls, volume: Tensor, grid: VolumeGrid, noise_power: Spectrum, transfer: Spectrum | None = None
-    ) -> TissueData:
-        """From a reconstructed volume of a linear method and a model of its noise.
-
-        Args:
-            volume: ``grid.shape`` HU.
-            grid: of the volume.
-            noise_power: HU² mm³ at (in-plane, axial) frequencies in line pairs per mm, e.g. from
-                :mod:`torchpcct.metrics.noise_power`.
-            transfer: the method's transfer function at the same; None: the values are means over
-                voxels, no softer; an edge that is softer reads so.
-
-        Raises:
-            ValueError: another shape than the grid's, noise power that is not finite or nowhere positive.
-        """
-        if tuple(volume.shape) != tuple(grid.shape):
-            raise ValueError(f"volume has shape {tuple(volume.shape)}, its grid {tuple(grid.shape)}")
-        gram = StationaryGram(grid, noise_power, transfer)
-        averaged = -BOX if transfer is None else 0.0
-        return cls(gram.statistic(volume), gram, 1.0, "volume with a stationary noise model", averaged)
 
     def apply(self, x: Tensor) -> Tensor:
         """G x, HU⁻¹, of volumes in HU ``(..., z, y, x)``."""

@@ -7,7 +7,7 @@ as fast as the weights allow, resampling, and Metropolis moves as wide as the cl
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,35 +22,23 @@ Target = Callable[[Floats], tuple[Floats, Floats]]
 _KEEP = 0.5
 """Effective share of the cloud that a step in temperature leaves."""
 _SCALES = (1.0, 0.5, 0.2)
+"""Widths of the Metropolis moves of every point at every temperature, as shares of the cloud's."""
 
 
-@dataclass(frozen=True, eq=False)
-class Cloud:
+class Cloud(NamedTuple):
     """A cloud at the posterior, of equal weights.
 
     Attributes:
         points: ``(m, d)``.
-        log_prior, log_likelihood: ``(m,)``.
         log_evidence: log of the mean likelihood under the prior.
-        temperatures: steps taken.
     """
 
     points: Floats
-    log_prior: Floats
-    log_likelihood: Floats
     log_evidence: float
-    temperatures: int
 
 
 def lead(
-    start: Floats,
-    base: Target,
-    target: Target,
-    rng: np.random.Generator,
-    *,
-    moves: int = 3,
-    log_evidence: float = 0.0,
-    most: int = 40,
+    start: Floats, base: Target, target: Target, rng: np.random.Generator, *, log_evidence: float = 0.0, most: int = 40
 ) -> Cloud:
     """Lead a cloud from one distribution to another.
 
@@ -59,7 +47,6 @@ def lead(
         base: its log prior and log likelihood (0 where the first is the prior).
         target: log prior and log likelihood of the last distribution; the prior is the same.
         rng: of all randomness.
-        moves: Metropolis moves of every point at every temperature.
         log_evidence: of the first distribution.
         most: largest number of temperatures.
     """
@@ -77,9 +64,8 @@ def lead(
         keep = _resample(weight, rng)
         points, log_prior, first, last = points[keep], log_prior[keep], first[keep], last[keep]
         factor = np.linalg.cholesky(spread) * (2.38 / np.sqrt(points.shape[1]))
-        for move in range(moves):
-            jump = rng.standard_normal(points.shape) @ factor.T * _SCALES[move % len(_SCALES)]
-            tried = points + jump
+        for scale in _SCALES:
+            tried = points + rng.standard_normal(points.shape) @ factor.T * scale
             prior, one = base(tried)
             _, other = target(tried)
             # −inf where the prior is 0.
@@ -88,7 +74,7 @@ def lead(
             points = np.where(taken[:, None], tried, points)
             log_prior, first = np.where(taken, prior, log_prior), np.where(taken, one, first)
             last = np.where(taken, other, last)
-    return Cloud(points, log_prior, last, log_evidence, steps)
+    return Cloud(points, log_evidence)
 
 
 def _step(gain: Floats, most: float) -> float:

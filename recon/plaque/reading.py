@@ -362,7 +362,7 @@ def _read(
         drawn_image(vessel, plain), drawn_layer(vessel, plain), square, spread, left, tau.sd_hu, tau.high_hu,
         {"particles": particles, "seed": seed, "log_evidence": cloud.log_evidence, "log_evidence_first": first,
          "point": prior_of_core.point, "vessel_prior": asdict(vessel.prior),
-         "source": vessel.data.source, "voxels": len(vessel.index),
+         "voxels": len(vessel.index),
          "core_center_mm": cloud.points[:, :3].mean(0).tolist(), "prior": prior, "second_core": other_core},
         third_core=None if found is None else _core_told(*found, more),
     )  # fmt: skip

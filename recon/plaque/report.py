@@ -80,7 +80,7 @@ def table(reading: PlaqueReading, others: Mapping[str, Any] | None = None, devia
         ]
     lines += [
         "",
-        f"Read from a {reading.info['source']}. Residual: {reading.chi2:.3f} ± {reading.chi2_sd:.3f} of what noise "
+        f"Residual: {reading.chi2:.3f} ± {reading.chi2_sd:.3f} of what noise "
         f"leaves. Texture of 0.3 mm: {reading.texture_hu:.0f} HU, at most {reading.texture_high_hu:.0f} HU (95 %). "
         "Believed before the data: "
         + ", ".join("{} {:g} ± {:g} HU".format(n, *reading.info["vessel_prior"][n]) for n in ("wall", "fibrous"))
@@ -146,7 +146,7 @@ def save(
         "explained": reading.explained,
         "mean_contrast_hu": reading.mean_contrast,
         "calcifications": reading.calcifications,
-        "figures": {n: e.as_dict() for n, e in reading.figures.items()},
+        "figures": {n: asdict(e) for n, e in reading.figures.items()},
         "refused": dict(reading.refused),
         "same_regions": {name: reading.read(volume) for name, volume in (others or {}).items()},
         "same_regions_sd": {name: dict(v) for name, v in (deviations or {}).items()},

@@ -25,7 +25,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.special import ndtr
 
 from recon.plaque.centreline import Centreline, Coordinates
-from recon.plaque.data import BOX, TissueData
+from recon.plaque.data import TissueData
 from recon.plaque.kernels import sharpened
 from recon.plaque.local_gram import LocalGram
 from recon.plaque.outline import Outline, OutlineAt
@@ -52,6 +52,10 @@ _BLUR, _BLUR_SD, BLUR_UNIT = 0.2, 1.0, 0.01
 """Variance by which edges are softer than the operator's: focal spot, turning gantry, tissue; in units of 0.01 mm²."""
 SOFT = 0.5
 """Standard deviation of an outline as drawn, in voxels: narrower aliases, wider needs more of what noise hides."""
+BOX = 1 / 12
+"""Variance of a voxel's box, in squared voxels: the operator takes a value for that of a whole voxel."""
+EXCESS = SOFT**2 + BOX
+"""Variance of outline and operator together, in squared voxels."""
 _END_SD_MM = (1.0, 0.1, 0.1)
 _FAR = 15.0
 """A step that gains more of the log posterior than this makes the curvature worth computing again."""
@@ -176,10 +180,7 @@ class Vessel:
         self.lookup = np.full(grid.shape, -1, np.int64)  # position of each of the grid's voxels in the index
         self.lookup.ravel()[flat] = np.arange(len(flat))
         self.points = points[flat]
-        # Of means over voxels nothing has to be taken off.
-        self._soft = SOFT if data.averaged >= 0.0 else math.sqrt(-data.averaged)
-        self.sd = self._soft * np.array(grid.spacing)
-        self.excess = self._soft**2 + data.averaged  # squared voxels, of outline and operator together
+        self.sd = SOFT * np.array(grid.spacing)
         self.outer_at = Coordinates(near.s[flat], near.rho[flat], near.theta[flat], near.frame[flat])
         self.lumen_at = start.lumen.coordinates(self.points)
         low, high = min(low, float(self.lumen_at.s.min())), max(high, float(self.lumen_at.s.max()))
@@ -257,11 +258,11 @@ class Vessel:
 
     def as_projected(self, soft: Any) -> Any:
         """What the operator must be given of ``(n,)`` or ``(n, k)`` values that are drawn as softly as outlines."""
-        return self._less(soft, self.excess)
+        return self._less(soft, EXCESS)
 
     def voxel_means(self, soft: Floats) -> Floats:
         """Means over the voxels of ``(n,)`` values that are drawn as softly as outlines."""
-        return np.asarray(self._less(soft, self._soft**2 - BOX))
+        return np.asarray(self._less(soft, SOFT**2 - BOX))
 
     def _less(self, soft: Any, excess: float) -> Any:
         columns = np.ascontiguousarray(soft).reshape(len(soft), -1)

@@ -17,7 +17,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -192,7 +192,7 @@ class Draws:
         else:
             found = {
                 "presence": reading.presence,
-                "figures": {n: e.as_dict() for n, e in {**reading.figures, **reading.given_core}.items()},
+                "figures": {n: asdict(e) for n, e in {**reading.figures, **reading.given_core}.items()},
                 "truth": true,
                 "calcifications": reading.calcifications,
                 "mean_contrast": reading.mean_contrast,

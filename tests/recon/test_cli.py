@@ -330,7 +330,7 @@ def test_help(command, capsys):
         assert flag in text
 
 
-def test_verify_finds_a_stale_readme_and_mends_it(tmp_path, capsys):
+def test_verify_finds_a_stale_readme_and_renders_it(tmp_path, capsys):
     folder = tmp_path / "notebooks"
     folder.mkdir()
     (folder / "r.json").write_text('{"a": 1.26}', encoding="utf-8")

@@ -144,7 +144,7 @@ def test_pwls_says_when_its_volume_does_not_explain_the_data(clean, caplog):
 
 
 @pytest.mark.parametrize("method", ["fbp", "pwls"])
-def test_a_dead_column_and_a_dead_view_are_mended_and_named(clean, method):
+def test_a_dead_column_and_a_dead_view_are_repaired_and_named(clean, method):
     """FBP's error was 1400 to 3750 HU, without a word."""
     scan = clean.with_noise(2.0, 0)
     broken = scan.counts.clone()
@@ -177,7 +177,7 @@ def _ellipse_scan(views, columns):
     return g, np.random.default_rng(0).poisson(1e5 * np.exp(-total)).astype(np.float32)
 
 
-def _said(readings, geometry, method):
+def _warnings_of(readings, geometry, method):
     scan = Scan.from_counts(readings, geometry, air=1e5, mu_water=0.02)
     return " ".join(reconstruct(scan, VolumeGrid((24, 32), 6.8), method).report["warnings"])
 
@@ -194,16 +194,16 @@ def test_wrong_descriptions_and_readings_are_named():
         "no row ends in air": (counts / 2, g),
         "column 70 reads 1.6 times": (counts * np.where(np.arange(200) == 70, 1.6, 1.0), g),
     }
-    assert _said(counts, g, "fbp") == ""
+    assert _warnings_of(counts, g, "fbp") == ""
     for text, wrong in words.items():
-        assert text in _said(*wrong, "fbp")
+        assert text in _warnings_of(*wrong, "fbp")
 
 
 @pytest.mark.parametrize("method", ["pwls", "mbir"])
 def test_iterative_methods_name_what_is_cut_off(method):
     """Both take what the detector does not show for free: values were -28 to 22 HU off by MBIR, without a word."""
     g, counts = _ellipse_scan(90, 60)
-    assert "first and the last column" in _said(counts[:, 15:45], replace(g, columns=30), method)
+    assert "first and the last column" in _warnings_of(counts[:, 15:45], replace(g, columns=30), method)
 
 
 def test_fbp_of_a_wrong_rotation_centre_is_named(clean):

@@ -184,7 +184,7 @@ def _case_ahead(settings: Settings, pieces: Pieces, name: str) -> None:
 
 
 def _reconstruct(scan: Scan, grid: VolumeGrid, method: str) -> Volume:
-    options = {"tissues": True} if method == "tissues" else {}
+    options: dict[str, Any] = {"tissues": True} if method == "tissues" else {}
     return reconstruct(scan, grid, "mbir" if method == "tissues" else method, **options)
 
 

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from recon.analytic.inset import InsetFbp, view_motion
 from recon.evaluate.store import Pieces
-from recon.least_squares.inset_problem import InsetProblem, reconstruct_pwls
+from recon.least_squares.inset_problem import InsetProblem
+from recon.least_squares.reconstruct import reconstruct_pwls
 from recon.mbir.mbir import Mbir
 from recon.study.motion.observed import Observed, Reference, observe
 from recon.study.motion.settings import Settings

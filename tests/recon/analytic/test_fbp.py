@@ -15,7 +15,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recon.analytic.fbp import backproject, fbp, filter_sinogram, filter_windowed, interleave
+from recon.analytic.fbp import Fbp, backproject, fbp, filter_sinogram, filter_windowed, interleave
 from recon.analytic.ramp import KERNELS
 from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid, full_turn
@@ -397,3 +397,17 @@ def test_memory_is_bounded(inset):
     out = subprocess.run([sys.executable, "-c", _PEAK.format(inset=inset)], capture_output=True, text=True, check=True)
     measured, kept, chunk = map(int, out.stdout.split())
     assert 0.4 * kept < measured < 1.15 * (kept + chunk) + 8e6
+
+
+def test_layer_is_the_function_with_batch_and_channels():
+    geometry, grid = ParallelBeam(np.arange(8) * math.pi / 8, 15, 1.9), VolumeGrid((9, 9), 2.0)
+    y = torch.randn(2, 3, 8, 15, generator=torch.Generator().manual_seed(0))
+    layer = Fbp(geometry, grid, "soft")
+    assert torch.equal(layer(y), fbp(y, geometry, grid, "soft"))
+    assert not list(layer.parameters())
+    narrow = y.bfloat16().requires_grad_()
+    out = layer(narrow)
+    assert out.dtype == torch.float32
+    assert torch.equal(out.detach(), fbp(y.bfloat16().float(), geometry, grid, "soft"))
+    out.sum().backward()
+    assert narrow.grad.dtype == torch.bfloat16
