@@ -50,6 +50,7 @@ class MethodOptions(PwlsOptions, total=False):
     network: Mbir | None
     fidelity: float | None
     noise_map: bool
+    outlines: bool
     tissues: bool
     point: Any
     vessel_prior: VesselPrior | None

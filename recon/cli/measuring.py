@@ -37,8 +37,8 @@ _STUDY_TASKS = (
 )  # fmt: skip
 _STUDY_METHODS = (
     "fbp:soft", "fbp:standard", "fbp:detail", "gaussian@fbp:standard", "perona_malik@fbp:standard",
-    "nlm@fbp:standard", "tv@fbp:standard", "bilateral@fbp:detail", "pwls", "mbir:prior=bilateral", "mbir:fidelity=0",
-    "mbir", "mbir:fidelity=1", "mbir:tissues",
+    "nlm@fbp:standard", "tv@fbp:standard", "bilateral@fbp:detail", "pwls", "mbir:outlines=no,prior=bilateral",
+    "mbir:outlines=no", "mbir:fidelity=0", "mbir", "mbir:fidelity=1", "mbir:tissues",
 )  # fmt: skip
 """Of ``dose-factor``: every method of the package, and each filter on the kernel on which it has the least error."""
 
@@ -245,6 +245,7 @@ def add_evaluate(commands: Commands) -> None:
         "torchpcct evaluate --task nodule --method mbir --n 20",
         "torchpcct evaluate --task my.yaml --method mylab.nets:reconstruct --denoiser mylab.nets:denoise@fbp:detail",
         before="methods: fbp:KERNEL, pwls, mbir, mbir:fidelity=1, mbir:weights=FILE, mbir:tissues,\n"
+        "         mbir:outlines=no, mbir:outlines=no,prior=bilateral,\n"
         "         FILTER@fbp:KERNEL (gaussian, perona_malik, bilateral, nlm, tv, bm4d),\n"
         "         package.module:function of (scan, grid), files:FOLDER\n\n",
         out="folder for report.md, .json, .csv, .html and pictures (default out/evaluate)",

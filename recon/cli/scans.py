@@ -301,7 +301,7 @@ def _require_voxels(shape: tuple[int, ...]) -> None:
         )
 
 
-_OPTIONS = {"kernel": "fbp", "fidelity": "mbir", "tissues": "mbir", "point": "mbir", "weights": "mbir"}
+_OPTIONS = {"kernel": "fbp", **dict.fromkeys(("fidelity", "no_outlines", "tissues", "point", "weights"), "mbir")}
 """Options that one method has."""
 
 
@@ -314,7 +314,10 @@ def _method_options(arguments: argparse.Namespace) -> dict[str, Any]:
     given = {k: v for k, v in vars(arguments).items() if k in _OPTIONS and v is not None and v is not False}
     for name in given:
         if arguments.method != _OPTIONS[name]:
-            raise ValueError(f"--{name} is an option of --method {_OPTIONS[name]}, not of {arguments.method}")
+            option = name.replace("_", "-")
+            raise ValueError(f"--{option} is an option of --method {_OPTIONS[name]}, not of {arguments.method}")
+    if given.pop("no_outlines", False):
+        given["outlines"] = False
     return given
 
 
@@ -531,6 +534,7 @@ def add_reconstruct(commands: Commands) -> None:
         ("--method", str, None, "fbp, pwls or mbir (default fbp)", {"default": "fbp"}),
         ("--kernel", str, None, "FBP kernel: soft, standard, detail, bone, ram-lak"),
         ("--fidelity --look", float, "F", "of MBIR: 0, quiet … 1, more contrast and noise (default 0.5)"),
+        ("--no-outlines", bool, None, "MBIR of an inset without drawing a vessel's outlines first"),
         ("--tissues", bool, None, "MBIR with the tissues of the vessel in the inset"),
         ("--weights", Path, "FILE", "of MBIR: your own (default: those that ship)"),
         ("--point", float, ("Z", "Y", "X"), "where a reader sees its plaque, mm", {"nargs": 3}),
