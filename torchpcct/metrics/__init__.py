@@ -9,7 +9,7 @@ its data at all, ``half_split`` what noise and resolution a real scan has, witho
 """
 
 from torchpcct.metrics.bootstrap import Estimate
-from torchpcct.metrics.cnr import Interval, cnr, cnr_from_moments, cnr_interval, cnr_range, mean_interval, sd_interval
+from torchpcct.metrics.cnr import Interval, cnr, cnr_from_moments, cnr_interval, cnr_range, sd_interval
 from torchpcct.metrics.control import controlled_log_variance, controlled_mean
 from torchpcct.metrics.data_limit import Ceiling, ceiling, information_matrix
 from torchpcct.metrics.jackknife import Jackknifed, combined
@@ -17,24 +17,20 @@ from torchpcct.metrics.noise_power import NoisePower, noise_power_spectrum
 from torchpcct.metrics.observer import (
     ObserverResult,
     auc,
-    auc_from_d_prime,
     channel_responses,
     d_prime,
     dog_channels,
-    false_positive_difference,
-    false_positive_rate,
     hotelling_scores,
     observe,
     template_channel,
 )
-from torchpcct.metrics.plaque_measures import cap_thickness, lumen_area, threshold_contour
+from torchpcct.metrics.plaque_measures import lumen_area
 from torchpcct.metrics.residual_test import ResidualTest, residual_test
 from torchpcct.metrics.resolution import (
     TransferFunction,
     edge_profile,
     edge_width,
     ellipsoid_distance,
-    match_edge_width,
     task_transfer,
 )
 
@@ -48,8 +44,6 @@ __all__ = [
     "ResidualTest",
     "TransferFunction",
     "auc",
-    "auc_from_d_prime",
-    "cap_thickness",
     "ceiling",
     "channel_responses",
     "cnr",
@@ -64,18 +58,13 @@ __all__ = [
     "edge_profile",
     "edge_width",
     "ellipsoid_distance",
-    "false_positive_difference",
-    "false_positive_rate",
     "hotelling_scores",
     "information_matrix",
     "lumen_area",
-    "match_edge_width",
-    "mean_interval",
     "noise_power_spectrum",
     "observe",
     "residual_test",
     "sd_interval",
     "task_transfer",
     "template_channel",
-    "threshold_contour",
 ]

@@ -13,7 +13,6 @@ from torchpcct.geometry import Geometry, VolumeGrid
 from torchpcct.projector.base import Operator
 from torchpcct.projector.engine import ENGINES, Engine
 from torchpcct.projector.tables import Tables, VectorTables
-from torchpcct.projector.vectors import as_circular
 from torchpcct.vector_geometry import VectorGeometry
 
 __all__ = ["Projector"]
@@ -219,7 +218,7 @@ def _tables(geometry: Any, grid: Any, window: Any, motion: Any, memory: int | No
         raise ValueError("a window belongs to a circular scan; of a VectorGeometry select the views, or use all of it")
     if motion is not None:
         geometry = geometry.moved(motion)
-    circular = as_circular(geometry)
+    circular = geometry.as_circular()
     return VectorTables(geometry, grid, memory) if circular is None else Tables(
         circular[0], grid, None, circular[1], memory
     )  # fmt: skip
