@@ -125,7 +125,6 @@ CALLS = {
     "projector: window": (lambda: Projector(CONE_2, GRID, "all"), "window"),
     "projector: motion": (lambda: Projector(CONE_2, GRID, motion=np.zeros(3)), "motion"),
     "projector: NaN motion": (lambda: Projector(CONE_2, GRID, motion=np.full((8, 3), NAN)), "motion"),
-    "projector: memory": (lambda: Projector(CONE_2, GRID, memory=0), "memory"),
     "projector: source inside": (lambda: Projector(CONE_2, VolumeGrid((2, 4, 4), 300.0)), "source"),
     "footprint: beyond the field": (
         lambda: footprint(CONE_2, VolumeGrid((1, 1, 1), 1.0, (0, 0, 90.0))),

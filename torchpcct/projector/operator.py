@@ -110,14 +110,11 @@ class Projector(Operator):
         window: the part of the detector to compute (``torchpcct.detector_window.footprint``), or None for all of it.
         motion: displacement of the grid in every view, ``(views, 2)`` (y, x) or ``(views, 3)`` (z, y, x) mm, or None:
             a volume that moves rigidly with its object is projected and reconstructed at rest.
-        memory: bytes of working memory that a pass may hold besides its input and output (see
-            :meth:`memory_estimate`), or None: as much as serves speed on the CPU (64 MiB of row sums), half of the
-            free memory on CUDA. Batches and views go through in slices that fit; the result is the same bit for bit.
 
     Raises:
         TypeError: an argument of the wrong kind, an input that is not float32 or float64.
         ValueError: geometry, grid, window and motion that do not fit together, a source inside the grid, an input
-            of the wrong shape, a ``memory`` that the smallest slice exceeds (found when a pass is called).
+            of the wrong shape.
     """
 
     def __init__(
@@ -126,13 +123,12 @@ class Projector(Operator):
         grid: VolumeGrid,
         window: DetectorWindow | None = None,
         motion: Any = None,
-        memory: int | None = None,
     ) -> None:
         super().__init__()
         self.geometry = geometry
         self.grid = grid
         self.window = window
-        self._engine = Engine(_tables(geometry, grid, window, motion, memory))
+        self._engine = Engine(_tables(geometry, grid, window, motion))
         self._adjoint: list[_Adjoint] = []  # in a list: a submodule that holds its parent would recurse
 
     @property
@@ -164,8 +160,8 @@ class Projector(Operator):
         Args:
             batch: number of volumes (or sinograms) in the pass.
             dtype: float32 or float64.
-            device: where the pass runs, "cpu" or a CUDA device. There, without a ``memory`` limit, the estimate is
-                that of the unsliced batch.
+            device: where the pass runs, "cpu" or a CUDA device: there the estimate is that of the whole batch; what
+                does not fit into half of the free memory goes through in slices, the same bit for bit.
 
         Raises:
             TypeError: another dtype. ValueError: a negative batch.
@@ -211,17 +207,15 @@ class _Adjoint(Operator):
         return f"{type(self.T.geometry).__name__}, {self.domain_shape} -> {self.range_shape}"
 
 
-def _tables(geometry: Any, grid: Any, window: Any, motion: Any, memory: int | None) -> Tables | VectorTables:
+def _tables(geometry: Any, grid: Any, window: Any, motion: Any) -> Tables | VectorTables:
     if not isinstance(geometry, VectorGeometry):
-        return Tables(geometry, grid, window, motion, memory)
+        return Tables(geometry, grid, window, motion)
     if window is not None:
         raise ValueError("a window belongs to a circular scan; of a VectorGeometry select the views, or use all of it")
     if motion is not None:
         geometry = geometry.moved(motion)
     circular = geometry.as_circular()
-    return VectorTables(geometry, grid, memory) if circular is None else Tables(
-        circular[0], grid, None, circular[1], memory
-    )  # fmt: skip
+    return VectorTables(geometry, grid) if circular is None else Tables(circular[0], grid, None, circular[1])
 
 
 def _checked(x: Any, inner: tuple[int, ...], name: str, operator: str) -> Tensor:
