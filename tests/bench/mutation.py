@@ -169,7 +169,7 @@ FAULTS = (
           _C + "test_damaged_pieces_are_computed_again"),
     Fault("threads left behind by a fork", "torchpcct/threads.py", "after_in_child=_renew", "after_in_parent=_renew",
           "tests/torchpcct/projector/test_base.py::test_a_forked_process_computes_on_threads_of_its_own"),
-    Fault("ends of pieces forgotten", "torchpcct/threads.py", "self.kernel(begin, end,", "self.kernel(begin, end - 1,",
+    Fault("ends of pieces forgotten", "torchpcct/threads.py", "kernel(begin, end,", "kernel(begin, end - 1,",
           "tests/torchpcct/test_threads.py::test_every_index_once"),
     Fault("kernels with two copies of a function", "torchpcct/projector/cpu/cone_kernels.py", '"forceinline": True',
           '"forceinline": False', "tests/torchpcct/projector/test_fresh_kernels.py"),

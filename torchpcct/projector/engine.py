@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
-from torchpcct.projector.compiling import announce_compilation
+from torchpcct.kernel_cache import announce_compilation
 from torchpcct.projector.cuda import passes as cuda
 from torchpcct.projector.tables import Tables, VectorTables
 

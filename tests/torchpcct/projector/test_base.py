@@ -212,7 +212,7 @@ def test_a_word_while_kernels_compile(caplog):
     """Only for the package's own functions, and once."""
     from numba.core import event
 
-    from torchpcct.projector.compiling import announce_compilation
+    from torchpcct.kernel_cache import announce_compilation
 
     announce_compilation()
 
