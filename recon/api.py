@@ -15,9 +15,9 @@ from recon.analytic.inset import InsetFbp
 from recon.least_squares.inset_problem import reconstruct_pwls
 from recon.mbir.reconstruct import reconstruct_mbir
 from recon.metal import metal_warnings
-from torchpcct.defects import dead_readings, repair_defects
+from torchpcct.checks.defects import dead_readings, repair_defects
+from torchpcct.checks.readings import reading_warnings
 from torchpcct.geometry import VolumeGrid
-from torchpcct.reading_checks import reading_warnings
 from torchpcct.scan import Scan
 from torchpcct.validate import checked, choice
 from torchpcct.volume import Volume, from_hu
@@ -65,9 +65,9 @@ def reconstruct(
         device: where the returned volumes lie.
         options: of the method.
 
-    Readings that no object can cause (dead or hot cells, dead views, lost readings: :mod:`torchpcct.defects`) are
-    interpolated before; the report's ``warnings`` say so, and what else the readings say against their description (an
-    offset, saturation, transmissions, no light: :mod:`torchpcct.reading_checks`). Scans that contradict themselves or
+    Readings that no object can cause (dead or hot cells, dead views, lost readings: :mod:`torchpcct.checks.defects`)
+    are interpolated before; the report's ``warnings`` say so, and what else the readings say against their description
+    (an offset, saturation, transmissions, no light: :mod:`torchpcct.checks.readings`). Scans that contradict themselves or
     their description (centre, fan angles, steps between views, roll, rows that end inside the object, readings that are
     no line integrals) are named there, too (:func:`recon.analytic.coverage.consistency_warnings`); PWLS and MBIR test
     what they leave of the data besides. Metal is named (:mod:`recon.metal`), not corrected.

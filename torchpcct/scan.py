@@ -13,11 +13,10 @@ import torch
 from torch import Tensor
 
 from torchpcct import counting_noise as noise
-from torchpcct.dead_cells import bridge
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.files import read_hdf5
 from torchpcct.geometry import ConeBeam, Geometry
-from torchpcct.readings import MANY, counted, inverse_variance, log_bias, logged, smoothed
+from torchpcct.readings import MANY, bridge, counted, inverse_variance, log_bias, logged, smoothed
 from torchpcct.scan_checks import check_exposure, check_scan
 from torchpcct.scan_file import scan_fields, write_scan
 from torchpcct.scanner.linearisation import WaterLinearisation

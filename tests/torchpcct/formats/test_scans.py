@@ -20,13 +20,13 @@ from recon import reconstruct
 from recon.cli import main
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, VolumeGrid, full_turn
 from torchpcct.acquisition.config import read_config
+from torchpcct.checks.rotation_axis import axis_column
 from torchpcct.formats.damage import read_yaml
 from torchpcct.formats.dicom_ct_pd import read_dicom_ct_pd
 from torchpcct.formats.geometry_yaml import geometry_of, geometry_values
 from torchpcct.formats.preprocess import centred, cleaned, find_axis, without_outliers, without_stripes
 from torchpcct.formats.rtk import read_rtk
 from torchpcct.formats.scans import open_scan
-from torchpcct.metrics.rotation_axis import axis_column
 from torchpcct.vector_geometry import to_vectors
 from torchpcct.volume import Volume
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, full_turn
-from torchpcct.metrics.moments import STEP_TOLERANCE, WEIGHT_TOLERANCE, moment_test
+from torchpcct.checks.moments import STEP_TOLERANCE, WEIGHT_TOLERANCE, moment_test
 
 ELLIPSE = (90.0, 60.0, 8.0, -5.0, 0.02)
 """Semi-axes and centre in mm, attenuation in mm⁻¹."""

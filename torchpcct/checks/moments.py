@@ -81,7 +81,7 @@ def moment_test(lines: Tensor, geometry: Geometry) -> MomentTest:
         raise ValueError(f"lines must have the shape {g.shape}, got {tuple(lines.shape)}")
     values = lines.detach().to("cpu", torch.float64)
     if not bool(torch.isfinite(values).all()):
-        raise ValueError("lines hold NaN or Inf: bridge dead readings before (torchpcct.dead_cells.bridge)")
+        raise ValueError("lines hold NaN or Inf: bridge dead readings before (torchpcct.readings.bridge)")
     if isinstance(g, ConeBeam):
         middle = np.abs(g.row_positions) <= 0.5 * g.pitch[0] + 1e-9
         if not middle.any():

@@ -25,7 +25,7 @@ What no opposite rays can show, since the described scan is that of another obje
 view (the object turned), sod (the object scaled, its attenuation the other way; so are parallel rays' pitch), both the
 direction of rotation and that of the columns (the object mirrored; of parallel rays each alone), a displacement of the
 object, and all that happens to both rays alike: water's attenuation, gain and bowtie if air was measured with them,
-spectrum and pile-up (:mod:`torchpcct.metrics.moments` sees those in bodies that are not round).
+spectrum and pile-up (:mod:`torchpcct.checks.moments` sees those in bodies that are not round).
 """
 
 from __future__ import annotations
@@ -332,7 +332,7 @@ class _Pairs:
             raise ValueError(f"lines must have the shape {expected}, got {tuple(lines.shape)}")
         values = lines.detach().to("cpu", torch.float32).reshape(window.shape)
         if not bool(torch.isfinite(values).all()):
-            raise ValueError("lines hold NaN or Inf: bridge dead readings before (torchpcct.dead_cells.bridge)")
+            raise ValueError("lines hold NaN or Inf: bridge dead readings before (torchpcct.readings.bridge)")
         if isinstance(geometry, ConeBeam):
             window, values = _flat_part(geometry, window, values, cells)
             if not values.shape[1]:

@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, full_turn
-from torchpcct.detector_window import DetectorWindow
-from torchpcct.metrics.opposite_rays import (
+from torchpcct.checks.opposite_rays import (
     CENTRE_TOLERANCE,
     FALSE_ALARMS,
     SCALE_TOLERANCE,
@@ -18,6 +17,7 @@ from torchpcct.metrics.opposite_rays import (
     centre_test,
     geometry_test,
 )  # fmt: skip
+from torchpcct.detector_window import DetectorWindow
 
 VIEWS, RODS = 180, ((12.0, -7.0, 6.0, 0.02), (12.0, -7.0, 3.0, 0.01), (-20.0, 15.0, 9.0, 0.015))
 """Rods along z: x, y, radius in mm, attenuation in mm⁻¹."""
