@@ -67,10 +67,10 @@ def reconstruct(
 
     Readings that no object can cause (dead or hot cells, dead views, lost readings: :mod:`torchpcct.checks.defects`)
     are interpolated before; the report's ``warnings`` say so, and what else the readings say against their description
-    (an offset, saturation, transmissions, no light: :mod:`torchpcct.checks.readings`). Scans that contradict themselves or
-    their description (centre, fan angles, steps between views, roll, rows that end inside the object, readings that are
-    no line integrals) are named there, too (:func:`recon.analytic.coverage.consistency_warnings`); PWLS and MBIR test
-    what they leave of the data besides. Metal is named (:mod:`recon.metal`), not corrected.
+    (an offset, saturation, transmissions, no light: :mod:`torchpcct.checks.readings`). Scans that contradict themselves
+    or their description (centre, fan angles, steps between views, roll, rows that end inside the object, readings that
+    are no line integrals) are named there, too (:func:`recon.analytic.coverage.consistency_warnings`); PWLS and MBIR
+    test what they leave of the data besides. Metal is named (:mod:`recon.metal`), not corrected.
 
     The number of threads does not change a bit of an inset's FBP and PWLS. FBP of whole rows and MBIR, where torch's
     matrix products and convolutions decide about the order of sums, agree within 0.01 HU.
