@@ -148,10 +148,10 @@ def _by_opposites(lines: Tensor, geometry: Any) -> tuple[float, float] | None:
     error = math.inf
     for _ in range(12):
         test = centre_test(lines, at_axis(geometry, column))
-        if not math.isfinite(test.columns):
+        if "centre" not in test.sizes:
             return None if math.isinf(error) else (column, error)
-        error = test.error
-        step = min(max(test.columns, -2.0), 2.0)
+        error = test.errors["centre"]
+        step = min(max(test.sizes["centre"], -2.0), 2.0)
         column += step  # described too high by so much: the axis lies at a higher column
         if abs(step) < max(0.05 * error, 1e-3):
             break
