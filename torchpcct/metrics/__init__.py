@@ -1,18 +1,17 @@
 """Figures of merit: CNR, the limit of the data, observer, resolution, noise.
 
 Reading order: ``placement`` and ``roi`` say where is measured, ``cnr`` is the paper's figure over realisations,
-``data_limit`` the best that any unbiased method can reach. ``bootstrap`` and ``jackknife`` give figures their
-intervals, ``control`` narrows them. (What they are for, the dose factor, is :mod:`recon.evaluate`.) ``observer`` asks
+``data_limit`` the best that any unbiased method can reach. ``intervals`` gives figures theirs (bootstrap,
+jackknife), ``control`` narrows them. (What they are for, the dose factor, is :mod:`recon.evaluate`.) ``observer`` asks
 whether the core is seen, ``resolution`` and ``noise_power`` how sharp and how noisy an image is, and
 ``plaque_measures`` measures lumen, core and cap. ``residual_test`` asks whether a volume explains
 its data at all, ``half_split`` what noise and resolution a real scan has, without a truth.
 """
 
-from torchpcct.metrics.bootstrap import Estimate
 from torchpcct.metrics.cnr import Interval, cnr, cnr_from_moments, cnr_interval, cnr_range, sd_interval
 from torchpcct.metrics.control import controlled_log_variance, controlled_mean
 from torchpcct.metrics.data_limit import Ceiling, ceiling, information_matrix
-from torchpcct.metrics.jackknife import Jackknifed, combined
+from torchpcct.metrics.intervals import Estimate, Jackknifed, combined
 from torchpcct.metrics.noise_power import NoisePower, noise_power_spectrum
 from torchpcct.metrics.observer import (
     ObserverResult,

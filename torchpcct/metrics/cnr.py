@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-from torchpcct.metrics.bootstrap import generator
+from torchpcct.metrics.intervals import generator
 from torchpcct.validate import broadcast, checked, coverage, number, whole
 
 __all__ = ["Interval", "cnr", "cnr_from_moments", "cnr_interval", "cnr_range", "sd_interval"]

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import expit, logit, ndtri
 
 from torchpcct.geometry import VolumeGrid
-from torchpcct.metrics.bootstrap import Estimate, bca_interval, evaluate, leave_one_out, resampling
+from torchpcct.metrics.intervals import Estimate, bca_interval, evaluate, leave_one_out, resampling
 from torchpcct.metrics.roi import as_array
 from torchpcct.validate import checked, coverage
 

@@ -11,7 +11,7 @@ from torchpcct.metrics import (
     controlled_log_variance,
     controlled_mean,
 )
-from torchpcct.metrics.jackknife import log_of_sum
+from torchpcct.metrics.intervals import log_of_sum
 
 SIGMA = np.array([[1.0, 0.3], [0.3, 2.0]])
 MU = np.array([3.0, -1.0])
