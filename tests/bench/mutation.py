@@ -168,7 +168,7 @@ FAULTS = (
     Fault("damaged pieces pass", "recon/evaluate/store.py", "if mark and digest !=", "if False and digest !=",
           _C + "test_damaged_pieces_are_computed_again"),
     Fault("threads left behind by a fork", "torchpcct/threads.py", "after_in_child=_renew", "after_in_parent=_renew",
-          "tests/torchpcct/projector/test_base.py::test_a_forked_process_computes_on_threads_of_its_own"),
+          "tests/torchpcct/projector/test_operator.py::test_a_forked_process_computes_on_threads_of_its_own"),
     Fault("ends of pieces forgotten", "torchpcct/threads.py", "kernel(begin, end, *given",
           "kernel(begin, end - 1, *given", "tests/torchpcct/test_threads.py::test_every_index_once"),
     Fault("kernels with two copies of a function", "torchpcct/projector/cpu/cone_kernels.py", '"forceinline": True',

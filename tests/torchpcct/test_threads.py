@@ -1,4 +1,4 @@
-"""Sharing of kernels among threads: every index once, whoever calls and whatever goes wrong (forks: test_base)."""
+"""Sharing of kernels among threads: every index once, whoever calls and whatever goes wrong (forks: test_operator)."""
 
 import gc
 import subprocess
