@@ -16,9 +16,9 @@ from recon.least_squares.pwls import PwlsOptions
 from recon.least_squares.reconstruct import reconstruct_pwls
 from recon.mbir.reconstruct import reconstruct_mbir
 from recon.metal import metal_warnings
-from torchpcct.defects import dead_readings, repair_defects
+from torchpcct.checks.defects import dead_readings, repair_defects
+from torchpcct.checks.readings import reading_warnings
 from torchpcct.geometry import VolumeGrid
-from torchpcct.reading_checks import reading_warnings
 from torchpcct.scan import Scan
 from torchpcct.validate import checked, choice
 from torchpcct.volume import Volume, from_hu
@@ -103,12 +103,12 @@ def reconstruct(
         device: where the returned volumes lie.
         options: of the method (:class:`MethodOptions`).
 
-    Readings that no object can cause (dead or hot cells, dead views, lost readings: :mod:`torchpcct.defects`) are
-    interpolated before; the report's ``warnings`` say so, and what else the readings say against their description (an
-    offset, saturation, transmissions, no light: :mod:`torchpcct.reading_checks`). Scans that contradict themselves or
-    their description (centre, fan angles, steps between views, roll, rows that end inside the object, readings that are
-    no line integrals) are named there, too (:func:`recon.analytic.coverage.consistency_warnings`); PWLS and MBIR test
-    what they leave of the data besides. Metal is named (:mod:`recon.metal`), not corrected.
+    Readings that no object can cause (dead or hot cells, dead views, lost readings: :mod:`torchpcct.checks.defects`)
+    are interpolated before; the report's ``warnings`` say so, and what else the readings say against their description
+    (an offset, saturation, transmissions, no light: :mod:`torchpcct.checks.readings`). Scans that contradict themselves
+    or their description (centre, fan angles, steps between views, roll, rows that end inside the object, readings that
+    are no line integrals) are named there, too (:func:`recon.analytic.coverage.consistency_warnings`); PWLS and MBIR
+    test what they leave of the data besides. Metal is named (:mod:`recon.metal`), not corrected.
 
     The number of threads does not change a bit of an inset's FBP and PWLS. FBP of whole rows and MBIR, where torch's
     matrix products and convolutions decide about the order of sums, agree within 0.01 HU.

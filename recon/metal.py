@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from torchpcct.robust import MEDIAN_TO_SD
+from torchpcct.readings import MEDIAN_TO_SD
 from torchpcct.validate import checked
 
 __all__ = ["DENSEST_HU", "metal_warnings"]

@@ -29,7 +29,7 @@ from torchpcct import (
     spectral,
 )
 from torchpcct.detector_window import DetectorWindow, footprint
-from torchpcct.metrics import cnr, mean_interval, sd_interval
+from torchpcct.metrics import cnr, sd_interval
 from torchpcct.metrics.residual_test import residual_test
 from torchpcct.scanner import SiliconDetector, Source, TransportedSilicon, presets
 from torchpcct.scanner.linearisation import WaterLinearisation
@@ -86,8 +86,6 @@ TABLE = [
     (full_turn, {"views": 8}, {"views": COUNT}),
     (sd_interval, {"sd": 1.0, "realizations": 10, "level": 0.9},
      {"sd": (*NO_NUMBER, NAN, INF, -1.0), "realizations": (*COUNT, 1), "level": (*NO_NUMBER, NAN, 0.0, 1.0, 95)}),
-    (mean_interval, {"means": [1.0, 2.0], "level": 0.9},
-     {"means": ([], [1.0], [NAN, 1.0], [[1.0, 2.0]], [INF, 1.0]), "level": (*NO_NUMBER, NAN, 0.0, 1.0, 95)}),
     (QGGMRF, {"strength": 0.3, "threshold": 300.0},
      {"strength": (NAN, INF, -1.0, "a"), "threshold": (NAN, -1.0, 0.0, "a")}),
 ]  # fmt: skip
@@ -127,7 +125,6 @@ CALLS = {
     "projector: window": (lambda: Projector(CONE_2, GRID, "all"), "window"),
     "projector: motion": (lambda: Projector(CONE_2, GRID, motion=np.zeros(3)), "motion"),
     "projector: NaN motion": (lambda: Projector(CONE_2, GRID, motion=np.full((8, 3), NAN)), "motion"),
-    "projector: memory": (lambda: Projector(CONE_2, GRID, memory=0), "memory"),
     "projector: source inside": (lambda: Projector(CONE_2, VolumeGrid((2, 4, 4), 300.0)), "source"),
     "footprint: beyond the field": (
         lambda: footprint(CONE_2, VolumeGrid((1, 1, 1), 1.0, (0, 0, 90.0))),

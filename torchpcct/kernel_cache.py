@@ -1,17 +1,21 @@
-"""Compiled kernels that are older than a function they hold: numba's cache looks at a kernel's own file only.
+"""What numba keeps of compiled kernels: a message before it compiles, and kernels older than a function they hold.
 
-A kernel holds the compiled code of all functions it calls. Where one of them, in another file, is edited or updated in
-place (``git pull`` of an editable installation), the cache would go on giving the old code, silently.
+A kernel holds the compiled code of all functions it calls, but numba's cache looks at the kernel's own file only. Where
+one of them, in another file, is edited or updated in place (``git pull`` of an editable installation), the cache would
+go on giving the old code, silently.
 """
 
 from __future__ import annotations
 
+import logging
 import sys
 import time
+from functools import cache
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
-__all__ = ["OURS", "folders", "forget_outdated", "sources"]
+__all__ = ["OURS", "announce_compilation", "folders", "forget_outdated", "sources"]
 
 OURS = ("torchpcct.", "recon.", "train.")
 """What the names of our modules begin with."""
@@ -74,3 +78,26 @@ def folders(name: str) -> set[str]:
 
 def _changed(path: Path) -> float:
     return path.stat().st_mtime
+
+
+@cache
+def announce_compilation() -> None:
+    """From now on, log a warning when the first kernel of the package is compiled rather than read from the cache."""
+    from numba.core import event
+
+    class Announce(event.Listener):
+        announced = False
+
+        def on_start(self, event: Any) -> None:
+            function = getattr(event.data.get("dispatcher"), "py_func", None)
+            if not self.announced and getattr(function, "__module__", "").startswith(OURS):
+                Announce.announced = True
+                logging.getLogger(__name__).warning(
+                    "compiling kernels for this processor: this call takes up to a minute longer, later ones read them "
+                    "from numba's cache"
+                )
+
+        def on_end(self, event: Any) -> None:
+            pass
+
+    event.register("numba:compile", Announce())

@@ -7,10 +7,9 @@ and fight with those of torch. These here are plain threads that wait asleep; a 
 from __future__ import annotations
 
 import os
-import threading
 from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import pairwise
-from queue import SimpleQueue
 from typing import Any
 
 __all__ = ["get_num_threads", "run", "set_num_threads"]
@@ -20,6 +19,7 @@ _PIECES = 4
 _LEAST = 50_000
 """Operations of a piece at least: as long as it takes to wake a thread, some 50 µs."""
 _number: int | None = None
+_helpers: ThreadPoolExecutor | None = None
 
 
 def get_num_threads() -> int:
@@ -39,82 +39,28 @@ def set_num_threads(number: int) -> None:
     if number < 1:
         raise ValueError(f"the number of threads must be at least 1, got {number}")
     _number = int(number)
-
-
-class _Call:
-    """The pieces of one call that nobody has taken yet, and reports from those who took some."""
-
-    def __init__(self, kernel: Any, pieces: list[tuple[int, int]], args: tuple[Any, ...]) -> None:
-        self.kernel, self.pieces, self.args = kernel, deque(pieces), args
-        self.reports: SimpleQueue[tuple[int, BaseException | None]] = SimpleQueue()
-
-    def work(self) -> tuple[int, BaseException | None]:
-        """Take pieces until none is left: how many, and what went wrong; after that they are not computed."""
-        taken, error = 0, None
-        while True:
-            try:
-                begin, end = self.pieces.popleft()
-            except IndexError:
-                return taken, error
-            taken += 1
-            if error is None:
-                try:
-                    self.kernel(begin, end, *self.args)
-                except BaseException as caught:
-                    error = caught
-
-
-class _Helper:
-    """A thread that waits for calls. It is in ``idle`` while it waits, and is taken from there by who needs it."""
-
-    def __init__(self, idle: deque[_Helper]) -> None:
-        self.calls: SimpleQueue[_Call] = SimpleQueue()
-        threading.Thread(target=self._serve, args=(idle,), name="torchpcct", daemon=True).start()
-
-    def _serve(self, idle: deque[_Helper]) -> None:
-        while True:
-            call = self.calls.get()
-            report, reports = call.work(), call.reports
-            del call  # the arrays are the caller's alone when it goes on, and this thread is free for its next call
-            idle.append(self)
-            reports.put(report)
-            del report, reports
-
-
-class _Pool:
-    def __init__(self) -> None:
-        self.idle: deque[_Helper] = deque()
-        self.started, self.lock = 0, threading.Lock()
-
-    def helpers(self, number: int) -> list[_Helper]:
-        """At most so many. Those that help elsewhere are not waited for: the caller does their part itself."""
-        found: list[_Helper] = []
-        while len(found) < number:
-            try:
-                found.append(self.idle.pop())
-            except IndexError:
-                with self.lock:
-                    if self.started >= number:
-                        break
-                    try:
-                        found.append(_Helper(self.idle))
-                    except RuntimeError:  # the system, or an interpreter that is ending, has no more threads
-                        break
-                    self.started += 1
-        return found
-
-
-_pool = _Pool()
+    _renew()
 
 
 def _renew() -> None:
-    """In a forked process: the threads stayed behind, and another may have held the lock."""
-    global _pool
-    _pool = _Pool()
+    """Helpers are started anew: of another number, or in a forked process, where the threads stayed behind."""
+    global _helpers
+    _helpers = None
 
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_renew)
+
+
+def _helped(work: Any, number: int) -> list[Future[None]]:
+    """``work`` on so many other threads, as soon as one is free."""
+    global _helpers
+    if _helpers is None:
+        _helpers = ThreadPoolExecutor(max(get_num_threads() - 1, 1), "torchpcct")
+    try:
+        return [_helpers.submit(work) for _ in range(number)]
+    except RuntimeError:  # the system, or an interpreter that is ending, has no more threads: the caller does it all
+        return []
 
 
 def run(kernel: Any, count: int, *args: Any, operations: int = _LEAST) -> None:
@@ -135,17 +81,25 @@ def run(kernel: Any, count: int, *args: Any, operations: int = _LEAST) -> None:
         if count:
             kernel(0, count, *args)
         return
-    bounds = [count * i // number for i in range(number + 1)]
-    call = _Call(kernel, list(pairwise(bounds)), args)
+    pieces = deque(pairwise(count * i // number for i in range(number + 1)))
+    given = [args]
+
+    def work() -> None:
+        while pieces:
+            try:
+                begin, end = pieces.popleft()
+            except IndexError:  # another was faster
+                return
+            kernel(begin, end, *given[0])
+
+    helping = _helped(work, min(threads, number) - 1)
     try:
-        for helper in _pool.helpers(min(threads, number) - 1):
-            helper.calls.put(call)
-        reports = [call.work()]
-        while sum(taken for taken, _ in reports) < number:
-            reports.append(call.reports.get())
+        work()
     finally:
-        call.pieces.clear()  # of an interrupted call
-        call.args = ()  # a helper that wakes only now must not keep the arrays
-    for _, error in reports:
+        pieces.clear()  # of a call that went wrong
+        # Those that help elsewhere are not waited for: nothing is left for them.
+        errors = [future.exception() for future in helping if not future.cancel()]
+        given.clear()  # who wakes only now must not keep the arrays
+    for error in errors:
         if error is not None:
             raise error

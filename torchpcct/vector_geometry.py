@@ -206,6 +206,43 @@ class VectorGeometry(Geometry):
         poses = self.poses
         return self._with(1, poses[:, 1] - back, 0, None if self.parallel else poses[:, 0] - back)
 
+    def as_circular(self) -> tuple[Geometry, Floats | None] | None:
+        """The circular scan, and the motion of the grid or None, that this scan is, to 1e-9; else None.
+
+        A radial displacement and a larger orbit look the same: the orbit is the one with the smallest motion.
+        """
+        if self.parallel and self.rows is not None:
+            return None  # no parallel beam with rows is one of ours
+        v, (source, centre, u, up) = np.array(self.vectors), self.poses.transpose(1, 0, 2)
+        angles = np.arctan2(-u[:, 0], u[:, 1])  # columns grow along (-sin, cos)
+        radial, tangent = (np.stack(x, axis=1) for x in ((u[:, 1], -u[:, 0]), (u[:, 0], u[:, 1])))
+        pitch = np.linalg.norm(tangent, axis=1)
+        radial, tangent, pitch = radial / pitch[:, None], tangent / pitch[:, None], float(pitch.mean())
+        found: Geometry
+        if self.parallel:
+            offset = float((centre[:, :2] * tangent).sum(1).mean())
+            found, motion = ParallelBeam(angles, self.columns, pitch, offset), offset * tangent - centre[:, :2]
+        else:
+            way = source - centre
+            sdd, offset = float((way[:, :2] * radial).sum(1).mean()), -float((way[:, :2] * tangent).sum(1).mean())
+            sod, row_pitch = float((source[:, :2] * radial).sum(1).mean()), float(up[:, 2].mean())
+            if not (0 < sod < sdd and row_pitch > 0):
+                return None
+            orbit, pitches = (angles, sod, sdd, self.columns), (row_pitch, pitch)
+            if self.rows is None:
+                found = FanBeam(*orbit, pitch, offset)
+            else:
+                found = ConeBeam(*orbit, self.rows, pitches, (-float(way[:, 2].mean()), offset))
+            axes = 2 if self.rows is None else 3
+            motion = to_vectors(found)[:, :axes] - v[:, :axes]
+        motion = np.ascontiguousarray(motion[:, ::-1])
+        again, scale = to_vectors(found, motion), float(np.abs(v).max())
+        if self.parallel:  # a ray's direction has no length, and its line no sense
+            v[:, :2] *= (np.sign((v[:, :2] * again[:, :2]).sum(1)) / np.linalg.norm(v[:, :2], axis=1))[:, None]
+        if np.abs(again - v).max() > 1e-9 * scale:
+            return None
+        return found, None if np.abs(motion).max() <= 1e-9 * scale else motion
+
     def _with(self, *parts: Any) -> VectorGeometry:
         """Other vectors: place, ``(views, 3)`` or None (unchanged), in turn."""
         poses = self.poses.copy()

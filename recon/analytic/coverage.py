@@ -12,10 +12,10 @@ import numpy as np
 from recon.analytic.angular_weights import SAME_VIEW, angular_weights, is_offset
 from recon.analytic.any_orbit import rebin_to_circle
 from recon.analytic.detector_edges import cut_off
-from torchpcct.defects import BRIGHT, GAIN_ERROR
+from torchpcct.checks.defects import BRIGHT, GAIN_ERROR
 from torchpcct.detector_window import footprint
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid, view_step
-from torchpcct.robust import MEDIAN_TO_SD
+from torchpcct.readings import MEDIAN_TO_SD
 from torchpcct.scan import Scan
 from torchpcct.validate import checked
 from torchpcct.vector_geometry import VectorGeometry
@@ -158,8 +158,8 @@ def sampling_warnings(geometry: Geometry) -> list[str]:
 def consistency_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
     """Whether a scan contradicts itself or its description, whatever reconstructs it.
 
-    Opposite rays (:mod:`torchpcct.metrics.opposite_rays`); where they agree, the moments of the views
-    (:mod:`torchpcct.metrics.moments`) of a whole field; rows that end inside the object; and of a window whether its
+    Opposite rays (:mod:`torchpcct.checks.opposite_rays`); where they agree, the moments of the views
+    (:mod:`torchpcct.checks.moments`) of a whole field; rows that end inside the object; and of a window whether its
     borders see the surround, and its cells have one gain.
 
     Args:
@@ -169,8 +169,8 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
     Returns:
         Warnings; empty if nothing is found, or nothing can be compared.
     """
-    from torchpcct.metrics.moments import moment_test
-    from torchpcct.metrics.opposite_rays import geometry_test  # loads scipy.stats
+    from torchpcct.checks.moments import moment_test
+    from torchpcct.checks.opposite_rays import geometry_test  # loads scipy.stats
 
     whole, window, about = scan, scan.window, (0.0, 0.0)
     if window is not None:
@@ -293,7 +293,7 @@ def _gain_spread(lines: Any, columns: Any) -> float:
 
 def _gain_texts(lines: Any) -> list[str]:
     """A column that reads too much or too little in all views, beside good ones: rows tell each other's gains
-    (:mod:`torchpcct.defects`), a single row has only its neighbours."""
+    (:mod:`torchpcct.checks.defects`), a single row has only its neighbours."""
     rows = lines.reshape(lines.shape[0], -1, lines.shape[-1])
     if rows.shape[1] > 1 or rows.shape[-1] < _FEWEST_COLUMNS:
         return []

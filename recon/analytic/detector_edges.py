@@ -18,7 +18,7 @@ from torch import Tensor
 
 from recon.analytic.angular_weights import is_offset
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid
-from torchpcct.robust import MEDIAN_TO_SD
+from torchpcct.readings import MEDIAN_TO_SD
 from torchpcct.validate import checked
 
 __all__ = ["Rows", "continued", "cut_off", "ends_cut_off", "mirrored", "reach", "row_ends"]

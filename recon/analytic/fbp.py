@@ -21,9 +21,9 @@ from recon.analytic.coverage import check_rows, refuse_helix
 from recon.analytic.detector_edges import Rows, continued, cut_off, mirrored
 from recon.analytic.filter_plan import FilterPlan, kernel_names
 from recon.linear_operator import apply_linear
-from torchpcct.dead_cells import bridge
 from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid, view_step
+from torchpcct.readings import bridge
 from torchpcct.validate import checked, number, reals
 from torchpcct.vector_geometry import VectorGeometry
 
@@ -218,7 +218,7 @@ def fbp(
 
     Args:
         sinogram: line integrals ``(..., views, [rows,] columns)``, float32 or float64. NaN and Inf are dead readings:
-            they are bridged by their neighbours (:func:`torchpcct.dead_cells.bridge`) with a warning.
+            they are bridged by their neighbours (:func:`torchpcct.readings.bridge`) with a warning.
         geometry: parallel, fan or cone beam; a closed circle, a short scan (at least π plus the fan angle), views in
             any order, irregularly spaced or repeated; or a :class:`~torchpcct.vector_geometry.VectorGeometry` that is
             nearly so (:mod:`recon.analytic.any_orbit`).

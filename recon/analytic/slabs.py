@@ -32,14 +32,22 @@ from recon.api import reconstruct, require_light
 from recon.least_squares.memory import available_bytes, memory_bytes, pwls_bytes, resident_bytes
 from recon.least_squares.qggmrf import QGGMRF
 from recon.metal import metal_warnings
-from torchpcct.dead_cells import MOST_DEAD
-from torchpcct.defects import Cells, cell_sums, dark_views, is_repaired, photon_and_light, repair_defects, wrong_cells
+from torchpcct.checks.defects import (
+    Cells,
+    cell_sums,
+    dark_views,
+    is_repaired,
+    photon_and_light,
+    repair_defects,
+    wrong_cells,
+)
+from torchpcct.checks.readings import reading_warnings
 from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.formats.scans import adapted, open_scan, own_options
 from torchpcct.formats.volume_slabs import CHUNK, SlabFile, check_slab_name
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
 from torchpcct.projector import Projector
-from torchpcct.reading_checks import reading_warnings
+from torchpcct.readings import MOST_DEAD
 from torchpcct.scan import Scan
 from torchpcct.validate import checked, choice
 from torchpcct.volume import from_hu, to_hu
@@ -416,7 +424,7 @@ def reconstruct_to(
 
     What is different: defects are looked for slab by slab, with ``HALO`` rows on either side, so that one at the
     limits of what is recognised may be judged otherwise; the readings are tested against their description
-    (:mod:`torchpcct.reading_checks`, :func:`recon.analytic.coverage.consistency_warnings`) in the middle rows or
+    (:mod:`torchpcct.checks.readings`, :func:`recon.analytic.coverage.consistency_warnings`) in the middle rows or
     slices, which the report's ``notes`` name; and what a file does not tell (its reading of one photon) is estimated
     from its first slices.
 

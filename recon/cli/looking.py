@@ -59,7 +59,7 @@ def _is_dicom(path: Path) -> bool:
 def _info(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     import yaml
 
-    from torchpcct.defects import dead_readings, repair_defects
+    from torchpcct.checks.defects import dead_readings, repair_defects
     from torchpcct.formats.geometry_yaml import geometry_values
     from torchpcct.formats.scans import open_scan
     from torchpcct.volume import Volume

@@ -4,7 +4,7 @@ One rule makes every dose factor: of two methods the one whose figure is larger 
 and every figure here (noise variance, variance of a contrast at slope 1, CNR², d′²) is proportional to the dose for a
 linear method. So the factor is the ratio of the method's figure to the linear reference's at the same dose. Both are of
 the same noise realisations, so what is luck of the draws cancels in the ratio; intervals are jackknife intervals over
-realisations (:mod:`torchpcct.metrics.jackknife`). What is drawn is controlled (:mod:`torchpcct.metrics.control`) by
+realisations (:mod:`torchpcct.metrics.intervals`). What is drawn is controlled (:mod:`torchpcct.metrics.control`) by
 linear functionals of the same noise, whose moments are exactly known: of MBIR by its own response
 (:mod:`recon.evaluate.response`), of other methods by the reference's ROI means. Of FBP all but noise and d′ is exact.
 
@@ -28,9 +28,8 @@ from numpy.typing import NDArray
 
 from recon.evaluate.measure import OBSERVERS, Readings
 from recon.evaluate.task import Facts
-from torchpcct.metrics.bootstrap import Estimate
 from torchpcct.metrics.control import controlled_log_variance, controlled_mean
-from torchpcct.metrics.jackknife import Jackknifed, combined, log_of_sum
+from torchpcct.metrics.intervals import Estimate, Jackknifed, combined, log_of_sum
 from torchpcct.metrics.observer import hotelling_scores
 
 __all__ = ["Known", "Record", "pivot", "records_of"]
@@ -146,7 +145,7 @@ class _Figures:
 
 
 def joint(function: Callable[..., Any], *figures: Figure) -> Figure:
-    """:func:`torchpcct.metrics.jackknife.combined`, exact where all figures are."""
+    """:func:`torchpcct.metrics.intervals.combined`, exact where all figures are."""
     if any(isinstance(f, Jackknifed) for f in figures):
         return combined(function, *figures)
     return float(function(*figures))

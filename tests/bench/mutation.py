@@ -38,10 +38,10 @@ _T = "tests/torchpcct/test_no_silent_errors.py::"
 _R = "tests/recon/test_no_silent_errors.py::"
 _C = "tests/recon/test_cli_refusals.py::"
 _FIELD, _WF = "recon/least_squares/field_model.py", "tests/recon/least_squares/test_whole_field.py::"
-_D = "tests/torchpcct/test_defects.py::"
+_D = "tests/torchpcct/checks/test_defects.py::"
 _Q = "tests/torchpcct/metrics/test_residual_test.py::"
-_O = "tests/torchpcct/metrics/test_opposite_rays.py::"
-_OPP = "torchpcct/metrics/opposite_rays.py"
+_O = "tests/torchpcct/checks/test_opposite_rays.py::"
+_OPP = "torchpcct/checks/opposite_rays.py"
 _P = "tests/recon/evaluate/test_store.py::"
 _SAME = _P + "test_finished_pieces_are_used_again_by_the_same_settings_and_source_only"
 _W = "tests/recon/analytic/test_angular_weights.py"
@@ -151,26 +151,26 @@ FAULTS = (
           _Q + "test_a_wrong_noise_level_is_found"),
     Fault("views untested", "torchpcct/metrics/residual_test.py", '(("views", (1, 2), 2), ("rows", (0, 2), 1))',
           '(("rows", (0, 2), 1),)', _Q + "test_gains_are_found"),
-    Fault("noise taken for dead cells", "torchpcct/defects.py", "BRIGHT = 30.0", "BRIGHT = 0.3",
+    Fault("noise taken for dead cells", "torchpcct/checks/defects.py", "BRIGHT = 30.0", "BRIGHT = 0.3",
           _D + "test_starved_data_are_left_alone"),
-    Fault("half lost is dead", "torchpcct/defects.py", "dark > 0.98 * seen", "dark > 0.25 * seen",
+    Fault("half lost is dead", "torchpcct/checks/defects.py", "dark > 0.98 * seen", "dark > 0.25 * seen",
           _D + "test_readings_lost_at_random_are_found"),
-    Fault("edges of metal are lost readings", "torchpcct/defects.py", "] for side in (-1, 1)]", "] for side in (1, 1)]",
-          _D + "test_readings_lost_at_random_are_found"),
-    Fault("dead views pass", "torchpcct/defects.py", "share > 0.99", "share > 9",
+    Fault("edges of metal are lost readings", "torchpcct/checks/defects.py", "] for side in (-1, 1)]",
+          "] for side in (1, 1)]", _D + "test_readings_lost_at_random_are_found"),
+    Fault("dead views pass", "torchpcct/checks/defects.py", "share > 0.99", "share > 9",
           _D + "test_every_kind_of_defect_is_found_and_nothing_else"),
-    Fault("hot cells pass", "torchpcct/defects.py", "lost | (dead | hot)[part]", "lost | dead[part]",
+    Fault("hot cells pass", "torchpcct/checks/defects.py", "lost | (dead | hot)[part]", "lost | dead[part]",
           _D + "test_every_kind_of_defect_is_found_and_nothing_else"),
-    Fault("bridged from the wrong side", "torchpcct/dead_cells.py", "share = (place - left)", "share = (right - place)",
-          "tests/torchpcct/test_dead_cells.py::test_lost_columns_rows_and_views_of_linear_data_come_back"),
-    Fault("window ignored", "torchpcct/defects.py", "parts = [np.s_[:, c : c + columns] for c in first]",
+    Fault("bridged from the wrong side", "torchpcct/readings.py", "share = (place - left)", "share = (right - place)",
+          "tests/torchpcct/test_readings.py::test_lost_columns_rows_and_views_of_linear_data_come_back"),
+    Fault("window ignored", "torchpcct/checks/defects.py", "parts = [np.s_[:, c : c + columns] for c in first]",
           "parts = [np.s_[:, 0:columns] for c in first]", _D + "test_cells_are_followed_through_a_window"),
     Fault("damaged pieces pass", "recon/evaluate/store.py", "if mark and digest !=", "if False and digest !=",
           _C + "test_damaged_pieces_are_computed_again"),
     Fault("threads left behind by a fork", "torchpcct/threads.py", "after_in_child=_renew", "after_in_parent=_renew",
-          "tests/torchpcct/projector/test_base.py::test_a_forked_process_computes_on_threads_of_its_own"),
-    Fault("ends of pieces forgotten", "torchpcct/threads.py", "self.kernel(begin, end,", "self.kernel(begin, end - 1,",
-          "tests/torchpcct/test_threads.py::test_every_index_once"),
+          "tests/torchpcct/projector/test_operator.py::test_a_forked_process_computes_on_threads_of_its_own"),
+    Fault("ends of pieces forgotten", "torchpcct/threads.py", "kernel(begin, end, *given",
+          "kernel(begin, end - 1, *given", "tests/torchpcct/test_threads.py::test_every_index_once"),
     Fault("kernels with two copies of a function", "torchpcct/projector/cpu/cone_kernels.py", '"forceinline": True',
           '"forceinline": False', "tests/torchpcct/projector/test_fresh_kernels.py"),
     Fault("rows by the wrong gain", "torchpcct/projector/cpu/cone_kernels.py", "real(1.0 / step), out, out.size)",

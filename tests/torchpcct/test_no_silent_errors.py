@@ -15,7 +15,7 @@ from torchpcct import ConeBeam, FanBeam, ParallelBeam, Projector, Scan, Volume, 
 from torchpcct.acquisition.acquire import plan
 from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import view_step
-from torchpcct.metrics import cnr_interval, mean_interval, sd_interval
+from torchpcct.metrics import cnr_interval, sd_interval
 from torchpcct.scanner.linearisation import WaterLinearisation
 from torchpcct.scene.materials import material
 from torchpcct.spectral import Basis, vmi_noise
@@ -171,7 +171,6 @@ def test_a_grid_that_no_row_sees_casts_no_shadow(z):
 def test_intervals_refuse_an_impossible_coverage(level):
     values = np.array([1.0, 2.0, 4.0])
     for call in (
-        lambda: mean_interval(values, level=level),
         lambda: sd_interval(1.0, 10, level=level),
         lambda: cnr_interval(values, values[::-1] + 0.1, level=level),
     ):
@@ -182,12 +181,8 @@ def test_intervals_refuse_an_impossible_coverage(level):
 def test_intervals_refuse_one_realisation():
     with pytest.raises(ValueError, match="at least 2"):
         sd_interval(1.0, 1)
-    with pytest.raises(ValueError, match="at least 2"):
-        mean_interval([1.0])
     with pytest.raises(ValueError, match="sd must be"):
         sd_interval(math.nan, 10)
-    with pytest.raises(ValueError, match="one ROI at a time"):
-        mean_interval(np.ones((3, 4)))
 
 
 def test_an_indefinite_covariance_has_no_noise():

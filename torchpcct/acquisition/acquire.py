@@ -13,15 +13,14 @@ import torch
 from torch import Tensor
 
 from torchpcct.acquisition.bodies import Bodies
-from torchpcct.acquisition.detection import quanta, recorded, signal_spectra
+from torchpcct.acquisition.detection import detected, signal_spectra
 from torchpcct.acquisition.plan import Plan, make_plan
 from torchpcct.acquisition.transmission import SUB_RAY_COUNTS, Beam, expected_readings
 from torchpcct.acquisition.transmission import sub_rays as sub_rays_of
 from torchpcct.acquisition.voxels import acquire_voxels
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import VolumeGrid
-from torchpcct.scan import Scan
-from torchpcct.scan_checks import check_exposure
+from torchpcct.scan import Scan, check_exposure
 from torchpcct.scanner.scanner import Scanner
 from torchpcct.scene.scene import Scene
 from torchpcct.scene.voxels import VoxelScene
@@ -103,7 +102,6 @@ def acquire(
     bodies = Bodies.of(scene, g, exposure_s if rotation_s is None else rotation_s, duty)
     plan_ = make_plan(bodies, scanner, region, tolerance_hu, sub_rays)
     log.info("%s", plan_.table())
-    bins, integrating = scanner.detector.bins, scanner.detector.energy_integrating
     energies, spectra, air = signal_spectra(scanner)
     beam = Beam(spectra, scanner.row_factor, scanner.source.focal_spot, plan_.points)
     # One view for all: the densest sampling of every effect costs nothing here.
@@ -111,33 +109,14 @@ def acquire(
     symmetric, step = bodies.symmetric(energies, one), np.array([bodies.view_step])
     surround = expected_readings(one, DetectorWindow.full(one), symmetric, dense, step).numpy()[:, 0]
     counts = _readings(plan_, bodies, scanner, energies, beam, surround, progress, keep or _computed)
-    if plan_.pile_up is not None:
-        counts, air, surround = recorded(plan_.pile_up, counts, air, surround, plan_.kept or DetectorWindow.full(g))
-    quantum = quanta(scanner, counts, energies)
-
-    def squeezed(t: Tensor) -> Tensor:
-        return t[0] if bins == 1 else t[:bins]
-
-    def tensor(values: Any) -> Tensor:
-        return squeezed(torch.from_numpy(np.array(values, dtype=np.float32)))
-
-    scan = Scan(
-        counts=squeezed(counts),
-        air=tensor(air),
-        geometry=g,
-        linearisation=scanner.water_linearisation(),
-        window=plan_.kept,
-        surround=None if plan_.kept is None else tensor(surround),
-        counting=not integrating,
-        info={
-            "scanner": scanner.name,
-            "scene": list(scene.names),
-            "plan": plan_.as_dict(),
-            "seconds": round(time.perf_counter() - start, 2),
-        },
-        quantum=None if quantum is None else squeezed(quantum),
-        electronic_noise=scanner.detector.electronic_noise if integrating else 0.0,
-    )
+    info = {
+        "scanner": scanner.name,
+        "scene": list(scene.names),
+        "plan": plan_.as_dict(),
+        "seconds": round(time.perf_counter() - start, 2),
+    }
+    kept = None if plan_.kept is None else surround
+    scan = detected(scanner, counts, air, energies, info, kept, plan_.kept)
     return scan if exposure_s is None else scan.with_noise(exposure_s, seed)
 
 

@@ -10,9 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpcct.acquisition.detection import quanta, recorded, signal_spectra
+from torchpcct.acquisition.detection import detected, signal_spectra
 from torchpcct.acquisition.transmission import compress
-from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam
 from torchpcct.projector import Projector
 from torchpcct.scan import Scan
@@ -70,15 +69,6 @@ def acquire_voxels(
             counts[:, v0 + v] = _readings(lines[:, v], spectrum, weight, sub_columns) * rows[:, None]
         if progress is not None:
             progress((v0 + part.views) / g.views)
-    pile_up = scanner.pile_up()
-    if pile_up is not None:
-        counts, air, _ = recorded(pile_up, counts, air, air, DetectorWindow.full(g))
-    quantum = quanta(scanner, counts, energies)
-    kept = scanner.detector.bins
-
-    def of_bins(t: Tensor) -> Tensor:
-        return t[0] if kept == 1 else t[:kept]
-
     info = {
         "scanner": scanner.name,
         "scene": list(scene.names),
@@ -91,16 +81,7 @@ def acquire_voxels(
         },
         "seconds": round(time.perf_counter() - start, 2),
     }
-    return Scan(
-        counts=of_bins(counts),
-        air=of_bins(torch.from_numpy(np.array(air, dtype=np.float32))),
-        geometry=g,
-        linearisation=scanner.water_linearisation(),
-        counting=not scanner.detector.energy_integrating,
-        info=info,
-        quantum=None if quantum is None else of_bins(quantum),
-        electronic_noise=scanner.detector.electronic_noise if scanner.detector.energy_integrating else 0.0,
-    )
+    return detected(scanner, counts, air, energies, info)
 
 
 def _readings(lines: Tensor, spectrum: Tensor, weight: Tensor, sub_columns: int) -> Tensor:

@@ -8,11 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpcct.dead_cells import bridge
-from torchpcct.defects import repair_defects
+from torchpcct.checks.defects import repair_defects
+from torchpcct.checks.rotation_axis import RotationAxis, at_axis, rotation_axis
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam
-from torchpcct.metrics.rotation_axis import RotationAxis, at_axis, rotation_axis
-from torchpcct.robust import MEDIAN_TO_SD
+from torchpcct.readings import MEDIAN_TO_SD, bridge
 from torchpcct.scan import Scan
 from torchpcct.validate import checked
 
@@ -23,7 +22,7 @@ __all__ = ["centred", "cleaned", "find_axis", "without_outliers", "without_strip
 def find_axis(scan: Scan) -> RotationAxis:
     """The column of the rotation axis with its error: of a full turn of any beam, or half a turn of parallel rays.
 
-    Of several slices the one with the most to be seen is looked at (:mod:`torchpcct.metrics.rotation_axis`).
+    Of several slices the one with the most to be seen is looked at (:mod:`torchpcct.checks.rotation_axis`).
 
     Raises:
         ValueError: a part of the detector, a geometry view by view, energy bins; too few opposite rays, or nothing to
@@ -53,8 +52,8 @@ def cleaned(scan: Scan, *, snr: float = 3.0, threshold: float = 0.08) -> Scan:
     """The same parallel or fan-beam scan without outliers and stripes (:func:`without_outliers`,
     :func:`without_stripes`).
 
-    Readings that no object can cause (:func:`torchpcct.defects.repair_defects`) are bridged before. The others are
-    changed by the factor that their logarithms ask for, so that the scan keeps its weights.
+    Readings that no object can cause (:func:`torchpcct.checks.defects.repair_defects`) are bridged before. The others
+    are changed by the factor that their logarithms ask for, so that the scan keeps its weights.
 
     Raises:
         ValueError: a cone beam, or a scan of a part of the detector.

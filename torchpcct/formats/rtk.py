@@ -13,28 +13,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchpcct.formats.damage import reading
 from torchpcct.validate import number, per_axis, whole
 from torchpcct.vector_geometry import VectorGeometry
 
-__all__ = ["read_rtk", "read_rtk_vectors"]
+__all__ = ["read_rtk"]
 
 _OURS = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 """RTK's (x, y, z) to ours."""
 
 
 def read_rtk(path: str | os.PathLike[str], columns: int, rows: int, pitch: Any, origin: Any = None) -> VectorGeometry:
-    """The scan of :func:`read_rtk_vectors`, for ``Projector`` and ``recon.analytic.fbp.fbp``; its arguments and
-    errors."""
-    return VectorGeometry(read_rtk_vectors(path, columns, rows, pitch, origin), columns, rows)
-
-
-def read_rtk_vectors(
-    path: str | os.PathLike[str], columns: int, rows: int, pitch: Any, origin: Any = None
-) -> NDArray[np.float64]:
-    """Vectors of a cone beam, ``(views, 12)`` mm: source, detector centre, steps to the next column and row.
+    """A cone beam, view by view: for ``Projector`` and ``recon.analytic.fbp.fbp``.
 
     Args:
         path: XML file.
@@ -68,7 +59,7 @@ def read_rtk_vectors(
                 raise ValueError("a <Projection> has no <SourceToDetectorDistance>")
             sdd = number("SourceToDetectorDistance", distance, positive=True, unit="mm")
             vectors.append(_vector(matrix.reshape(3, 4), sdd, (u, v), (du, dv)))
-    return np.array(vectors)
+    return VectorGeometry(np.array(vectors), columns, rows)
 
 
 def _vector(p: Any, sdd: float, middle: tuple[float, float], step: tuple[float, float]) -> Any:

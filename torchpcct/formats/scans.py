@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 
+from torchpcct.checks.rotation_axis import at_axis
 from torchpcct.files import is_sealed
 from torchpcct.formats.catsim import read_catsim
 from torchpcct.formats.damage import reading
@@ -16,7 +17,6 @@ from torchpcct.formats.data_exchange import read_data_exchange
 from torchpcct.formats.dicom_ct_pd import read_dicom_ct_pd
 from torchpcct.formats.stack import read_stack
 from torchpcct.geometry import Geometry, ParallelBeam
-from torchpcct.metrics.rotation_axis import at_axis
 from torchpcct.scan import Scan
 from torchpcct.scan_file import slice_axis, sliced
 from torchpcct.validate import number

@@ -1,40 +1,35 @@
 """Figures of merit: CNR, the limit of the data, observer, resolution, noise.
 
 Reading order: ``placement`` and ``roi`` say where is measured, ``cnr`` is the paper's figure over realisations,
-``data_limit`` the best that any unbiased method can reach. ``bootstrap`` and ``jackknife`` give figures their
-intervals, ``control`` narrows them. (What they are for, the dose factor, is :mod:`recon.evaluate`.) ``observer`` asks
+``data_limit`` the best that any unbiased method can reach. ``intervals`` gives figures theirs (bootstrap,
+jackknife), ``control`` narrows them. (What they are for, the dose factor, is :mod:`recon.evaluate`.) ``observer`` asks
 whether the core is seen, ``resolution`` and ``noise_power`` how sharp and how noisy an image is, and
 ``plaque_measures`` measures lumen, core and cap. ``residual_test`` asks whether a volume explains
 its data at all, ``half_split`` what noise and resolution a real scan has, without a truth.
 """
 
-from torchpcct.metrics.bootstrap import Estimate
-from torchpcct.metrics.cnr import Interval, cnr, cnr_from_moments, cnr_interval, cnr_range, mean_interval, sd_interval
+from torchpcct.metrics.cnr import Interval, cnr, cnr_from_moments, cnr_interval, cnr_range, sd_interval
 from torchpcct.metrics.control import controlled_log_variance, controlled_mean
 from torchpcct.metrics.data_limit import Ceiling, ceiling, information_matrix
-from torchpcct.metrics.jackknife import Jackknifed, combined
+from torchpcct.metrics.intervals import Estimate, Jackknifed, combined
 from torchpcct.metrics.noise_power import NoisePower, noise_power_spectrum
 from torchpcct.metrics.observer import (
     ObserverResult,
     auc,
-    auc_from_d_prime,
     channel_responses,
     d_prime,
     dog_channels,
-    false_positive_difference,
-    false_positive_rate,
     hotelling_scores,
     observe,
     template_channel,
 )
-from torchpcct.metrics.plaque_measures import cap_thickness, lumen_area, threshold_contour
+from torchpcct.metrics.plaque_measures import lumen_area
 from torchpcct.metrics.residual_test import ResidualTest, residual_test
 from torchpcct.metrics.resolution import (
     TransferFunction,
     edge_profile,
     edge_width,
     ellipsoid_distance,
-    match_edge_width,
     task_transfer,
 )
 
@@ -48,8 +43,6 @@ __all__ = [
     "ResidualTest",
     "TransferFunction",
     "auc",
-    "auc_from_d_prime",
-    "cap_thickness",
     "ceiling",
     "channel_responses",
     "cnr",
@@ -64,18 +57,13 @@ __all__ = [
     "edge_profile",
     "edge_width",
     "ellipsoid_distance",
-    "false_positive_difference",
-    "false_positive_rate",
     "hotelling_scores",
     "information_matrix",
     "lumen_area",
-    "match_edge_width",
-    "mean_interval",
     "noise_power_spectrum",
     "observe",
     "residual_test",
     "sd_interval",
     "task_transfer",
     "template_channel",
-    "threshold_contour",
 ]

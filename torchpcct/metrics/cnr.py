@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-from torchpcct.metrics.bootstrap import generator
+from torchpcct.metrics.intervals import generator
 from torchpcct.validate import broadcast, checked, coverage, number, whole
 
-__all__ = ["Interval", "cnr", "cnr_from_moments", "cnr_interval", "cnr_range", "mean_interval", "sd_interval"]
+__all__ = ["Interval", "cnr", "cnr_from_moments", "cnr_interval", "cnr_range", "sd_interval"]
 
 Floats = NDArray[np.float64]
 
@@ -73,21 +73,6 @@ def cnr_from_moments(fg_mean: ArrayLike, fg_sd: ArrayLike, bg_mean: ArrayLike, b
         raise ValueError("the ROI means do not vary: CNR needs noisy realisations (exposure_s is not None)")
     value = (bg - fg) / noise
     return float(value) if value.ndim == 0 else value
-
-
-@checked
-def mean_interval(means: ArrayLike, level: float = 0.95) -> Interval:
-    """Student's interval for the mean over realisations, ``means`` ``(realisations,)``.
-
-    Raises:
-        ValueError: another shape, fewer than 2 realisations, NaN or Inf, a level outside (0, 1).
-    """
-    m = _means("means", means)
-    if m.ndim != 1:
-        raise ValueError(f"means must have the shape (realisations,), got {m.shape}: take one ROI at a time")
-    coverage("level", level)
-    half = stats.t.ppf(0.5 + level / 2, m.size - 1) * m.std(ddof=1) / np.sqrt(m.size)
-    return Interval(float(m.mean() - half), float(m.mean() + half))
 
 
 @checked

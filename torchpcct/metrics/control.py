@@ -14,7 +14,7 @@ half-width of a factor of σ_y² and an exact variance (FBP's) at n = 200 is ×1
 R = 0.97 and ×1.01 at 0.999.
 
 Intervals are jackknife intervals, each realisation left out once in closed form: they do not ask for normal values, and
-figures of the same draws combine (:mod:`torchpcct.metrics.jackknife`). Simulated coverage of nominal 95 % (2000
+figures of the same draws combine (:mod:`torchpcct.metrics.intervals`). Simulated coverage of nominal 95 % (2000
 experiments each, R = 0.97 and 0.999): 94–96 % at n = 200 and at 40 for normal values and for residuals of Student's t
 with 6 degrees of freedom; 94–95 % at n = 200 for a relation whose quadratic part has 2 % of the variance, but 91–94 %
 at n = 40. The half-widths are wider there than the correlation promises (×1.10 in place of ×1.01).
@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from torchpcct.metrics.jackknife import Jackknifed
+from torchpcct.metrics.intervals import Jackknifed
 from torchpcct.validate import checked
 
 __all__ = [

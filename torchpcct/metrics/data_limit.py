@@ -91,11 +91,6 @@ class Ceiling:
     functional_covariance: Floats
 
     @property
-    def amplitude_sd(self) -> Floats:
-        """SD of each amplitude, ``(tissues,)`` HU."""
-        return np.sqrt(np.diag(self.covariance))
-
-    @property
     def functional_sd(self) -> Floats:
         """SD of each functional, ``(m,)`` HU."""
         return np.sqrt(np.diag(self.functional_covariance))

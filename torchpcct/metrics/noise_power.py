@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchpcct.metrics.resolution import first_below
 from torchpcct.metrics.roi import as_array
 from torchpcct.validate import checked, number, per_axis
 
@@ -63,27 +62,6 @@ class NoisePower:
         number("width", step, positive=True, unit="cycles per mm")
         inside = f <= 0.5 / max(self.spacing) + 1e-12
         return _shells(f[inside], self.power.ravel()[inside], step)
-
-    @property
-    def autocorrelation(self) -> Floats:
-        """Circular autocorrelation, 1 at lag 0; lags in the order of ``numpy.fft.fftfreq``, shape of ``power``."""
-        covariance = np.fft.ifftn(self.power).real
-        if not covariance.flat[0] > 0:
-            raise ValueError("the realisations do not vary: there is no noise to correlate")
-        return covariance / covariance.flat[0]
-
-    def correlation_length(self, level: float = np.exp(-1.0)) -> float:
-        """Distance in mm at which the radial mean of the autocorrelation first falls to ``level``.
-
-        White noise filtered by a Gaussian of σ has ``exp(−r² / 4σ²)``: 2σ at the level 1 / e. Voxels that are not
-        correlated give less than one voxel (linear interpolation to the first shell). Inf where it never falls.
-        """
-        if not 0 < level < 1:
-            raise ValueError(f"level must lie in (0, 1), got {level}")
-        lags = [np.fft.fftfreq(n, 1.0 / (n * s)) for n, s in zip(self.power.shape, self.spacing, strict=True)]
-        r = np.sqrt(sum(np.square(a) for a in np.meshgrid(*lags, indexing="ij"))).ravel()
-        radius, rho = _shells(r, self.autocorrelation.ravel(), 0.5 * min(self.spacing))
-        return first_below(radius, rho, level, float("inf"))
 
 
 def _shells(radius: Floats, values: Floats, width: float) -> tuple[Floats, Floats]:

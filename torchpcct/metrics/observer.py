@@ -16,22 +16,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import expit, logit, ndtr, ndtri
+from scipy.special import expit, logit, ndtri
 
 from torchpcct.geometry import VolumeGrid
-from torchpcct.metrics.bootstrap import Estimate, bca_interval, evaluate, leave_one_out, resampling
+from torchpcct.metrics.intervals import Estimate, bca_interval, evaluate, leave_one_out, resampling
 from torchpcct.metrics.roi import as_array
 from torchpcct.validate import checked, coverage
 
 __all__ = [
     "ObserverResult",
     "auc",
-    "auc_from_d_prime",
     "channel_responses",
     "d_prime",
     "dog_channels",
-    "false_positive_difference",
-    "false_positive_rate",
     "hotelling_scores",
     "observe",
     "template_channel",
@@ -252,13 +249,6 @@ def d_prime(present: ArrayLike, absent: ArrayLike, level: float = 0.95, draws: i
     return Estimate(value, *bca_interval(value, resampled, statistic(leave_one_out(a.size)), level))
 
 
-@checked
-def auc_from_d_prime(value: ArrayLike) -> Any:
-    """Area of normal scores of equal variance, ``Φ(d′ / √2)``."""
-    area = ndtr(np.asarray(value, dtype=np.float64) / math.sqrt(2.0))
-    return float(area) if np.ndim(area) == 0 else area
-
-
 class ObserverResult(NamedTuple):
     """What :func:`observe` found: area, detectability, and the scores ``(n,)`` they come from."""
 
@@ -293,56 +283,3 @@ def observe(
         means = tuple(channel_responses(as_array(m)[None], channels)[0] for m in known_means)
     s1, s0 = hotelling_scores(*responses, known_means=means, train=train)
     return ObserverResult(auc(s1, s0, level=level), d_prime(s1, s0, level=level, seed=seed), s1, s0)
-
-
-@checked
-def false_positive_rate(present: ArrayLike, absent: ArrayLike, sensitivity: float = 0.9) -> float:
-    """Share of absent scores at or above the highest threshold that still finds ``sensitivity`` of the present ones.
-
-    Raises:
-        ValueError: a sensitivity outside (0, 1].
-    """
-    a, b = _pair(present, absent)
-    return float(_false_positives(a[None], b[None], sensitivity)[0])
-
-
-def _false_positives(a: Floats, b: Floats, sensitivity: float) -> Floats:
-    if not 0 < sensitivity <= 1:
-        raise ValueError(f"sensitivity must lie in (0, 1], got {sensitivity}")
-    n = a.shape[-1]
-    found = math.ceil(sensitivity * n - 1e-9)
-    threshold = np.partition(a, n - found, axis=-1)[..., n - found]
-    return (b >= threshold[..., None]).mean(-1)
-
-
-@checked
-def false_positive_difference(
-    method: tuple[Any, Any],
-    reference: tuple[Any, Any],
-    sensitivity: float = 0.9,
-    level: float = 0.95,
-    draws: int = 2000,
-    seed: int = 0,
-) -> Estimate:
-    """False-positive rate of a method minus that of a reference at equal sensitivity, with a paired interval.
-
-    Args:
-        method, reference: ``(present, absent)`` scores, all ``(n,)`` on the same n noise seeds.
-        sensitivity: of both.
-        level, draws, seed: of the percentile bootstrap over seeds.
-
-    Raises:
-        ValueError: numbers of scores that differ.
-    """
-    (a, b), (c, d) = _pair(*method), _pair(*reference)
-    if len({a.size, b.size, c.size, d.size}) != 1:
-        raise ValueError(f"all scores must be on the same seeds, got {a.size}, {b.size}, {c.size} and {d.size}")
-
-    def statistic(i: Any) -> Floats:
-        return _false_positives(a[i], b[i], sensitivity) - _false_positives(c[i], d[i], sensitivity)
-
-    value = float(statistic(np.arange(a.size)[None])[0])
-    drawn = evaluate(statistic, resampling(a.size, draws, seed))
-    coverage("level", level)
-    low, high = np.quantile(drawn, [0.5 - level / 2, 0.5 + level / 2])
-    return Estimate(value, float(low), float(high))

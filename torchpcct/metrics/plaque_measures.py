@@ -1,7 +1,7 @@
 """What is measured on a plaque's axial image: by contours at a threshold, by segmentation, on a line.
 
-By contours, :func:`lumen_area` and :func:`cap_thickness` find the closed contour around a point that is known to lie in
-the region, to a fraction of a voxel; they need no protocol and no fat around the vessel.
+By contours, :func:`lumen_area` finds the closed contour around a point that is known to lie in the lumen, to a fraction
+of a voxel; it needs no protocol and no fat around the vessel.
 
 By segmentation, :func:`segment_plaque` follows the protocol of Li et al. (section "Image Resolution"): on the axial
 image of 0.035 mm pixels the lumen is what reads at least 250 HU (half of the contrast-enhanced blood), the necrotic
@@ -39,11 +39,9 @@ __all__ = [
     "PlaqueSegmentation",
     "basin_depth",
     "cap_on_line",
-    "cap_thickness",
     "dice",
     "lumen_area",
     "segment_plaque",
-    "threshold_contour",
 ]
 
 LUMEN_HU = 250.0
@@ -60,67 +58,25 @@ _CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], dtype=bool)
 
 
 @checked
-def threshold_contour(image: ArrayLike, grid: VolumeGrid, threshold: float, seed: tuple[float, float]) -> Floats | None:
-    """Closed contour at a threshold around a point, by marching squares with linear interpolation.
+def lumen_area(image: ArrayLike, grid: VolumeGrid, seed: tuple[float, float], threshold: float = LUMEN_HU) -> float:
+    """Area in mm² inside the contour at a threshold around a point, by marching squares with linear interpolation.
 
     Args:
         image: ``(y, x)`` or ``(1, y, x)`` HU, tensor or array.
         grid: of the image.
+        seed: ``(y, x)`` mm, a point of the lumen: the smallest closed contour around it is taken.
         threshold: HU.
-        seed: ``(y, x)`` mm, a point of the region: the smallest closed contour around it is taken.
 
     Returns:
-        ``(points, 2)`` y, x in mm, first point repeated at the end; None where no closed contour surrounds the seed
-        (the region is lost, or merged with the image's border).
+        NaN where no closed contour surrounds the seed (the lumen is lost, or merged with the image's border).
 
     Raises:
         ValueError: an image that is not one slice of the grid's shape, NaN or Inf.
     """
     x, plane = _slice(image, grid)
     origin = np.array([a[0] for a in plane.axes])
-    best, area = None, math.inf
-    for contour in find_contours(x, threshold):
-        if not np.array_equal(contour[0], contour[-1]):
-            continue
-        points = origin + contour * plane.spacing
-        if _surrounds(points, seed) and _area(points) < area:
-            best, area = points, _area(points)
-    return best
-
-
-@checked
-def lumen_area(image: ArrayLike, grid: VolumeGrid, seed: tuple[float, float], threshold: float = LUMEN_HU) -> float:
-    """Area in mm² inside the threshold contour around ``seed`` (sub-voxel); NaN where there is no closed contour.
-
-    Args:
-        image, grid, threshold, seed: as in :func:`threshold_contour`.
-    """
-    contour = threshold_contour(image, grid, threshold, seed)
-    return math.nan if contour is None else _area(contour)
-
-
-@checked
-def cap_thickness(
-    image: ArrayLike,
-    grid: VolumeGrid,
-    lumen_seed: tuple[float, float],
-    core_seed: tuple[float, float],
-    lumen_threshold: float = LUMEN_HU,
-    core_threshold: float = 70.0,
-) -> float:
-    """Smallest distance in mm between the lumen's and the core's contour; NaN where either is lost.
-
-    Args:
-        image, grid: as in :func:`threshold_contour`.
-        lumen_seed, core_seed: ``(y, x)`` mm, points of the two regions.
-        lumen_threshold: the lumen is brighter than this, HU.
-        core_threshold: the core is darker than this, HU: halfway between core (40) and fibrous tissue (100).
-    """
-    lumen = threshold_contour(image, grid, lumen_threshold, lumen_seed)
-    core = threshold_contour(image, grid, core_threshold, core_seed)
-    if lumen is None or core is None:
-        return math.nan
-    return min(_to_line(lumen, core), _to_line(core, lumen))
+    closed = (origin + c * plane.spacing for c in find_contours(x, threshold) if np.array_equal(c[0], c[-1]))
+    return min((_area(c) for c in closed if _surrounds(c, seed)), default=math.nan)
 
 
 @dataclass(frozen=True, eq=False)
@@ -329,15 +285,6 @@ def _surrounds(points: Floats, seed: tuple[float, float]) -> bool:
     cross = (y[:-1] > 0) != (y[1:] > 0)
     x0, x1, y0, y1 = x[:-1][cross], x[1:][cross], y[:-1][cross], y[1:][cross]
     return bool(((x0 - y0 * (x1 - x0) / (y1 - y0)) > 0).sum() % 2)
-
-
-def _to_line(points: Floats, line: Floats) -> float:
-    """Smallest distance from points to the segments of a polyline."""
-    start, along = line[:-1], np.diff(line, axis=0)
-    length = np.maximum(np.square(along).sum(-1), 1e-300)
-    offset = points[:, None] - start
-    part = np.clip((offset * along).sum(-1) / length, 0.0, 1.0)
-    return float(np.sqrt(np.square(offset - part[..., None] * along).sum(-1).min()))
 
 
 def _largest(labels: Any) -> Mask:

@@ -10,7 +10,6 @@ surface share this.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.roi import as_array
-from torchpcct.validate import checked, number
+from torchpcct.validate import checked
 
 __all__ = [
     "TransferFunction",
@@ -27,7 +26,6 @@ __all__ = [
     "edge_width",
     "ellipsoid_distance",
     "first_below",
-    "match_edge_width",
     "task_transfer",
 ]
 
@@ -237,41 +235,3 @@ def task_transfer(
     keep = frequencies <= 0.25 / bin_mm
     frequencies, values = frequencies[keep], values[keep]
     return TransferFunction(frequencies, values / np.sinc(frequencies * bin_mm) ** 2, positions, profile)
-
-
-@checked
-def match_edge_width(
-    target_mm: float, width_of: Callable[[float], float], low: float, high: float, tolerance: float = 1e-3
-) -> float:
-    """The parameter (the σ of a post-filter, a kernel's cut-off) at which a method's edge is as wide as another's.
-
-    Args:
-        target_mm: edge width to reach, mm.
-        width_of: edge width in mm as a continuous monotone function of the parameter.
-        low, high: range of the parameter.
-        tolerance: relative, of the width reached.
-
-    Raises:
-        ValueError: the target lies outside the widths at ``low`` and ``high``.
-    """
-    ends = width_of(low) - target_mm, width_of(high) - target_mm
-    number("tolerance", tolerance, positive=True)
-    if ends[0] * ends[1] > 0:
-        raise ValueError(
-            f"the edge width {target_mm:g} mm lies outside {ends[0] + target_mm:g}…{ends[1] + target_mm:g} mm, "
-            f"what parameters {low:g}…{high:g} give: widen the range"
-        )
-    a, b, fa = low, high, ends[0]
-    for end, gap in zip((low, high), ends, strict=True):
-        if abs(gap) <= tolerance * target_mm:
-            return float(end)
-    for _ in range(100):
-        middle = 0.5 * (a + b)
-        gap = width_of(middle) - target_mm
-        if abs(gap) <= tolerance * target_mm:
-            break
-        if (gap > 0) == (fa > 0):
-            a = middle
-        else:
-            b = middle
-    return float(middle)

@@ -117,11 +117,6 @@ class RoiMean:
         """Pixels in the ROI."""
         return int(self.mask.sum())
 
-    @property
-    def area_mm2(self) -> float:
-        """Area of the ROI (of all its slices) in mm²."""
-        return self.pixels * self.image.spacing[1] * self.image.spacing[2]
-
     def __call__(self, volume: Tensor) -> Tensor:
         """ROI mean of ``volume`` ``(..., z, y, x)``, ``(...)`` float64."""
         if tuple(volume.shape[-3:]) != self.grid.shape:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
-from torchpcct.projector.compiling import announce_compilation
+from torchpcct.kernel_cache import announce_compilation
 from torchpcct.projector.cuda import passes as cuda
 from torchpcct.projector.tables import Tables, VectorTables
 
@@ -96,12 +96,7 @@ class Engine:
         return self._on_cpu(flat, transposed).reshape(*lead, *outer).to(x.device)
 
     def _on_cpu(self, x: Tensor, transposed: bool) -> Tensor:
-        array, memory = x.cpu().contiguous().numpy(), self.tables.memory
-        if memory is not None and (need := self.cpu.workspace(len(array), array.itemsize)) > memory:
-            raise ValueError(
-                f"a pass of this scan needs {need} bytes of working memory, memory allows {memory}: raise it, or use "
-                "fewer voxels, fewer columns, float32" + (", or a smaller batch" if self.tables.grid.ndim == 2 else "")
-            )
+        array = x.cpu().contiguous().numpy()
         announce_compilation()
         result = self.cpu.adjoint(array) if transposed else self.cpu.forward(array)
         return torch.from_numpy(np.ascontiguousarray(result))

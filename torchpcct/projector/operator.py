@@ -3,23 +3,126 @@
 from __future__ import annotations
 
 import math
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
+import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import Geometry, VolumeGrid
-from torchpcct.projector.base import Operator
 from torchpcct.projector.engine import ENGINES, Engine
 from torchpcct.projector.tables import Tables, VectorTables
-from torchpcct.projector.vectors import as_circular
 from torchpcct.vector_geometry import VectorGeometry
 
-__all__ = ["Projector"]
+if TYPE_CHECKING:
+    from scipy.sparse.linalg import LinearOperator
+
+__all__ = ["Operator", "Projector"]
 
 _DTYPES = (torch.float32, torch.float64)
 _NARROW = (torch.float16, torch.bfloat16)
+
+
+class Operator(nn.Module):
+    """A linear operator with a matched adjoint ``T``, between ``domain_shape`` and ``range_shape``."""
+
+    @property
+    def domain_shape(self) -> tuple[int, ...]:
+        """Shape of one input."""
+        raise NotImplementedError
+
+    @property
+    def range_shape(self) -> tuple[int, ...]:
+        """Shape of one output."""
+        raise NotImplementedError
+
+    @property
+    def T(self) -> Operator:
+        """The adjoint operator."""
+        raise NotImplementedError
+
+    @property
+    def H(self) -> Operator:
+        """The adjoint operator; all weights are real, so it is ``A.T``."""
+        return self.T
+
+    def __matmul__(self, x: Tensor) -> Tensor:
+        return cast(Tensor, self(x))
+
+    def norm(self, tolerance: float = 1e-4, most: int = 200) -> float:
+        """Largest singular value, by power iteration on AᵀA in float32; kept after the first call.
+
+        Args:
+            tolerance: stop when the value grows by less than this share in one iteration. It is approached from
+                below.
+            most: largest number of iterations, one pass in either direction each.
+        """
+        kept = self.__dict__.get("_norm")
+        if kept is None or kept[0] > tolerance:
+            # A constant start is near the largest eigenvector, and the noise keeps it from being orthogonal to it.
+            noise = torch.rand(self.domain_shape, generator=torch.Generator().manual_seed(0))
+            x, value = 1 + noise, 0.0
+            for _ in range(most):
+                x = x / x.norm().clamp_min(torch.finfo(x.dtype).tiny)
+                with torch.no_grad():
+                    y = self(x)
+                    x = self.T(y)
+                before, value = value, float(y.norm())
+                if value <= before * (1 + tolerance):
+                    break
+            kept = self.__dict__["_norm"] = (tolerance, value)
+        return cast(float, kept[1])
+
+    def as_scipy(self, dtype: Any = np.float32) -> LinearOperator:
+        """A :class:`scipy.sparse.linalg.LinearOperator` on flattened arrays, for SciPy's solvers.
+
+        Args:
+            dtype: float32 or float64, in which it computes.
+
+        Raises:
+            TypeError: another dtype.
+        """
+        from scipy.sparse.linalg import LinearOperator
+
+        if np.dtype(dtype) not in (np.dtype(np.float32), np.dtype(np.float64)):
+            raise TypeError(f"dtype must be float32 or float64, got {dtype!r}")
+
+        def columns(operator: Operator, values: Any) -> Any:
+            # Columns of a matrix are a batch.
+            batch = np.ascontiguousarray(np.asarray(values, dtype=dtype).reshape(values.shape[0], -1).T)
+            with torch.no_grad():
+                out = operator(torch.from_numpy(batch).reshape(-1, *operator.domain_shape))
+            return out.reshape(len(batch), -1).numpy().T.reshape(-1, *values.shape[1:])
+
+        return LinearOperator(
+            (math.prod(self.range_shape), math.prod(self.domain_shape)),
+            matvec=lambda x: columns(self, x),
+            rmatvec=lambda y: columns(self.T, y),
+            matmat=lambda x: columns(self, x),
+            rmatmat=lambda y: columns(self.T, y),
+            dtype=dtype,
+        )
+
+    def as_pylops(self, dtype: Any = np.float32) -> Any:
+        """A ``pylops.LinearOperator`` on flattened arrays; see :meth:`as_scipy`.
+
+        Raises:
+            ModuleNotFoundError: PyLops is not installed.
+        """
+        import pylops
+
+        return pylops.aslinearoperator(self.as_scipy(dtype))
+
+    def as_deepinv(self) -> Any:
+        """A ``deepinv.physics.LinearPhysics``: differentiable, on batches ``(batch, …, *shape)``.
+
+        Raises:
+            ModuleNotFoundError: deepinv is not installed.
+        """
+        from deepinv.physics import LinearPhysics
+
+        return LinearPhysics(A=lambda x, **_: self(x), A_adjoint=lambda y, **_: self.T(y))
 
 
 class _Pass(torch.autograd.Function):
@@ -96,7 +199,7 @@ class Projector(Operator):
 
     In and out have one dtype (float32 or float64) and one device; float16 and bfloat16, as autocast leaves them, are
     computed and returned in float32. ``A @ x``, ``A.H``, ``A.norm()`` and the operator in the form of other libraries
-    (``as_scipy``, ``as_pylops``, ``as_deepinv``) come from :class:`torchpcct.projector.base.Operator`. Units: ``x``
+    (``as_scipy``, ``as_pylops``, ``as_deepinv``) come from :class:`Operator`. Units: ``x``
     in mm⁻¹ gives line integrals without unit. Both directions are differentiable any number of times and work under
     ``torch.func``. NaN and Inf in the input reach the output (a NaN may also reach readings that share a grid line with
     it). ``torch.compile`` and, within the process, ``torch.export`` take a pass as one operation. The module has no
@@ -111,14 +214,11 @@ class Projector(Operator):
         window: the part of the detector to compute (``torchpcct.detector_window.footprint``), or None for all of it.
         motion: displacement of the grid in every view, ``(views, 2)`` (y, x) or ``(views, 3)`` (z, y, x) mm, or None:
             a volume that moves rigidly with its object is projected and reconstructed at rest.
-        memory: bytes of working memory that a pass may hold besides its input and output (see
-            :meth:`memory_estimate`), or None: as much as serves speed on the CPU (64 MiB of row sums), half of the
-            free memory on CUDA. Batches and views go through in slices that fit; the result is the same bit for bit.
 
     Raises:
         TypeError: an argument of the wrong kind, an input that is not float32 or float64.
         ValueError: geometry, grid, window and motion that do not fit together, a source inside the grid, an input
-            of the wrong shape, a ``memory`` that the smallest slice exceeds (found when a pass is called).
+            of the wrong shape.
     """
 
     def __init__(
@@ -127,13 +227,12 @@ class Projector(Operator):
         grid: VolumeGrid,
         window: DetectorWindow | None = None,
         motion: Any = None,
-        memory: int | None = None,
     ) -> None:
         super().__init__()
         self.geometry = geometry
         self.grid = grid
         self.window = window
-        self._engine = Engine(_tables(geometry, grid, window, motion, memory))
+        self._engine = Engine(_tables(geometry, grid, window, motion))
         self._adjoint: list[_Adjoint] = []  # in a list: a submodule that holds its parent would recurse
 
     @property
@@ -165,8 +264,8 @@ class Projector(Operator):
         Args:
             batch: number of volumes (or sinograms) in the pass.
             dtype: float32 or float64.
-            device: where the pass runs, "cpu" or a CUDA device. There, without a ``memory`` limit, the estimate is
-                that of the unsliced batch.
+            device: where the pass runs, "cpu" or a CUDA device: there the estimate is that of the whole batch; what
+                does not fit into half of the free memory goes through in slices, the same bit for bit.
 
         Raises:
             TypeError: another dtype. ValueError: a negative batch.
@@ -212,17 +311,15 @@ class _Adjoint(Operator):
         return f"{type(self.T.geometry).__name__}, {self.domain_shape} -> {self.range_shape}"
 
 
-def _tables(geometry: Any, grid: Any, window: Any, motion: Any, memory: int | None) -> Tables | VectorTables:
+def _tables(geometry: Any, grid: Any, window: Any, motion: Any) -> Tables | VectorTables:
     if not isinstance(geometry, VectorGeometry):
-        return Tables(geometry, grid, window, motion, memory)
+        return Tables(geometry, grid, window, motion)
     if window is not None:
         raise ValueError("a window belongs to a circular scan; of a VectorGeometry select the views, or use all of it")
     if motion is not None:
         geometry = geometry.moved(motion)
-    circular = as_circular(geometry)
-    return VectorTables(geometry, grid, memory) if circular is None else Tables(
-        circular[0], grid, None, circular[1], memory
-    )  # fmt: skip
+    circular = geometry.as_circular()
+    return VectorTables(geometry, grid) if circular is None else Tables(circular[0], grid, None, circular[1])
 
 
 def _checked(x: Any, inner: tuple[int, ...], name: str, operator: str) -> Tensor:

@@ -14,7 +14,7 @@ from torchpcct.geometry import Geometry, VolumeGrid
 from torchpcct.projector.rays import Segments, check_pair, check_source, rays_of, slab_lattice, split
 from torchpcct.vector_geometry import VectorGeometry, check_motion
 
-__all__ = ["Tables", "VectorTables", "check_memory", "layer_spacing"]
+__all__ = ["Tables", "VectorTables", "layer_spacing"]
 
 # Row edges may move by this part of the blur between two depth layers (see layer_spacing).
 LAYER_SHIFT = 0.04
@@ -24,7 +24,7 @@ class Tables:
     """Tables of one scan.
 
     Args:
-        geometry, grid, window, motion, memory: as for ``Projector``.
+        geometry, grid, window, motion: as for ``Projector``.
 
     Raises:
         TypeError, ValueError: see ``rays.check_pair``, ``rays.check_source`` and ``Projector``.
@@ -36,10 +36,8 @@ class Tables:
         grid: VolumeGrid,
         window: DetectorWindow | None = None,
         motion: Any = None,
-        memory: int | None = None,
     ) -> None:
         check_pair(geometry, grid, window)
-        self.memory = check_memory(memory)
         # Symmetric views share their work only if all of the detector is read and nothing moves.
         self.geometry, self.grid, self.windowed = geometry, grid, window is not None or motion is not None
         self.rays = rays_of(geometry, window)
@@ -84,20 +82,19 @@ class VectorTables:
     """The same of a scan given by vectors that no circular scan describes; its passes need no tables.
 
     Args:
-        geometry, grid, memory: as for ``Projector``.
+        geometry, grid: as for ``Projector``.
 
     Raises:
         TypeError: an argument of the wrong kind.
         ValueError: a grid of other axes than the detector needs, a source inside the grid.
     """
 
-    def __init__(self, geometry: VectorGeometry, grid: VolumeGrid, memory: int | None = None) -> None:
+    def __init__(self, geometry: VectorGeometry, grid: VolumeGrid) -> None:
         if not isinstance(grid, VolumeGrid):
             raise TypeError(f"grid must be a VolumeGrid, got {type(grid).__name__}")
         axes = 2 if geometry.rows is None else 3
         if grid.ndim != axes:
             raise ValueError(f"vectors of {len(geometry.vectors[0])} numbers need a {axes}-D grid, got {grid.shape}")
-        self.memory = check_memory(memory)
         self.geometry, self.grid = geometry, grid
         if geometry.parallel:
             return
@@ -117,13 +114,6 @@ class VectorTables:
     @property
     def range_shape(self) -> tuple[int, ...]:
         return self.geometry.shape
-
-
-def check_memory(memory: Any) -> int | None:
-    """Bytes, or None; ``ValueError`` for anything else."""
-    if memory is not None and (isinstance(memory, bool) or not isinstance(memory, int) or memory < 1):
-        raise ValueError(f"memory must be a number of bytes ≥ 1 or None, got {memory!r}")
-    return memory
 
 
 def layer_spacing(pose: NDArray[np.float64], grid: VolumeGrid, row0: float, row_pitch: float, rows: int) -> float:

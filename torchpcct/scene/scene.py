@@ -203,11 +203,15 @@ class Scene:
                 low, high = np.minimum(low, box[0] + shift), np.maximum(high, box[1] + shift)
         return np.stack([low, high])
 
-    def _extremes(self, name: str) -> Floats:
-        """All combinations of the extreme displacements of a body, ``(N, 3)``; one row of zeros if it stands still."""
+    def _extremes(self, name: str, seen_from: str | None = None) -> Floats:
+        """All combinations of the extreme displacements of a body, ``(N, 3)``, one row of zeros if it stands still.
+
+        ``seen_from``: another body, which may move with it; None: the scanner.
+        """
         shifts = np.zeros((1, 3))
         for move in self.motion:
-            if move.amplitude > 0 and name in self.inside(move.body):
+            members = self.inside(move.body)
+            if move.amplitude > 0 and (name in members) != (seen_from in members):
                 shifts = (shifts[:, None] + np.concatenate([move.extremes(), np.zeros((1, 3))])).reshape(-1, 3)
         return shifts
 
@@ -229,19 +233,9 @@ class Scene:
                 if parents[j] == parents[k]:
                     self._require_apart(k, j, surfaces)
 
-    def _relative_shifts(self, k: int, j: int) -> Floats:
-        """Extreme displacements of body ``k`` as seen from body ``j``."""
-        inside = [set(self.inside(move.body)) for move in self.motion]
-        names = self.bodies[k].name, self.bodies[j].name
-        shifts = np.zeros((1, 3))
-        for move, members in zip(self.motion, inside, strict=True):
-            if move.amplitude > 0 and (names[0] in members) != (names[1] in members):
-                shifts = (shifts[:, None] + np.concatenate([move.extremes(), np.zeros((1, 3))])).reshape(-1, 3)
-        return shifts
-
     def _require_inside(self, k: int, p: int, surface: Floats) -> None:
         parent = self.bodies[p]
-        for shift in self._relative_shifts(k, p):
+        for shift in self._extremes(self.bodies[k].name, parent.name):
             level = parent.shape.level(surface + shift)
             worst = int(level.argmax())
             if level[worst] > 1.0 + _TOUCH:
@@ -252,7 +246,7 @@ class Scene:
 
     def _require_apart(self, k: int, j: int, surfaces: Sequence[Floats]) -> None:
         a, b = self.bodies[k], self.bodies[j]
-        for shift in self._relative_shifts(k, j):
+        for shift in self._extremes(a.name, b.name):
             box_a, box_b = a.shape.bounding_box + shift, b.shape.bounding_box
             if (box_a[0] > box_b[1]).any() or (box_b[0] > box_a[1]).any():
                 continue

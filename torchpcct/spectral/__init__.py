@@ -19,7 +19,6 @@ from torchpcct.spectral.model import SpectralModel
 from torchpcct.spectral.vmi import (
     VMI_ENERGIES_KEV,
     VmiCurve,
-    sample_covariance,
     vmi,
     vmi_curve,
     vmi_noise,
@@ -44,7 +43,6 @@ __all__ = [
     "mmd",
     "nearest",
     "pe_pvc",
-    "sample_covariance",
     "vmi",
     "vmi_curve",
     "vmi_noise",

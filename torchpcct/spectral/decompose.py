@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from torchpcct.scan import Scan
-from torchpcct.spectral.decompose_kernels import sensitivity, solve
+from torchpcct.spectral.decompose_kernels import solve
 from torchpcct.spectral.model import SpectralModel, evaluate
 from torchpcct.threads import run
 from torchpcct.validate import checked
@@ -53,7 +53,7 @@ class Decomposition:
     Attributes:
         line_integrals: ``(2, ...)`` in mm, dtype of the counts.
         information: ``(3, ...)`` Fisher information F₁₁, F₁₂, F₂₂ in mm⁻² at the estimate: the weights of a joint
-            model-based reconstruction. Not differentiable.
+            model-based reconstruction.
         at_bound: ``(...)`` bool, rays whose estimate stopped at the bounds: they hold (almost) no counts.
         converged: ``(...)`` bool.
     """
@@ -93,8 +93,7 @@ def decompose(
         bounds: ``((low, high), (low, high))`` in mm; None: ``model.bounds``, far beyond any body.
 
     Returns:
-        :class:`Decomposition`. ``line_integrals`` is differentiable by ``counts`` (once; implicit function theorem);
-        the gradient of a component at its bound is 0.
+        :class:`Decomposition`; not differentiable.
 
     Raises:
         TypeError: counts that are no floating-point tensor.
@@ -116,56 +115,22 @@ def decompose(
     if box.shape != (2, 2) or not (np.isfinite(box).all() and (box[:, 0] < box[:, 1]).all()):
         raise ValueError(f"bounds must be ((low, high), (low, high)) in mm with low < high, got {bounds!r}")
     column, intensity = model.rays(tuple(counts.shape[1:]), columns, scale)
-    line_integrals, information, steps = _Decompose.apply(
-        counts, model, column, intensity, bool(bias_reduction), float(tolerance), box
-    )
+    n, shape = counts.detach().contiguous().reshape(model.bins, -1), counts.shape[1:]
+    line_integrals, information = (torch.empty((k, column.size), dtype=counts.dtype) for k in (2, 3))
+    steps = torch.empty(column.size, dtype=torch.int32)
+    # One step goes at most two attenuation lengths at 60 keV.
+    reach = np.diff(model.bounds, axis=1)[:, 0] / 10.0
+    run(
+        solve, column.size, n.numpy(), column, intensity, model.attenuation, model.spectra, *model.coarse, *model.start,
+        box, reach, bool(bias_reduction), COARSE_TOLERANCE, float(tolerance), STEP_LIMIT, line_integrals.numpy(),
+        information.numpy(), steps.numpy(), operations=30 * model.spectra[0].size,
+    )  # fmt: skip
+    # Absurd counts (1e30) would carry infinite information in float32.
+    information.clamp_(max=torch.finfo(counts.dtype).max)
+    line_integrals, information = line_integrals.reshape(2, *shape), information.reshape(3, *shape)
     low_, high_ = (torch.from_numpy(b.copy()).reshape(2, *(1,) * (counts.ndim - 1)).to(counts.dtype) for b in box.T)
     at_bound = ((line_integrals <= low_) | (line_integrals >= high_)).any(0)
-    return Decomposition(line_integrals, information, at_bound, steps > 0)
-
-
-class _Decompose(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any, counts: Tensor, model: SpectralModel, column: Any, intensity: Any, reduce_bias: bool,
-        tolerance: float, box: Any,
-    ) -> Any:  # fmt: skip
-        n = counts.detach().contiguous().reshape(model.bins, -1)
-        rays = column.size
-        out = torch.empty((2, rays), dtype=counts.dtype)
-        information = torch.empty((3, rays), dtype=counts.dtype)
-        steps = torch.empty(rays, dtype=torch.int32)
-        coarse_mu, coarse_spectra = model.coarse
-        # One step goes at most two attenuation lengths at 60 keV.
-        reach = np.diff(model.bounds, axis=1)[:, 0] / 10.0
-        results = (out.numpy(), information.numpy(), steps.numpy())
-        run(
-            solve, rays, n.numpy(), column, intensity, model.attenuation, model.spectra, coarse_mu, coarse_spectra,
-            *model.start, box, reach, reduce_bias, COARSE_TOLERANCE, tolerance, STEP_LIMIT, *results,
-            operations=30 * model.spectra[0].size,
-        )  # fmt: skip
-        # Absurd counts (1e30) would carry infinite information in float32.
-        information.clamp_(max=torch.finfo(counts.dtype).max)
-        shape = counts.shape[1:]
-        out, information, steps = out.reshape(2, *shape), information.reshape(3, *shape), steps.reshape(shape)
-        ctx.save_for_backward(counts, out)
-        ctx.rest = (model, column, intensity, reduce_bias, box)
-        ctx.mark_non_differentiable(information, steps)
-        return out, information, steps
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad: Tensor, *_: Any) -> Any:
-        counts, out = ctx.saved_tensors
-        model, column, intensity, reduce_bias, box = ctx.rest
-        jacobian = torch.empty((2, model.bins, column.size), dtype=torch.float64)
-        n, a = (x.detach().to(torch.float64).contiguous().reshape(x.shape[0], -1).numpy() for x in (counts, out))
-        run(
-            sensitivity, column.size, n, a, column, intensity, model.attenuation, model.spectra, box, reduce_bias,
-            jacobian.numpy(), operations=10 * model.spectra[0].size,
-        )  # fmt: skip
-        g = (grad.reshape(2, 1, -1) * jacobian).sum(0)
-        return g.reshape(counts.shape).to(counts.dtype), *(None,) * 6
+    return Decomposition(line_integrals, information, at_bound, (steps > 0).reshape(shape))
 
 
 @checked

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-__all__ = ["expected", "sensitivity", "solve"]
+__all__ = ["expected", "solve"]
 
 # exp(x) = 2^k exp(r): one loop without branches or calls, which LLVM turns into vector instructions (numba calls the
 # scalar libm otherwise: 4 times slower). Adding MAGIC leaves round(x / ln 2) in the low bits of the sum.
@@ -223,73 +223,3 @@ def expected(
             counts[b, i] = m[b, 0]
             for k in range(5):
                 slopes[k, b, i] = m[b, 1 + k]
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def sensitivity(
-    begin: int, end: int, counts: Any, line_integrals: Any, column: Any, scale: Any, mu: Any, spectra: Any, bounds: Any,
-    reduce_bias: bool, out: Any,
-) -> None:  # fmt: skip
-    """∂a / ∂n (2, bins, rays) at the solution, by the implicit function theorem: (−∂U/∂a)⁻¹ ∂U/∂n.
-
-    The derivative of the pseudo-counts c_i = ½ tr(G ∂²λ_i), G = F⁻¹, is
-    ∂_s c_i = ½ tr(G ∂_s∂²λ_i) − ½ tr(G ∂_sF G ∂²λ_i).
-    """
-    bins = counts.shape[0]
-    energies = mu.shape[1]
-    for i in range(begin, end):
-        a1, a2 = line_integrals[0, i], line_integrals[1, i]
-        held1 = a1 <= bounds[0, 0] or a1 >= bounds[0, 1]
-        held2 = a2 <= bounds[1, 0] or a2 >= bounds[1, 1]
-        v = np.empty((6, energies))
-        m = np.empty((bins, 6))
-        third = np.zeros((bins, 4))  # λ₁₁₁ λ₁₁₂ λ₁₂₂ λ₂₂₂
-        _transmissions(a1, a2, mu, v)
-        _moments(spectra[column[i]], v, scale[i], m)
-        f11, f12, f22 = _information(m)
-        det = max(f11 * f22 - f12 * f12, 1e-13 * f11 * f22)
-        g = np.array([[f22 / det, -f12 / det], [-f12 / det, f11 / det]])
-        df = np.zeros((2, 2, 2))  # ∂_s F
-        if reduce_bias:
-            for b in range(bins):
-                for e in range(energies):
-                    s = -spectra[column[i], b, e] * scale[i]
-                    third[b, 0] += s * v[3, e] * mu[0, e]
-                    third[b, 1] += s * v[3, e] * mu[1, e]
-                    third[b, 2] += s * v[5, e] * mu[0, e]
-                    third[b, 3] += s * v[5, e] * mu[1, e]
-                for s in range(2):
-                    for p in range(2):
-                        for q in range(2):
-                            df[s, p, q] += (
-                                m[b, 3 + s + p] * m[b, 1 + q]
-                                + m[b, 1 + p] * m[b, 3 + s + q]
-                                - m[b, 1 + p] * m[b, 1 + q] * m[b, 1 + s] / m[b, 0]
-                            ) / m[b, 0]
-        j = np.zeros((2, 2))  # −∂U_r / ∂a_s
-        for b in range(bins):
-            excess = counts[b, i] - m[b, 0]
-            if reduce_bias:
-                excess += 0.5 * (g[0, 0] * m[b, 3] + 2.0 * g[0, 1] * m[b, 4] + g[1, 1] * m[b, 5])
-            for s in range(2):
-                slope = -m[b, 1 + s]
-                if reduce_bias:
-                    k = g @ df[s] @ g
-                    slope += 0.5 * (g[0, 0] * third[b, s] + 2.0 * g[0, 1] * third[b, 1 + s] + g[1, 1] * third[b, 2 + s])
-                    slope -= 0.5 * (k[0, 0] * m[b, 3] + (k[0, 1] + k[1, 0]) * m[b, 4] + k[1, 1] * m[b, 5])
-                for r in range(2):
-                    bend = m[b, 3 + r + s] / m[b, 0] - m[b, 1 + r] * m[b, 1 + s] / (m[b, 0] * m[b, 0])
-                    j[r, s] -= slope * m[b, 1 + r] / m[b, 0] + excess * bend
-        jdet = j[0, 0] * j[1, 1] - j[0, 1] * j[1, 0]
-        for b in range(bins):
-            l1, l2 = m[b, 1] / m[b, 0], m[b, 2] / m[b, 0]
-            d1 = d2 = 0.0
-            if held1 and not held2:
-                d2 = l2 / j[1, 1]
-            elif held2 and not held1:
-                d1 = l1 / j[0, 0]
-            elif not held1:
-                d1 = (j[1, 1] * l1 - j[0, 1] * l2) / jdet
-                d2 = (j[0, 0] * l2 - j[1, 0] * l1) / jdet
-            out[0, b, i] = d1
-            out[1, b, i] = d2

@@ -21,7 +21,7 @@ from torchpcct.scene.materials import material
 from torchpcct.spectral.basis import Basis
 from torchpcct.validate import checked
 
-__all__ = ["VMI_ENERGIES_KEV", "VmiCurve", "sample_covariance", "vmi", "vmi_curve", "vmi_noise", "vmi_weights"]
+__all__ = ["VMI_ENERGIES_KEV", "VmiCurve", "vmi", "vmi_curve", "vmi_noise", "vmi_weights"]
 
 Floats = NDArray[np.float64]
 
@@ -112,25 +112,6 @@ def vmi_noise(
     g = torch.from_numpy(vmi_weights(basis, energies_kev, water)[0]).to(c)
     terms = torch.stack([g[:, 0] ** 2, 2 * g[:, 0] * g[:, 1], g[:, 1] ** 2], dim=1)
     return torch.tensordot(terms, c, dims=1).clamp_min(0).sqrt()
-
-
-@checked
-def sample_covariance(basis_images: ArrayLike, mask: Any = None) -> Floats:
-    """Covariance ``(3,)`` of basis values over a region or over realisations, with n − 1 in the denominator.
-
-    Args:
-        basis_images: ``(2, ...)``.
-        mask: ``(...)`` bool, the voxels to use; None: all.
-
-    Raises:
-        ValueError: fewer than two values, a wrong shape.
-    """
-    values = _pair("basis_images", basis_images, 2).detach().to(torch.float64).cpu()
-    flat = values.reshape(2, -1) if mask is None else values[:, torch.as_tensor(mask, dtype=torch.bool)]
-    if flat.shape[1] < 2:
-        raise ValueError(f"a covariance needs at least 2 values, the region has {flat.shape[1]}")
-    c = torch.cov(flat)
-    return np.array([c[0, 0], c[0, 1], c[1, 1]], np.float64)
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchpcct.metrics.bootstrap import bca_interval, leave_one_out, resampling
+from torchpcct.metrics.intervals import bca_interval, leave_one_out, resampling
 
 __all__ = [
     "Pair",

@@ -14,8 +14,7 @@ from recon.analytic.any_orbit import rebin_to_circle
 from recon.analytic.fbp import fbp
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
-from torchpcct.projector.vectors import to_vectors
-from torchpcct.vector_geometry import VectorGeometry, helical_motion
+from torchpcct.vector_geometry import VectorGeometry, helical_motion, to_vectors
 
 MU = 0.02
 BODY = (Ellipsoid((4.0, -6.0), (30.0, 36.0), value=MU), Gaussian((10.0, 12.0), 5.0, value=0.3 * MU))

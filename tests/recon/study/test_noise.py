@@ -26,7 +26,7 @@ from recon.study.noise.settings import Settings
 from recon.study.paper import facts as paper
 from recon.study.paper.plaque_scan import Functional, inset_grid, prepare
 from recon.study.paper.tables import published, table_checks
-from torchpcct.metrics.bootstrap import resampling
+from torchpcct.metrics.intervals import resampling
 from torchpcct.metrics.placement import RoiRule, place_rois
 from torchpcct.metrics.roi import axial_grid
 from torchpcct.scanner import presets

@@ -20,14 +20,14 @@ from recon import reconstruct
 from recon.cli import main
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, VolumeGrid, full_turn
 from torchpcct.acquisition.config import read_config
+from torchpcct.checks.rotation_axis import axis_column
 from torchpcct.formats.damage import read_yaml
 from torchpcct.formats.dicom_ct_pd import read_dicom_ct_pd
 from torchpcct.formats.geometry_yaml import geometry_of, geometry_values
 from torchpcct.formats.preprocess import centred, cleaned, find_axis, without_outliers, without_stripes
-from torchpcct.formats.rtk import read_rtk, read_rtk_vectors
+from torchpcct.formats.rtk import read_rtk
 from torchpcct.formats.scans import open_scan
-from torchpcct.metrics.rotation_axis import axis_column
-from torchpcct.projector.vectors import as_circular, to_vectors
+from torchpcct.vector_geometry import to_vectors
 from torchpcct.volume import Volume
 
 MU = 0.02
@@ -392,13 +392,12 @@ def test_rtk_matrices(tmp_path):
     path = tmp_path / "geometry.xml"
     distance = "<SourceToDetectorDistance>500</SourceToDetectorDistance>"
     path.write_text(f"<RTKThreeDCircularGeometry>{distance}{''.join(parts)}</RTKThreeDCircularGeometry>")
-    found = read_rtk_vectors(path, CONE.columns, CONE.rows, CONE.pitch)
-    np.testing.assert_allclose(found, to_vectors(CONE), atol=1e-8)
     geometry = read_rtk(path, CONE.columns, CONE.rows, CONE.pitch)
-    circular = as_circular(geometry)
+    np.testing.assert_allclose(geometry.vectors, to_vectors(CONE), atol=1e-8)
+    circular = geometry.as_circular()
     assert circular is not None
     np.testing.assert_allclose(circular[0].angles % (2 * math.pi), CONE.angles, atol=1e-9)
-    survive(path, lambda: read_rtk_vectors(path, CONE.columns, CONE.rows, CONE.pitch))
+    survive(path, lambda: read_rtk(path, CONE.columns, CONE.rows, CONE.pitch))
 
 
 def test_unknown_endings_are_refused_first(tmp_path):

@@ -11,7 +11,7 @@ from torchpcct.metrics import (
     controlled_log_variance,
     controlled_mean,
 )
-from torchpcct.metrics.jackknife import log_of_sum
+from torchpcct.metrics.intervals import log_of_sum
 
 SIGMA = np.array([[1.0, 0.3], [0.3, 2.0]])
 MU = np.array([3.0, -1.0])
@@ -53,11 +53,11 @@ def test_closed_forms_are_refits():
 
 
 def test_variance_is_unbiased():
-    """Mean over 4000 experiments of 12 draws, where the correction for the error of β is 20 % of the residual."""
-    found = [math.exp(controlled_log_variance(*draws(12, 0.8, seed=s)[:2], SIGMA).value) for s in range(4000)]
+    """Mean over 1500 experiments of 12 draws, where the correction for the error of β is 7 % of the variance."""
+    found = [math.exp(controlled_log_variance(*draws(12, 0.8, seed=s)[:2], SIGMA).value) for s in range(1500)]
     true = draws(12, 0.8)[2]
-    assert np.mean(found) == pytest.approx(true, abs=3.5 * np.std(found) / math.sqrt(4000))
-    assert np.std(found) / math.sqrt(4000) < 0.01 * true
+    assert np.mean(found) == pytest.approx(true, abs=3.5 * np.std(found) / math.sqrt(1500))
+    assert np.std(found) / math.sqrt(1500) < 0.015 * true
 
 
 def test_without_controls():
@@ -96,11 +96,14 @@ def paper_cnr(y, z, x):
     return combined(lambda f, b, vf, vb: (b - f) / np.sqrt(np.exp(vf) + np.exp(vb)), *means, *logs)
 
 
+@pytest.mark.parametrize(
+    ("experiments", "low", "high"), [(150, 0.89, 1.0), pytest.param(1000, 0.93, 0.97, marks=pytest.mark.slow)]
+)
 @pytest.mark.parametrize("kind", ["normal", "tails", "bent"])
-def test_coverage(kind):
-    """1000 experiments of 200 draws: variance, mean and CNR within 93–97 % (binomial error 0.7 %)."""
+def test_coverage(kind, experiments, low, high):
+    """Of experiments of 200 draws: variance, mean and CNR within 93–97 % (binomial error of 1000: 0.7 %)."""
     hits = np.zeros(3)
-    for s in range(1000):
+    for s in range(experiments):
         y, x, true = draws(200, 0.97, kind, seed=s)
         z = 9.0 + (x - MU) @ [0.1, 0.7] + np.random.default_rng(10_000 + s).standard_normal(200) * 0.2
         true_z = np.array([0.1, 0.7]) @ SIGMA @ [0.1, 0.7] + 0.04
@@ -110,8 +113,8 @@ def test_coverage(kind):
             (paper_cnr(y, z, x).estimate(), 4.0 / math.sqrt(true + true_z)),
         )
         hits += [f.low <= t <= f.high for f, t in figures]
-    assert (hits >= 930).all(), hits
-    assert (hits <= 970).all(), hits
+    assert (low * experiments <= hits).all(), hits
+    assert (hits <= high * experiments).all(), hits
 
 
 def test_pairs_of_methods():

@@ -14,7 +14,6 @@ from torchpcct.metrics import (
     edge_profile,
     edge_width,
     ellipsoid_distance,
-    match_edge_width,
     task_transfer,
 )
 
@@ -77,17 +76,6 @@ def test_edge_width_of_a_profile(sigma, offset, contrast):
     width = edge_width(r, offset + contrast * blurred(r, sigma, 0, 1))
     assert width == pytest.approx(2.56310 * sigma, rel=0.01)
     assert edge_width(r, offset - contrast * blurred(r, sigma, 0, 1)) == pytest.approx(width, rel=1e-6)
-
-
-def test_matching_edge_widths():
-    def width(sigma):
-        return task_transfer(blurred(DISK, sigma), DISK, (1.5, 1.5), 0.03).edge_width
-
-    assert match_edge_width(width(0.23), width, 0.1, 0.4) == pytest.approx(0.23, rel=2e-3)
-    assert match_edge_width(1.0, lambda p: 5 - p, 1.0, 4.0) == 4.0
-    assert match_edge_width(2.5, lambda p: 5 - p, 0.0, 4.0, 1e-6) == pytest.approx(2.5, rel=1e-5)
-    with pytest.raises(ValueError, match="widen the range"):
-        match_edge_width(3.0, width, 0.1, 0.4)
 
 
 @pytest.mark.parametrize("axes", [(0.6, 0.985, 0.985), (1.0, 0.3, 2.0), (1.0, 1.0, 1.0), (math.inf, 0.5, 1.5)])

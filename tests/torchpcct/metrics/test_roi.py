@@ -32,7 +32,6 @@ def test_roi_mean_is_the_mean_of_the_interpolated_image():
     direct = sample_axial(volume, GRID, image)[:, torch.from_numpy(mask)].mean(-1)
     torch.testing.assert_close(roi(volume), direct)
     assert roi.weights.sum().item() == pytest.approx(1)
-    assert roi.area_mm2 == pytest.approx(mask.sum() * 0.035**2)
 
 
 def test_refusals():

@@ -10,7 +10,7 @@ from analytic import Ellipsoid, Gaussian, line_integrals, rasterize
 from torchpcct.detector_window import footprint
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
 from torchpcct.projector import Projector
-from torchpcct.projector.vectors import to_vectors
+from torchpcct.vector_geometry import to_vectors
 
 ANGLES = full_turn(6, 0.2)
 PLANE, VOLUME = VolumeGrid((40, 36), 0.5, (1.0, -2.0)), VolumeGrid((28, 40, 36), 0.5, (0.5, 1.0, -2.0))

@@ -13,7 +13,7 @@ from torchpcct import ConeBeam, FanBeam, ParallelBeam, Projector, VectorGeometry
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.formats.geometry_yaml import geometry_of
 from torchpcct.projector.tables import Tables, VectorTables
-from torchpcct.vector_geometry import helical_motion
+from torchpcct.vector_geometry import helical_motion, to_vectors
 
 CONE = ConeBeam(full_turn(7, 0.2), 60.0, 110.0, 18, 11, (1.8, 2.1), (0.3, 0.5))
 FAN = FanBeam(full_turn(7, 0.2), 60.0, 110.0, 21, 2.1, 0.5)
@@ -228,3 +228,40 @@ def test_refusals():
         Projector(wobbling(CONE), GRID, DetectorWindow.full(CONE))
     with pytest.raises(TypeError, match="geometry must be a ConeBeam"):
         helical_motion(FAN, 3.0)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("geometry", "expected"),
+    [
+        (FanBeam([math.pi / 2], 60.0, 110.0, 21, 2.0, 3.0), [0, 60, -3, -50, -2, 0]),
+        (ConeBeam([0.0], 60.0, 110.0, 21, 4, (1.5, 2.0), (0.5, 3.0)), [60, 0, 0, -50, 3, 0.5, 0, 2, 0, 0, 0, 1.5]),
+        (ParallelBeam([0.0], 3, 2.0, 0.5), [-1, 0, 0, 0.5, 0, 2]),
+    ],
+)
+def test_vectors_of_the_first_view(geometry, expected):
+    assert to_vectors(geometry)[0] == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize("moving", [False, True])
+@pytest.mark.parametrize("geometry", [CONE, FAN, PARALLEL])
+def test_a_circle_is_found_in_its_vectors(geometry, moving):
+    """Of a radial displacement and a larger orbit, which look the same, with no larger motion than the one given."""
+    motion = np.random.default_rng(4).uniform(-3, 3, (7, 3 if geometry.has_rows else 2)) if moving else None
+    vectors = VectorGeometry.of(geometry, motion)
+    found, moved = vectors.as_circular()
+    assert (moved is not None) == moving
+    np.testing.assert_allclose(to_vectors(found, moved), vectors.vectors, atol=1e-11)
+    if moving:
+        assert np.linalg.norm(moved) < np.linalg.norm(motion)
+    else:
+        np.testing.assert_allclose(found.angles % (2 * math.pi), geometry.angles, atol=1e-11)
+
+
+@pytest.mark.parametrize(("place", "off"), [(slice(3, 5), 1.0), (slice(8, 9), 0.5), (slice(2, 3), 1.0)])
+def test_no_circle(place, off):
+    """A detector without the source, one that is rolled, a source without the detector."""
+    vectors = np.array(VectorGeometry.of(CONE).vectors)
+    vectors[1, place] += off
+    assert VectorGeometry(vectors, CONE.columns, CONE.rows).as_circular() is None
+    assert VectorGeometry.of(CONE).flipped(columns=True).as_circular() is None
+    assert laminography().as_circular() is None

@@ -178,37 +178,6 @@ def test_starved_rays_converge(model):
     assert torch.isfinite(found.information).all()
 
 
-def test_gradient(model):
-    columns = np.array([0, 1, 3])
-    a = truth(*BEHIND_24_CM_FAT, 60.0, 3.0, 10.0, 0.5)
-    counts = model.expected(a, columns=columns) * torch.linspace(0.9, 1.15, 8, dtype=torch.float64)[:, None]
-    for bias_reduction in (False, True):
-        assert torch.autograd.gradcheck(
-            lambda n, b=bias_reduction: (
-                decompose(n, model, columns=columns, bias_reduction=b, tolerance=1e-10).line_integrals
-            ),
-            counts.clone().requires_grad_(),
-            eps=1e-4,
-            rtol=1e-5,
-            atol=1e-7,
-        )
-
-
-def test_gradient_of_expected_counts_inverts_the_model(model):
-    a = truth(*BEHIND_24_CM_FAT).requires_grad_()
-    counts = model.expected(a, columns=[0])
-    back = decompose(counts, model, columns=[0], bias_reduction=False, tolerance=1e-9).line_integrals
-    torch.testing.assert_close(torch.autograd.grad(back[0, 0], a)[0][:, 0], torch.tensor([1.0, 0.0]).double())
-
-
-def test_gradient_at_a_bound_is_zero(model):
-    counts = torch.zeros(8, 1, dtype=torch.float64, requires_grad=True)
-    found = decompose(counts, model, columns=[0], bounds=((-10, 100), (-5, 10)))
-    assert found.at_bound.all()
-    (gradient,) = torch.autograd.grad(found.line_integrals.sum(), counts)
-    assert torch.isfinite(gradient).all()
-
-
 def scene():
     return Scene([Body("rod", EllipticCylinder(20.0), "polyethylene")])
 

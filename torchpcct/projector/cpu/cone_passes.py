@@ -63,10 +63,7 @@ class ConePasses:
 
     def views_at_once(self, itemsize: int) -> int:
         """Views whose row sums the adjoint holds at a time."""
-        _, rest, per_view = self.bytes(itemsize)
-        memory = self.tables.memory
-        room = ROW_SUMS_BYTES if memory is None else min(ROW_SUMS_BYTES, memory - rest)
-        return int(max(1, min(self.tables.rays.views, room // per_view)))
+        return int(max(1, min(self.tables.rays.views, ROW_SUMS_BYTES // self.bytes(itemsize)[2])))
 
 
 def running_sums(x: NDArray[Any]) -> NDArray[Any]:

@@ -29,7 +29,7 @@ class _Code:
     """Helpers to write the loops; ``real``: the scalar type, ``wide``: all lanes, ``double``: those of two knots."""
 
     def __init__(self, context: Any, builder: Any, signature: Any, args: Any) -> None:
-        self.b = builder
+        self.b, self.context = builder, context
         self.width = signature.args[0].count
         self.dtype = next(t for t in signature.args if isinstance(t, types.Array)).dtype
         self.real = ir.FloatType() if self.dtype == types.float32 else ir.DoubleType()
@@ -148,6 +148,17 @@ class _Code:
             body(self.b.add(r0, self.b.mul(loop.index, group)), size)
         with cgutils.for_range(self.b, r1, start=self.b.add(r0, self.b.mul(groups, group))) as loop:
             body(loop.index, 1)
+
+
+def _written(write: Any, *kinds: Any) -> Any:
+    """Signature and code of an intrinsic without result: ``write(code, *values)`` writes its loops."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        code = _Code(context, builder, signature, args)
+        write(code, *code.values)
+        return context.get_dummy_value()
+
+    return types.void(*kinds), codegen
 
 
 @intrinsic
@@ -275,29 +286,21 @@ def add_lines(typingctx, lanes, lines, offset, low, high, e0, e1, size, below, a
 
     ``size``: elements of a line, a multiple of the vector's length W. The sums stay in registers.
     """
-    signature = types.void(lanes, lines, offset, low, high, e0, e1, size, below, above)
 
-    def codegen(context, builder, signature, args):
-        c = _Code(context, builder, signature, args)
-        _, lines, offset, low, high, e0, e1, size, below, above = c.values
+    def write(c, _, lines, offset, low, high, e0, e1, size, below, above):
         _gather_lines(c, lines, offset, (low, high), e0, e1, size, (below, above), fresh=False)
-        return context.get_dummy_value()
 
-    return signature, codegen
+    return _written(write, lanes, lines, offset, low, high, e0, e1, size, below, above)
 
 
 @intrinsic
 def sum_lines(typingctx, lanes, lines, offset, low, e0, e1, size, total):
     """``total = Σ_e low[e] lines[offset[e]:]``: as ``add_lines``, for slabs that belong to no two layers."""
-    signature = types.void(lanes, lines, offset, low, e0, e1, size, total)
 
-    def codegen(context, builder, signature, args):
-        c = _Code(context, builder, signature, args)
-        _, lines, offset, low, e0, e1, size, total = c.values
+    def write(c, _, lines, offset, low, e0, e1, size, total):
         _gather_lines(c, lines, offset, (low,), e0, e1, size, (total,), fresh=True)
-        return context.get_dummy_value()
 
-    return signature, codegen
+    return _written(write, lanes, lines, offset, low, e0, e1, size, total)
 
 
 def _gather_lines(
@@ -329,29 +332,21 @@ def _gather_lines(
 @intrinsic
 def spread_lines(typingctx, lanes, lines, offset, low, high, e0, e1, size, below, above):
     """Transpose of ``add_lines``: ``lines[offset[e]:] += low[e] below + high[e] above`` for e from e0 to e1."""
-    signature = types.void(lanes, lines, offset, low, high, e0, e1, size, below, above)
 
-    def codegen(context, builder, signature, args):
-        c = _Code(context, builder, signature, args)
-        _, lines, offset, low, high, e0, e1, size, below, above = c.values
+    def write(c, _, lines, offset, low, high, e0, e1, size, below, above):
         _spread(c, lines, offset, (low, high), e0, e1, size, (below, above))
-        return context.get_dummy_value()
 
-    return signature, codegen
+    return _written(write, lanes, lines, offset, low, high, e0, e1, size, below, above)
 
 
 @intrinsic
 def spread_line(typingctx, lanes, lines, offset, low, e0, e1, size, line):
     """Transpose of ``sum_lines``: ``lines[offset[e]:] += low[e] line`` for e from e0 to e1."""
-    signature = types.void(lanes, lines, offset, low, e0, e1, size, line)
 
-    def codegen(context, builder, signature, args):
-        c = _Code(context, builder, signature, args)
-        _, lines, offset, low, e0, e1, size, line = c.values
+    def write(c, _, lines, offset, low, e0, e1, size, line):
         _spread(c, lines, offset, (low,), e0, e1, size, (line,))
-        return context.get_dummy_value()
 
-    return signature, codegen
+    return _written(write, lanes, lines, offset, low, e0, e1, size, line)
 
 
 def _spread(c: Any, lines: Any, offset: Any, weights: Any, e0: Any, e1: Any, size: Any, sources: Any) -> None:

@@ -14,7 +14,7 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
-from torchpcct.projector.cpu.simd import _Code
+from torchpcct.projector.cpu.simd import _written
 
 __all__ = ["add_steps", "set_steps"]
 
@@ -29,32 +29,24 @@ def add_steps(typingctx, lanes, line, zeta0, step, last, size, gain, out, count)
     ``line``: knots 0…last, to which positions are clamped, with ``size`` elements, > last. ``lanes``: tuple of the
     vector's length W. ``count``: a multiple of W.
     """
-    signature = types.void(lanes, line, zeta0, step, last, size, gain, out, count)
 
-    def codegen(context, builder, signature, args):
-        c = _Code(context, builder, signature, args)
-        _, line, zeta0, step, last, size, gain, out, count = c.values
+    def write(c, _, line, zeta0, step, last, size, gain, out, count):
         wide = c.splat(gain, c.width)
         steps = _Steps(c, line, zeta0, step, last, size, count)
-        steps.give(context, lambda change, at: c.store(c.add(c.load(out, at, c.wide), c.mul(wide, change)), out, at))
-        return context.get_dummy_value()
+        steps.give(lambda change, at: c.store(c.add(c.load(out, at, c.wide), c.mul(wide, change)), out, at))
 
-    return signature, codegen
+    return _written(write, lanes, line, zeta0, step, last, size, gain, out, count)
 
 
 @intrinsic
 def set_steps(typingctx, lanes, line, zeta0, step, last, size, out, count):
     """``out[i] = line(i + 1) - line(i)`` for i < count, see ``add_steps``."""
-    signature = types.void(lanes, line, zeta0, step, last, size, out, count)
 
-    def codegen(context, builder, signature, args):
-        c = _Code(context, builder, signature, args)
-        _, line, zeta0, step, last, size, out, count = c.values
+    def write(c, _, line, zeta0, step, last, size, out, count):
         steps = _Steps(c, line, zeta0, step, last, size, count)
-        steps.give(context, lambda change, at: c.store(change, out, at))
-        return context.get_dummy_value()
+        steps.give(lambda change, at: c.store(change, out, at))
 
-    return signature, codegen
+    return _written(write, lanes, line, zeta0, step, last, size, out, count)
 
 
 class _Steps:
@@ -64,10 +56,10 @@ class _Steps:
         self.c, self.line, self.step, self.size, self.count = c, line, step, size, count
         self.positions = _Positions(c, zeta0, step, last)
 
-    def give(self, context: Any, take: Callable[[Any, Any], None]) -> None:
+    def give(self, take: Callable[[Any, Any], None]) -> None:
         """Call ``take(W steps, index of the first)`` for all of them."""
         c, b = self.c, self.c.b
-        features = context.codegen().magic_tuple()[2]
+        features = c.context.codegen().magic_tuple()[2]
         if c.width != 8 or c.dtype != types.float32 or "+avx2" not in features.split(","):
             self._run(self._one_by_one, take)
             return

@@ -80,9 +80,7 @@ class GpuPasses:
 
     def _budget(self) -> int | None:
         """Bytes of working memory allowed, None for no limit."""
-        if self.tables.memory is None and self.device.type == "cuda":
-            return int(torch.cuda.mem_get_info(self.device)[0]) // 2
-        return self.tables.memory
+        return int(torch.cuda.mem_get_info(self.device)[0]) // 2 if self.device.type == "cuda" else None
 
     def forward(self, x: Tensor) -> Tensor:
         """``(batch, *domain_shape)`` to ``(batch, *range_shape)``."""
@@ -177,8 +175,7 @@ def _table_bytes(tables: Tables) -> int:
 def slices(tables: Tables, budget: int | None, batch: int, itemsize: int) -> tuple[int, int]:
     """Volumes per launch and, for the adjoint, views at a time, so that the working memory stays within the budget.
 
-    Raises:
-        ValueError: ``Projector``'s ``memory`` is less than one volume and one view need.
+    At least one of each, whatever the budget.
     """
     views = tables.rays.views
     if budget is None:
@@ -188,20 +185,13 @@ def slices(tables: Tables, budget: int | None, batch: int, itemsize: int) -> tup
     volumes = min(batch, room // max(forward, adjoint + views * per_view))
     if volumes >= 1:
         return volumes, views
-    least = max(forward, adjoint + per_view)
-    if room < least and tables.memory is not None:
-        raise ValueError(
-            f"a pass of this scan needs {least + _table_bytes(tables)} bytes of working memory at least, memory allows "
-            f"{tables.memory}: raise it, or use fewer voxels or float32"
-        )
     return 1, max(1, min(views, (room - adjoint) // per_view))
 
 
 def workspace(tables: Tables, batch: int, itemsize: int) -> int:
-    """Bytes that one pass on a CUDA device holds besides input and output, within the scan's limit if it has one."""
-    volumes, views = slices(tables, tables.memory, batch, itemsize)
+    """Bytes that one pass of a whole batch on a CUDA device holds besides input and output."""
     forward, adjoint, per_view = _slice_bytes(tables, itemsize)
-    return _table_bytes(tables) + volumes * max(forward, adjoint + views * per_view)
+    return _table_bytes(tables) + batch * max(forward, adjoint + tables.rays.views * per_view)
 
 
 def _power_of_two(n: int) -> int:

@@ -150,10 +150,6 @@ class Plaque:
         """Points ``(..., 3)`` of the plaque's frame in the scanner's frame, mm."""
         return self.outer.to_scanner(points)
 
-    def to_plaque(self, points: ArrayLike) -> Floats:
-        """Points ``(..., 3)`` of the scanner's frame in the plaque's frame, mm."""
-        return self.outer.to_local(points)
-
     def section(self, name: str, z: ArrayLike = 0.0) -> tuple[Floats, Floats, Floats, Floats]:
         """The axial section of a surface: an ellipse with axes along the plaque's x and y.
 

@@ -9,8 +9,8 @@ import torch
 from analytic import Ellipsoid, line_integrals
 
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, full_turn
+from torchpcct.checks.rotation_axis import RotationAxis, at_axis, axis_column, rotation_axis
 from torchpcct.formats.preprocess import centred, find_axis
-from torchpcct.metrics.rotation_axis import RotationAxis, at_axis, axis_column, rotation_axis
 
 COLUMNS = 120
 TURNS = {

@@ -25,7 +25,7 @@ What no opposite rays can show, since the described scan is that of another obje
 view (the object turned), sod (the object scaled, its attenuation the other way; so are parallel rays' pitch), both the
 direction of rotation and that of the columns (the object mirrored; of parallel rays each alone), a displacement of the
 object, and all that happens to both rays alike: water's attenuation, gain and bowtie if air was measured with them,
-spectrum and pile-up (:mod:`torchpcct.metrics.moments` sees those in bodies that are not round).
+spectrum and pile-up (:mod:`torchpcct.checks.moments` sees those in bodies that are not round).
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, view_step
 from torchpcct.validate import checked, coverage
 
-__all__ = ["CENTRE_TOLERANCE", "CentreTest", "GeometryTest", "OppositeRays", "centre_test", "geometry_test"]
+__all__ = ["CENTRE_TOLERANCE", "UNKNOWN", "OppositeRays", "ScanTest", "centre_test", "geometry_test"]
 
 CENTRE_TOLERANCE = 0.1
 """Error of the centre in columns that is no finding: alignment, and what interpolation between the views leaves."""
@@ -78,46 +78,22 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class CentreTest:
-    """Result of :func:`centre_test`.
+class ScanTest:
+    """What a test of a scan found.
 
     Attributes:
-        columns: how many columns too high the described positions of the columns are; NaN: not known.
-        error: its standard error.
-        swing: amplitude in columns by which it changes twice in a turn; NaN: not known.
-        p_value: probability that noise alone looks like an error (or swing) beyond :data:`CENTRE_TOLERANCE` at least so
-            much.
+        sizes: cause → its estimated size, if it were the only one; causes that this scan cannot show are missing.
+        errors: cause → standard error of its size, where there is one.
         findings: what was found, in words; empty: nothing at the stated rate of false alarms.
-    """
-
-    columns: float
-    error: float
-    swing: float
-    p_value: float
-    findings: tuple[str, ...]
-
-
-_UNKNOWN = CentreTest(math.nan, math.inf, math.nan, 1.0, ())
-
-
-@dataclass(frozen=True)
-class GeometryTest:
-    """Result of :func:`geometry_test`.
-
-    Attributes:
-        sizes: cause → its estimated size, if it were the only one: ``centre`` in columns (described too high),
-            ``scale`` (fan angles described too small, relative), ``step`` (steps between views described too small,
-            relative), ``roll`` in rad. Causes that this scan cannot show are missing.
-        errors: cause → standard error of its size.
-        mismatch: mean square of the difference over that of what changes from view to view, noise taken off: 0 of a
-            sound scan, 1 of rays that have nothing to do with each other; NaN: not known.
-        findings: the likeliest cause in words; empty: nothing at the stated rate of false alarms.
     """
 
     sizes: Mapping[str, float]
     errors: Mapping[str, float]
-    mismatch: float
     findings: tuple[str, ...]
+
+
+UNKNOWN = ScanTest({}, {}, ())
+"""Of a scan in which nothing is to be seen."""
 
 
 @checked
@@ -127,7 +103,7 @@ def centre_test(
     window: DetectorWindow | None = None,
     about: tuple[float, float] = (0.0, 0.0),
     false_alarms: float = FALSE_ALARMS,
-) -> CentreTest:
+) -> ScanTest:
     """Measure the rotation centre by the opposite rays of a scan, of a cone beam by those near the plane of the source.
 
     Args:
@@ -139,14 +115,16 @@ def centre_test(
         false_alarms: share of scans with an error of :data:`CENTRE_TOLERANCE` that raise an alarm.
 
     Returns:
-        The test; with ``p_value`` 1 and no finding where no opposite rays were measured or nothing is to be seen.
+        The test of ``centre``: how many columns too high the described positions of the columns are; and of ``swing``,
+        the amplitude in columns by which it changes twice in a turn. :data:`UNKNOWN` where no opposite rays were
+        measured or nothing is to be seen.
 
     Raises:
         ValueError: a wrong shape, NaN or Inf, a rate outside (0, 1).
     """
     coverage("false_alarms", false_alarms)
     pairs = _Pairs.of(lines, geometry, window, about)
-    return _UNKNOWN if pairs is None else _centre(pairs, false_alarms)[0]
+    return UNKNOWN if pairs is None else _centre(pairs, false_alarms)[0]
 
 
 @checked
@@ -156,7 +134,7 @@ def geometry_test(
     window: DetectorWindow | None = None,
     about: tuple[float, float] = (0.0, 0.0),
     false_alarms: float = FALSE_ALARMS,
-) -> GeometryTest:
+) -> ScanTest:
     """Test the description of a scan by its opposite rays: centre, fan angles, steps between views, roll.
 
     Args:
@@ -164,7 +142,10 @@ def geometry_test(
         false_alarms: share of scans whose errors are as large as tolerated that raise an alarm.
 
     Returns:
-        The test; of several causes the one that explains most is named.
+        The test of ``centre`` (see :func:`centre_test`), ``scale`` (fan angles described too small, relative), ``step``
+        (steps between views described too small, relative), ``roll`` in rad, and ``mismatch``: the mean square of the
+        difference over that of what changes from view to view, noise taken off, 0 of a sound scan, 1 of rays that have
+        nothing to do with each other. Of several causes the one that explains most is named.
 
     Raises:
         ValueError: a wrong shape, NaN or Inf, a rate outside (0, 1).
@@ -172,14 +153,12 @@ def geometry_test(
     coverage("false_alarms", false_alarms)
     pairs = _Pairs.of(lines, geometry, window, about)
     if pairs is None:
-        return GeometryTest({}, {}, math.nan, ())
+        return UNKNOWN
     # What a cone's rays lie apart along z looks like an error of the angles, not like one of the centre.
     plane = pairs if window is not None or pairs.rays.flat else _Pairs.of(lines, geometry, window, about, _PLANE_CELLS)
     centre, explained = _centre(pairs, false_alarms / 3.0)
     ranked = [(explained / pairs.here.numel(), text) for text in centre.findings]
-    sizes, errors = {}, {}
-    if math.isfinite(centre.columns):
-        sizes["centre"], errors["centre"] = centre.columns, centre.error
+    sizes, errors = ({k: v for k, v in values.items() if k == "centre"} for values in (centre.sizes, centre.errors))
     causes = [(pairs, "roll"), *((plane, name) for name in ("scale", "step") if plane is not None)]
     for of, name in causes:
         cause = of.cause(name)
@@ -201,7 +180,9 @@ def geometry_test(
     explained = max((share for share, _ in ranked), default=0.0)
     if plane is not None and differ and (mirrored or explained < _EXPLAINED * plane.disagreement):
         ranked = [(math.inf, _mismatch_text(mismatch, differ == 2, mirrored))]
-    return GeometryTest(sizes, errors, mismatch, tuple(text for _, text in sorted(ranked, reverse=True)[:1]))
+    if math.isfinite(mismatch):
+        sizes["mismatch"] = mismatch
+    return ScanTest(sizes, errors, tuple(text for _, text in sorted(ranked, reverse=True)[:1]))
 
 
 def _scale_text(size: float, error: float) -> str:
@@ -246,7 +227,7 @@ def _mismatch_text(mismatch: float, strangers: bool, mirrored: bool) -> str:
     return f"opposite rays disagree by {share}: the object moved, or the order or the angles of some views are wrong"
 
 
-def _centre(pairs: _Pairs, false_alarms: float) -> tuple[CentreTest, float]:
+def _centre(pairs: _Pairs, false_alarms: float) -> tuple[ScanTest, float]:
     """The centre's test, and how much of the squared difference its error explains."""
     found = []
     for columns in _COLUMNS:
@@ -257,8 +238,8 @@ def _centre(pairs: _Pairs, false_alarms: float) -> tuple[CentreTest, float]:
             waves = [_blocks(power * wave(turn), pairs.used(columns)) for wave in (np.cos, np.sin)]
             score, power = (_blocks(v, pairs.used(columns)) for v in sums)
             test = _tested(score, power, np.stack([power, *waves], 1), false_alarms / len(_COLUMNS))
-            found.append((test, 0.0 if math.isnan(test.columns) else test.columns**2 * float(power.sum())))
-    return next((f for f in found if f[0].findings), found[0] if found else (_UNKNOWN, 0.0))
+            found.append((test, test.sizes.get("centre", 0.0) ** 2 * float(power.sum())))
+    return next((f for f in found if f[0].findings), found[0] if found else (UNKNOWN, 0.0))
 
 
 @dataclass(frozen=True)
@@ -332,7 +313,7 @@ class _Pairs:
             raise ValueError(f"lines must have the shape {expected}, got {tuple(lines.shape)}")
         values = lines.detach().to("cpu", torch.float32).reshape(window.shape)
         if not bool(torch.isfinite(values).all()):
-            raise ValueError("lines hold NaN or Inf: bridge dead readings before (torchpcct.dead_cells.bridge)")
+            raise ValueError("lines hold NaN or Inf: bridge dead readings before (torchpcct.readings.bridge)")
         if isinstance(geometry, ConeBeam):
             window, values = _flat_part(geometry, window, values, cells)
             if not values.shape[1]:
@@ -533,9 +514,9 @@ def _joined_rows(geometry: ConeBeam, window: DetectorWindow, values: Tensor) -> 
     return wider, window.with_rows(0, rows), values
 
 
-def _tested(score: Floats, power: Floats, waves: Floats, false_alarms: float) -> CentreTest:
+def _tested(score: Floats, power: Floats, waves: Floats, false_alarms: float) -> ScanTest:
     if power.sum() <= 0.0:
-        return _UNKNOWN
+        return UNKNOWN
     fit = _fitted(score, power, CENTRE_TOLERANCE)
     swing, swinging = _swing(score, waves)
     findings = []
@@ -550,7 +531,8 @@ def _tested(score: Floats, power: Floats, waves: Floats, false_alarms: float) ->
             f"opposite rays disagree by {swing:.2f} columns to either side in the course of a turn: the object moved, "
             "or the angles of the views are wrong"
         )
-    return CentreTest(fit.size, fit.error, swing, min(1.0, 2.0 * min(fit.p_value, swinging)), tuple(findings))
+    sizes = {"centre": fit.size} | ({} if math.isnan(swing) else {"swing": swing})
+    return ScanTest(sizes, {"centre": fit.error}, tuple(findings))
 
 
 def _swing(score: Floats, waves: Floats) -> tuple[float, float]:

@@ -11,8 +11,8 @@ from analytic import Ellipsoid, line_integrals
 
 from recon import reconstruct
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, VolumeGrid, full_turn
-from torchpcct.defects import repair_defects
-from torchpcct.reading_checks import reading_warnings
+from torchpcct.checks.defects import repair_defects
+from torchpcct.checks.readings import reading_warnings
 from torchpcct.readings import log_bias, smoothed
 
 MU, AIR = 0.02, 1e5

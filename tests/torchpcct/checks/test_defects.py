@@ -8,7 +8,7 @@ import torch
 from scipy.ndimage import gaussian_filter1d
 
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, full_turn
-from torchpcct.defects import dead_readings, find_defects, repair_defects
+from torchpcct.checks.defects import dead_readings, find_defects, repair_defects
 from torchpcct.scanner.linearisation import WaterLinearisation
 
 VIEWS, ROWS, COLUMNS = 90, 6, 60

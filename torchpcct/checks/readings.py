@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchpcct.readings import DIM, FEWEST, smoothed
-from torchpcct.robust import MEDIAN_TO_SD
+from torchpcct.readings import DIM, FEWEST, MEDIAN_TO_SD, smoothed
 from torchpcct.scan import Scan
 
 __all__ = ["reading_warnings"]

@@ -1,7 +1,7 @@
 """Where is the rotation axis? Found from the readings, with an error that contains the truth.
 
 * Opposite rays that were measured see one line: of a full turn of any beam, or what a scan covers twice
-  (:mod:`torchpcct.metrics.opposite_rays`). What all views of a full turn share is taken off before: the mean over the
+  (:mod:`torchpcct.checks.opposite_rays`). What all views of a full turn share is taken off before: the mean over the
   turn is the same on both sides of the axis, gains of single cells are not.
 * Of half a turn of parallel rays the ends meet: the first views, mirrored, go on where the last ones stop.
 * There, too, the centroid of an object that is seen whole runs through the views as a sine about the axis (Helgason and
@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
+from torchpcct.checks.opposite_rays import OppositeRays, centre_test
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, view_step
-from torchpcct.metrics.opposite_rays import OppositeRays, centre_test
-from torchpcct.robust import MEDIAN_TO_SD
+from torchpcct.readings import MEDIAN_TO_SD
 
 __all__ = ["RotationAxis", "at_axis", "axis_column", "rotation_axis"]
 
@@ -148,10 +148,10 @@ def _by_opposites(lines: Tensor, geometry: Any) -> tuple[float, float] | None:
     error = math.inf
     for _ in range(12):
         test = centre_test(lines, at_axis(geometry, column))
-        if not math.isfinite(test.columns):
+        if "centre" not in test.sizes:
             return None if math.isinf(error) else (column, error)
-        error = test.error
-        step = min(max(test.columns, -2.0), 2.0)
+        error = test.errors["centre"]
+        step = min(max(test.sizes["centre"], -2.0), 2.0)
         column += step  # described too high by so much: the axis lies at a higher column
         if abs(step) < max(0.05 * error, 1e-3):
             break

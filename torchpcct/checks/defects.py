@@ -17,9 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchpcct.dead_cells import MOST_DEAD, bridge
-from torchpcct.readings import dispersion
-from torchpcct.robust import MEDIAN_TO_SD
+from torchpcct.readings import MEDIAN_TO_SD, MOST_DEAD, bridge, dispersion
 from torchpcct.scan import Scan
 from torchpcct.threads import run
 
@@ -181,7 +179,7 @@ def cell_sums(n: Any, air: Tensor, first: Any, lost: NDArray[np.bool_], light: f
         ``(5, rows, detector columns)``: how often each was read, and 0; the sum of its readings; how far its log signal
         lies above the mean of its neighbours', summed over the views in which both are good, and how many those are.
     """
-    from torchpcct.defects_kernels import bends, levels  # numba loads with its first use
+    from torchpcct.checks.defect_kernels import bends, levels  # numba loads with its first use
 
     rows, alive = n.shape[1], np.flatnonzero(~lost)
     sums = np.zeros((5, *air.shape))
@@ -393,7 +391,7 @@ def repair_defects(scan: Scan, cells: Cells | None = None, photon: float | None 
     """A scan whose impossible readings are bridged by their neighbours, and what was done.
 
     Of a scan without window they are dead from then on (``scan.dead``): they weigh nothing. In views of which more is
-    lost than :data:`torchpcct.dead_cells.MOST_DEAD`, and in scans with a window, they are replaced by the counts that
+    lost than :data:`torchpcct.readings.MOST_DEAD`, and in scans with a window, they are replaced by the counts that
     the interpolated line integrals stand for, which are less noisy than those lost.
 
     Args:

@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, full_turn
-from torchpcct.detector_window import DetectorWindow
-from torchpcct.metrics.opposite_rays import (
+from torchpcct.checks.opposite_rays import (
     CENTRE_TOLERANCE,
     FALSE_ALARMS,
     SCALE_TOLERANCE,
@@ -18,6 +17,7 @@ from torchpcct.metrics.opposite_rays import (
     centre_test,
     geometry_test,
 )  # fmt: skip
+from torchpcct.detector_window import DetectorWindow
 
 VIEWS, RODS = 180, ((12.0, -7.0, 6.0, 0.02), (12.0, -7.0, 3.0, 0.01), (-20.0, 15.0, 9.0, 0.015))
 """Rods along z: x, y, radius in mm, attenuation in mm⁻¹."""
@@ -60,18 +60,17 @@ def test_a_wrong_centre_is_found_and_measured(kind, columns):
     g = GEOMETRIES[kind]
     lines = _lines(g)
     found = centre_test(lines, _moved(g, columns))
-    assert found.columns == pytest.approx(columns, rel=0.2)
-    assert found.p_value < FALSE_ALARMS
+    assert found.sizes["centre"] == pytest.approx(columns, rel=0.2)
     assert f"too {'high' if columns > 0 else 'low'}" in found.findings[0]
     right = centre_test(lines, g)
-    assert abs(right.columns) < CENTRE_TOLERANCE / 4
+    assert abs(right.sizes["centre"]) < CENTRE_TOLERANCE / 4
     assert right.findings == ()
 
 
 def test_an_error_within_the_tolerance_is_measured_but_no_finding():
     g = GEOMETRIES["fan"]
     found = centre_test(_lines(g), _moved(g, 0.7 * CENTRE_TOLERANCE))
-    assert found.columns == pytest.approx(0.7 * CENTRE_TOLERANCE, rel=0.3)
+    assert found.sizes["centre"] == pytest.approx(0.7 * CENTRE_TOLERANCE, rel=0.3)
     assert found.findings == ()
 
 
@@ -86,11 +85,11 @@ def test_a_swing_is_found_and_a_displacement_is_not(kind):
         return torch.cat([_lines(g.select(slice(k, k + 1)), [(x, y + d, radius, mu)]) for k, d in enumerate(shift)])
 
     moving = centre_test(scanned(swing * np.sin(g.angles)), g)
-    assert abs(moving.columns) < CENTRE_TOLERANCE
-    assert moving.swing == pytest.approx(0.4, rel=0.3)  # c(β) = a sin β cos β
+    assert abs(moving.sizes["centre"]) < CENTRE_TOLERANCE
+    assert moving.sizes["swing"] == pytest.approx(0.4, rel=0.3)  # c(β) = a sin β cos β
     assert "the object moved" in moving.findings[0]
     elsewhere = centre_test(scanned(np.full(g.views, swing)), g)
-    assert elsewhere.swing < CENTRE_TOLERANCE
+    assert elsewhere.sizes["swing"] < CENTRE_TOLERANCE
     assert elsewhere.findings == ()
 
 
@@ -98,7 +97,7 @@ def test_the_order_of_the_views_does_not_matter():
     g = _moved(GEOMETRIES["fan"], 0.5)
     order = np.random.default_rng(0).permutation(VIEWS)
     expected, shuffled = centre_test(_lines(g), g), centre_test(_lines(g)[order], g.select(order))
-    assert shuffled.columns == pytest.approx(expected.columns, abs=1e-6)
+    assert shuffled.sizes["centre"] == pytest.approx(expected.sizes["centre"], abs=1e-6)
 
 
 def test_each_pair_of_rays_counts_once():
@@ -123,7 +122,7 @@ def test_a_window_that_follows_an_inset():
     lines = DetectorWindow.full(g).crop(_lines(g, [rod]), window)
     for columns in (0.0, 0.4):
         found = centre_test(lines, _moved(g, columns), window, (rod[1], rod[0]))
-        assert found.columns == pytest.approx(columns, abs=0.08)
+        assert found.sizes["centre"] == pytest.approx(columns, abs=0.08)
         assert bool(found.findings) == (columns > 0)
 
 
@@ -152,7 +151,6 @@ def test_without_opposite_rays_or_anything_to_see_nothing_is_found():
     for geometry, lines in cases:
         found = centre_test(lines, geometry)
         assert found.findings == ()
-        assert found.p_value > FALSE_ALARMS
 
 
 @pytest.mark.parametrize("kind", ["fan", "flat", "cone"])
@@ -195,7 +193,7 @@ def test_a_sound_scan_has_no_finding_and_small_sizes():
         g = GEOMETRIES[kind]
         found = geometry_test(_lines(g, WIDE), g)
         assert found.findings == ()
-        assert found.mismatch < 0.01
+        assert found.sizes["mismatch"] < 0.01
         assert abs(found.sizes["step"]) < STEP_TOLERANCE / 4
         assert abs(found.sizes.get("scale", 0.0)) < SCALE_TOLERANCE
 

@@ -16,7 +16,6 @@ length of the pitch, and gain errors of single columns, which both directions sh
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,9 +23,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchpcct.checks.opposite_rays import UNKNOWN, ScanTest
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, view_step
 
-__all__ = ["STEP_TOLERANCE", "WEIGHT_TOLERANCE", "MomentTest", "moment_test"]
+__all__ = ["STEP_TOLERANCE", "WEIGHT_TOLERANCE", "moment_test"]
 
 WEIGHT_TOLERANCE = 0.002
 """Root mean square of the sum's relative change with the direction that is no finding: 0.3 % of a thorax are some 20 HU
@@ -40,29 +40,7 @@ _DIRECTIONS, _LEAST_ARC = 24, 0.8 * math.pi
 Floats = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class MomentTest:
-    """Result of :func:`moment_test`.
-
-    Attributes:
-        weight: relative change of the sum with the direction, root mean square; NaN: not known.
-        weight_error: its standard error.
-        step: relative size by which the steps between the views are described too small; NaN: not known.
-        step_error: its standard error.
-        findings: what was found, in words; empty: nothing.
-    """
-
-    weight: float
-    weight_error: float
-    step: float
-    step_error: float
-    findings: tuple[str, ...]
-
-
-_UNKNOWN = MomentTest(math.nan, math.inf, math.nan, math.inf, ())
-
-
-def moment_test(lines: Tensor, geometry: Geometry) -> MomentTest:
+def moment_test(lines: Tensor, geometry: Geometry) -> ScanTest:
     """Test the first three moments of a scan whose rows end in air; of a cone beam those of the plane of the source.
 
     Args:
@@ -70,8 +48,9 @@ def moment_test(lines: Tensor, geometry: Geometry) -> MomentTest:
         geometry: parallel, fan or cone beam.
 
     Returns:
-        The test; without a finding where far less than half a turn of directions was measured, or nothing is to be
-        seen.
+        The test of ``weight`` (relative change of the sum with the direction, root mean square) and ``step`` (relative
+        size by which the steps between the views are described too small; of less than a full turn).
+        :data:`~torchpcct.checks.opposite_rays.UNKNOWN` where far less than half a turn of directions was measured.
 
     Raises:
         ValueError: a wrong shape, NaN or Inf.
@@ -81,11 +60,11 @@ def moment_test(lines: Tensor, geometry: Geometry) -> MomentTest:
         raise ValueError(f"lines must have the shape {g.shape}, got {tuple(lines.shape)}")
     values = lines.detach().to("cpu", torch.float64)
     if not bool(torch.isfinite(values).all()):
-        raise ValueError("lines hold NaN or Inf: bridge dead readings before (torchpcct.dead_cells.bridge)")
+        raise ValueError("lines hold NaN or Inf: bridge dead readings before (torchpcct.readings.bridge)")
     if isinstance(g, ConeBeam):
         middle = np.abs(g.row_positions) <= 0.5 * g.pitch[0] + 1e-9
         if not middle.any():
-            return _UNKNOWN
+            return UNKNOWN
         values = values[:, torch.from_numpy(middle)].mean(1)
     order = np.argsort(g.angles, kind="stable")
     angles, p = g.angles[order], values.numpy()[order]
@@ -95,7 +74,7 @@ def moment_test(lines: Tensor, geometry: Geometry) -> MomentTest:
         theta, p = _parallel(angles, g.fan_angles, p)
         t = g.sod * np.sin(g.fan_angles)
     if theta.size < _DIRECTIONS or np.ptp(theta) + view_step(theta) < _LEAST_ARC:
-        return _UNKNOWN
+        return UNKNOWN
     width = np.gradient(t)
     scale = float(np.abs(t).max())
     moments = [(p * width * (t / scale) ** k).sum(1) for k in range(3)]
@@ -116,7 +95,9 @@ def moment_test(lines: Tensor, geometry: Geometry) -> MomentTest:
             "saturation, or too few photons for a logarithm), or the object moved; values are wrong by tens of HU, in "
             "long shades"
         )
-    return MomentTest(weight, weight_error, step, step_error, tuple(findings))
+    found = {"weight": (weight, weight_error), "step": (step, step_error)}
+    sizes, errors = ({k: v[i] for k, v in found.items() if math.isfinite(v[0])} for i in (0, 1))
+    return ScanTest(sizes, errors, tuple(findings))
 
 
 def _parallel(angles: Floats, gamma: Floats, p: Floats) -> tuple[Floats, Floats]:

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from torchpcct.dead_cells import bridge
+from torchpcct.readings import bridge
 
 
 def test_bridging_is_linear_and_knows_nothing_of_the_dead():
