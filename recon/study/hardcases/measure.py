@@ -9,12 +9,13 @@ from __future__ import annotations
 import logging
 import re
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -24,9 +25,8 @@ from recon.evaluate.store import Pieces
 from recon.study.hardcases.body import GRID, body_scan, body_truth
 from recon.study.hardcases.case import untouched
 from recon.study.hardcases.cases import CASES
-from recon.study.hardcases.settings import Settings
 from recon.study.paper.rods import rod_values
-from recon.study.study import Clock, Progress, silent
+from recon.study.study import Clock, Measured, Progress, StudySettings, silent
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
@@ -34,9 +34,10 @@ from torchpcct.scanner import Scanner, presets
 from torchpcct.scene import Scene
 from torchpcct.scene.phantoms import thorax
 from torchpcct.scene.plaque import Plaque, plaque_scene
+from torchpcct.validate import choice, number
 from torchpcct.volume import Volume
 
-__all__ = ["RIGHT_NOISES", "WORSE", "Measured", "measure", "verdict"]
+__all__ = ["RIGHT_NOISES", "WORSE", "Settings", "figures", "measure", "verdict"]
 
 RIGHT_NOISES = 0.5
 """A result is right if what the case adds is at most half of the noise that the sound scan has anyway: 12 % more."""
@@ -44,24 +45,43 @@ WORSE = 1.05
 """A method that is further from the truth than soft FBP of the same scan by more than this factor has to say so."""
 _ROWS, _GRID_MM = 20, (6.4, 9.2, 9.2)
 _ROD_VIEWS = 60
+_COLOURS = {"right": "tab:green", "warned": "tab:orange", "unseen": "tab:grey", "SILENT": "tab:red"}
 
 
-@dataclass
-class Measured:
-    """What the report needs.
+@dataclass(frozen=True)
+class Settings(StudySettings):
+    """Settings of the hard cases; the quick ones have an eighth of the views, FBP alone, every case.
 
-    Attributes:
-        rows: one for each case and method: ``case``, ``base``, ``title``, ``method``, ``error_hu`` (rms of the
-            difference to the sound scan's volume, of another scene what it adds to the error against the truth; None if
-            refused), ``noise_hu`` (rms of the sound scan's noise), ``finite``, ``messages`` (warnings, or the refusal),
-            ``refused``, ``seconds``, ``verdict``, ``truth_hu`` (rms of the difference to the truth), ``soft_hu`` (that
-            of soft FBP from the same scan; either is None if refused).
-        seconds: per step.
+    Args:
+        views: of the plaque's scan that is made hard, at least 120.
+        exposure_s: its exposure in s.
+        voxel_mm: voxel size of its inset.
+        seed: of the noise, and of what is broken at random.
+        methods: of :func:`recon.reconstruct`; ``"tissues"``: MBIR with them, of some scans of the plaque.
+        cases: names of :data:`recon.study.hardcases.cases.CASES`.
+
+    Raises:
+        TypeError, ValueError: a value of the wrong kind or out of range; an unknown case.
     """
 
-    settings: Settings
-    rows: list[dict[str, Any]]
-    seconds: dict[str, float]
+    views: int = 360
+    exposure_s: float = 2.0
+    voxel_mm: float = 0.4
+    seed: int = 0
+    methods: tuple[str, ...] = ("fbp", "pwls", "mbir", "tissues")
+    cases: tuple[str, ...] = tuple(CASES)
+
+    QUICK: ClassVar = {"views": 120, "methods": ("fbp",)}
+
+    def __post_init__(self) -> None:
+        self.check_whole(views=120, seed=0)
+        number("exposure_s", self.exposure_s, positive=True, unit="s")
+        number("voxel_mm", self.voxel_mm, positive=True, unit="mm")
+        for name in ("methods", "cases"):
+            if isinstance(getattr(self, name), str) or not getattr(self, name):
+                raise ValueError(f"{name} must be one name or more, got {getattr(self, name)!r}")
+        for name in self.cases:
+            choice("case", name, CASES)
 
 
 def verdict(
@@ -92,7 +112,14 @@ def verdict(
 
 
 def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
-    """Reconstruct every case by every method; see :mod:`recon.study.study`."""
+    """Reconstruct every case by every method; see :mod:`recon.study.study`.
+
+    ``rows`` of the data, one for each case and method: ``case``, ``base``, ``title``, ``method``, ``error_hu`` (rms of
+    the difference to the sound scan's volume, of another scene what it adds to the error against the truth; None if
+    refused), ``noise_hu`` (rms of the sound scan's noise), ``finite``, ``messages`` (warnings, or the refusal),
+    ``refused``, ``seconds``, ``verdict``, ``truth_hu`` (rms of the difference to the truth), ``soft_hu`` (that of soft
+    FBP from the same scan; either is None if refused).
+    """
     clock, pieces = Clock(), Pieces(folder, settings)
     bases = _bases(settings, pieces, progress)
     clock.lap("simulate")
@@ -107,7 +134,9 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
         rows += _case(name, bases[CASES[name].base], settings, pieces.within(f"case_{name}"), progress)
         progress("cases", (k + 1) / len(settings.cases))
     clock.lap("cases")
-    return Measured(settings, rows, clock.seconds)
+    counts = Counter(row["verdict"] for row in rows)
+    data = {"rows": rows, "cases": len(settings.cases), "verdicts": dict(counts), "silent": counts["SILENT"]}
+    return Measured(settings, data, clock.seconds)
 
 
 @dataclass(frozen=True)
@@ -331,3 +360,24 @@ def _heard() -> Iterator[list[str]]:
         for log, propagate in zip(loggers, before, strict=True):
             log.removeHandler(listener)
             log.propagate = propagate
+
+
+def figures(measured: Measured) -> dict[str, Any]:
+    """Error over noise of every case, a panel per method; refused cases have no bar."""
+    from matplotlib.figure import Figure
+
+    methods, cases = measured.settings.methods, measured.settings.cases
+    figure = Figure(figsize=(4.2 * len(methods) + 2, 0.24 * len(cases) + 1.2), dpi=150, layout="constrained")
+    panels = figure.subplots(1, len(methods), sharey=True, squeeze=False)[0]
+    for panel, method in zip(panels, methods, strict=True):
+        rows = [r for r in measured.data["rows"] if r["method"] == method]
+        for k, r in enumerate(rows):
+            if r["error_hu"] is None or not r["finite"]:
+                panel.text(0.011, k, "refused" if r["refused"] else "not finite", va="center", fontsize=7)
+            else:
+                panel.barh(k, max(r["error_hu"] / r["noise_hu"], 0.0105), color=_COLOURS[r["verdict"]], height=0.7)
+        panel.axvline(RIGHT_NOISES, color="black", linewidth=0.8, linestyle=":")
+        panel.set(xscale="log", xlim=(0.01, None), xlabel="error / noise of the sound scan", title=method)
+        panel.set_yticks(range(len(rows)), [r["title"] for r in rows], fontsize=7)
+    panels[0].invert_yaxis()
+    return {"hardcases.png": figure}
