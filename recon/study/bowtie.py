@@ -41,26 +41,7 @@ from torchpcct.scene.phantoms.thorax import thorax
 from torchpcct.validate import choice, number, numbers
 from torchpcct.volume import to_hu
 
-__all__ = [
-    "BOWTIES",
-    "DoseMaps",
-    "Images",
-    "Settings",
-    "checks",
-    "combine",
-    "dose_maps",
-    "figures",
-    "measure",
-    "noise",
-    "polynomial_linearisation",
-    "radial_profile",
-    "ratios",
-    "region_ratio",
-    "slice_image",
-    "slice_scans",
-    "transmission",
-    "wide_scanners",
-]
+__all__ = ["Settings", "checks", "figures", "measure"]
 
 Floats = NDArray[np.float64]
 
@@ -176,7 +157,7 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     for k, name in enumerate(("ctdi", "thorax")):
         maps[name] = _kept(s, pieces, f"map_{name}")
         progress("dose", 0.3 + 0.3 * (k + 1))
-    data["thorax_dose_ratio"] = thorax_ratios(maps["thorax"], scenes["thorax"])
+    data["thorax_dose_ratio"] = {t: region_ratio(maps["thorax"], scenes["thorax"], b) for t, b in TISSUES.items()}
     data["patient_dose_ratio"] = _kept(s, pieces, "patient")
     progress("dose", 1.0)
     clock.lap("dose")
@@ -433,11 +414,6 @@ def region_ratio(maps: DoseMaps, scene: Scene, begins: tuple[str, ...]) -> dict[
     if not inside.any():
         raise ValueError("none of the map's voxels lies in these bodies: refine the grid or name others")
     return {kind: float(dose[1][inside].mean() / dose[0][inside].mean()) for kind, dose in maps.doses.items()}
-
-
-def thorax_ratios(maps: DoseMaps, scene: Scene) -> dict[str, dict[str, float]]:
-    """:func:`region_ratio` of every tissue of the thorax."""
-    return {tissue: region_ratio(maps, scene, begins) for tissue, begins in TISSUES.items()}
 
 
 def patient_ratio(scanners: dict[str, Scanner], exposure_s: float, histories: int, seed: int) -> dict[str, float]:

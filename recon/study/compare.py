@@ -27,7 +27,7 @@ from torchpcct.scanner import presets
 from torchpcct.validate import numbers
 from torchpcct.viz import Panel, panels
 
-__all__ = ["SCREEN", "Settings", "claim", "figures", "measure"]
+__all__ = ["SCREEN", "Settings", "figures", "measure"]
 
 SCREEN = "compare_screen"
 """Template of what a terminal shows: the answer, the dose factors of every method, and where the rest is."""
@@ -103,7 +103,8 @@ def claim(records: list[dict[str, Any]]) -> dict[str, Any] | None:
     if ours is None or factor is None or fbp is None:
         return None
     needed = _HIGH_S / _LOW_S
-    met = "yes" if factor["low"] >= needed else "no" if factor["high"] < needed else "open"
+    low, high = (factor["value"] if factor[end] is None else factor[end] for end in ("low", "high"))
+    met = "yes" if low >= needed else "no" if high < needed else "open"
     return {"mbir_s": _LOW_S, "fbp_s": _HIGH_S, "needed": needed, "mbir": ours, "fbp": fbp, "factor": factor,
             "met": met}  # fmt: skip
 

@@ -25,7 +25,7 @@ from torchpcct.scanner.silicon_transport import Stack, efficiency, follow
 from torchpcct.scene.materials import PLAQUE_MATERIALS, material
 from torchpcct.validate import numbers
 
-__all__ = ["Settings", "charge_sharing", "checks", "counts", "efficiencies", "figures", "measure", "pile_up"]
+__all__ = ["Settings", "checks", "figures", "measure"]
 
 Floats = NDArray[np.float64]
 

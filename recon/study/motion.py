@@ -41,7 +41,7 @@ from torchpcct.scene.plaque import Plaque, plaque_scene
 from torchpcct.validate import number
 from torchpcct.viz import WINDOW_HU, Panel, panels
 
-__all__ = ["METHODS", "Found", "Observed", "Reference", "Settings", "checks", "figures", "measure", "observe"]
+__all__ = ["Settings", "checks", "figures", "measure"]
 
 METHODS = {"fbp": "FBP", "pwls": "q-GGMRF PWLS", "mbir": "MBIR (learned prior)"}
 

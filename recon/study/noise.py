@@ -40,22 +40,7 @@ from torchpcct.scanner import presets
 from torchpcct.scene.plaque import plaque_scene
 from torchpcct.viz import Panel, panels
 
-__all__ = [
-    "Moments",
-    "Pair",
-    "Settings",
-    "Table",
-    "checks",
-    "few_run_tables",
-    "figures",
-    "kendall",
-    "measure",
-    "measured_table",
-    "pair_differences",
-    "published",
-    "resampled_tables",
-    "table_checks",
-]
+__all__ = ["Settings", "checks", "figures", "measure"]
 
 Floats = NDArray[np.float64]
 
@@ -302,20 +287,12 @@ def _against_dose(s: Settings, m: Moments) -> dict[str, Any]:
 
 
 def _ten_run_experiments(s: Settings, m: Moments, exposure: float) -> dict[str, Any]:
-    """What experiments of ten realisations find: which setting wins, and how their rankings agree (Kendall's τ)."""
+    """How often each setting has the highest CNR in experiments of ten realisations."""
     shared = few_run_tables(m.expected, m.covariance / exposure, _TEN, s.experiments, s.seed)
     winners = np.bincount(shared.cnr.argmax(-1), minlength=len(s.axes)) / s.experiments
-    half = s.experiments // 2
-
-    def spread(values: Any) -> Any:
-        """Median between the ends of the 95 % range."""
-        return np.quantile(values, [0.025, 0.5, 0.975])
-
     return {
         "experiments": s.experiments,
         "winners": {f"{k} {v:.2f} mm": float(w) for (k, v), w in zip(s.axes, winners, strict=True)},
-        "tau_exact_shared": spread(kendall(shared.cnr, m.exact(exposure).cnr)),
-        "tau_between_experiments": spread(kendall(shared.cnr[:half], shared.cnr[half : 2 * half])),
     }
 
 
@@ -479,13 +456,6 @@ def pair_differences(
         low, high = bca_interval(value, boot[:, a] - boot[:, b], jackknife[:, a] - jackknife[:, b], level)
         result.append(Pair(a, b, value, low, high, float(exact.cnr[a] - exact.cnr[b])))
     return result
-
-
-def kendall(a: Any, b: Any) -> Floats:
-    """Kendall's τ_a between rankings ``(..., settings)`` (broadcast): 1 the same order, 0 unrelated, −1 reversed."""
-    a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
-    i, j = np.triu_indices(a.shape[-1], 1)
-    return np.asarray(np.sign((a[..., i] - a[..., j]) * (b[..., i] - b[..., j])).mean(-1))
 
 
 # --- the report -----------------------------------------------------------------------------------------------------

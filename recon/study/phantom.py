@@ -27,7 +27,7 @@ from torchpcct.scene.plaque import PATIENT_DIAMETER, Plaque, plaque_scene
 from torchpcct.validate import number, numbers
 from torchpcct.viz import Panel, panels
 
-__all__ = ["TRANSMITTED", "Settings", "analytic_lengths", "checks", "figures", "measure", "raster_lengths"]
+__all__ = ["Settings", "checks", "figures", "measure"]
 
 TRANSMITTED, MIDDLE = "100 kVp behind 24 cm fat", "64 keV"
 """Spectra whose CT numbers are checked."""

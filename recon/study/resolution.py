@@ -50,20 +50,7 @@ from torchpcct.scene.plaque import PATIENT_DIAMETER, Plaque, plaque_scene
 from torchpcct.validate import number
 from torchpcct.viz import panels
 
-__all__ = [
-    "FWHM_PER_SIGMA",
-    "Settings",
-    "SystemWidth",
-    "blur",
-    "blur_series",
-    "checks",
-    "crossing",
-    "figures",
-    "limits",
-    "measure",
-    "point_width",
-    "wire_width",
-]
+__all__ = ["Settings", "checks", "figures", "measure"]
 
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
 _PX_FWHM = FWHM_PER_SIGMA * PROTOCOL_PIXEL_MM

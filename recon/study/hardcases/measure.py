@@ -23,7 +23,7 @@ import torch
 from recon import reconstruct
 from recon.evaluate.store import Pieces
 from recon.study.hardcases.body import GRID, body_scan, body_truth
-from recon.study.hardcases.case import untouched
+from recon.study.hardcases.case import Case, untouched
 from recon.study.hardcases.cases import CASES
 from recon.study.paper.rods import rod_values
 from recon.study.study import Clock, Measured, Progress, StudySettings, silent
@@ -249,12 +249,8 @@ def _case(name: str, base: _Base, settings: Settings, pieces: Pieces, progress: 
     for method in settings.methods:
         if method == "tissues" and not case.tissues:
             continue
-        volume, texts, noise, _ = base.sound[method]
-        usual = {_kind(text) for text in texts}
-        against = _Against(
-            volume, truth, base.truth if case.other else None, seen, noise, usual, lost, soft, case.unseen
-        )
-        row = pieces(method, partial(_row, scan, base.grid, method, against))
+        run = partial(_row, scan, base, method, case, truth, seen, lost, soft)
+        row = pieces(method, run)
         rows.append({"case": name, "base": case.base, "title": case.title, "method": method, **row})
     return rows
 
@@ -265,28 +261,6 @@ def _truth(scene: Scene, scanner: Scanner, grid: VolumeGrid) -> torch.Tensor:
     hu = rod_values(scene, scanner, grid.center[::-1], tissues=tissues, views=_ROD_VIEWS).hu
     values = {name: hu.get(name, 0.0) for name in scene.names}  # what a case adds is left out
     return torch.from_numpy(scene.render(grid, values)).float()
-
-
-@dataclass(frozen=True)
-class _Against:
-    """What a row is judged by.
-
-    Attributes:
-        sound, truth: volumes in HU. usual_truth: of the sound scan where its scene is another, else None. seen: the
-            voxels that count.
-        noise: rms noise of the sound volume. usual: kinds of warnings of the sound scan.
-        lost, unseen: of :func:`verdict`. soft: error of soft FBP against the truth, None if refused.
-    """
-
-    sound: torch.Tensor
-    truth: torch.Tensor
-    usual_truth: torch.Tensor | None
-    seen: torch.Tensor
-    noise: float
-    usual: set[str]
-    lost: float
-    soft: float | None
-    unseen: str
 
 
 def _from_truth(scan: Scan | Exception, grid: VolumeGrid, truth: torch.Tensor, seen: torch.Tensor) -> float | None:
@@ -301,32 +275,38 @@ def _from_truth(scan: Scan | Exception, grid: VolumeGrid, truth: torch.Tensor, s
     return _rms((volume.data - truth)[seen])
 
 
-def _row(scan: Scan | Exception, grid: VolumeGrid, method: str, by: _Against) -> dict[str, Any]:
+def _row(
+    scan: Scan | Exception, base: _Base, method: str, case: Case, truth: torch.Tensor, seen: torch.Tensor, lost: float,
+    soft: float | None,
+) -> dict[str, Any]:  # fmt: skip
+    """A case by a method; ``seen``: the voxels that count, ``lost``: ``noise`` of :func:`verdict`."""
+    sound, usual, noise, _ = base.sound[method]
     start = time.perf_counter()
     with _heard() as messages:
         try:
             if isinstance(scan, Exception):
                 raise scan
-            volume = _reconstruct(scan, grid, method)
+            volume = _reconstruct(scan, base.grid, method)
         except (ValueError, TypeError) as error:
             return {
-                "error_hu": None, "noise_hu": by.noise, "finite": True, "messages": [str(error)], "refused": True,
-                "seconds": time.perf_counter() - start, "verdict": verdict(None, by.noise, True, [str(error)]),
-                "truth_hu": None, "soft_hu": by.soft,
+                "error_hu": None, "noise_hu": noise, "finite": True, "messages": [str(error)], "refused": True,
+                "seconds": time.perf_counter() - start, "verdict": verdict(None, noise, True, [str(error)]),
+                "truth_hu": None, "soft_hu": soft,
             }  # fmt: skip
     seconds = time.perf_counter() - start
     finite = bool(torch.isfinite(volume.data).all())
-    error_hu, truth_hu = (_rms((volume.data - other)[by.seen]) for other in (by.sound, by.truth))
-    if by.usual_truth is not None:
-        error_hu = max(truth_hu**2 - _rms((by.sound - by.usual_truth)[by.seen]) ** 2, 0.0) ** 0.5
+    error_hu, truth_hu = (_rms((volume.data - other)[seen]) for other in (sound, truth))
+    if case.other:
+        error_hu = max(truth_hu**2 - _rms((sound - base.truth)[seen]) ** 2, 0.0) ** 0.5
     texts = list(dict.fromkeys([*volume.report.get("warnings", []), *messages]))
-    more = [t for t in texts if _kind(t) not in by.usual]
+    kinds = set(map(_kind, usual))
+    more = [t for t in texts if _kind(t) not in kinds]
     # The standard kernel is sharper and noisier than the soft one by intent.
-    worse = 1.0 if by.soft is None or method == "fbp" else truth_hu / by.soft
+    worse = 1.0 if soft is None or method == "fbp" else truth_hu / soft
     return {
-        "error_hu": error_hu, "noise_hu": by.noise, "finite": finite, "messages": texts, "refused": False,
-        "seconds": seconds, "verdict": verdict(error_hu, by.noise, finite, more, by.lost, worse, by.unseen),
-        "truth_hu": truth_hu, "soft_hu": by.soft,
+        "error_hu": error_hu, "noise_hu": noise, "finite": finite, "messages": texts, "refused": False,
+        "seconds": seconds, "verdict": verdict(error_hu, noise, finite, more, lost, worse, case.unseen),
+        "truth_hu": truth_hu, "soft_hu": soft,
     }  # fmt: skip
 
 

@@ -172,9 +172,7 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     data["vmi"] = _vmi(scan, images)
     done("monochromatic images")
     tissues = Tissues(scan, data["vmi"]["voxel_covariance"])
-    data["separation"] = tissues.separation()
     data["slices"] = len(tissues.truth)
-    data["misplaced_core"] = tissues.misplaced_core(noise_free)
     data["dice"] = {
         name: [_scores(level, tissues, images.fbp(level), rule) for level in s.noise_levels]
         for rule, name in RULES.items()

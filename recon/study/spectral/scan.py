@@ -232,22 +232,3 @@ class Tissues:
         known = self.truth >= 0
         found, truth = self.labels(images, rule)[known], self.truth[known]
         return [dice(found == k, truth == k) for k in range(len(MMD_TISSUES))]
-
-    def misplaced_core(self, images: Tensor) -> float:
-        """Share of the voxels labelled core that lie outside it, among them all that hold several tissues."""
-        core = MMD_TISSUES.index("necrotic_core")
-        found = self.labels(images) == core
-        return float((found & (self.truth != core)).sum() / found.sum().clamp_min(1))
-
-    def separation(self) -> dict[str, float]:
-        """Distances in the plane of the basis in standard deviations of a voxel: what noise can hide."""
-        c11, c12, c22 = self.covariance
-        white = np.linalg.cholesky(np.linalg.inv([[c11, c12], [c12, c22]])).T @ self.corners
-        blood, core, fibrous, fat = white.T
-        line = (fat - fibrous) / np.linalg.norm(fat - fibrous)
-        return {
-            "core to fibrous": float(np.linalg.norm(core - fibrous)),
-            "core to fat": float(np.linalg.norm(core - fat)),
-            "blood to fibrous": float(np.linalg.norm(blood - fibrous)),
-            "core to the line from fat to fibrous": float(abs(line[0] * (core - fat)[1] - line[1] * (core - fat)[0])),
-        }

@@ -16,7 +16,6 @@ from recon.study.noise import (
     Settings,
     Table,
     few_run_tables,
-    kendall,
     measured_table,
     pair_differences,
     published,
@@ -200,13 +199,6 @@ def test_a_setting_does_not_differ_from_itself():
     pair = pair_differences(means, exact_table(_covariance()), [(0, 1)], draws=100)[0]
     assert (pair.difference, pair.low, pair.high) == (0, 0, 0)
     assert not pair.established
-
-
-def test_kendall():
-    assert kendall([1, 2, 3, 4], [10, 20, 30, 40]) == 1
-    assert kendall([1, 2, 3, 4], [4, 3, 2, 1]) == -1
-    assert kendall([1, 2, 3, 4], [2, 1, 4, 3]) == pytest.approx(1 / 3)
-    assert kendall(np.array([[1, 2, 3], [3, 2, 1]]), [1, 2, 3]).tolist() == [1, -1]
 
 
 def test_table_checks_are_those_of_the_paper():
