@@ -35,7 +35,7 @@ from recon.cli import main
 from recon.study import registry
 from recon.evaluate.store import Store
 out, name = sys.argv[1:]
-kind = registry.part(name, "settings").Settings if name != "evaluate" else type("", (), {})
+kind = registry.part(name).Settings if name != "evaluate" else type("", (), {})
 kind.quick = classmethod(lambda cls, **changes: cls(**{**TINY[name], **changes}))
 piece = Store.piece
 def noted(self, at, key, compute):

@@ -183,11 +183,9 @@ def _run_study(name: str, settings: Any, arguments: argparse.Namespace, progress
     progress.close()
     if report is None:
         return
-    if "command" in report.data:
-        report.made_by(shlex.join(["torchpcct", *arguments.command_line]))
     files = report.save(folder)
     Pieces.clear(folder)
-    print(report.screen or report.text)
+    print(report.screen)
     print(f"\n{time.perf_counter() - start:.0f} s in all. Written: {', '.join(map(str, files))}")
 
 
@@ -199,7 +197,7 @@ def _study(arguments: argparse.Namespace, progress: ProgressBars) -> None:
 
 def _own_study(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     """A study that is a command of its own, with options named like its settings."""
-    kind = registry.part(arguments.command, "settings").Settings
+    kind = registry.part(arguments.command).Settings
     given = {f.name: getattr(arguments, f.name, None) for f in fields(kind)}
     changes = {name: tuple(v) if isinstance(v, list) else v for name, v in given.items() if v is not None}
     settings = kind.quick(**changes) if arguments.quick else kind(**changes)

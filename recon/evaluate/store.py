@@ -186,9 +186,9 @@ def _ahead(root: Path, settings: Any, prefix: str, function: Callable[..., Any],
 
 
 def _study_digest(settings: Any) -> str:
-    """Of the module ``measure`` beside a study's settings, with all it imports."""
+    """Of the module of a study, in which its settings stand beside its measuring, with all it imports."""
     module = type(settings).__module__
-    return source_digest(f"{module.rpartition('.')[0]}.measure") if module.startswith("recon.") else source_digest()
+    return source_digest(module) if module.startswith("recon.") else source_digest()
 
 
 def packed(value: Any) -> dict[str, Any]:

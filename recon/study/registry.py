@@ -8,7 +8,7 @@ from __future__ import annotations
 import ast
 import importlib
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,9 +16,9 @@ from torchpcct.validate import choice, meant
 
 if TYPE_CHECKING:
     from recon.study.report import Report
-    from recon.study.study import Progress
+    from recon.study.study import Measured, Progress
 
-__all__ = ["STUDIES", "build_settings", "folder", "part", "run", "settings_of"]
+__all__ = ["STUDIES", "build_settings", "folder", "part", "report_of", "run", "settings_of"]
 
 STUDIES: dict[str, str] = {
     "compare": "what dose MBIR saves at the paper's plaque, beside FBP, PWLS and the best simple filter",
@@ -31,14 +31,14 @@ STUDIES: dict[str, str] = {
     "hardcases": "starved, broken, incomplete and wrongly described scans: which results are wrong, and who says so",
     "spectral": "energy bins into PE and PVC: monochromatic images, best energy, tissue maps, by FBP and joint MBIR",
 }
-"""Name → one line of help. The study ``some-name`` is the package ``recon.study.some_name``."""
+"""Name → one line of help. The study ``some-name`` is the module ``recon.study.some_name``."""
 
 _FORMER = {"dose": "bowtie"}
 """The study "bowtie" was first published as "dose"; whoever calls it so still gets it."""
 
 
 def folder(name: str) -> str:
-    """Name of a study's package, and of the folder of its committed result.
+    """Name of a study's module, of its template, and of the folder of its committed result.
 
     Raises:
         ValueError: an unknown study.
@@ -46,13 +46,13 @@ def folder(name: str) -> str:
     return choice("study", _FORMER.get(name, name), STUDIES).replace("-", "_")
 
 
-def part(name: str, module: str) -> Any:
-    """One of the modules ``settings``, ``measure`` and ``report`` of a study.
+def part(name: str) -> Any:
+    """The module of a study, with the names that :mod:`recon.study.study` lists.
 
     Raises:
         ValueError: an unknown study.
     """
-    return importlib.import_module(f"recon.study.{folder(name)}.{module}")
+    return importlib.import_module(f"recon.study.{folder(name)}")
 
 
 def settings_of(name: str, values: Mapping[str, Any]) -> Any:
@@ -61,7 +61,7 @@ def settings_of(name: str, values: Mapping[str, Any]) -> Any:
     Raises:
         ValueError, TypeError: an unknown study; values that its settings refuse.
     """
-    kind = part(name, "settings").Settings
+    kind = part(name).Settings
     known = {f.name for f in fields(kind) if f.init}
     return kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items() if k in known})
 
@@ -79,7 +79,7 @@ def build_settings(name: str, *, quick: bool = False, seed: int | None = None, c
         ValueError: an unknown study or field, a change without ``=``, a value that the settings refuse.
         TypeError: a value of a wrong type.
     """
-    kind = part(name, "settings").Settings
+    kind = part(name).Settings
     known = {f.name for f in fields(kind) if f.init}
     values: dict[str, Any] = {} if seed is None or "seed" not in known else {"seed": seed}
     for change in changes:
@@ -111,9 +111,25 @@ def run(name: str, settings: Any, progress: Progress | None = None, pieces: str 
     """
     from recon.study.study import silent  # loads torch
 
-    kind = part(name, "settings").Settings
-    if not isinstance(settings, kind):
+    study = part(name)
+    if not isinstance(settings, study.Settings):
+        kind = study.Settings
         raise TypeError(f"settings must be {kind.__module__}.Settings, got {type(settings).__name__}")
-    measured = part(name, "measure").measure(settings, progress or silent, pieces)
-    report: Report = part(name, "report").build_report(measured)
-    return report
+    return report_of(name, study.measure(settings, progress or silent, pieces))
+
+
+def report_of(name: str, measured: Measured) -> Report:
+    """The report of what a study measured: settings, values, checks, pictures.
+
+    Raises:
+        ValueError: an unknown study.
+    """
+    from recon.study.report import Report
+    from recon.study.study import environment
+
+    study = part(name)
+    data = {"study": folder(name), "settings": asdict(measured.settings), **measured.data}
+    if hasattr(study, "checks"):
+        data["checks"] = [check.as_dict() for check in study.checks(data)]
+    data |= {"seconds": measured.seconds, "environment": environment()}
+    return Report(folder(name), data, study.figures(measured), getattr(study, "SCREEN", ""))

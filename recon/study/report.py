@@ -1,4 +1,9 @@
-"""What every study leaves behind: ``report.json``, ``report.md``, ``report.html`` and figures, each written whole."""
+"""What every study leaves behind: ``report.json``, ``report.md``, ``report.html`` and figures, each written whole.
+
+The text is a template (``templates/NAME.md.j2``, in Jinja's language) filled in from the JSON values, so that it can be
+rendered from a committed ``report.json``. Templates write Markdown tables as they come to mind; :func:`aligned` pads
+them. A word that hinges on a figure is chosen there by the figure's sign.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +11,10 @@ import io
 import json
 import math
 import os
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -16,35 +23,102 @@ import numpy as np
 from recon.evaluate.report import page
 from torchpcct.files import atomic_write
 
-__all__ = ["Report", "by_sign", "markdown_table", "or_dash", "records_table"]
+__all__ = ["Check", "Report", "aligned", "around", "render"]
 
 
-def or_dash(value: float, digits: int) -> str:
-    """A table's cell: the value, or a dash for NaN."""
-    return "–" if math.isnan(value) else f"{value:.{digits}f}"
+@dataclass(frozen=True)
+class Check:
+    """One figure that a study must show.
+
+    Args:
+        name: what it is, with its unit.
+        ours: as measured; NaN where it could not be determined (never inside).
+        paper: the published figure as text, or as a number.
+        low, high: accepted range, both ends included; infinite where open.
+        note: where it is outside: the computed cause.
+    """
+
+    name: str
+    ours: float
+    paper: float | str
+    low: float = -math.inf
+    high: float = math.inf
+    note: str = ""
+
+    @property
+    def ok(self) -> bool:
+        """Whether the figure lies in the accepted range."""
+        return bool(self.low <= self.ours <= self.high)
+
+    def explained(self, cause: str) -> Check:
+        """The check with ``cause`` as its note, where it is outside."""
+        return self if self.ok or not cause else replace(self, note=cause)
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON values, ``ok`` among them; open ends are None."""
+        ends = {k: v if math.isfinite(v) else None for k, v in (("low", self.low), ("high", self.high))}
+        return {**vars(self), **ends, "ours": float(self.ours), "ok": self.ok}
 
 
-def by_sign(value: float, above: str, below: str, zero: float = 0.0) -> str:
-    """The word for a figure above ``zero`` (1 of a ratio), or for one that is not: directions are not fixed."""
-    return above if value > zero else below
+def around(name: str, ours: float, paper: float, tolerance: float, note: str = "") -> Check:
+    """A check that accepts ``paper`` ± ``tolerance``."""
+    return Check(name, ours, paper, paper - tolerance, paper + tolerance, note)
 
 
-def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table, first column left, the others right aligned, padded so that it reads well as plain text."""
-    cells = [list(header), *[list(map(str, r)) for r in rows]]
-    widths = [max(len(row[i]) for row in cells) for i in range(len(header))]
+def render(name: str, data: Mapping[str, Any]) -> str:
+    """The text of a report, or another text that a study tells.
+
+    Args:
+        name: of the template, without its ending, e.g. ``"phantom"``.
+        data: JSON values of the report.
+
+    Returns:
+        Markdown without a line break at its end.
+
+    Raises:
+        jinja2.UndefinedError: a value that the template asks for is missing.
+    """
+    text = _templates().get_template(f"{name}.md.j2").render(data)
+    return aligned(re.sub(r"\n{3,}", "\n\n", text).strip())
+
+
+@cache
+def _templates() -> Any:
+    import jinja2
+
+    folder = jinja2.FileSystemLoader(Path(__file__).parent / "templates")
+    made = jinja2.Environment(loader=folder, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    made.filters |= {"f": _figure, "interval": _interval, "cell": lambda text: str(text).replace("|", "\\|")}
+    return made
+
+
+def _figure(value: float | None, spec: str) -> str:
+    """A figure by Python's format; a dash where there is none."""
+    return "–" if value is None or math.isnan(value) else format(value, spec)
+
+
+def _interval(value: Any, spec: str = ".2f") -> str:
+    """``[value, low, high]`` or a record of an evaluation, as ``1.53 [1.47, 1.59]``; the value alone if it is exact."""
+    middle, low, high = (value[k] for k in ("value", "low", "high")) if isinstance(value, Mapping) else value
+    text = _figure(middle, spec)
+    return text if low is None or math.isnan(low) else f"{text} [{low:{spec}}, {high:{spec}}]"
+
+
+def aligned(text: str) -> str:
+    """Markdown whose tables are padded so that they read well as plain text; columns but the first to the right."""
+    return re.sub(r"(?:^\|.*\|$\n?){2,}", lambda m: _padded(m[0]), text, flags=re.MULTILINE)
+
+
+def _padded(table: str) -> str:
+    rows = [[c.strip() for c in re.split(r"(?<!\\)\|", line)[1:-1]] for line in table.splitlines()]
+    widths = [max(map(len, column)) for column in zip(*(r for k, r in enumerate(rows) if k != 1), strict=True)]
+    rule = ["|", *((":" if i == 0 else "") + "-" * (w + 1) + (":" if i else "") + "|" for i, w in enumerate(widths))]
 
     def line(row: Sequence[str]) -> str:
-        padded = [c.ljust(w) if i == 0 else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True))]
-        return "| " + " | ".join(padded) + " |"
+        cells = (c.ljust(w) if i == 0 else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True)))
+        return f"| {' | '.join(cells)} |"
 
-    rule = "|" + "|".join((":" if i == 0 else "") + "-" * (w + 1) + (":" if i else "") for i, w in enumerate(widths))
-    return "\n".join([line(cells[0]), rule + "|", *map(line, cells[1:])])
-
-
-def records_table(records: Iterable[Mapping[str, Any]], columns: Mapping[str, str]) -> str:
-    """A table of records; ``columns``: heading → format of the cell, e.g. ``"{dqe:.3f} ± {dqe_error:.3f}"``."""
-    return markdown_table(list(columns), [[cell.format(**record) for cell in columns.values()] for record in records])
+    return "\n".join([line(rows[0]), "".join(rule), *map(line, rows[2:])]) + ("\n" if table.endswith("\n") else "")
 
 
 def _plain(value: Any) -> Any:
@@ -52,8 +126,6 @@ def _plain(value: Any) -> Any:
         return value.tolist()
     if isinstance(value, np.generic):
         return value.item()
-    if hasattr(value, "_asdict"):
-        return value._asdict()
     return str(value)
 
 
@@ -62,28 +134,31 @@ class Report:
     """A study's result.
 
     Args:
-        name: of the study.
+        name: of the study, and of its template.
         data: JSON values (NumPy arrays and scalars are converted).
-        text: Markdown.
         figures: file name → matplotlib figure.
-        screen: what a terminal shows of it; empty: the text.
+        screen_template: name of the template of what a terminal shows of it; empty: the text.
     """
 
     name: str
     data: dict[str, Any]
-    text: str
     figures: dict[str, Any] = field(default_factory=dict)
-    screen: str = ""
-
-    def made_by(self, command: str) -> None:
-        """Add the command that repeats the study to values and text."""
-        self.data["command"] = command
-        self.text += f" Command: `{command}`."
+    screen_template: str = ""
 
     @property
     def json(self) -> str:
         """The values as JSON text."""
         return json.dumps(self.data, indent=1, default=_plain)
+
+    @property
+    def text(self) -> str:
+        """Markdown, of the values alone."""
+        return render(self.name, json.loads(self.json))
+
+    @property
+    def screen(self) -> str:
+        """What a terminal shows."""
+        return render(self.screen_template or self.name, json.loads(self.json))
 
     def save(self, folder: str | os.PathLike[str]) -> list[Path]:
         """Write ``report.json``, ``report.md``, the figures and ``report.html`` into ``folder`` (made if need be).
@@ -91,12 +166,11 @@ class Report:
         Returns:
             The files written.
         """
-        out = Path(folder)
+        out, text = Path(folder), self.text
         out.mkdir(parents=True, exist_ok=True)
-        contents = {"report.json": f"{self.json}\n".encode(), "report.md": f"{self.text}\n".encode()}
+        contents = {"report.json": f"{self.json}\n".encode(), "report.md": f"{text}\n".encode()}
         pictures = {name: _drawn(figure, name) for name, figure in self.figures.items()}
-        title = f"torchpcct: {self.name}"
-        contents |= {**pictures, "report.html": page(title, self.text, pictures).encode()}
+        contents |= {**pictures, "report.html": page(f"torchpcct: {self.name}", text, pictures).encode()}
         for name, content in contents.items():
             with atomic_write(out / name) as part:
                 part.write_bytes(content)

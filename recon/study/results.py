@@ -1,7 +1,8 @@
 """What the studies found, in sentences whose figures are read from the committed reports.
 
 ``notebooks/results.template.md`` is Markdown with fields in double braces; :func:`render` fills them in and gives
-``notebooks/RESULTS.md`` and the block of the README between its two marks. So no sentence can disagree with a result:
+``notebooks/RESULTS.md`` and the block of the README between its two marks; the reports of the studies are rendered from
+their values, too. So no sentence can disagree with a result:
 ``torchpcct verify`` renders again and compares. A field is
 
 * ``{{FILE: PATH | FORMAT}}``: FILE lies in ``notebooks``, a name alone means its ``report.json``; PATH is a chain of
@@ -23,6 +24,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from recon.study import registry, report
+
 __all__ = ["README_MARKS", "differences", "lookup", "render"]
 
 README_MARKS = ("<!-- results: rendered by torchpcct verify --write -->", "<!-- end of results -->")
@@ -37,8 +40,11 @@ PASSING = (
     "rays_per_second",
     "rays_per_core_second",
     "threads",
+    "peak_memory",
+    "tables",
 )
-"""Keys of results that tell of the run and not of what was found: they differ from run to run."""
+"""Keys of results that tell of the run and not of what was found: they differ from run to run. Tables are Markdown of
+records that stand beside them, and hold seconds."""
 
 _FIELD = re.compile(r"\{\{([^:{}]+):([^{}]+)\}\}")
 _RECORD = ("task", "method", "exposure_s", "figure", "where")
@@ -46,7 +52,8 @@ _ROW = re.compile(r"^([^[]*)\[(.+)\]$")
 
 
 def render(root: Path) -> dict[str, str]:
-    """File, relative to the repository ``root``, → its text with the committed figures: RESULTS.md and README.md.
+    """File, relative to the repository ``root``, → its text with the committed figures: RESULTS.md, README.md and the
+    ``report.md`` of every study that is committed.
 
     Raises:
         ValueError: a report, key or figure is missing, a format does not fit, a mark is missing.
@@ -59,7 +66,13 @@ def render(root: Path) -> dict[str, str]:
     if any(part.count(mark) != 1 for part in (text, readme) for mark in README_MARKS):
         raise ValueError(f"README.md and results.template.md must hold each of {first} and {last} once")
     block = text[text.index(first) : text.index(last)]
+    reports = {study: folder / study / "report.json" for study in map(registry.folder, registry.STUDIES)}
     return {
+        **{
+            f"notebooks/{study}/report.md": report.render(study, _parsed(path, path.stat().st_mtime_ns)) + "\n"
+            for study, path in reports.items()
+            if path.exists()
+        },
         "README.md": readme[: readme.index(first)] + block + readme[readme.index(last) :],
         "notebooks/RESULTS.md": "\n".join(line for line in text.splitlines() if line not in README_MARKS) + "\n",
     }

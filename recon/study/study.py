@@ -1,16 +1,16 @@
-"""The skeleton of every study: its settings, its clock, and what it says to whoever waits.
+"""What every study is made of: its settings, its clock, what it measured, and what it tells whoever waits.
 
-A study is a folder of this package with four modules, listed in :mod:`recon.study.registry`, which runs it by its name:
+A study is a module (or a package that exports the same names) of :mod:`recon.study`, listed in
+:mod:`recon.study.registry`, which runs it by its name. It has
 
-* ``settings.py``: ``Settings(StudySettings)``, a frozen dataclass that validates itself;
-* ``measure.py``: ``measure(settings, progress=silent, folder=None) -> Measured``, which simulates, reconstructs and
-  measures. It prints nothing and writes nothing, but finished pieces into ``folder`` (:mod:`recon.evaluate.store`), so
-  that an interrupted study goes on;
-* ``report.py``: ``build_report(measured) -> Report``: JSON values, Markdown and the figures; it measures nothing;
-* ``figures.py``: the pictures of the report.
-
-``Measured`` is the study's own: a dataclass with ``settings``, ``seconds`` (of a :class:`Clock`) and what was found. So
-data walks one way, settings → measure → report, and no module looks back.
+* ``Settings(StudySettings)``, a frozen dataclass that validates itself;
+* ``measure(settings, progress=silent, folder=None) -> Measured``, which simulates, reconstructs and measures. It prints
+  nothing and writes nothing, but finished pieces into ``folder`` (:mod:`recon.evaluate.store`), so that an interrupted
+  study goes on;
+* ``figures(measured)``: file name → picture of the report;
+* ``checks(data)``, where there is something to check: the report's figures beside the paper's;
+* ``templates/NAME.md.j2``: the report's text, a template that :mod:`recon.study.report` fills in from the JSON values
+  of the report and from nothing else. So the text of a committed report can be rendered again from its values.
 
 Noise has one rule in all studies: realisation i draws with the seed ``settings.seed + i``, the same at every dose, in
 every scene and for every method, so that their results can be paired.
@@ -23,6 +23,7 @@ import platform
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -30,7 +31,7 @@ import numpy as np
 import torchpcct
 from torchpcct.validate import whole
 
-__all__ = ["Clock", "Progress", "ProgressBars", "StudySettings", "environment", "silent", "time_line"]
+__all__ = ["Clock", "Measured", "Progress", "ProgressBars", "StudySettings", "environment", "silent"]
 
 Progress = Callable[[str, float], None]
 """Called with the name of a step (after a bar, ``|``, what changes in the meantime) and its finished fraction, 0…1."""
@@ -132,6 +133,23 @@ class Clock:
         self.lap(step)
 
 
+@dataclass
+class Measured:
+    """What a study found.
+
+    Attributes:
+        settings: of the study.
+        data: JSON values by part (NumPy arrays and scalars among them), of which the report is made.
+        seconds: step → seconds.
+        seen: what its pictures show besides, the study's own.
+    """
+
+    settings: Any
+    data: dict[str, Any]
+    seconds: dict[str, float]
+    seen: Any = None
+
+
 def environment() -> dict[str, Any]:
     """Versions and machine that made a result."""
     import numba
@@ -148,9 +166,3 @@ def environment() -> dict[str, Any]:
         "machine": platform.machine(),
         "cores": os.cpu_count(),
     }
-
-
-def time_line(seconds: Mapping[str, float], note: str = "") -> str:
-    """The last line of a report: what took how long."""
-    parts = ", ".join(f"{step} {value:.0f} s" for step, value in seconds.items())
-    return f"Time: {parts}{'; ' if note else ''}{note}."

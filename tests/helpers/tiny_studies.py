@@ -29,12 +29,12 @@ TINY: dict[str, dict[str, Any]] = {
     },
     "noise": {
         "realizations": 24, "views": 48, "kernels": ("soft", "bone"), "voxels_mm": (0.25, 0.40),
-        "doses": {"1x": 0.35, "5.7x": 2.0}, "reconstructed": 2, "experiments": 500, "placements": False,
+        "doses": {"1x": 0.35, "5.7x": 2.0}, "reconstructed": 2, "experiments": 500,
     },
-    "resolution": {"thinning": 32, "sigmas_px": (0.0, 3.75, 10.0), "bulges_mm": ()},
+    "resolution": {"thinning": 32, "sigmas_px": (0.0, 3.75, 10.0)},
     "spectral": {
         "views": 60, "voxel_mm": 0.4, "realizations": 2, "mbir_realizations": 1, "noise_levels": (0.0, 1.0),
-        "starved_rays": 300, "calibration_views": 60, "transport_photons": 50_000,
+        "calibration_views": 60, "transport_photons": 50_000,
     },
 }  # fmt: skip
 """Study → settings."""
@@ -70,11 +70,11 @@ class TinyStudy:
 def run_tiny(name: str, folder: Path) -> TinyStudy:
     """Measure a study at its smallest scale."""
     steps: list[tuple[str, float]] = []
-    settings = registry.part(name, "settings").Settings(**TINY[name])
-    measured = registry.part(name, "measure").measure(
-        settings, lambda step, fraction: steps.append((step, fraction)), folder
+    study = registry.part(name)
+    measured = study.measure(
+        study.Settings(**TINY[name]), lambda step, fraction: steps.append((step, fraction)), folder
     )
-    return TinyStudy(name, measured, registry.part(name, "report").build_report(measured), folder, steps)
+    return TinyStudy(name, measured, registry.report_of(name, measured), folder, steps)
 
 
 def assert_report_is_whole(tiny: TinyStudy, folder: Path, figures: set[str], sections: tuple[str, ...]) -> dict:

@@ -1,5 +1,5 @@
-"""Hard cases: what every method makes of scans that are starved, broken, incomplete or wrongly described.
+"""What every method makes of hard scans: ``case`` → ``cases``, ``body`` (what is done to them) → ``measure``."""
 
-Read ``settings`` → ``cases`` (the registry: what is done to the scan) → ``measure`` (error, warning, verdict of every
-case and method) → ``report`` → ``figures``.
-"""
+from recon.study.hardcases.measure import Settings, figures, measure
+
+__all__ = ["Settings", "figures", "measure"]

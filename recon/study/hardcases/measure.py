@@ -9,12 +9,13 @@ from __future__ import annotations
 import logging
 import re
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -22,11 +23,10 @@ import torch
 from recon import reconstruct
 from recon.evaluate.store import Pieces
 from recon.study.hardcases.body import GRID, body_scan, body_truth
-from recon.study.hardcases.case import untouched
+from recon.study.hardcases.case import Case, untouched
 from recon.study.hardcases.cases import CASES
-from recon.study.hardcases.settings import Settings
 from recon.study.paper.rods import rod_values
-from recon.study.study import Clock, Progress, silent
+from recon.study.study import Clock, Measured, Progress, StudySettings, silent
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
@@ -34,9 +34,10 @@ from torchpcct.scanner import Scanner, presets
 from torchpcct.scene import Scene
 from torchpcct.scene.phantoms import thorax
 from torchpcct.scene.plaque import Plaque, plaque_scene
+from torchpcct.validate import choice, number
 from torchpcct.volume import Volume
 
-__all__ = ["RIGHT_NOISES", "WORSE", "Measured", "measure", "verdict"]
+__all__ = ["RIGHT_NOISES", "WORSE", "Settings", "figures", "measure", "verdict"]
 
 RIGHT_NOISES = 0.5
 """A result is right if what the case adds is at most half of the noise that the sound scan has anyway: 12 % more."""
@@ -44,24 +45,43 @@ WORSE = 1.05
 """A method that is further from the truth than soft FBP of the same scan by more than this factor has to say so."""
 _ROWS, _GRID_MM = 20, (6.4, 9.2, 9.2)
 _ROD_VIEWS = 60
+_COLOURS = {"right": "tab:green", "warned": "tab:orange", "unseen": "tab:grey", "SILENT": "tab:red"}
 
 
-@dataclass
-class Measured:
-    """What the report needs.
+@dataclass(frozen=True)
+class Settings(StudySettings):
+    """Settings of the hard cases; the quick ones have an eighth of the views, FBP alone, every case.
 
-    Attributes:
-        rows: one for each case and method: ``case``, ``base``, ``title``, ``method``, ``error_hu`` (rms of the
-            difference to the sound scan's volume, of another scene what it adds to the error against the truth; None if
-            refused), ``noise_hu`` (rms of the sound scan's noise), ``finite``, ``messages`` (warnings, or the refusal),
-            ``refused``, ``seconds``, ``verdict``, ``truth_hu`` (rms of the difference to the truth), ``soft_hu`` (that
-            of soft FBP from the same scan; either is None if refused).
-        seconds: per step.
+    Args:
+        views: of the plaque's scan that is made hard, at least 120.
+        exposure_s: its exposure in s.
+        voxel_mm: voxel size of its inset.
+        seed: of the noise, and of what is broken at random.
+        methods: of :func:`recon.reconstruct`; ``"tissues"``: MBIR with them, of some scans of the plaque.
+        cases: names of :data:`recon.study.hardcases.cases.CASES`.
+
+    Raises:
+        TypeError, ValueError: a value of the wrong kind or out of range; an unknown case.
     """
 
-    settings: Settings
-    rows: list[dict[str, Any]]
-    seconds: dict[str, float]
+    views: int = 360
+    exposure_s: float = 2.0
+    voxel_mm: float = 0.4
+    seed: int = 0
+    methods: tuple[str, ...] = ("fbp", "pwls", "mbir", "tissues")
+    cases: tuple[str, ...] = tuple(CASES)
+
+    QUICK: ClassVar = {"views": 120, "methods": ("fbp",)}
+
+    def __post_init__(self) -> None:
+        self.check_whole(views=120, seed=0)
+        number("exposure_s", self.exposure_s, positive=True, unit="s")
+        number("voxel_mm", self.voxel_mm, positive=True, unit="mm")
+        for name in ("methods", "cases"):
+            if isinstance(getattr(self, name), str) or not getattr(self, name):
+                raise ValueError(f"{name} must be one name or more, got {getattr(self, name)!r}")
+        for name in self.cases:
+            choice("case", name, CASES)
 
 
 def verdict(
@@ -92,7 +112,14 @@ def verdict(
 
 
 def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
-    """Reconstruct every case by every method; see :mod:`recon.study.study`."""
+    """Reconstruct every case by every method; see :mod:`recon.study.study`.
+
+    ``rows`` of the data, one for each case and method: ``case``, ``base``, ``title``, ``method``, ``error_hu`` (rms of
+    the difference to the sound scan's volume, of another scene what it adds to the error against the truth; None if
+    refused), ``noise_hu`` (rms of the sound scan's noise), ``finite``, ``messages`` (warnings, or the refusal),
+    ``refused``, ``seconds``, ``verdict``, ``truth_hu`` (rms of the difference to the truth), ``soft_hu`` (that of soft
+    FBP from the same scan; either is None if refused).
+    """
     clock, pieces = Clock(), Pieces(folder, settings)
     bases = _bases(settings, pieces, progress)
     clock.lap("simulate")
@@ -107,7 +134,9 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
         rows += _case(name, bases[CASES[name].base], settings, pieces.within(f"case_{name}"), progress)
         progress("cases", (k + 1) / len(settings.cases))
     clock.lap("cases")
-    return Measured(settings, rows, clock.seconds)
+    counts = Counter(row["verdict"] for row in rows)
+    data = {"rows": rows, "cases": len(settings.cases), "verdicts": dict(counts), "silent": counts["SILENT"]}
+    return Measured(settings, data, clock.seconds)
 
 
 @dataclass(frozen=True)
@@ -220,12 +249,8 @@ def _case(name: str, base: _Base, settings: Settings, pieces: Pieces, progress: 
     for method in settings.methods:
         if method == "tissues" and not case.tissues:
             continue
-        volume, texts, noise, _ = base.sound[method]
-        usual = {_kind(text) for text in texts}
-        against = _Against(
-            volume, truth, base.truth if case.other else None, seen, noise, usual, lost, soft, case.unseen
-        )
-        row = pieces(method, partial(_row, scan, base.grid, method, against))
+        run = partial(_row, scan, base, method, case, truth, seen, lost, soft)
+        row = pieces(method, run)
         rows.append({"case": name, "base": case.base, "title": case.title, "method": method, **row})
     return rows
 
@@ -236,28 +261,6 @@ def _truth(scene: Scene, scanner: Scanner, grid: VolumeGrid) -> torch.Tensor:
     hu = rod_values(scene, scanner, grid.center[::-1], tissues=tissues, views=_ROD_VIEWS).hu
     values = {name: hu.get(name, 0.0) for name in scene.names}  # what a case adds is left out
     return torch.from_numpy(scene.render(grid, values)).float()
-
-
-@dataclass(frozen=True)
-class _Against:
-    """What a row is judged by.
-
-    Attributes:
-        sound, truth: volumes in HU. usual_truth: of the sound scan where its scene is another, else None. seen: the
-            voxels that count.
-        noise: rms noise of the sound volume. usual: kinds of warnings of the sound scan.
-        lost, unseen: of :func:`verdict`. soft: error of soft FBP against the truth, None if refused.
-    """
-
-    sound: torch.Tensor
-    truth: torch.Tensor
-    usual_truth: torch.Tensor | None
-    seen: torch.Tensor
-    noise: float
-    usual: set[str]
-    lost: float
-    soft: float | None
-    unseen: str
 
 
 def _from_truth(scan: Scan | Exception, grid: VolumeGrid, truth: torch.Tensor, seen: torch.Tensor) -> float | None:
@@ -272,32 +275,38 @@ def _from_truth(scan: Scan | Exception, grid: VolumeGrid, truth: torch.Tensor, s
     return _rms((volume.data - truth)[seen])
 
 
-def _row(scan: Scan | Exception, grid: VolumeGrid, method: str, by: _Against) -> dict[str, Any]:
+def _row(
+    scan: Scan | Exception, base: _Base, method: str, case: Case, truth: torch.Tensor, seen: torch.Tensor, lost: float,
+    soft: float | None,
+) -> dict[str, Any]:  # fmt: skip
+    """A case by a method; ``seen``: the voxels that count, ``lost``: ``noise`` of :func:`verdict`."""
+    sound, usual, noise, _ = base.sound[method]
     start = time.perf_counter()
     with _heard() as messages:
         try:
             if isinstance(scan, Exception):
                 raise scan
-            volume = _reconstruct(scan, grid, method)
+            volume = _reconstruct(scan, base.grid, method)
         except (ValueError, TypeError) as error:
             return {
-                "error_hu": None, "noise_hu": by.noise, "finite": True, "messages": [str(error)], "refused": True,
-                "seconds": time.perf_counter() - start, "verdict": verdict(None, by.noise, True, [str(error)]),
-                "truth_hu": None, "soft_hu": by.soft,
+                "error_hu": None, "noise_hu": noise, "finite": True, "messages": [str(error)], "refused": True,
+                "seconds": time.perf_counter() - start, "verdict": verdict(None, noise, True, [str(error)]),
+                "truth_hu": None, "soft_hu": soft,
             }  # fmt: skip
     seconds = time.perf_counter() - start
     finite = bool(torch.isfinite(volume.data).all())
-    error_hu, truth_hu = (_rms((volume.data - other)[by.seen]) for other in (by.sound, by.truth))
-    if by.usual_truth is not None:
-        error_hu = max(truth_hu**2 - _rms((by.sound - by.usual_truth)[by.seen]) ** 2, 0.0) ** 0.5
+    error_hu, truth_hu = (_rms((volume.data - other)[seen]) for other in (sound, truth))
+    if case.other:
+        error_hu = max(truth_hu**2 - _rms((sound - base.truth)[seen]) ** 2, 0.0) ** 0.5
     texts = list(dict.fromkeys([*volume.report.get("warnings", []), *messages]))
-    more = [t for t in texts if _kind(t) not in by.usual]
+    kinds = set(map(_kind, usual))
+    more = [t for t in texts if _kind(t) not in kinds]
     # The standard kernel is sharper and noisier than the soft one by intent.
-    worse = 1.0 if by.soft is None or method == "fbp" else truth_hu / by.soft
+    worse = 1.0 if soft is None or method == "fbp" else truth_hu / soft
     return {
-        "error_hu": error_hu, "noise_hu": by.noise, "finite": finite, "messages": texts, "refused": False,
-        "seconds": seconds, "verdict": verdict(error_hu, by.noise, finite, more, by.lost, worse, by.unseen),
-        "truth_hu": truth_hu, "soft_hu": by.soft,
+        "error_hu": error_hu, "noise_hu": noise, "finite": finite, "messages": texts, "refused": False,
+        "seconds": seconds, "verdict": verdict(error_hu, noise, finite, more, lost, worse, case.unseen),
+        "truth_hu": truth_hu, "soft_hu": soft,
     }  # fmt: skip
 
 
@@ -331,3 +340,24 @@ def _heard() -> Iterator[list[str]]:
         for log, propagate in zip(loggers, before, strict=True):
             log.removeHandler(listener)
             log.propagate = propagate
+
+
+def figures(measured: Measured) -> dict[str, Any]:
+    """Error over noise of every case, a panel per method; refused cases have no bar."""
+    from matplotlib.figure import Figure
+
+    methods, cases = measured.settings.methods, measured.settings.cases
+    figure = Figure(figsize=(4.2 * len(methods) + 2, 0.24 * len(cases) + 1.2), dpi=150, layout="constrained")
+    panels = figure.subplots(1, len(methods), sharey=True, squeeze=False)[0]
+    for panel, method in zip(panels, methods, strict=True):
+        rows = [r for r in measured.data["rows"] if r["method"] == method]
+        for k, r in enumerate(rows):
+            if r["error_hu"] is None or not r["finite"]:
+                panel.text(0.011, k, "refused" if r["refused"] else "not finite", va="center", fontsize=7)
+            else:
+                panel.barh(k, max(r["error_hu"] / r["noise_hu"], 0.0105), color=_COLOURS[r["verdict"]], height=0.7)
+        panel.axvline(RIGHT_NOISES, color="black", linewidth=0.8, linestyle=":")
+        panel.set(xscale="log", xlim=(0.01, None), xlabel="error / noise of the sound scan", title=method)
+        panel.set_yticks(range(len(rows)), [r["title"] for r in rows], fontsize=7)
+    panels[0].invert_yaxis()
+    return {"hardcases.png": figure}

@@ -15,7 +15,6 @@ import numpy as np
 from torchpcct.scanner import presets
 
 __all__ = [
-    "ASSUMED_FACTOR",
     "BACKGROUND",
     "BOWTIE",
     "CNR",
@@ -44,9 +43,6 @@ KERNELS = ("soft", "standard", "detail", "bone")
 VOXELS_MM = (0.20, 0.25, 0.30, 0.35, 0.40)
 DOSES = {"1x": ROTATION_S, "2x": 0.70, "5.7x": 2.00, "8x": 2.80}
 """Exposure (one rotation) in s of each dose level, at 1000 mA."""
-
-ASSUMED_FACTOR = 5.7
-"""Dose that the paper assumes denoising to save."""
 
 TABLE_EXPOSURE_S = 2.00
 """Exposure of both tables. The paper does not state it; the text of its noise section and the size of its standard

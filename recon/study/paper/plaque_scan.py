@@ -27,14 +27,12 @@ __all__ = [
     "REFERENCE_KERNEL",
     "REFERENCE_VOXEL_MM",
     "SCANNERS",
-    "Functional",
     "PlaqueScan",
     "duty",
     "enclosing",
     "equal_dose",
     "inset_grid",
     "prepare",
-    "roi_entry",
 ]
 
 INSET_MM = (11.3, 9.0, 9.0)
@@ -67,20 +65,6 @@ def equal_dose(scanner: Scanner) -> float:
 
     The spectrum in front of the patient is the same, so it falls with the square of the tube's distance."""
     return float((scanner.geometry.sod / presets.pcct(8).geometry.sod) ** 2)
-
-
-@dataclass(frozen=True)
-class Functional:
-    """A linear functional of a volume, as :func:`recon.analytic.exact_noise.roi_covariance` takes ROI means.
-
-    Args:
-        weights: shape of the volume, float64.
-    """
-
-    weights: Tensor
-
-    def __call__(self, volume: Tensor) -> float:
-        return float((self.weights * volume).sum())
 
 
 @dataclass
@@ -144,17 +128,6 @@ def prepare(
     keep = pieces or Pieces(None, None)
     clean = keep("scan", lambda: acquire(bodies, scanner, region=region, duty=on, progress=progress))
     return PlaqueScan(clean, fine, grids, [rois.on(g) for g in grids], rois, InsetFbp(clean, grids, kernels))
-
-
-def roi_entry(method: str, kernel: str, voxel: float, pair: Any, volume: Any) -> dict[str, Any]:
-    """The two ROI means of a volume, as reports hold them."""
-    return {
-        "method": method,
-        "kernel": kernel,
-        "voxel_mm": voxel,
-        "foreground_hu": float(pair[0](volume)),
-        "background_hu": float(pair[1](volume)),
-    }
 
 
 def enclosing(grids: list[VolumeGrid]) -> VolumeGrid:

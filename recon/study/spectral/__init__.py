@@ -1,6 +1,5 @@
-"""The plaque in energy bins: basis materials, monochromatic images, tissue maps, by FBP and joint MBIR.
+"""The plaque in energy bins: ``scan`` (and tissue maps), ``calibration`` (wrong ones), ``measure`` (the study)."""
 
-Read ``settings`` → ``measure`` (the order of the parts, noise and CNR of monochromatic images, joint MBIR) → ``scan``
-(the scan, decomposed ray by ray, and its checks) → ``tissues`` (tissue maps and what they find) → ``calibration``
-(scans decomposed with a wrong model) → ``report`` → ``figures``.
-"""
+from recon.study.spectral.measure import Settings, checks, figures, measure
+
+__all__ = ["Settings", "checks", "figures", "measure"]

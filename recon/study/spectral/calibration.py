@@ -1,24 +1,8 @@
-"""What a wrong calibration of the decomposition costs: noise-free scans decomposed with a model that is not theirs.
-
-A decomposition knows tube, filters and detector only by calibration. Three errors are tried:
-
-* thresholds: every comparator stands lower than assumed. This is the energy axis of a counting detector: pulse heights
-  drift with the electronics' gain and offset, and no air scan shows by how much;
-* tube voltage: the spectrum is softer than assumed;
-* gain: a relative error of the counts since the air scan, in all bins (tube output) or in one.
-
-The first two are seen by the air scan of every calibration, which sets the assumed counts in air to the measured ones
-bin by bin; what is left is the wrong *shape* of the spectra. Without that scan the error is larger: both are given.
-
-The scan is always the true one and the model is wrong, never the other way round. A detector of another kind needs its
-own scan: that with :class:`~torchpcct.scanner.transported.TransportedSilicon`, whose photons interact more than once,
-decomposed with the response of one interaction.
-"""
+"""What a wrong calibration of the decomposition costs: noise-free scans decomposed with a model that is not theirs."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from copy import copy
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -28,25 +12,33 @@ from torch import Tensor
 
 from recon.analytic.inset import InsetFbp
 from recon.study.paper import facts as paper
-from recon.study.spectral.scan import SpectralScan
-from recon.study.spectral.settings import Settings
-from recon.study.spectral.tissues import BODIES, Tissues
+from recon.study.spectral.scan import BODIES, FAT_MM, SpectralScan, Tissues
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S
 from torchpcct.scanner import Scanner, SiliconDetector, TransportedSilicon
-from torchpcct.spectral import MMD_TISSUES, SpectralModel, decompose_scan, decompose_surround, vmi
+from torchpcct.spectral import (
+    MMD_TISSUES,
+    SpectralModel,
+    decompose_scan,
+    decompose_surround,
+    vmi,
+)
 
-__all__ = ["SHOWN_KEV", "CalibrationError", "calibration_costs", "cases", "decomposed"]
+__all__ = ["SHOWN_KEV", "CalibrationError", "calibration_cases", "calibration_costs", "decomposed"]
 
 SHOWN_KEV = (52.0, 70.0)
-"""Energies of the monochromatic images that are compared: the paper's best, and one where contrasts are usual."""
-
+"""Energies at which wrong calibrations are compared: the paper's best, and one where contrasts are usual."""
 _PURE = 0.999
-_FAT_MM = 3.2  # from the vessel's axis on there is only fat
 
 
 @dataclass(frozen=True)
 class CalibrationError:
-    """How a calibration is wrong.
+    """How a calibration is wrong: a decomposition knows tube, filters and detector only by it.
+
+    The scan is always the true one and the model is wrong, never the other way round. Thresholds lower than assumed
+    are the energy axis of a counting detector: pulse heights drift with the electronics' gain and offset. These and a
+    softer spectrum are seen by the air scan of every calibration, which sets the assumed counts in air to the measured
+    ones bin by bin; what is left is the wrong *shape* of the spectra. Without that scan the error is larger: both are
+    given.
 
     Args:
         name: in tables.
@@ -76,7 +68,7 @@ class CalibrationError:
         return scanner.replace(detector=replace(detector, thresholds_kev=thresholds), source=source)
 
 
-def cases(s: Settings, bins: int) -> list[CalibrationError]:
+def calibration_cases(s: Any, bins: int) -> list[CalibrationError]:
     """The errors of a study's settings, none first."""
     kev, kv, gain = s.threshold_error_kev, s.voltage_error_kv, s.gain_error
     errors = [
@@ -109,17 +101,17 @@ def decomposed(scan: SpectralScan, error: CalibrationError, calibrated: Scanner)
     air = torch.from_numpy(model.air).to(scan.clean.air)
     factor = air / scan.clean.air if error.air_scan else torch.ones_like(air)
     factor[slice(None) if error.bin is None else error.bin] *= 1.0 + error.gain
-    clean = scan.clean
-    assert clean.surround is not None
-    counts = clean.counts * scan.window.take(factor).to(clean.counts)
+    true = scan.clean
+    assert true.surround is not None
+    counts = true.counts * scan.window.take(factor).to(true.counts)
     # The model's own counts in air, so that it takes the scan for its own.
-    believed = replace(clean, counts=counts, surround=clean.surround * factor.to(clean.surround), air=air)
+    believed = replace(true, counts=counts, surround=true.surround * factor.to(true.surround), air=air)
     found = decompose_scan(believed, model, tolerance=1e-3)
-    fbp = InsetFbp(clean, [scan.grid], [scan.settings.kernel], surround=decompose_surround(believed, model))
+    fbp = InsetFbp(true, [scan.grid], [scan.settings.kernel], surround=decompose_surround(believed, model))
     return fbp.images(found.line_integrals)[0][0], float((~found.converged).double().mean())
 
 
-def calibration_costs(s: Settings, tissues: Tissues, progress: Callable[[float], None]) -> dict[str, Any]:
+def calibration_costs(s: Any, tissues: Tissues, progress: Callable[[float], None]) -> dict[str, Any]:
     """HU of the tissues, contrast and tissue maps with every wrong calibration.
 
     Args:
@@ -129,8 +121,7 @@ def calibration_costs(s: Settings, tissues: Tissues, progress: Callable[[float],
 
     Returns:
         JSON values: ``cases``, one row per error (the first is none) with HU by energy and tissue, contrast, Dice, and
-        their costs, the difference to the first; ``half_views``: largest difference of a cost in HU if every other view
-        is left out.
+        their costs, the difference to the first.
     """
     few = replace(s, views=s.calibration_views)
     # Fewer views stand for the paper's scan, thinned out: each sees as much of the gantry's turn.
@@ -141,43 +132,26 @@ def calibration_costs(s: Settings, tissues: Tissues, progress: Callable[[float],
         scans[1] = SpectralScan(few, lambda f: progress(0.3 + 0.3 * f), silicon, full)
     plain = scans[0].scanner
     other = plain.replace(detector=replace(silicon, transport_seed=s.seed + 1)) if s.transport_photons else plain
-    errors, rows, half = cases(s, plain.detector.bins), [], []
+    errors, rows = calibration_cases(s, plain.detector.bins), []
     for k, error in enumerate(errors):
         scan, calibrated = scans[min(error.transported, 1)], other if error.transported == 2 else plain
         images, failed = decomposed(scan, error, calibrated)
-        rows.append({**asdict(error), "failed": failed, **_measured(scan, tissues, images)})
-        if (error.threshold_kev and error.air_scan) or k == 0:
-            thin = _thinned(scan)
-            half.append(_measured(thin, tissues, decomposed(thin, error, calibrated)[0])["hu"])
+        rows.append({**asdict(error), "failed": failed, **_read(scan, tissues, images)})
         progress(0.6 + 0.4 * (k + 1) / len(errors))
     base = rows[0]
     for row in rows:
         row["cost_hu"] = {e: {t: v - base["hu"][e][t] for t, v in hu.items()} for e, hu in row["hu"].items()}
         row["cost_dice"] = {t: v - base["dice"][t] for t, v in row["dice"].items()}
-    result = {"views": s.calibration_views, "energies_kev": list(SHOWN_KEV), "cases": rows}
-    if len(half) == 2:
-        shifted = next(r for r in rows if r["threshold_kev"] and r["air_scan"])["cost_hu"]
-        change = [half[1][e][t] - half[0][e][t] - v for e, hu in shifted.items() for t, v in hu.items()]
-        result["half_views_hu"] = float(np.abs(change).max())
-    return result
+    return {"views": s.calibration_views, "energies_kev": list(SHOWN_KEV), "cases": rows}
 
 
-def _thinned(scan: SpectralScan) -> SpectralScan:
-    """The scan with every other view."""
-    thin, views = copy(scan), slice(None, None, 2)
-    geometry, counts = scan.clean.geometry.select(views), scan.clean.counts[:, views].contiguous()
-    thin.window = scan.window.select(views)
-    thin.clean = replace(scan.clean, counts=counts, geometry=geometry, window=thin.window)
-    return thin
-
-
-def _measured(scan: SpectralScan, tissues: Tissues, images: Tensor) -> dict[str, Any]:
+def _read(scan: SpectralScan, tissues: Tissues, images: Tensor) -> dict[str, Any]:
     """HU of the tissues and of the contrast by energy, and Dice coefficients of the tissue map."""
     _, y, x = (a - c for a, c in zip(scan.grid.axes, scan.grid.center, strict=True))
     middle = scan.grid.shape[0] // 2
     lumen = torch.from_numpy(scan.scene.volume_fractions(scan.grid)[scan.scene.index(BODIES["blood_iodine"])] > _PURE)
     fat = torch.zeros(scan.grid.shape, dtype=torch.bool)
-    fat[middle - 4 : middle + 4] = torch.from_numpy(np.hypot(y[:, None], x) > _FAT_MM)
+    fat[middle - 4 : middle + 4] = torch.from_numpy(np.hypot(y[:, None], x) > FAT_MM)
     hu = {}
     for energy in SHOWN_KEV:
         volume = vmi(images, scan.basis, [energy])[0].double()

@@ -1,23 +1,26 @@
-"""The spectral study: decomposition into PE and PVC, virtual monochromatic images, tissue maps, by FBP and joint MBIR.
+"""The plaque in energy bins: basis materials, monochromatic images, tissue maps, by FBP and joint MBIR.
 
 The paper's plaque is scanned in eight energy bins and every ray decomposed into line integrals of the two basis
-materials. Their FBP, and their joint model-based reconstruction, give basis images, those virtual monochromatic images
-(VMI) and tissue maps.
+materials, PE and PVC. Their FBP, and their joint model-based reconstruction, give basis images, those virtual
+monochromatic images (VMI) and tissue maps.
 
 * Noise of VMIs is exact: FBP is linear, the rays' covariance is known (Cramér–Rao, which the decomposition reaches: the
   study checks it on its own rays), so one adjoint pass per functional replaces realisations.
 * The paper's noise levels are shares of the *standard noise*: the difference of a noisy to the noise-free scan is
   multiplied by 0.25, 0.5 and 1.
+* What a wrong calibration costs is found by decomposing noise-free scans with a model that is not theirs, see
+  :mod:`recon.study.spectral.calibration`.
 """
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -27,20 +30,95 @@ from recon.analytic.exact_noise import functional_covariance
 from recon.evaluate.store import Pieces
 from recon.least_squares.basis_problem import BasisProblem
 from recon.least_squares.qggmrf import DEFAULT_PRIOR
+from recon.study.figures import extent
+from recon.study.paper import facts as paper
+from recon.study.report import Check, around
 from recon.study.spectral.calibration import calibration_costs
-from recon.study.spectral.scan import SpectralScan, second_order_bound, starved_rays, water_hu
-from recon.study.spectral.settings import Settings
-from recon.study.spectral.tissues import RULES, Tissues
-from recon.study.study import Clock, Progress, silent
-from torchpcct.spectral import MMD_TISSUES, VMI_ENERGIES_KEV, VmiCurve, vmi, vmi_curve
+from recon.study.spectral.scan import FAT_MM, RULES, SpectralScan, Tissues
+from recon.study.study import Clock, Measured, Progress, StudySettings, silent
+from torchpcct.spectral import (
+    MMD_TISSUES,
+    VMI_ENERGIES_KEV,
+    VmiCurve,
+    pe_pvc,
+    vmi,
+    vmi_curve,
+)
+from torchpcct.validate import number
+from torchpcct.viz import WINDOW_HU
 
-__all__ = ["Images", "Measured", "measure"]
+__all__ = ["Images", "Settings", "checks", "figures", "measure"]
+
+VISIBLE_DICE = 0.5
+"""The core counts as visible in a tissue map if its Dice coefficient reaches this. The paper judges by eye."""
 
 LOW_EXPOSURE_S = 0.35
 """The paper's shortest exposure: the decomposition must hold there, too."""
-
-_FAT_MM = 3.2  # from the vessel's axis on there is only fat
 _LOW_EXPOSURE_STEP = 8  # views between those that are looked at there
+
+_COLOURS = ("#2ca02c", "#d62728", "#1f77b4", "#202020")  # the paper's: blood green, core red, fibrous blue, fat dark
+_PICTURED_KEV = (40.0, 52.0, 70.0)
+
+
+@dataclass(frozen=True)
+class Settings(StudySettings):
+    """Settings of the study; the quick ones take an eighth of the views, one realisation, no wrong calibrations.
+
+    Args:
+        exposure_s: of the standard noise (the paper does not state it; 2.0 s is the exposure of its tables).
+        realizations: of the noise, for tissue maps by FBP.
+        mbir_realizations: of these, how many are reconstructed by joint MBIR at every noise level; 0: none.
+        noise_levels: shares of the standard noise, ascending, 0 first.
+        views: per rotation.
+        voxel_mm: [paper: 0.2].
+        kernel: of FBP (the paper names none for its spectral images).
+        calibration_views: of the noise-free scans with a wrong calibration; 0: no wrong calibrations.
+        threshold_error_kev: by which every threshold lies lower than the decomposition assumes.
+        voltage_error_kv: by which the tube's voltage lies lower than the decomposition assumes.
+        gain_error: relative error of the counts since the air scan, in all energy bins or in one.
+        transport_photons: followed through the silicon for a scan with all their interactions; 0: no such scan.
+        seed: first seed of the noise.
+
+    Raises:
+        TypeError, ValueError: a value of the wrong kind or out of range.
+    """
+
+    exposure_s: float = 2.0
+    realizations: int = 4
+    mbir_realizations: int = 2
+    noise_levels: tuple[float, ...] = (0.0, 0.25, 0.5, 1.0)
+    views: int = paper.FULL_VIEWS["PCCT"]
+    voxel_mm: float = 0.2
+    kernel: str = "standard"
+    calibration_views: int = 246
+    threshold_error_kev: float = 2.0
+    voltage_error_kv: float = 2.0
+    gain_error: float = 0.01
+    transport_photons: int = 1_000_000
+    seed: int = 0
+
+    QUICK: ClassVar = {
+        "views": 246, "realizations": 1, "mbir_realizations": 1, "calibration_views": 0,
+    }  # fmt: skip
+
+    def __post_init__(self) -> None:
+        number("exposure_s", self.exposure_s, positive=True, unit="s")
+        number("voxel_mm", self.voxel_mm, positive=True, unit="mm")
+        self.check_whole(realizations=1, mbir_realizations=0, views=60, seed=0)
+        self.check_whole(calibration_views=0, transport_photons=0)
+        number("threshold_error_kev", self.threshold_error_kev, low=-4.0, high=4.0, unit="keV")
+        number("voltage_error_kv", self.voltage_error_kv, low=-20.0, high=20.0, unit="kV")
+        number("gain_error", self.gain_error, low=-0.5, high=0.5)
+        for name, low in (("calibration_views", 60), ("transport_photons", 1000)):
+            if 0 < getattr(self, name) < low:
+                raise ValueError(f"{name} must be 0 or at least {low}, got {getattr(self, name)}")
+        if self.mbir_realizations > self.realizations:
+            raise ValueError(
+                f"mbir_realizations must lie in 0…{self.realizations} (realizations), got {self.mbir_realizations}"
+            )
+        levels = self.noise_levels
+        if not levels or levels[0] != 0 or any(b <= a for a, b in itertools.pairwise(levels)):
+            raise ValueError(f"noise_levels must ascend from 0, got {levels}")
 
 
 @dataclass
@@ -58,23 +136,12 @@ class Images:
 
 
 @dataclass(frozen=True)
-class Measured:
-    """What the report needs.
+class Seen:
+    """Geometry, truth and volumes of the pictures."""
 
-    Attributes:
-        settings: of the study.
-        data: JSON values by part.
-        scan, tissues, images: geometry, truth and volumes of the figures.
-        seconds: step → seconds; processor_seconds: of all steps.
-    """
-
-    settings: Settings
-    data: dict[str, Any]
     scan: SpectralScan
     tissues: Tissues
     images: Images
-    seconds: dict[str, float]
-    processor_seconds: float
 
 
 def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
@@ -89,11 +156,7 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     scan = SpectralScan(s, lambda fraction: progress("simulate", fraction), pieces=pieces)
     data: dict[str, Any] = {"plan": scan.clean.info["plan"]}
     done("simulate")
-    clean = scan.fbp.images(scan.exact.line_integrals)[0][0]
-    data["second_order_bound"] = pieces("bound", partial(second_order_bound, scan, LOW_EXPOSURE_S))
-    data["starved"] = pieces("starved", partial(starved_rays, scan, s.starved_rays, s.seed))
-    data["water"] = {k: v.tolist() for k, v in pieces("water", partial(water_hu, VMI_ENERGIES_KEV, s.views)).items()}
-    done("water and starved rays")
+    noise_free = scan.fbp.images(scan.exact.line_integrals)[0][0]
     lines, volumes, data["rays"] = [], [], []
     pieces.ahead(_noisy_ahead, *((k,) for k in range(s.realizations)))
     for k in range(s.realizations):
@@ -104,13 +167,12 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
         progress("decompose noisy scans", (k + 1) / (s.realizations + 1))
     low = pieces("noisy_low", lambda: scan.noisy(LOW_EXPOSURE_S, s.seed, _LOW_EXPOSURE_STEP)[1])
     data["rays"].append(low)
-    images = Images(clean, torch.stack(volumes))
+    images = Images(noise_free, torch.stack(volumes))
     done("decompose noisy scans")
     data["vmi"] = _vmi(scan, images)
     done("monochromatic images")
     tissues = Tissues(scan, data["vmi"]["voxel_covariance"])
-    data["separation"] = tissues.separation()
-    data["misplaced_core"] = tissues.misplaced_core(clean)
+    data["slices"] = len(tissues.truth)
     data["dice"] = {
         name: [_scores(level, tissues, images.fbp(level), rule) for level in s.noise_levels]
         for rule, name in RULES.items()
@@ -123,7 +185,9 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
         costs = partial(calibration_costs, s, tissues, lambda fraction: progress("wrong calibrations", fraction))
         data["calibration"] = pieces("calibration", costs)
         clock.lap("wrong calibrations")
-    return Measured(s, data, scan, tissues, images, clock.seconds, time.process_time() - spent)
+    residual = {name: float(np.abs(pe_pvc().residual(name)).max()) for name in ("necrotic_core", "blood_iodine")}
+    data |= {"basis_residual_hu": residual, "processor_seconds": time.process_time() - spent}
+    return Measured(s, data, clock.seconds, Seen(scan, tissues, images))
 
 
 def _noisy(scan: SpectralScan, pieces: Pieces, k: int) -> tuple[Tensor, list[Tensor], dict[str, Any]]:
@@ -189,7 +253,7 @@ def _at_energy(scan: SpectralScan, images: Tensor, energy: float) -> dict[str, f
     """ROI means, and the SD of voxels in fat, of one monochromatic image, HU."""
     hu = vmi(images, scan.basis, [energy])[0]
     _, y, x = (a - c for a, c in zip(scan.grid.axes, scan.grid.center, strict=True))
-    far = torch.from_numpy(np.hypot(y[:, None], x) > _FAT_MM)
+    far = torch.from_numpy(np.hypot(y[:, None], x) > FAT_MM)
     middle = scan.grid.shape[0] // 2
     fat = hu[middle - 4 : middle + 4][:, far]
     core, fibrous = (float(roi(hu)) for roi in scan.rois.on(scan.grid))
@@ -203,14 +267,14 @@ def _mbir(
     """Joint MBIR at every noise level, and its scores; volumes of the first realisation go to ``images``."""
     s = scan.settings
     problem = BasisProblem(scan.clean, scan.model(1.0), scan.grid)
-    clean, best = scan.exact.line_integrals, curves["voxel"]["optimum_kev"]
+    exact, best = scan.exact.line_integrals, curves["voxel"]["optimum_kev"]
     lowest = next((v for v in s.noise_levels if v > 0), 1.0)
     steps, scores, reports, pictures, values = 1 + (len(s.noise_levels) - 1) * len(lines), [], [], [], []
     for level in s.noise_levels:
         # Data without noise take the weights of the lowest noise: it is the prior that changes them.
         dose, found = s.exposure_s / (level or lowest) ** 2, []
         for k, noisy in enumerate(lines if level else lines[:1]):
-            data = clean + level * (noisy - clean)
+            data = exact + level * (noisy - exact)
             solve = partial(problem.solve, data, scan.window, dose=dose, tolerance=1.0)
             volume, report = pieces(f"mbir_{level:g}_{k}", solve)
             found.append(volume)
@@ -228,3 +292,121 @@ def _mbir(
         "solves": reports,
         "at_best_energy": values,
     }, scores
+
+
+# --- the report -----------------------------------------------------------------------------------------------------
+
+
+def checks(data: dict[str, Any]) -> list[Check]:
+    """The decomposition at its bound, the best energy, and what noise leaves of the core, beside the paper's."""
+    rays, curves, fbp = data["rays"], data["vmi"], data["dice"]["FBP"]
+    best, tolerance = paper.SPECTRAL["optimum_kev"], paper.SPECTRAL["optimum_tolerance_kev"]
+
+    def core(noise: float) -> float:
+        return next((s["necrotic_core"]["mean"] for s in fbp if s["noise"] == noise), float("nan"))
+
+    means = np.array([[s[t]["mean"] for t in MMD_TISSUES] for s in fbp])
+    rise = float(np.diff(means, axis=0).max()) if len(means) > 1 else float("nan")
+    limit, lost = paper.SPECTRAL["core_visible_up_to"], paper.SPECTRAL["core_lost_at"]
+    bound = "decomposition: variance over the Cramér–Rao bound"
+    return [
+        Check(f"{bound}, {rays[0]['exposure_s']:g} s", rays[0]["whitened_ratio"], "not given", high=1.05),
+        Check(f"{bound}, {rays[-1]['exposure_s']:g} s", rays[-1]["whitened_ratio"], "not given", high=1.08),
+        Check("decomposition: rays without a finite, converged answer", sum(r["failed"] for r in rays), "not given",
+              high=0.0),
+        around("best energy, noise of a voxel, keV", curves["voxel"]["optimum_kev"], best, tolerance),
+        around("best energy, noise of the ROI means, keV", curves["roi_means"]["optimum_kev"], best, tolerance),
+        Check(f"core's Dice at {100 * limit:.0f} % noise (visible ≥ {VISIBLE_DICE})", core(limit), "visible",
+              low=VISIBLE_DICE),
+        Check(f"core's Dice at {100 * lost:.0f} % noise (lost < {VISIBLE_DICE})", core(lost), "lost",
+              high=VISIBLE_DICE),
+        Check("largest rise of a tissue's Dice from one noise level to the next", rise, "monotone", high=0.0),
+    ]  # fmt: skip
+
+
+def figures(measured: Measured) -> dict[str, Any]:
+    """Basis and monochromatic images with the CNR curve, and tissue maps."""
+    return {"spectral.png": _curves_figure(measured), "tissues.png": _tissue_figure(measured)}
+
+
+def _show(ax: Any, image: Any, measured: Measured, title: str, **options: Any) -> Any:
+    ax.set_xticks([])
+    ax.set_yticks([])
+    ax.set_title(title, fontsize=8)
+    edges = extent(measured.seen.scan.grid)
+    return ax.imshow(np.asarray(image), origin="lower", extent=edges, interpolation="nearest", **options)
+
+
+def _curves_figure(measured: Measured) -> Any:
+    """Basis images, monochromatic images (noise free above, standard noise below), and CNR against energy."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11.0, 7.2), dpi=130, layout="constrained")
+    parts: Any = figure.subfigures(2, 1, height_ratios=(1.55, 1.0))
+    top, bottom = parts
+    axes = top.subplots(2, 5)
+    scan, images = measured.seen.scan, measured.seen.images
+    z = scan.grid.shape[0] // 2
+    low, high = WINDOW_HU[0] - WINDOW_HU[1] / 2, WINDOW_HU[0] + WINDOW_HU[1] / 2
+    for row, (name, volume) in enumerate((("noise free", images.clean), ("standard noise", images.noisy[0]))):
+        middle = volume[:, z]
+        for c, material in enumerate(("PE", "PVC")):
+            clean = images.clean[c, z]
+            reach = (float(clean.min()), float(clean.max()))
+            if row:
+                spread = 2 * float(middle[c].std())
+                reach = (reach[0] - spread, reach[1] + spread)
+            _show(axes[row, c], middle[c], measured, f"{material}, {name}", cmap="gray", vmin=reach[0], vmax=reach[1])
+        for c, energy in enumerate(_PICTURED_KEV):
+            hu = vmi(middle, scan.basis, [energy])[0]
+            shown = _show(axes[row, 2 + c], hu, measured, f"{energy:g} keV, {name}", cmap="gray", vmin=low, vmax=high)
+    top.colorbar(shown, ax=axes[:, -1], shrink=0.7, label="HU")
+    left, right = bottom.subplots(1, 2)
+    v = measured.data["vmi"]
+    energies = v["energies_kev"]
+    left.plot(energies, v["voxel"]["noise_hu"], color="tab:red", label="noise of a voxel")
+    left.plot(energies, v["voxel"]["contrast_hu"], color="tab:blue", label="contrast fibrous − core")
+    left.set_yscale("log")
+    left.set_ylabel("HU")
+    for key, style, label in (("voxel", "-", "voxel noise"), ("roi_means", "--", "ROI means (paper's protocol)")):
+        cnr = np.array(v[key]["cnr"])
+        best = v[key]["optimum_kev"]
+        right.plot(energies, cnr / cnr.max(), style, color="black", label=f"{label}: best {best:.1f} keV")
+        right.axvline(best, color="black", linestyle=style, linewidth=0.8)
+    right.axvline(paper.SPECTRAL["optimum_kev"], color="tab:orange", linewidth=1.2, label="paper: 52 keV")
+    right.set_ylabel("CNR / best CNR")
+    for ax in (left, right):
+        ax.set_xlabel("energy of the monochromatic image, keV")
+        ax.legend(fontsize=8)
+        ax.grid(alpha=0.3)
+    return figure
+
+
+def _tissue_figure(measured: Measured) -> Any:
+    """Tissue maps of the middle slice: truth, then one column per noise level; rows: FBP, joint MBIR."""
+    from matplotlib.colors import ListedColormap
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
+
+    levels, dice = measured.settings.noise_levels, measured.data["dice"]
+    tissues, images = measured.seen.tissues, measured.seen.images
+    methods = [m for m in ("FBP", "joint MBIR") if m in dice]
+    figure = Figure(figsize=(1.9 * (1 + len(levels)) + 0.4, 2.25 * len(methods) + 0.7), dpi=150, layout="constrained")
+    axes = figure.subplots(len(methods), 1 + len(levels), squeeze=False)
+    colours = ListedColormap(["white", *_COLOURS])
+    k = tissues.middle
+    for row, method in enumerate(methods):
+        _show(axes[row, 0], tissues.truth[k] + 1, measured, "truth" if row == 0 else "", cmap=colours, vmin=0, vmax=4)
+        axes[row, 0].set_ylabel(method, fontsize=9)
+        for c, level in enumerate(levels):
+            volume = images.fbp(level)[0] if images.mbir is None or method == "FBP" else images.mbir[c]
+            labels = tissues.labels(volume)[k]
+            ax = axes[row, 1 + c]
+            _show(ax, labels + 1, measured, f"{100 * level:.0f} % noise", cmap=colours, vmin=0, vmax=4)
+            score = dice[method][c]["necrotic_core"]["mean"]
+            ax.set_xlabel(f"core's Dice {score:.2f}", fontsize=7)
+    names = [t.replace("_", " ") for t in MMD_TISSUES]
+    handles = [Patch(color=c, label=n) for c, n in zip(_COLOURS, names, strict=True)]
+    handles.append(Patch(facecolor="white", edgecolor="black", label="vessel wall, mixed voxels (left out)"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=7)
+    return figure

@@ -17,7 +17,7 @@ from tiny_studies import run_tiny
 
 import recon.evaluate.store as store_module
 from recon.evaluate.store import Pieces, packed, unpacked
-from recon.study.noise.placements import Placements
+from recon.study.noise import Table
 from recon.study.results import differences
 from torchpcct import ConeBeam, VolumeGrid, full_turn
 from torchpcct.scan import Scan
@@ -39,7 +39,7 @@ def test_values_come_back_as_they_were(tmp_path):
         ("fbp", 0.25): (np.arange(6).reshape(2, 3), [True, None, 1.5, "α"]),
         0.35: np.float64(2.0),
         "nested": {"tensor": torch.arange(4.0), "empty": ()},
-        "of this software": [Placements("soft", 0.4, np.ones((2, 2)), np.zeros((2, 2))), VolumeGrid((2, 3, 4), 0.5)],
+        "of this software": [Table(np.ones((2, 2)), np.zeros((2, 2))), VolumeGrid((2, 3, 4), 0.5)],
     }
     back = _through_disk(value, tmp_path)
     assert list(back) == list(value)
@@ -49,9 +49,9 @@ def test_values_come_back_as_they_were(tmp_path):
     assert back[0.35] == 2.0
     assert torch.equal(back["nested"]["tensor"], torch.arange(4.0))
     assert back["nested"]["empty"] == ()
-    placements, grid = back["of this software"]
-    assert placements.kernel == "soft"
-    np.testing.assert_array_equal(placements.means, np.ones((2, 2)))
+    table, grid = back["of this software"]
+    assert isinstance(table, Table)
+    np.testing.assert_array_equal(table.mean, np.ones((2, 2)))
     assert grid == VolumeGrid((2, 3, 4), 0.5)
 
 

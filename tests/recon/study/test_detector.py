@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from tiny_studies import assert_report_is_whole
 
-from recon.study.detector.settings import Settings
+from recon.study.detector import Settings
 from torchpcct.scanner import SiliconDetector
 from torchpcct.scanner.compton import recoil
 

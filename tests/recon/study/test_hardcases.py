@@ -9,8 +9,7 @@ from tiny_studies import run_tiny
 
 from recon.study.hardcases.case import untouched
 from recon.study.hardcases.cases import CASES
-from recon.study.hardcases.measure import verdict
-from recon.study.hardcases.settings import Settings
+from recon.study.hardcases.measure import Settings, verdict
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scene.plaque import plaque_scene
 
@@ -34,7 +33,7 @@ def test_verdicts():
 
 
 def test_a_mended_case_is_right_and_a_refused_one_said(tiny):
-    rows = {r["case"]: r for r in tiny.measured.rows}
+    rows = {r["case"]: r for r in tiny.measured.data["rows"]}
     assert rows["sound"]["error_hu"] == 0.0
     assert rows["dead-column"]["verdict"] == "right"
     assert any("dead detector cells" in text for text in rows["dead-column"]["messages"])
@@ -44,7 +43,7 @@ def test_a_mended_case_is_right_and_a_refused_one_said(tiny):
 
 
 def test_a_whole_body(tiny):
-    rows = {r["case"]: r for r in tiny.measured.rows}
+    rows = {r["case"]: r for r in tiny.measured.data["rows"]}
     assert rows["body-sod"]["verdict"] == "unseen"
     assert rows["body-sod"]["error_hu"] > rows["body-sod"]["noise_hu"] > 20
     assert rows["body-reversed"]["verdict"] == "warned"
@@ -54,7 +53,7 @@ def test_a_whole_body(tiny):
 
 
 def test_metal_is_named_and_its_own_voxels_do_not_count(tiny):
-    rows = {r["case"]: r for r in tiny.measured.rows}
+    rows = {r["case"]: r for r in tiny.measured.data["rows"]}
     assert any("metal" in text for text in rows["metal"]["messages"])
     # The rod reads 16 000 HU: counted, it would be an error of more than a thousand.
     assert rows["metal"]["error_hu"] < 2 * rows["sound"]["noise_hu"]
@@ -77,7 +76,7 @@ def test_only_what_a_case_adds_is_left_out():
 
 
 def test_the_report_counts_silent_errors(tiny):
-    assert tiny.report.data["silent"] == 0 == sum(r["verdict"] == "SILENT" for r in tiny.measured.rows)
+    assert tiny.report.data["silent"] == 0 == sum(r["verdict"] == "SILENT" for r in tiny.measured.data["rows"])
     assert f"**Silent errors: {tiny.report.data['silent']}** of 8" in tiny.report.text
     assert "a dead column" in tiny.report.text
 

@@ -10,8 +10,7 @@ from plaque_image import tissue_volume
 from tiny_studies import assert_report_is_whole
 
 from recon.study import registry
-from recon.study.motion.observed import Reference, observe
-from recon.study.motion.settings import Settings
+from recon.study.motion import Reference, Settings, observe
 from recon.study.paper.plaque_scan import inset_grid
 from torchpcct.scene.plaque import plaque_scene
 
@@ -42,7 +41,7 @@ def test_measures_of_a_known_volume(drawn):
 
 
 def test_motion_spoils_and_its_knowledge_repairs(tiny):
-    m = tiny("motion").measured
+    m = tiny("motion").measured.seen
     assert m.range_mm == pytest.approx((0.0, 2.0), abs=0.01)
     small, large = (m.residual["PCCT", f] for f in (0.2, 1.0))
     assert 0.05 < small[0].nrmse < large[0].nrmse
@@ -63,7 +62,7 @@ def test_motion_spoils_and_its_knowledge_repairs(tiny):
 
 
 def test_eid_is_less_sensitive(tiny):
-    residual = tiny("motion").measured.residual
+    residual = tiny("motion").measured.seen.residual
     assert residual["EID-CT", 0.2][0].nrmse < residual["PCCT", 0.2][0].nrmse
 
 
@@ -76,7 +75,7 @@ def test_report(tiny, tmp_path):
     assert len(data["residual"]) == 3
     assert len(data["compensated"]) == 10
     first = data["residual"][0]["in_place"]
-    here = study.measured.residual["PCCT", 0.2][0]
+    here = study.measured.seen.residual["PCCT", 0.2][0]
     assert (first["nrmse"], first["lumen_mm2"]) == (here.nrmse, here.segmentation.lumen_area)
 
 

@@ -8,9 +8,7 @@ import pytest
 from tiny_studies import assert_report_is_whole
 
 from recon.study.paper import facts as paper
-from recon.study.phantom.geometry import analytic_lengths, raster_lengths
-from recon.study.phantom.report import TRANSMITTED, checks_of
-from recon.study.phantom.settings import Settings
+from recon.study.phantom import TRANSMITTED, Settings, analytic_lengths, checks, raster_lengths
 from torchpcct.scene.materials import MATERIALS
 from torchpcct.scene.plaque import plaque_scene
 
@@ -20,11 +18,11 @@ def test_report(tiny, tmp_path):
     sections = ("## Agreement with the paper", "## Materials", "## CT numbers", "## Geometry", "elastin")
     data = assert_report_is_whole(study, tmp_path, {"phantom.png"}, sections)
     assert {m["material"] for m in data["materials"]} == set(paper.MATERIALS) == set(data["hu"][TRANSMITTED])
-    assert len(data["checks"]) == 5 + 5 + 3 + 10 + 14
+    assert len(data["checks"]) == 5 + 5 + 10 + 14
 
 
 def test_lengths_of_the_bodies_are_the_paper_s(tiny):
-    lengths = tiny("phantom").measured.parts["lengths_mm"]
+    lengths = tiny("phantom").measured.data["lengths_mm"]
     for name, value in paper.PHANTOM_MM.items():
         assert lengths["bodies"][name] == pytest.approx(value, abs=0.05 if "isocentre" in name else 1e-3)
         assert lengths["raster"][name] == pytest.approx(value, abs=0.07)  # of voxels of 0.05 mm
@@ -48,7 +46,7 @@ def test_the_raster_sees_other_lengths():
 
 def test_known_ct_numbers(tiny):
     """Soft tissue reads the paper's HU at 64 keV; iodine and fat do not (fat loses contrast with energy)."""
-    hu = tiny("phantom").measured.parts["hu"]
+    hu = tiny("phantom").measured.data["hu"]
     for name in ("vessel_wall", "fibrous_tissue", "necrotic_core"):
         assert hu["64 keV"][name] == pytest.approx(paper.MATERIALS[name][1], abs=0.5)
     assert hu["55 keV"]["blood_iodine"] == pytest.approx(522, abs=3)
@@ -58,14 +56,14 @@ def test_known_ct_numbers(tiny):
 
 
 def test_checks_see_what_is_wrong(tiny):
-    parts = copy.deepcopy(tiny("phantom").measured.parts)
-    failed = {c.name for c in checks_of(parts) if not c.ok and "raster" not in c.name}
+    parts = copy.deepcopy(tiny("phantom").measured.data)
+    failed = {c.name for c in checks(parts) if not c.ok and "raster" not in c.name}
     assert failed == {"blood iodine, HU, 64 keV", "pericoronary fat, HU, 64 keV"}
     parts["materials"][0]["density_g_cm3"] += 0.01
-    parts["materials"][1]["from_molecules"] = 0.002
+    parts["materials"][1]["fraction_error"] = 0.002
     parts["hu"][TRANSMITTED]["necrotic_core"] = 50.0
     parts["lengths_mm"]["bodies"]["fibrous cap"] = 0.2
-    more = {c.name for c in checks_of(parts) if not c.ok and "raster" not in c.name} - failed
+    more = {c.name for c in checks(parts) if not c.ok and "raster" not in c.name} - failed
     assert len(more) == 4
 
 

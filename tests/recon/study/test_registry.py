@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import FrozenInstanceError, fields
 
+import jinja2
 import pytest
 from tiny_studies import TINY
 
 from recon.study import registry
-from recon.study.checks import Check, around, checks_section, effects_section
-from torchpcct.acquisition.plan import Effect
+from recon.study.report import Check, _templates, around
 
 
 def test_a_check_is_inside_its_closed_range_only():
@@ -25,18 +25,34 @@ def test_checks_as_json_values_and_as_text():
     assert checks[1].as_dict() == {
         "name": "dice", "ours": 0.2, "paper": "visible", "low": 0.5, "high": None, "note": "noise", "ok": False,
     }  # fmt: skip
-    text = checks_section(checks)
+    found = [c.as_dict() for c in checks]
+    text = rendered("{{ parts.checks(found) }}", found=found)
     assert "1 of 2 checks" in text
     assert "size, mm" in text
     assert "≥ 0.5" in text
-    assert "size, mm" not in checks_section(checks, every=False)
+    assert "size, mm" not in rendered("{{ parts.checks(found, every=false) }}", found=found)
+    assert "not found" in rendered("{{ parts.checks(found) }}", found=[Check("x", math.nan, 1.0).as_dict()])
 
 
 def test_effects_say_what_is_modelled():
-    text = effects_section([Effect("focal spot", True, 3.14159), Effect("scatter", False, None, "grid")], 0.5)
+    effects = [
+        {"name": "focal spot", "modelled": True, "cost_hu": 3.14159, "note": ""},
+        {"name": "scatter", "modelled": False, "cost_hu": None, "note": "grid"},
+    ]
+    text = rendered("{{ parts.effects(effects, 0.5) }}", effects=effects)
     assert "3.14" in text
     assert "not estimated" in text
     assert "less than 0.5 HU" in text
+
+
+def rendered(text, **data):
+    """A template with what reports share."""
+    return _templates().from_string('{% import "parts.md.j2" as parts %}' + text).render(**data)
+
+
+def test_a_missing_value_is_an_error_and_no_gap():
+    with pytest.raises(jinja2.UndefinedError, match="seconds"):
+        rendered("{{ parts.time(seconds) }}")
 
 
 COUNTS = {
@@ -85,6 +101,6 @@ def test_changes_from_the_command_line():
 
 def test_names():
     assert set(TINY) == set(COUNTS) == set(registry.STUDIES)
-    assert registry.part("dose", "measure") is registry.part("bowtie", "measure")  # its published name
+    assert registry.part("dose") is registry.part("bowtie")  # its published name
     with pytest.raises(ValueError, match="unknown study 'x'"):
         registry.build_settings("x")

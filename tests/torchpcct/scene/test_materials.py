@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from plaque_recipes import BASIS_FORMULAS, PLAQUE_RECIPES, elastin_formula, plaque_tissue
 
-from recon.study.phantom.recipes import BASIS_FORMULAS, PLAQUE_RECIPES, elastin_formula, plaque_tissue
 from torchpcct.scene.materials import (
     MATERIALS,
     PLAQUE_MATERIALS,
