@@ -339,7 +339,11 @@ def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     """One scan, or many, each as if it were alone."""
     if len(arguments.scan) == 1:
         arguments.scan = arguments.scan[0]
-        _reconstruct_scan(arguments, progress)
+        if arguments.memory is None or arguments.dry_run:
+            _reconstruct_scan(arguments, progress)
+        else:  # by slabs, which are jobs
+            with executing(arguments, (arguments.out or Path()).parent):
+                _reconstruct_scan(arguments, progress)
         return
     from recon.evaluate import execute
 
@@ -584,8 +588,8 @@ def add_reconstruct(commands: Commands) -> None:
     where.add_argument(
         "--memory",
         metavar="SIZE",
-        help="limit, e.g. 4GB, for volumes larger than memory: slab by slab to .nii or .zarr (default "
-        "SCAN_METHOD.nii); what was interrupted goes on",
+        help="limit of a process, e.g. 4GB, for volumes larger than memory: slab by slab, by --workers too, to .nii or "
+        ".zarr (default SCAN_METHOD.nii); what was interrupted goes on",
     )
     _add_output(parser)
     add_execution(parser)
