@@ -29,7 +29,8 @@ def dies(folder, name, times):
 
 
 def full(folder, name, host):
-    """A full disk of one machine."""
+    """A full disk of one machine; long enough that each gets one."""
+    time.sleep(0.3)
     if f"//{host}:" in execute._where()[0]:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
     return noted(folder, name, 0)

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from some_jobs import compiles, dies, full, noted, refuses, set_version, threads
+from some_jobs import compiles, dies, full, noted, refuses, set_version, threads, waits
 from tiny_studies import INSERT, TINY
 
 from recon.analytic.slabs import reconstruct_to
@@ -268,10 +268,12 @@ def test_a_worker_of_another_version_gets_no_jobs(cluster, tmp_path, caplog):
     (old,) = [a for a in cluster._addresses if "127.0.0.2" in a]
     try:
         cluster.client.run(set_version, "0.0.9", workers=[old])
-        done = run([Job(f"{k}", noted, (f"n{k}", k)) for k in range(6)], tmp_path, cluster)
-        assert len({pid for _, pid in done.values()}) == 1
+        cluster.log = tmp_path / "run.log"
+        run([Job(f"{k}", waits, (0.3,)) for k in range(6)], tmp_path, cluster)
+        assert cluster.log.read_text().count("on tcp://127.0.0.1:") == 6
         assert f"the worker {old} has another torchpcct (its version 0.0.9" in caplog.text
     finally:
+        cluster.log = None
         cluster.client.run(set_version, execute.VERSION, workers=[old])
         cluster.avoid.clear()
 
