@@ -49,6 +49,7 @@ __all__ = [
     "Plan",
     "Planned",
     "Processes",
+    "Unfit",
     "Unportable",
     "current",
     "packed_call",
