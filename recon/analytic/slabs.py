@@ -2,7 +2,8 @@
 
 Of a cone beam a slab needs the detector rows of its footprint, of a stack of parallel or fan-beam slices those slices.
 What decides about the whole (whether the rows end inside the object, how many readings are dead) is found in a first
-pass over the scan; every slab then gets the same bits as in one piece.
+pass over the scan; every slab then gets the same bits as in one piece. Slabs do not need each other, so that the
+workers of :mod:`recon.evaluate.execute` may make them, each within the limit.
 """
 
 from __future__ import annotations
@@ -13,14 +14,18 @@ import hashlib
 import logging
 import math
 import os
+import pickle
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple, TypedDict, Unpack
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.analytic.angular_weights import angular_weights
@@ -29,6 +34,9 @@ from recon.analytic.coverage import check_rows, consistency_warnings, sampling_w
 from recon.analytic.detector_edges import Rows, continued, ends_cut_off, mirrored, row_ends
 from recon.analytic.fbp import filter_windowed
 from recon.api import reconstruct, require_light
+from recon.evaluate import execute
+from recon.evaluate.sources import source_digest
+from recon.evaluate.store import Store
 from recon.least_squares.memory import available_bytes, memory_bytes, pwls_bytes, resident_bytes
 from recon.least_squares.qggmrf import QGGMRF
 from recon.metal import metal_warnings
@@ -43,6 +51,7 @@ from torchpcct.checks.defects import (
 )
 from torchpcct.checks.readings import reading_warnings
 from torchpcct.detector_window import DetectorWindow, footprint
+from torchpcct.files import clear_folder
 from torchpcct.formats.scans import adapted, open_scan, own_options
 from torchpcct.formats.volume_slabs import CHUNK, SlabFile, check_slab_name
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
@@ -135,6 +144,10 @@ class ScanSlices:
         self.geometry: Any = g.with_rows(-start, self.count) if isinstance(g, ConeBeam) else g
         lead = () if g.has_rows else (self.count,)
         self.counts = torch.empty((*lead, *self.geometry.shape), device="meta")
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For another process, which reads slabs: the file by its full path, no readings."""
+        return {**self.__dict__, "source": Path(self.source).resolve(), "first": None, "counts": None}  # type: ignore
 
     def _open(self, first: int, stop: int) -> Scan:
         part = slice(first, stop)
@@ -340,17 +353,19 @@ def plan_slabs(
     *,
     sides: tuple[bool, bool] = (False, False),
     done: int = 0,
+    parts: int = 1,
 ) -> SlabPlan:
     """Slabs in which a volume fits into memory.
 
     Args:
         geometry: of the whole scan: parallel, fan or cone beam.
         grid: ``(z, y, x)``, of a stack ``(slices, y, x)``.
-        memory: bytes that the process may hold, with what it holds already, or a text such as "4GB"; None: what it
-            holds and what is free.
+        memory: bytes that a process may hold, with what it holds already, or a text such as "4GB"; None: what it
+            holds, and its part of what is free.
         method: "fbp"; of stacks also "pwls".
         sides: where the rows end inside the object and are continued (found before the first slab).
         done: slices that are on the disk already.
+        parts: slabs at least, if there are slices enough.
 
     Raises:
         ValueError: a limit that is too small for the thinnest slab, with the smallest that is not; a grid, geometry or
@@ -358,7 +373,8 @@ def plan_slabs(
     """
     _check(geometry, grid, method)
     base = resident_bytes() + _RESERVE
-    limit = memory_bytes(memory) if memory is not None else resident_bytes() + available_bytes(torch.device("cpu"))
+    free = available_bytes(torch.device("cpu")) // parts
+    limit = memory_bytes(memory) if memory is not None else resident_bytes() + free
     fbp = _Fbp(geometry, grid, "standard", sides, 0.02) if method == "fbp" else None
     needs = fbp.needs if fbp is not None else _pwls_needs(geometry, grid)
     total = grid.shape[0]
@@ -369,7 +385,9 @@ def plan_slabs(
     def most(thick: int) -> int:
         return base + max((needs(*slab) for slab in cut(thick)), default=0)
 
-    thick = max(total - done, 1)
+    thick = max(-(-(total - done) // parts), 1)
+    if parts > 1 and thick > CHUNK:
+        thick -= thick % CHUNK
     while thick > 1 and most(thick) > limit:
         thick = CHUNK * ((thick - 1) // CHUNK) if thick > CHUNK else thick - 1
     if most(thick) > limit:
@@ -420,7 +438,9 @@ def reconstruct_to(
 
     The same as :func:`recon.reconstruct` and :meth:`torchpcct.volume.Volume.save`, to the bit on one thread. FBP (FDK)
     of parallel, fan and cone beams on a circle, PWLS of stacks of slices. If it is interrupted, the finished slabs
-    stay in ``path.unfinished``, and the same call goes on with them.
+    stay in ``path.unfinished``, and the same call goes on with them. Within :func:`recon.evaluate.execute.using` the
+    slabs of a file are jobs: each worker keeps to ``memory``, reads the file under its full path, and this process puts
+    the slabs into the volume.
 
     What is different: defects are looked for slab by slab, with ``HALO`` rows on either side, so that one at the
     limits of what is recognised may be judged otherwise; the readings are tested against their description
@@ -447,6 +467,7 @@ def reconstruct_to(
         ValueError: a limit that is too small, naming the smallest that works; a scan, grid or method that cannot be
             done in slabs; a starved scan; another ending.
         WriteError: the target cannot be written (a full disk): the finished slabs stay.
+        recon.evaluate.execute.LeftOut: slabs whose workers died; the others stay.
     """
     check_slab_name(path)
     source = scan if isinstance(scan, ScanSlices) else ScanSlices(scan, **dict(reader or {}))
@@ -454,9 +475,12 @@ def reconstruct_to(
     _check(g, grid, method)
     if not g.has_rows and grid.shape[0] != source.count:
         raise ValueError(f"this scan of {source.count} slices needs a grid of as many, got {grid.shape}")
-    plan = plan_slabs(g, grid, memory, method)
+    executor = None if isinstance(source.source, Scan) else execute.current()
+    parts = 1 if executor is None else 2 * max(1, getattr(executor, "workers", 1))
+    plan = plan_slabs(g, grid, memory, method, parts=parts)
     fixed = [*check_rows(g, grid), *sampling_warnings(g)] if method == "fbp" else []
-    key = hashlib.sha256(repr((source.identity(), grid, method, kernel, sorted(options.items()))).encode()).hexdigest()
+    all_of_it = source.identity(), grid, method, kernel, sorted(options.items()), source_digest(__name__)
+    key = hashlib.sha256(repr(all_of_it).encode()).hexdigest()
     thick = plan.slabs[0][1] - plan.slabs[0][0]
     source.find_cells(max(high - low for low, high in plan.bands))
     file = SlabFile(path, grid, source.unit, key, min(thick, CHUNK))
@@ -471,46 +495,110 @@ def reconstruct_to(
     sides: Any = tuple(notes["sides"])
     begun = file.done
     if begun or any(sides):
-        plan = plan_slabs(g, grid, memory, method, sides=sides, done=begun)
-    run = _Fbp(g, grid, kernel, sides, source.water) if method == "fbp" else None
+        plan = plan_slabs(g, grid, memory, method, sides=sides, done=begun, parts=parts)
+    maker = _Maker(source, grid, method, kernel, sides, options)
     found: dict[str, float] = {}  # in the order of their appearance
     low, high, total = math.inf, -math.inf, 0.0
-    for first, stop in plan.slabs:
-        if run is not None:
-            values = run(source, first, stop)
-            peak = float(values.max())
-            texts = metal_warnings(values) if source.unit == "HU" else []
-            if source.unit != "HU":
-                values = from_hu(values, source.water)
-        else:
-            part = _slices_of(grid, first, stop)
-            volume = reconstruct(source._open(first, stop), part, method, **options)
-            values, texts, peak = volume.data, volume.report["warnings"], 0.0
-        for text in texts:
-            found[text] = peak
-        low, high, total = (
-            min(low, float(values.min())),
-            max(high, float(values.max())),
-            total + float(values.sum(dtype=torch.float64)),
-        )
-        file.write(values.numpy())
-        del values
+
+    def keep(stop: int, values: Any, texts: dict[str, float]) -> None:
+        nonlocal low, high, total
+        found.update(texts)
+        low, high = min(low, float(values.min())), max(high, float(values.max()))
+        total += float(values.sum(dtype=np.float64))
+        file.write(values)
         if progress is not None:
             progress(stop / grid.shape[0])
-    metal = sorted((t for t in found if run is not None), key=lambda t: -found[t])[:1]  # that of the brightest slab
-    warnings = list(dict.fromkeys([*notes["warnings"], *fixed, *(metal if run is not None else found)]))
+
+    if executor is None:
+        for first, stop in plan.slabs:
+            keep(stop, *maker(first, stop))
+    else:
+        _as_jobs(executor, maker, plan, key, file.part.with_name(file.part.name + ".slabs"), keep)
+    fbp = method == "fbp"
+    metal = sorted((t for t in found if fbp), key=lambda t: -found[t])[:1]  # that of the brightest slab
+    warnings = list(dict.fromkeys([*notes["warnings"], *fixed, *(metal if fbp else found)]))
     for text in warnings:
         _LOG.warning("%s", text)
     report = {
-        "method": method, **({"kernel": kernel} if run is not None else {}),
+        "method": method, **({"kernel": kernel} if fbp else {}),
         "seconds": round(time.perf_counter() - start, 3), "warnings": warnings,
-        "notes": [*notes["notes"], *(view_notes(g) if run is not None else [])],
+        "notes": [*notes["notes"], *(view_notes(g) if fbp else [])],
         "dead_readings": notes["dead_readings"],
         "slabs": len(plan.slabs), "memory_bytes": plan.memory, "resumed_at": begun,
         "minimum": low, "maximum": high, "mean": total / max((grid.shape[0] - begun) * math.prod(grid.shape[1:]), 1),
     }  # fmt: skip
     file.finish(report)
     return report
+
+
+class _Maker:
+    """Makes slabs: all that a job is told."""
+
+    def __init__(
+        self, source: ScanSlices, grid: VolumeGrid, method: str, kernel: str, sides: tuple[bool, bool],
+        options: dict[str, Any],
+    ) -> None:  # fmt: skip
+        self.source, self.grid, self.method, self.kernel = source, grid, method, kernel
+        self.sides, self.options = sides, options
+
+    @cached_property
+    def fbp(self) -> _Fbp | None:
+        source = self.source
+        return _Fbp(source.geometry, self.grid, self.kernel, self.sides, source.water) if self.method == "fbp" else None
+
+    def __call__(self, first: int, stop: int) -> tuple[NDArray[np.float32], dict[str, float]]:
+        """Values ``(slices, y, x)`` in the scan's unit, and warnings with the brightness that each is for."""
+        source = self.source
+        if self.fbp is None:
+            part = _slices_of(self.grid, first, stop)
+            volume = reconstruct(source._open(first, stop), part, self.method, **self.options)
+            return volume.data.numpy(), dict.fromkeys(volume.report["warnings"], 0.0)
+        values = self.fbp(source, first, stop)
+        texts = dict.fromkeys(metal_warnings(values), float(values.max())) if source.unit == "HU" else {}
+        return (values if source.unit == "HU" else from_hu(values, source.water)).numpy(), texts
+
+
+def _as_jobs(executor: Any, maker: _Maker, plan: SlabPlan, key: str, folder: Path, keep: Callable[..., None]) -> None:
+    """Let workers make the slabs as pieces in ``folder``; each is kept when its turn has come."""
+    packed, plane = pickle.dumps(maker), math.prod(maker.grid.shape[1:])
+    jobs = [
+        execute.Job(
+            f"slices {first} … {stop - 1}", _slab, (packed, key, first, stop), (f"{first}-{stop}.npz",),
+            seconds=plan.seconds * (stop - first) / maker.grid.shape[0], mib=plan.memory / 2**20,
+            bytes=4.0 * (stop - first) * plane,
+        )
+        for first, stop in plan.slabs
+    ]  # fmt: skip
+    waiting, done = deque(plan.slabs), set[tuple[int, int]]()
+
+    def finished(job: execute.Job) -> None:
+        done.add(job.args[2:])
+        while waiting and waiting[0] in done:
+            first, stop = waiting.popleft()
+            piece = _slab_piece(folder, maker, key, first, stop)
+            keep(stop, piece["values"], dict(zip(piece["texts"].tolist(), piece["peaks"].tolist(), strict=True)))
+            (folder / f"{first}-{stop}.npz").unlink(missing_ok=True)
+
+    execute.run(jobs, folder, executor, finished=finished)
+    clear_folder(folder)
+
+
+def _slab(folder: Path, packed: bytes, key: str, first: int, stop: int) -> None:
+    _slab_piece(folder, _unpacked(packed), key, first, stop)
+
+
+@lru_cache(maxsize=1)
+def _unpacked(packed: bytes) -> _Maker:
+    maker: _Maker = pickle.loads(packed)
+    return maker
+
+
+def _slab_piece(folder: Path, maker: _Maker, key: str, first: int, stop: int) -> dict[str, Any]:
+    def compute() -> dict[str, Any]:
+        values, texts = maker(first, stop)
+        return {"values": values, "texts": np.array(list(texts), dtype=str), "peaks": np.array(list(texts.values()))}
+
+    return Store(folder).piece(f"{first}-{stop}", key, compute)
 
 
 def _slices_of(grid: VolumeGrid, first: int, stop: int) -> VolumeGrid:

@@ -325,7 +325,11 @@ def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     """One scan, or many, each as if it were alone."""
     if len(arguments.scan) == 1:
         arguments.scan = arguments.scan[0]
-        _reconstruct_scan(arguments, progress)
+        if arguments.memory is None or arguments.dry_run:
+            _reconstruct_scan(arguments, progress)
+        else:  # by slabs, which are jobs
+            with executing(arguments, (arguments.out or Path()).parent):
+                _reconstruct_scan(arguments, progress)
         return
     from recon.evaluate import execute
 
@@ -547,8 +551,8 @@ def add_reconstruct(commands: Commands) -> None:
          {"nargs": "+", "limits": {"unit": "mm"}}),
         ("--extent", _length, "MM", f"edge lengths, Z Y X (default: what is seen); {own}",
          {"nargs": "+", "limits": _LENGTH}),
-        ("--memory", str, "SIZE", "limit, e.g. 4GB, for volumes larger than memory: slab by slab to .nii or .zarr "
-         "(default SCAN_METHOD.nii); what was interrupted goes on"),
+        ("--memory", str, "SIZE", "limit of a process, e.g. 4GB, for volumes larger than memory: slab by slab, by "
+         "--workers too, to .nii or .zarr (default SCAN_METHOD.nii); what was interrupted goes on"),
         group="voxels",
     )  # fmt: skip
     _add_reader_options(parser, many=True)

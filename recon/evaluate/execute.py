@@ -33,7 +33,7 @@ from concurrent.futures import ProcessPoolExecutor as Pool
 from concurrent.futures import wait as wait_for
 from contextvars import ContextVar
 from dataclasses import dataclass, field
-from functools import cache
+from functools import lru_cache
 from pathlib import Path
 from tempfile import gettempdir
 from typing import Any
@@ -49,6 +49,7 @@ __all__ = [
     "Plan",
     "Planned",
     "Processes",
+    "Unfit",
     "Unportable",
     "current",
     "packed_call",
@@ -59,11 +60,9 @@ __all__ = [
 log = logging.getLogger(__name__)
 
 DEATHS = 3
-"""Of workers, or of their disks, until a job is left out."""
+"""Of processes until a job is left out; a Dask scheduler counts by itself."""
 _ANSWER_S = 8.0
 """That a scheduler may take."""
-_AHEAD = 4
-"""Jobs for a worker that are submitted before one of them is done."""
 
 _DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)
 
@@ -80,6 +79,18 @@ class Planned(Exception):
 
 class Unportable(TypeError):
     """A function or value that no other process can be given."""
+
+
+class Unfit(ValueError):
+    """A worker that cannot take jobs, named: its torchpcct is another one, it takes several at once, its disk is full.
+
+    Args:
+        worker: its address.
+        why: what is wrong with it.
+    """
+
+    def __str__(self) -> str:
+        return f"the worker {self.args[0]} {self.args[1]}"
 
 
 @dataclass(frozen=True)
@@ -121,14 +132,13 @@ class _Run:
 
 @dataclass
 class _Done:
-    """What comes back: ``problem`` is what a disk said, ``said`` what was logged as a warning."""
+    """What comes back: ``said`` is what was logged as a warning."""
 
     where: str
     value: Any = None
     files: dict[str, bytes] = field(default_factory=dict)
     seconds: float = 0.0
     compiled_s: float = 0.0
-    problem: str = ""
     said: list[str] = field(default_factory=list)
 
 
@@ -194,6 +204,7 @@ class Processes(ThreadPoolExecutor):
 
 def _load() -> None:
     importlib.import_module("recon.evaluate.experiment")
+    source_digest()  # of all files as they are loaded: what is installed while a worker runs, it does not have
 
 
 def _end_with_parent() -> None:
@@ -222,7 +233,7 @@ class Cluster(Executor):
 
     def __init__(self, scheduler: str, threads: int | None = None) -> None:
         try:
-            from distributed import Client
+            from distributed import Client, fire_and_forget
         except ImportError as error:
             raise ImportError("--scheduler needs Dask: pip install 'torchpcct[cluster]'") from error
         is_file = scheduler.endswith(".json") or Path(scheduler).is_file()
@@ -238,13 +249,14 @@ class Cluster(Executor):
             raise ConnectionError(f"no Dask scheduler answers at {scheduler} within {_ANSWER_S:g} s") from error
         finally:
             quiet.setLevel(level)
-        self.avoid: set[str] = set()
+        self.avoid: dict[str, str] = {}  # machine → why
         self._asked: tuple[float, list[str]] = -9.0, []
         from cloudpickle import dumps
 
         self.dumps = dumps
-
-        self.first = [self.client.submit(_load, workers=[a], pure=False) for a in self._addresses]
+        for address in self._addresses:
+            first = self.client.submit(_load, workers=[address], allow_other_workers=True, pure=False)
+            fire_and_forget(first)  # not kept: a worker that dies would lose it, and nobody needs it
 
     @property
     def workers(self) -> int:
@@ -256,7 +268,7 @@ class Cluster(Executor):
         now = time.monotonic()
         if now - self._asked[0] > 1.0:  # a way to the scheduler and back
             self._asked = now, list(self.client.scheduler_info(-1)["workers"])
-        return [a for a in self._asked[1] if a not in self.avoid]
+        return [a for a in self._asked[1] if _machine(a) not in self.avoid]
 
     @property
     def dashboard(self) -> str:
@@ -265,9 +277,15 @@ class Cluster(Executor):
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """See :class:`concurrent.futures.Executor`."""
-        only = {"workers": self._addresses} if self.avoid else {}
+        # Machines, not workers: one that dies is started again under another address.
+        only = {"workers": sorted(set(map(_machine, self._addresses)))} if self.avoid else {}
         found: Future[Any] = self.client.get_executor(pure=False, **only).submit(fn, *args, **kwargs)
         return found
+
+    def refuse(self, error: Unfit) -> None:
+        """Give no more jobs to the machine of a worker, whose other workers have the same software and disks."""
+        if self.avoid.setdefault(_machine(error.args[0]), str(error)) == str(error):
+            log.warning("%s; jobs go to other machines", error)
 
     def check(self) -> None:
         """Raise ``ConnectionError`` if the scheduler is gone, or was: it has forgotten what it was given."""
@@ -278,6 +296,12 @@ class Cluster(Executor):
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Part from the scheduler, which goes on; what was submitted and is not done is dropped."""
         self.client.close()
+
+
+def _machine(address: str) -> str:
+    from distributed.comm import get_address_host
+
+    return str(get_address_host(address))
 
 
 # --- what a worker does -------------------------------------------------------------------------------------------
@@ -293,7 +317,7 @@ def _where() -> tuple[str, str | None, int]:
     return str(worker.address), str(worker.local_directory), int(worker.state.nthreads)
 
 
-@cache
+@lru_cache(maxsize=1)  # until another number is asked for
 def _use_threads(threads: int) -> None:
     """In a worker: torch, BLAS and our own kernels. Dask sets none of the last two, and N workers would fight."""
     import torch
@@ -307,11 +331,19 @@ def _use_threads(threads: int) -> None:
 
 
 @contextlib.contextmanager
-def _compile_time() -> Iterator[list[float]]:
-    """Seconds in which numba compiled kernels, one number for each."""
+def _compiling(own: bool) -> Iterator[list[float]]:
+    """Seconds in which numba compiled kernels, one number for each.
+
+    Of the workers of a machine one at a time compiles, or looks into the cache for what another has compiled: every
+    kernel is compiled once on each machine, however many workers begin with it together.
+    """
+    import fcntl
+
     from numba.core import event
 
     found: list[float] = []
+    depths: dict[int, int] = defaultdict(int)
+    path = Path(gettempdir()) / f"torchpcct-{os.getuid()}.compiling"
 
     class Timer(event.TimingListener):
         def on_end(self, event: Any) -> None:
@@ -319,7 +351,21 @@ def _compile_time() -> Iterator[list[float]]:
             if self.done:
                 found.append(self.duration)
 
-    with event.install_listener("numba:compile", Timer()):
+    class Alone(event.Listener):  # numba takes its lock before it looks into the cache, also for what a kernel calls
+        def on_start(self, event: Any) -> None:
+            me = threading.get_ident()
+            if not depths[me]:
+                fcntl.flock(file, fcntl.LOCK_EX)
+            depths[me] += 1
+
+        def on_end(self, event: Any) -> None:
+            me = threading.get_ident()
+            depths[me] -= 1
+            if not depths[me]:
+                fcntl.flock(file, fcntl.LOCK_UN)
+
+    alone = contextlib.nullcontext() if own else event.install_listener("numba:compiler_lock", Alone())
+    with path.open("w") as file, event.install_listener("numba:compile", Timer()), alone:
         yield found
 
 
@@ -346,13 +392,14 @@ def _work(call: bytes, module: str, digest: str, makes: tuple[str, ...], of: _Ru
     where, scratch, at_once = _where()
     if not own:
         if at_once > 1:
-            raise ValueError(f"the worker {where} takes {at_once} jobs at once: start it with --nthreads 1 (more "
-                             "workers of a machine: --nworkers)")  # fmt: skip
+            raise Unfit(where, f"takes {at_once} jobs at once: start it with --nthreads 1 (more workers of a machine: "
+                        "--nworkers)")  # fmt: skip
         if of.path not in sys.path and os.path.isdir(of.path):
             sys.path.insert(0, of.path)
+        source_digest()  # as in _load, for a worker that came later
         if (VERSION, source_digest(module)) != (of.version, digest):
-            raise ValueError(f"the worker {where} has another torchpcct (its version {VERSION}, here {of.version}; the "
-                             f"sources of {module} differ): install the same one")  # fmt: skip
+            raise Unfit(where, f"has another torchpcct (its version {VERSION}, here {of.version}; the sources of "
+                        f"{module} differ): install the same one, and start it again")  # fmt: skip
         if of.threads is not None:
             _use_threads(of.threads)
     function, args = pickle.loads(call)
@@ -361,17 +408,16 @@ def _work(call: bytes, module: str, digest: str, makes: tuple[str, ...], of: _Ru
     start = time.perf_counter()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with _compile_time() as compiled, _heard(own) as said:
+        with _compiling(own) as compiled, _heard(own) as said:
             value = function(folder, *args)
     except OSError as error:
-        if own or (error.errno not in _DISK and not isinstance(error, WriteError)):
+        if scratch is None or (error.errno not in _DISK and not isinstance(error, WriteError)):
             raise
-        return _Done(where, problem=str(error))
+        raise Unfit(where, f"cannot write: {error}") from error
     made = {} if shared else {
         p.relative_to(folder).as_posix(): p.read_bytes() for pattern in makes for p in folder.glob(pattern)
     }  # fmt: skip
-    seconds = time.perf_counter() - start
-    return _Done(where, value, made, seconds, sum(compiled), said=said)
+    return _Done(where, value, made, time.perf_counter() - start, sum(compiled), said)
 
 
 # --- the client ---------------------------------------------------------------------------------------------------
@@ -407,8 +453,9 @@ def run(
         Name → what the job's function gave.
 
     Raises:
-        LeftOut: jobs whose workers, or whose disks, failed three times; all others are done.
+        LeftOut: jobs of which three workers died, or for which no worker is left; all others are done.
         Unportable: a job that cannot be pickled.
+        Unfit: a process that has other sources than this one; of a cluster such workers are left aside.
         ConnectionError: the scheduler is gone.
         Exception: whatever a job's function raises; those that are done are kept.
     """
@@ -447,22 +494,34 @@ def _run(
 
     try:
         while ready or running:
-            workers = getattr(executor, "workers", 16)
-            while ready and len(running) < _AHEAD * max(1, workers):
+            workers, avoid = getattr(executor, "workers", 16), getattr(executor, "avoid", {})
+            # No more than there are workers: what waits on one that dies would count as having killed it.
+            while ready and len(running) < max(1, workers):
                 job = ready.popleft()
-                if not workers and getattr(executor, "avoid", None):
-                    leave_out(job, "no worker is left")
+                if not workers and avoid:
+                    leave_out(job, f"no worker is left: {'; '.join(avoid.values())}")
                     continue
                 module = job.module or job.function.__module__
                 call = packed_call(executor, (job.function, job.args))
                 running[executor.submit(_work, call, module, source_digest(module), job.makes, of)] = job
             for future in wait_for(running, 1.0, FIRST_COMPLETED)[0] if running else ():
                 job = running.pop(future)
-                done, why = _outcome(future, executor)
-                if done is None:
-                    deaths[job.name] += DEATHS if "KilledWorker" in why else 1
+                try:
+                    done = future.result()
+                except CancelledError:
+                    raise _gone(executor) from None
+                except Unfit as error:
+                    if not isinstance(executor, Cluster):
+                        raise
+                    executor.refuse(error)
+                    book.note(f"again    {job.name}: {error}")
+                    ready.append(job)
+                    continue
+                except Exception as error:
+                    why = _death(error, executor)
+                    deaths[job.name] += 1
                     book.note(f"failed   {job.name}: {why}")
-                    if deaths[job.name] < DEATHS:
+                    if deaths[job.name] < DEATHS and isinstance(executor, Processes):
                         ready.append(job)
                     else:
                         leave_out(job, why)
@@ -505,27 +564,13 @@ def _keep(folder: Path, files: dict[str, bytes]) -> None:
             part.write_bytes(data)
 
 
-def _outcome(future: Future[_Done], executor: Executor) -> tuple[_Done | None, str]:
-    """What a job gave, or why it has to be repeated."""
-    try:
-        done = future.result()
-    except CancelledError:
-        raise _gone(executor) from None
-    except BrokenExecutor:
-        if not isinstance(executor, Processes):
-            raise
-        return None, "its process died"
-    except Exception as error:
-        if type(error).__name__ != "KilledWorker":  # of Dask, which has repeated it
-            raise
-        return None, "KilledWorker: every worker that took it died"
-    if not done.problem:
-        return done, ""
-    if not isinstance(executor, Cluster):
-        raise WriteError(done.problem)
-    executor.avoid.add(done.where)
-    log.warning("%s: %s; its jobs go elsewhere", done.where, done.problem)
-    return None, f"{done.where}: {done.problem}"
+def _death(error: Exception, executor: Executor) -> str:
+    """What to say of a job whose worker died; any other error is raised."""
+    if isinstance(error, BrokenExecutor) and isinstance(executor, Processes):
+        return "its process died"
+    if type(error).__name__ == "KilledWorker":  # of Dask, which has repeated it
+        return "KilledWorker: every worker that took it died"
+    raise error
 
 
 def _gone(executor: Executor) -> ConnectionError:

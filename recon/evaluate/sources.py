@@ -39,8 +39,15 @@ def source_digest(*modules: str) -> str:
     files |= {found for folder in {f.parent for f in files} for ending in endings for found in folder.glob(ending)}
     roots = Path(str(importlib.import_module("torchpcct").__file__)).parent.parent
     for path in sorted(files):
-        total.update(path.relative_to(roots).as_posix().encode() + path.read_bytes())
+        total.update(path.relative_to(roots).as_posix().encode() + _content(path))
     return total.hexdigest()
+
+
+@functools.cache
+def _content(path: Path) -> bytes:
+    """SHA-256 of a file when it was first asked for."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").digest()
 
 
 @functools.cache

@@ -39,7 +39,6 @@ inset: {size: [6, 8, 8], voxel_mm: 0.4}
 exposures_s: [10, 20]
 """
 METHODS = ["fbp:soft", "gaussian@fbp:soft", "tv@fbp:soft"]
-DASK = [sys.executable, "-m", "distributed.cli"]
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
 
 
@@ -143,7 +142,8 @@ def main(kills: int = 20, budget_s: float = 1e9) -> None:
             print(run, dict(seen), flush=True)
     finally:
         parts.end()
-    found = {k: dict(v) for k, v in seen.items()}
+    found: dict[str, Any] = {k: dict(v) for k, v in seen.items()}
+    found |= {"command": " ".join(sys.argv), "date": time.strftime("%Y-%m-%d")}
     write_results(Path(__file__).parent, "cluster_kills", found, f"{json.dumps(found)}\n")
 
 

@@ -6,6 +6,10 @@ import os
 import signal
 import time
 
+from numba import njit
+
+from recon.evaluate import execute
+
 
 def noted(folder, name, value):
     """Write a file, give a value and where it was computed."""
@@ -24,18 +28,37 @@ def dies(folder, name, times):
     return noted(folder, name, times)
 
 
-def full(folder, name, pid):
-    """A full disk for one process."""
-    if os.getpid() == pid:
+def full(folder, name, host):
+    """A full disk of one machine; long enough that each gets one."""
+    time.sleep(0.3)
+    if f"//{host}:" in execute._where()[0]:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
     return noted(folder, name, 0)
 
 
+def set_version(version):
+    """Of a worker."""
+    execute.VERSION = version
+
+
 def waits(folder, seconds):
-    """Compute for so long."""
-    end = time.perf_counter() + seconds
-    while time.perf_counter() < end:
-        pass
+    """Take so long, and no processor."""
+    time.sleep(seconds)
+
+
+@njit(cache=True)
+def _kernel(x):
+    return x.reshape(2, -1).sum(axis=1).max() + x.mean() + x[::-1].copy().argmax()
+
+
+def compiles(folder, name, together):
+    """Compile a kernel, when as many others are about to."""
+    import numpy as np
+
+    (folder / f"{name}.here").touch()
+    while len(list(folder.glob("*.here"))) < together:
+        time.sleep(0.01)
+    return float(_kernel(np.ones(4)))
 
 
 def refuses(folder):

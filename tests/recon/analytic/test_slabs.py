@@ -204,7 +204,14 @@ def test_killed_between_slabs(name, tmp_path, monkeypatch):
     whole = recon.reconstruct(scan, GRID)
     assert float((Volume.load(path).data - whole.data).abs().max()) <= 1e-4
     assert [p.name for p in tmp_path.iterdir()] == [name]
-    # What was begun with other settings is begun anew.
+    # What was begun with other sources, or other settings, is begun anew.
+    monkeypatch.setattr(SlabFile, "write", killed)
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct_to(scan, GRID, path, memory=memory)
+    monkeypatch.setattr(SlabFile, "write", write)
+    with monkeypatch.context() as patch:
+        patch.setattr(slabs, "source_digest", lambda module: "other")
+        assert reconstruct_to(scan, GRID, path, memory=memory)["resumed_at"] == 0
     monkeypatch.setattr(SlabFile, "write", killed)
     with pytest.raises(KeyboardInterrupt):
         reconstruct_to(scan, GRID, path, memory=memory)

@@ -1,29 +1,37 @@
 """Jobs in other processes and on a cluster: the same figures, nothing lost, and what is wrong is said."""
 
 import contextlib
+import doctest
 import json
 import os
 import pickle
+import re
+import signal
 import subprocess
 import sys
 import time
+import warnings
+from pathlib import Path
 
 import pytest
 import torch
-from some_jobs import dies, full, noted, refuses, threads
+from some_jobs import compiles, dies, full, noted, refuses, set_version, threads, waits
 from tiny_studies import INSERT, TINY
 
+from recon.analytic.slabs import reconstruct_to
 from recon.cli import main
 from recon.evaluate import execute
 from recon.evaluate.execute import Cluster, Job, LeftOut, Processes, run
 from recon.evaluate.experiment import evaluate
 from recon.evaluate.methods import Method, method_of
-from recon.evaluate.sources import _follow, source_digest
+from recon.evaluate.sources import _content, _follow, source_digest
 from recon.evaluate.tasks import read_task
 from recon.study import registry
 from recon.study.results import differences
-from torchpcct import ConeBeam, Scan, Volume, full_turn
+from torchpcct import ConeBeam, Scan, Volume, VolumeGrid, full_turn
+from torchpcct.formats.volume_slabs import SlabFile
 
+PAGE = Path(__file__).parents[3] / "notebooks" / "docs" / "howto" / "cluster.md"
 METHODS = ["fbp:soft", "gaussian@fbp:soft", "mbir"]
 
 
@@ -31,7 +39,8 @@ METHODS = ["fbp:soft", "gaussian@fbp:soft", "mbir"]
 def task(tmp_path_factory):
     path = tmp_path_factory.mktemp("task") / "insert.yaml"
     # On the voxels that the network knows, few of them.
-    path.write_text(INSERT.replace("size: [6, 8, 8], voxel_mm: 0.4", "size: [3, 6, 6], voxel_mm: 0.2"))
+    text = INSERT.replace("size: [6, 8, 8], voxel_mm: 0.4", "size: [3, 6, 6], voxel_mm: 0.2")
+    path.write_text(text.replace("views: 90", "views: 40"))
     return read_task(path)
 
 
@@ -43,8 +52,11 @@ def processes():
 
 @pytest.fixture(scope="module")
 def cluster():
+    """Of two machines: addresses of this one that look like two."""
     distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as workers:
+    nodes = {k: {"cls": distributed.Nanny, "options": {"host": f"127.0.0.{k}", "nthreads": 1}} for k in (1, 2)}
+    scheduler = {"cls": distributed.Scheduler, "options": {"host": "127.0.0.1", "dashboard_address": ":0"}}
+    with distributed.SpecCluster(nodes, scheduler) as workers:
         executor = Cluster(workers.scheduler_address)
         yield executor
         executor.shutdown()
@@ -132,6 +144,45 @@ def test_many_scans_are_reconstructed_as_if_each_were_alone(processes, tmp_path,
     assert "4 jobs" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("where", ["processes", pytest.param("cluster", marks=pytest.mark.cluster)])
+def test_slabs_of_a_volume_are_jobs(where, tmp_path, monkeypatch, request):
+    """The same file, to the bit, as slab by slab in one process; what was made is made once."""
+    g, grid = ConeBeam(full_turn(24), 300.0, 500.0, 24, 12, 1.0), VolumeGrid((10, 12, 12), 0.6)
+    scan, made = tmp_path / "scan.h5", SlabFile.write
+    counts = torch.poisson(torch.full(g.shape, 500.0), generator=torch.Generator().manual_seed(0))
+    Scan.from_counts(counts, g, air=1000.0, gain=1.0).save(scan)
+    with warnings_off():
+        here = reconstruct_to(scan, grid, tmp_path / "here.nii")
+    executor = request.getfixturevalue(where)
+    if where == "cluster":  # on disks of their own
+        monkeypatch.setattr(execute, "marker", lambda folder: contextlib.nullcontext(folder / "not" / "there"))
+    executor.log = tmp_path / "run.log"
+
+    def interrupted(self, values):
+        made(self, values)
+        raise KeyboardInterrupt
+
+    with execute.using(executor), warnings_off():
+        monkeypatch.setattr(SlabFile, "write", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            reconstruct_to(scan, grid, tmp_path / "there.nii")
+        monkeypatch.setattr(SlabFile, "write", made)
+        there = reconstruct_to(scan, grid, tmp_path / "there.nii")
+    assert (tmp_path / "there.nii").read_bytes() == (tmp_path / "here.nii").read_bytes()
+    assert (here["slabs"], there["slabs"], there["resumed_at"]) == (1, 4, 3)  # of what was left
+    assert here["warnings"] == there["warnings"]
+    assert "done     slices 0 … 2" in executor.log.read_text()
+    assert not list(tmp_path.glob("*unfinished*"))
+    executor.log = None
+
+
+@contextlib.contextmanager
+def warnings_off():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
 def test_a_lambda_is_computed_here(task, processes, tmp_path, caplog):
     mine = Method("mine", lambda draw: draw.fbp("soft"), kernels=("soft",))
     found = evaluate(task, ["fbp:soft", mine], n=8, folder=tmp_path, executor=processes)
@@ -156,6 +207,16 @@ def test_a_job_whose_process_dies_is_repeated_and_left_out_after_three(processes
     assert "noted" not in capfd.readouterr().err
 
 
+@pytest.mark.cluster
+def test_a_job_that_kills_workers_of_a_cluster_is_left_out_alone(cluster, tmp_path):
+    """Dask counts every job that a dead worker had been given: the others must not be among them."""
+    jobs = [Job("once", dies, ("once", 1)), Job("always", dies, ("always", 99)),
+            *(Job(f"other {k}", noted, (f"o{k}", k)) for k in range(8))]  # fmt: skip
+    with pytest.raises(LeftOut, match=r"1 of 10 jobs are missing: always \(KilledWorker"):
+        run(jobs, tmp_path, cluster)
+    assert len(list(tmp_path.glob("o*.txt"))) == 9
+
+
 def test_what_a_job_itself_refuses_ends_the_run(processes, tmp_path):
     with pytest.raises(ValueError, match="bad input"):
         run([Job("bad", refuses, ())], tmp_path, processes)
@@ -169,20 +230,60 @@ def test_threads_of_all_libraries_are_the_workers(processes, tmp_path):
 
 @pytest.mark.cluster
 def test_threads_on_a_cluster(cluster, tmp_path):
-    assert run([Job("t", threads, ())], tmp_path, cluster)["t"] == (1, 1, 1)
+    """Of each job what its command asks for, whatever another command asked of the same worker."""
+    one = [Job("t", threads, ())]
+    found = []
+    for number in (1, 2, 1):
+        cluster.threads = number
+        cluster.avoid = {"127.0.0.2": "the other worker would do as well"}
+        found.append(run(one, tmp_path, cluster)["t"])
+    cluster.avoid = {}
+    assert found == [(1, 1, 1), (2, 2, 2), (1, 1, 1)]
+
+
+def test_workers_of_a_machine_compile_a_kernel_once(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    with Processes(2, 1) as executor:
+        executor.log = tmp_path / "run.log"
+        run([Job(f"{k}", compiles, (f"{k}", 2)) for k in range(2)], tmp_path, executor)
+    assert executor.log.read_text().count("s of it compiling") == 1
 
 
 @pytest.mark.cluster
-def test_a_full_disk_of_one_worker_is_named_and_the_rest_goes_on(cluster, tmp_path, caplog):
-    pid = run([Job("who", noted, ("who", 1))], tmp_path, cluster)["who"][1]
-    jobs = [Job(f"{k}", full, (f"f{k}", pid)) for k in range(6)]
+def test_a_full_disk_of_one_machine_is_named_and_the_rest_goes_on(cluster, tmp_path, caplog):
+    jobs = [Job(f"{k}", full, (f"f{k}", "127.0.0.1")) for k in range(6)]
     try:
-        values = run(jobs, tmp_path, cluster)
-        assert len(values) == 6
-        assert len(cluster.avoid) <= 1
-        assert not cluster.avoid or "No space left on device" in caplog.text
+        assert len(run(jobs, tmp_path, cluster)) == 6
+        assert list(cluster.avoid) == ["127.0.0.1"]
+        assert re.search(r"the worker tcp://127\.0\.0\.1:\d+ cannot write: .*No space left on device", caplog.text)
+        more = [Job(f"{k}", full, (f"f{k}", "127.0.0.2")) for k in range(6)]
+        with pytest.raises(LeftOut, match=r"6 of 6 jobs are missing.*no worker is left: .*No space left on device"):
+            run(more, tmp_path, cluster)
     finally:
         cluster.avoid.clear()
+
+
+@pytest.mark.cluster
+def test_a_worker_of_another_version_gets_no_jobs(cluster, tmp_path, caplog):
+    (old,) = [a for a in cluster._addresses if "127.0.0.2" in a]
+    try:
+        cluster.client.run(set_version, "0.0.9", workers=[old])
+        cluster.log = tmp_path / "run.log"
+        run([Job(f"{k}", waits, (0.3,)) for k in range(6)], tmp_path, cluster)
+        assert cluster.log.read_text().count("on tcp://127.0.0.1:") == 6
+        assert f"the worker {old} has another torchpcct (its version 0.0.9" in caplog.text
+    finally:
+        cluster.log = None
+        cluster.client.run(set_version, execute.VERSION, workers=[old])
+        cluster.avoid.clear()
+
+
+def test_what_is_installed_while_a_worker_runs_it_does_not_have(tmp_path):
+    path = tmp_path / "module.py"
+    path.write_text("a")
+    found = _content(path)
+    path.write_text("b")
+    assert _content(path) == found
 
 
 def test_another_version_is_refused(processes, tmp_path, monkeypatch):
@@ -206,6 +307,62 @@ def test_an_unreachable_scheduler_is_told_in_one_sentence(tmp_path, capsys):
     assert "no Dask scheduler answers at tcp://127.0.0.1:9" in output
     assert main([*command, str(tmp_path / "none.json")]) == 2
     assert "dask scheduler --scheduler-file writes it" in capsys.readouterr().err
+
+
+@pytest.mark.cluster
+def test_the_recipe_of_dask_jobqueue():
+    """The page prints the script of a worker that SLURM would be given."""
+    pytest.importorskip("dask_jobqueue")
+    flags = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+    with warnings_off():  # its scheduler looks for a free port
+        found = doctest.testfile(str(PAGE), module_relative=False, optionflags=flags)
+    assert found.attempted > 3
+    assert not found.failed
+
+
+SRUN = """#!/bin/bash
+echo "$@" >> "$CALLS"
+while [[ $1 == --* ]]; do shift; done
+exec "$@"
+"""
+COMMAND = """#!{python}
+import sys
+sys.path[:0] = {path!r}
+from pathlib import Path
+from some_jobs import noted
+from recon.evaluate.execute import Cluster, Job, run
+cluster = Cluster(sys.argv[sys.argv.index("--scheduler") + 1])
+while not cluster.workers:
+    pass
+run([Job("x", noted, ("x", 1))], Path({folder!r}), cluster)
+"""
+
+
+@pytest.mark.cluster
+def test_the_recipe_of_srun(tmp_path):
+    """The page's script as it stands, with an ``srun`` that starts one process of each step here."""
+    pytest.importorskip("distributed")
+    (script,) = re.findall(r"```bash\n(#!/bin/bash.*?)```", PAGE.read_text(encoding="utf-8"), re.S)
+    path = [p for p in sys.path if p]
+    texts = {"srun": SRUN, "torchpcct": COMMAND.format(python=sys.executable, path=path, folder=str(tmp_path)),
+             "job": script.replace("/shared/$USER", str(tmp_path))}  # fmt: skip
+    for name, text in texts.items():
+        (tmp_path / name).write_text(text)
+        (tmp_path / name).chmod(0o755)
+    environment = {
+        **os.environ, "PATH": os.pathsep.join([str(tmp_path), str(Path(sys.executable).parent), os.environ["PATH"]]),
+        "SLURM_JOB_ID": "17", "CALLS": str(tmp_path / "calls"), "PYTHONPATH": os.pathsep.join(path),
+    }  # fmt: skip
+    job = subprocess.Popen([tmp_path / "job"], cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True,
+                           start_new_session=True)  # fmt: skip
+    try:
+        assert job.wait(600) == 0
+    finally:
+        os.killpg(job.pid, signal.SIGKILL)  # as SLURM ends the steps of a job that is over
+        job.stderr.close()
+    assert (tmp_path / "x.txt").read_text() == "1"
+    tasks = re.findall(r"--ntasks=(\d+) --exact", (tmp_path / "calls").read_text())
+    assert sum(map(int, tasks)) == int(re.search(r"#SBATCH --ntasks=(\d+)", script)[1])
 
 
 def test_a_dry_run_lists_the_jobs(task, tmp_path, capsys):
