@@ -167,7 +167,7 @@ def _add_study(commands: Commands) -> None:
     listed = "".join(f"  {name:<12} {text}\n" for name, text in registry.STUDIES.items())
     before = f"studies:\n{listed}\n"
     examples(parser, "torchpcct study noise --quick", "torchpcct study motion --set views=492", before=before)
-    parser.add_argument("name", metavar="NAME", help="of the study")
+    parser.add_argument("name", metavar="NAME", help="name of the study")
     add_execution(parser)
     parser.add_argument("--quick", action="store_true", help="reduced settings: a first look, < 60 s")
     parser.add_argument(

@@ -204,13 +204,13 @@ def add_evaluate(commands: Commands) -> None:
         "--reference",
         default="fbp",
         metavar="NAME",
-        help="with --volumes: of a linear method, unsmoothed (default fbp)",
+        help="with --volumes: name of a linear method, unsmoothed (default fbp)",
     )
     measured.add_argument(
         "--voxel", type=float, metavar="MM", help="with --scans: voxel size (default: the detector's)"
     )
-    measured.add_argument("--extent", type=float, nargs="+", metavar="MM", help="with --scans: of the volume, Z Y X")
-    measured.add_argument("--center", type=float, nargs="+", metavar="MM", help="with --scans: of the volume, Z Y X")
+    measured.add_argument("--extent", type=float, nargs="+", metavar="MM", help="with --scans: edge lengths, Z Y X")
+    measured.add_argument("--center", type=float, nargs="+", metavar="MM", help="with --scans: centre, Z Y X")
     parser.add_argument(
         "--export", type=Path, metavar="FOLDER", help="write the noisy scans for another program instead of evaluating"
     )
@@ -230,13 +230,13 @@ def add_dose_factor(commands: Commands) -> None:
 
 
 def _add_common(parser: argparse.ArgumentParser, n: int) -> None:
-    parser.add_argument("--task", action="append", metavar="TASK", help="name or YAML file, repeatable")
+    parser.add_argument("--task", action="append", metavar="TASK", help="ready task or YAML file (repeatable)")
     parser.add_argument("--method", action="append", metavar="METHOD", help="see below (repeatable)")
     parser.add_argument(
         "--denoiser", action="append", metavar="FUNCTION@BASE", help="a function of (volume) or (volume, sigma) in HU"
     )
     parser.add_argument(
-        "--exposure", dest="exposures_s", type=float, nargs="+", metavar="S", help="in s (default: those of each task)"
+        "--exposure", dest="exposures_s", type=float, nargs="+", metavar="S", help="exposures (default: of the task)"
     )
     add_execution(parser)
     parser.add_argument("--n", type=int, default=n, help=f"noise realisations, at least 8 (default {n})")

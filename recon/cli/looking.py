@@ -200,7 +200,7 @@ def add_view(commands: Commands) -> None:
     to.add_argument("--out", type=Path, metavar="PATH", help="picture: .png, .pdf or .svg (default VOLUME.png)")
     add_force(parser)
     parser.add_argument("--level", type=float, help="centre of the grey scale (default 40 HU, mm⁻¹: of the values)")
-    parser.add_argument("--window", type=float, help="its width (default 400 HU, mm⁻¹: of the values)")
+    parser.add_argument("--window", type=float, help="width of the grey scale (default 400 HU; mm⁻¹: from the values)")
     picture = parser.add_argument_group("the picture")
     picture.add_argument("--plane", choices=("z", "y", "x"), default="z", help="axis across the slice (default z)")
     picture.add_argument("--slice", type=int, metavar="K", help="index along it (default: the middle)")

@@ -234,9 +234,9 @@ def add_execution(parser: argparse.ArgumentParser) -> None:
         "--scheduler",
         metavar="ADDRESS",
         default=os.environ.get("DASK_SCHEDULER_ADDRESS"),
-        help="of Dask: tcp://HOST:PORT or its scheduler file (default: $DASK_SCHEDULER_ADDRESS); extra: cluster",
+        help="Dask scheduler, tcp://HOST:PORT or its file (default: $DASK_SCHEDULER_ADDRESS); extra: cluster",
     )
-    group.add_argument("--threads", type=int, metavar="K", help="of each worker (default: cores / N; of Dask 1)")
+    group.add_argument("--threads", type=int, metavar="K", help="threads of each worker (default: cores / N; Dask: 1)")
     if not any(action.dest == "dry_run" for action in parser._actions):
         group.add_argument("--dry-run", action="store_true", help="list the jobs, their time and memory; run none")
 

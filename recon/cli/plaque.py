@@ -83,12 +83,12 @@ def add_plaque(commands: Commands) -> None:
     parser.add_argument("scan", type=Path, metavar="SCAN", help="scan file written by simulate")
     axes = ("Z", "Y", "X")
     parser.add_argument("--point", type=float, nargs=3, metavar=axes, help="where a reader sees the plaque, mm")
-    parser.add_argument("--point-sd", type=float, default=0.4, metavar="MM", help="its error (default 0.4)")
+    parser.add_argument("--point-sd", type=float, default=0.4, metavar="MM", help="error of the point (default 0.4)")
     parser.add_argument("--particles", type=int, default=300, metavar="N", help="shapes followed (default 300)")
     for tissue in ("wall", "fibrous"):
         parser.add_argument(
             f"--{tissue}", type=float, nargs=2, metavar=("HU", "SD"),
-            help="its value before the data (default: what is usual; the report says it)",
+            help="value and SD that are expected before the scan (default: usual ones, named in the report)",
         )  # fmt: skip
     parser.add_argument("--beside", nargs="*", default=[], choices=("pwls", "mbir"), help="also read these")
     parser.add_argument("--voxel", type=float, default=0.2, metavar="MM", help="voxel size (default 0.2)")

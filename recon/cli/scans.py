@@ -199,12 +199,12 @@ def _add_reader_options(parser: argparse._ActionsContainer, number: str | None =
         help="geometry of files that do not hold it; kind: vectors, rtk, or with pose: in place of the file's own",
     )
     parser.add_argument("--mu-water", type=float, metavar="MM⁻¹", help="attenuation of water: result in HU")
-    parser.add_argument("--axis", type=float, metavar="COLUMN", help="that the rotation axis projects onto")
+    parser.add_argument("--axis", type=float, metavar="COLUMN", help="column that the rotation axis projects onto")
     parser.add_argument(
         "--pitch", type=float, metavar="MM", help="cell width of parallel beams (of files that do not know it)"
     )
     parser.add_argument(
-        "--photons", type=float, metavar="N", help="of an unattenuated reading, of scans given as line integrals"
+        "--photons", type=float, metavar="N", help="photons of an unattenuated reading, for line integrals"
     )
     parser.add_argument("--slices", metavar="A:B", help="slices of parallel and fan beams, or rows of a cone, to read")
 
@@ -557,11 +557,11 @@ def add_reconstruct(commands: Commands) -> None:
         "--look",
         type=float,
         metavar="F",
-        help="of MBIR: 0, quiet … 1, more contrast and noise (default 0.5)",
+        help="MBIR: from 0 (quiet) to 1 (more contrast and noise), default 0.5",
     )
     how.add_argument("--tissues", action="store_true", help="MBIR with the tissues of the vessel in the inset")
-    how.add_argument("--weights", type=Path, metavar="FILE", help="of MBIR: your own (default: those that ship)")
-    how.add_argument("--point", type=float, nargs=3, metavar=axes, help="where a reader sees its plaque, mm")
+    how.add_argument("--weights", type=Path, metavar="FILE", help="weights of MBIR (default: those that ship)")
+    how.add_argument("--point", type=float, nargs=3, metavar=axes, help="with --tissues: point in the plaque, mm")
     where = parser.add_argument_group("voxels")
     where.add_argument("--voxel", type=float, metavar="MM", help="voxel size (default: the detector's; inset: 0.25)")
     own = "of a scan of slices Y X alone"
@@ -623,5 +623,5 @@ def add_lower_dose(commands: Commands) -> None:
     )  # fmt: skip
     examples(parser, "torchpcct lower-dose scan.h5 --fraction 0.25 --out quarter.h5")
     _add_reader_options(parser)
-    parser.add_argument("--fraction", type=float, required=True, metavar="F", help="of the dose, 0 < F ≤ 1")
+    parser.add_argument("--fraction", type=float, required=True, metavar="F", help="share of the dose, 0 < F ≤ 1")
     parser.add_argument("--json", action="store_true", help="print the whole summary as JSON")
