@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from urllib.parse import unquote
 
 import numpy as np
 import pytest
@@ -150,6 +151,29 @@ def test_the_gallery_is_large_enough():
     assert len(GALLERY) >= 12
 
 
+def test_links_of_the_repository_lead_somewhere():
+    """Files that a reader of the repository meets; pages of the site are checked as they are built."""
+    listed = subprocess.run(["git", "ls-files", "*.md"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    found = 0
+    for path in (ROOT / name for name in listed.splitlines()):
+        for link in re.findall(r"\]\(([^)\s]+)\)", path.read_text(encoding="utf-8")):
+            file, _, anchor = link.partition("#")
+            if "://" in link or path.is_relative_to(DOCS):
+                continue
+            found += 1
+            assert (path.parent / file).exists(), f"{path}: {link}"
+            assert not anchor, f"{path}: {link}"
+    assert found > 40
+
+
+def test_the_readme_is_short():
+    """At most 100 lines; at most 40 numerals, code blocks left out (the whole of it has about 60)."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 100
+    prose = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+    assert len(re.findall(r"\d+(?:[.,]\d+)*", prose)) <= 40
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("path", GALLERY, ids=lambda p: p.stem)
 def test_a_script_of_the_gallery_runs(path, tmp_path):
@@ -183,6 +207,15 @@ def test_the_site_builds_without_a_warning_and_without_a_network(tmp_path):
     loads = r"<(?:script|img|iframe)[^>]*src=\"https?://|<link[^>]*rel=\"stylesheet\"[^>]*href=\"https?://"
     pages = list(tmp_path.rglob("*.html"))
     assert len(pages) > 60
+    anchors = {p: set(re.findall(r"\sid=\"([^\"]+)\"", p.read_text(encoding="utf-8"))) for p in pages}
+    for path in pages:
+        for link in re.findall(r"<a\s[^>]*href=\"([^\"]+)\"", path.read_text(encoding="utf-8")):
+            file, _, anchor = unquote(link).partition("#")
+            if "://" in link or link.startswith("mailto:"):
+                continue
+            target = (path.parent / file).resolve() if file else path
+            assert target.exists(), f"{path.name}: {link}"
+            assert not anchor or anchor in anchors.get(target, ()), f"{path.name}: {link}"
     assert not [p.name for p in pages if re.search(loads, p.read_text(encoding="utf-8"))]
 
 
