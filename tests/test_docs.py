@@ -8,12 +8,13 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from urllib.parse import unquote
 
 import numpy as np
 import pytest
 import torch
 
-from torchpcct import FanBeam, ParallelBeam, Projector, VolumeGrid
+from torchpcct import ConeBeam, FanBeam, ParallelBeam, Projector, VolumeGrid
 from torchpcct.vector_geometry import to_vectors
 
 ROOT = Path(__file__).parents[1]
@@ -27,6 +28,89 @@ def test_the_conversions_run():
     found = doctest.testfile(str(DOCS / "explanation" / "conventions.md"), module_relative=False)
     assert found.attempted > 25
     assert not found.failed
+
+
+def _flat(points, source, first, row, column):
+    """Cells of a flat detector, from the source, the centre of cell (0, 0) and the steps to the next row and column."""
+    return np.array([np.linalg.solve(np.c_[row, column, source - p], source - first)[:2] for p in points]).T
+
+
+def _turned(angle):
+    return np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+
+
+def _astra(points, angle):
+    """The vectors of its circular cone beam: 500 and 300 mm, 64 × 128 cells of 1.4 × 1.2 mm."""
+    s, c = np.sin(angle), np.cos(angle)
+    u, v = 1.2 * np.array([c, s, 0]), np.array([0, 0, 1.4])
+    return _flat(points, 500 * np.array([s, -c, 0]), 300 * np.array([-s, c, 0]) - 63.5 * u - 31.5 * v, v, u)
+
+
+def _rtk(points, angle):
+    """Its projection matrix, then origin and spacing of its projection images; its x, y, z are our y, z, x."""
+    s, c = np.sin(angle), np.cos(angle)
+    x, y, z = np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]]) @ points[:, [1, 2, 0]].T
+    return np.array([-1536 * y / (z - 1000) + 5 + 127.5, (-1536 * x / (z - 1000) - 10 + 204.4) / 0.8])
+
+
+def _tigre(points, angle):
+    """Source on +x, the first row at the lowest z, all turned by the angle; offsets 3 and 12 mm."""
+    first = [-536, 0.8 * (0.5 - 512 / 2) + 12, 0.5 - 256 / 2 + 3]
+    turn = _turned(angle)
+    return _flat(points, turn @ [1000.0, 0, 0], turn @ first, np.array([0, 0, 1.0]), turn @ [0, 0.8, 0])
+
+
+def _catsim(points, angle):
+    """Source on +y, modules of one column at angles that grow towards +x, all turned by the angle."""
+    x, y, z = (points @ _turned(angle) - [0, 541, 0]).T
+    column = (np.arctan2(x, -y) + np.arctan(1.25 * 1.0239 / 949)) / (2 * np.arctan(1.0239 / 2 / 949)) + 443.5
+    return np.array([(z * 949 / np.hypot(x, y) - 0.5 * 1.0988) / 1.0988 + 7.5, 887 - column])  # its columns turned over
+
+
+def _dicom_ct_pd(points, angle):
+    """Focal spot at (−ρ sin φ, ρ cos φ); element i, counted from 1, at the angle (i − i₀) Δ / d counter-clockwise."""
+    focus = 595 * np.array([-np.sin(angle), np.cos(angle), 0])
+    x, y, z = (points - focus).T
+    middle = np.arctan2(-focus[1], -focus[0])
+    seen = (np.arctan2(y, x) - middle + np.pi) % (2 * np.pi) - np.pi
+    element = 369.625 + seen * 1085.6 / 1.2858
+    return np.array([32.5 + z * 1085.6 / np.hypot(x, y) / 1.0947 - 1, 736 - element])  # its elements turned over
+
+
+def _ours(points, g):
+    """Cells of the first view by the definitions of the conventions page."""
+    b = g.angles[0]
+    radial, tangential = np.array([np.cos(b), np.sin(b), 0]), np.array([-np.sin(b), np.cos(b), 0])
+    back, u, z = -((points - g.sod * radial) @ radial), points @ tangential, points[:, 2]
+    mm = np.array([z / back, u / back]) * g.sdd
+    if g.detector == "curved":
+        mm = np.array([z / np.hypot(back, u), np.arctan2(u, back)]) * g.sdd
+    middle = np.array([[g.rows - 1], [g.columns - 1]]) / 2
+    return (mm - np.reshape(g.offset, (2, 1))) / np.reshape(g.pitch, (2, 1)) + middle
+
+
+@pytest.mark.parametrize("name", ["astra", "rtk", "tigre", "catsim", "dicom_ct_pd"])
+def test_a_point_is_seen_where_the_other_program_sees_it(name):
+    """The conversions against formulas that each program publishes, written here once more, with nothing of ours."""
+    page = (DOCS / "explanation" / "conventions.md").read_text(encoding="utf-8")
+    names = {}
+    for example in doctest.DocTestParser().get_examples(page):
+        exec(compile(example.source, "conventions.md", "exec"), names)
+    points = np.random.default_rng(1).uniform(-60, 60, (50, 3))
+    theirs = {"astra": _astra, "rtk": _rtk, "tigre": _tigre, "catsim": _catsim, "dicom_ct_pd": _dicom_ct_pd}[name]
+    convert = names[f"from_{name}"]
+    for angle in (0.0, 1.1, 4.4):
+        ours = {
+            "astra": lambda a: ConeBeam(convert([a], 500.0, 300.0, 128, 1.2).angles, 500, 800, 128, 64, (1.4, 1.2)),
+            "rtk": lambda a: convert(
+                [np.rad2deg(a)], 1000.0, 1536.0, (512, 256), (0.8, 1.0), (-204.4, -127.5), (10, -5)
+            ),
+            "tigre": lambda a: convert([a], 1000.0, 1536.0, (256, 512), (1.0, 0.8), (3.0, 12.0)),
+            "catsim": lambda a: convert(1, 541.0, 949.0, 888, 16, 1.0239, 1.0988, -1.25, 0.5, np.rad2deg(a)),
+            "dicom_ct_pd": lambda a: convert([a], 595.0, 1085.6, 736, 64, 1.2858, 1.0947, (369.625, 32.5)),
+        }[name](angle)
+        # CatSim's cells are flat, and their middles lie on chords: 1e-5 of a cell.
+        np.testing.assert_allclose(_ours(points, ours), theirs(points, angle), atol=1e-4 if name == "catsim" else 1e-9)
 
 
 def test_every_public_name_is_in_the_reference(tmp_path):
@@ -67,6 +151,29 @@ def test_the_gallery_is_large_enough():
     assert len(GALLERY) >= 12
 
 
+def test_links_of_the_repository_lead_somewhere():
+    """Files that a reader of the repository meets; pages of the site are checked as they are built."""
+    listed = subprocess.run(["git", "ls-files", "*.md"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    found = 0
+    for path in (ROOT / name for name in listed.splitlines()):
+        for link in re.findall(r"\]\(([^)\s]+)\)", path.read_text(encoding="utf-8")):
+            file, _, anchor = link.partition("#")
+            if "://" in link or path.is_relative_to(DOCS):
+                continue
+            found += 1
+            assert (path.parent / file).exists(), f"{path}: {link}"
+            assert not anchor, f"{path}: {link}"
+    assert found > 40
+
+
+def test_the_readme_is_short():
+    """At most 100 lines; at most 40 numerals, code blocks left out (the whole of it has about 60)."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 100
+    prose = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+    assert len(re.findall(r"\d+(?:[.,]\d+)*", prose)) <= 40
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("path", GALLERY, ids=lambda p: p.stem)
 def test_a_script_of_the_gallery_runs(path, tmp_path):
@@ -100,6 +207,15 @@ def test_the_site_builds_without_a_warning_and_without_a_network(tmp_path):
     loads = r"<(?:script|img|iframe)[^>]*src=\"https?://|<link[^>]*rel=\"stylesheet\"[^>]*href=\"https?://"
     pages = list(tmp_path.rglob("*.html"))
     assert len(pages) > 60
+    anchors = {p: set(re.findall(r"\sid=\"([^\"]+)\"", p.read_text(encoding="utf-8"))) for p in pages}
+    for path in pages:
+        for link in re.findall(r"<a\s[^>]*href=\"([^\"]+)\"", path.read_text(encoding="utf-8")):
+            file, _, anchor = unquote(link).partition("#")
+            if "://" in link or link.startswith("mailto:"):
+                continue
+            target = (path.parent / file).resolve() if file else path
+            assert target.exists(), f"{path.name}: {link}"
+            assert not anchor or anchor in anchors.get(target, ()), f"{path.name}: {link}"
     assert not [p.name for p in pages if re.search(loads, p.read_text(encoding="utf-8"))]
 
 

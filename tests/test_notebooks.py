@@ -158,6 +158,25 @@ def test_benchmark_runs(tmp_path):
     assert "The limit of the data" in text
 
 
+@pytest.mark.slow
+def test_reading_a_plaque_runs(tmp_path):
+    notebook = run("reading_a_plaque.ipynb", tmp_path, 1800)
+    (text,) = (o.data["text/markdown"] for o in outputs(notebook) if "text/markdown" in o.get("data", {}))
+    assert float(text.split("core: ")[1].split(".\n")[0]) > 0.9  # the scan holds a core
+
+
+@pytest.mark.slow
+@needs_weights
+def test_train_your_own_prior_runs(tmp_path):
+    notebook = run("train_your_own_prior.ipynb", tmp_path, 3600)
+    texts = [o.data["text/markdown"] for o in outputs(notebook) if "text/markdown" in o.get("data", {})]
+    assert "weights.safetensors" in texts[0]
+    noise = [float(row.split(" | ")[-1].rstrip(" |")) for row in texts[1].splitlines()[2:]]
+    assert len(noise) == 3
+    assert noise[2] < noise[0]  # the weights that ship, FBP
+    assert [path.name for path in tmp_path.iterdir()] == ["train_your_own_prior.ipynb"]
+
+
 def test_a_full_run_is_a_full_run(tmp_path):
     """The switch is found in the cell itself: a tag once was lost, and ``--full`` ran the quick version."""
     path = tmp_path / "small.ipynb"

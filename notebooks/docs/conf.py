@@ -22,7 +22,7 @@ os.environ["MPLBACKEND"] = "agg"
 os.environ["COLUMNS"] = "100"  # argparse breaks the lines of --help there
 
 from drawing import draw  # noqa: E402
-from pages import canonical, write_api, write_cli, write_results  # noqa: E402
+from pages import canonical, write_api, write_cli, write_notebooks, write_results  # noqa: E402
 
 project, author = "torchpcct", "the authors of torchpcct"
 extensions = [
@@ -120,5 +120,6 @@ def setup(app):
     write_api(HERE / "reference" / "generated")
     write_cli(HERE / "reference" / "generated" / "commands.md")
     write_results(HERE / "reports")
+    write_notebooks(HERE / "reports")
     draw(HERE / "reference" / "generated" / "conventions.svg")
     return {"parallel_read_safe": True}

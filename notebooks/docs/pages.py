@@ -2,7 +2,9 @@
 
 import argparse
 import ast
+import base64
 import importlib.util
+import json
 import re
 from pathlib import Path
 from types import ModuleType
@@ -100,9 +102,10 @@ def write_cli(path):
     parser, commands, _ = _parser()
     shown = {c.dest: c.help for c in commands._choices_actions}
     lines = ["# Command line", "", "Written from the parsers: what `--help` prints.", "", _help(parser)]
-    for name, command in commands.choices.items():
-        lines += [f"## torchpcct {name}", "", f"{shown.get(name) or ''}", "", _help(command)]
-    _write(path, "\n".join([*lines, "## python -m train", "", _help(training())]))
+    for name, command in sorted(commands.choices.items(), key=lambda item: item[0] == "train"):
+        lines += [f"## torchpcct {name}", "", f"{shown.get(name) or ''}", ""]
+        lines += [_help(command)] if name != "train" else []  # it reads its own options
+    _write(path, "\n".join([*lines, _help(training())]))
 
 
 def _help(parser):
@@ -120,6 +123,11 @@ def write_results(folder):
         pictures = [f"![{p}](../../{name}/{p})\n" for p in shown]
         text = re.sub(r"\]\((\w+\.png)\)", rf"](../../{name}/\1)", text)
         _write(folder / f"{name}.md", _linked("\n".join([f"# {name}: {title[2:]}", *pictures, text]), ""))
+    records = (ROOT / "tests" / "bench" / f"{name}.md" for name in ("projectors", "solvers"))
+    speed = re.sub(r"^#", "##", "\n".join(r.read_text(encoding="utf-8") for r in records), flags=re.MULTILINE)
+    speed = re.sub(r"\]\((\w+\.png)\)", r"](../../../tests/bench/\1)", speed)
+    _write(folder / "speed.md", f"# Speed against error\n\n{speed}")
+    names.append("speed")
     toctree = "\n".join(["", "```{toctree}", ":hidden:", *(f"reports/{name}" for name in names), "```", ""])
     _write(
         folder.parent / "results.md",
@@ -134,8 +142,32 @@ def write_results(folder):
         _write(folder / f"{name}.txt", _linked((ROOT / path).read_text(encoding="utf-8"), ""))
 
 
+def write_notebooks(folder):
+    """The stored notebooks as pages, with what they printed and drew."""
+    for path in sorted(HERE.parent.glob("*.ipynb")):
+        parts = []
+        for number, cell in enumerate(json.loads(path.read_text(encoding="utf-8"))["cells"]):
+            source = "".join(cell["source"])
+            if cell["cell_type"] == "markdown":
+                parts.append(_linked(re.sub(r"\]\((\w+)\.ipynb\)", r"](notebook_\1.md)", source), ""))
+                continue
+            parts.append("```python\n" + re.sub(r"^%.*\n", "", source, flags=re.MULTILINE) + "\n```")
+            for output in cell["outputs"]:
+                data = output.get("data", {})
+                if "image/png" in data:
+                    picture = folder / f"notebook_{path.stem}_{number}.png"
+                    picture.parent.mkdir(parents=True, exist_ok=True)
+                    picture.write_bytes(base64.b64decode(data["image/png"]))
+                    parts.append(f"![what the cell above drew]({picture.name})")
+                elif "text/markdown" in data:
+                    parts.append(re.sub(r"^#", "###", "".join(data["text/markdown"]), flags=re.MULTILINE))
+        _write(folder / f"notebook_{path.stem}.md", "\n\n".join([*parts, ""]))
+
+
 def _linked(text, to):
     text = re.sub(r"\]\((\w+)/report\.md\)", rf"]({to}\1.md)", text)
+    text = re.sub(r"\]\([^)]*tests/bench/(?:projectors|solvers)\.md\)", rf"]({to}speed.md)", text)
+    text = text.replace("](docs/", "](")
     return re.sub(r"\[([^\]]*)\]\([^)]*(?:causes|size|training|RESULTS)\.md\)", r"`\1`", text)
 
 

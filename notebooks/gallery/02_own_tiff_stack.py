@@ -16,7 +16,7 @@ from torchpcct import VolumeGrid
 from torchpcct.formats.scans import open_scan
 
 work, rng, u = Path(tempfile.mkdtemp()), np.random.default_rng(0), np.arange(128) - 63.5
-for k, angle in enumerate(np.linspace(0, np.pi, 180, endpoint=False)):  # the camera is played: water with a pin in it
+for k, angle in enumerate(np.linspace(0, np.pi, 180, endpoint=False)):  # a simulated camera: water with a pin
     lengths = [2 * np.sqrt(np.clip(r**2 - (u - at) ** 2, 0, None)) for r, at in ((40, 0), (5, -20 * np.sin(angle)))]
     tifffile.imwrite(work / f"p{k:04d}.tif", rng.poisson(20000 * np.exp(-0.02 * sum(lengths)), (4, 128)).astype("u2"))
 (work / "scan.yaml").write_text("""{readings: "p*.tif", kind: counts, air: 20000, mu_water: 0.02, geometry:

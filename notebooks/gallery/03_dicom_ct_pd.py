@@ -19,8 +19,8 @@ folder, gamma = Path(tempfile.mkdtemp()), (np.arange(256) - 127.5) * 2 / 1085.6 
 tags = {0x70291002: ("FL", 2.0), 0x70291006: ("FL", 2.0), 0x7029100B: ("CS", "CYLINDRICAL"), 0x70291010: ("US", 4)}
 tags |= {0x70291011: ("US", 256), 0x70311002: ("FL", 0.0), 0x70311003: ("FL", 595.0), 0x70311031: ("FL", 1085.6)}
 tags |= {0x70311033: ("FL", [128.5, 2.5]), 0x7033100E: ("CS", "FFSNONE"), 0x70411001: ("DS", "0.02")}
-for k, phi in enumerate(2 * np.pi * np.arange(240) / 240):  # the scanner is played: 20 cm of water, a file a view
-    across = 595 * np.sin(gamma) - 40 * np.cos(phi + gamma)  # of each ray, from the middle of the water at x = 40 mm
+for k, phi in enumerate(2 * np.pi * np.arange(240) / 240):  # a simulated scanner: 20 cm of water, a file a view
+    across = 595 * np.sin(gamma) - 30 * np.cos(phi + gamma)  # of each ray, from the middle of the water at x = 30 mm
     path = 0.04 * np.sqrt(np.clip(100**2 - across**2, 0, None))
     d = Dataset()
     d.preamble = bytes(128)
@@ -37,5 +37,5 @@ volume = recon.reconstruct(open_scan(folder), VolumeGrid((2, 150, 150), 2.0), "f
 plt.figure(figsize=(4.6, 3.6), layout="constrained")
 plt.imshow(volume.data[1], cmap="gray", vmin=-200, vmax=200, extent=(-150, 150) * 2, origin="lower")
 plt.colorbar(label="HU")
-plt.gca().set(xlabel="x, mm", ylabel="y, mm", title="20 cm of water, its middle at x = 40 mm")
+plt.gca().set(xlabel="x, mm", ylabel="y, mm", title="20 cm of water, its middle at x = 30 mm")
 print(f"water reads {float(volume.data[1, 60:90, 80:110].mean()):.1f} HU")

@@ -19,7 +19,7 @@ fig, axes = plt.subplots(1, 3, figsize=(10, 3.2), layout="constrained")
 for ax, (fidelity, volume) in zip(axes, volumes.items(), strict=True):
     noise = float(volume.data[:, :8].std())  # rows of plain fat
     shown = ax.imshow(volume.data[25], cmap="gray", vmin=-150, vmax=450, extent=(-4.5, 4.5) * 2, origin="lower")
-    ax.set(title=f"look = {fidelity:g}: {noise:.0f} HU in fat", xlabel="x, mm", ylabel="y, mm")
-    print(f"look {fidelity:g}: noise in fat {noise:.1f} HU")
+    ax.set(title=f"fidelity = {fidelity:g}: {noise:.0f} HU in fat", xlabel="x, mm", ylabel="y, mm")
+    print(f"fidelity {fidelity:g}: noise in fat {noise:.1f} HU")
 fig.colorbar(shown, ax=axes, label="HU")
 print("what the training did not see:", volumes[0.5].report["warnings"] or "nothing")

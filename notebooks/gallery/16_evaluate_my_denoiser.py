@@ -1,7 +1,7 @@
 """
 Evaluate my denoiser
 ====================
-How much dose does *your* denoiser really save? (Here a Gaussian filter: quiet pictures, little dose saved.)
+How much dose does *your* denoiser really save? (Here it is a Gaussian filter: quiet images, little dose saved.)
 """
 
 import matplotlib.pyplot as plt

@@ -496,7 +496,7 @@ def reconstruct_to(
     begun = file.done
     if begun or any(sides):
         plan = plan_slabs(g, grid, memory, method, sides=sides, done=begun, parts=parts)
-    maker = _Maker(source, grid, method, kernel, sides, options)
+    maker = _Maker(source, grid, method, kernel, sides, dict(options))
     found: dict[str, float] = {}  # in the order of their appearance
     low, high, total = math.inf, -math.inf, 0.0
 

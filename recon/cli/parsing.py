@@ -278,9 +278,9 @@ def add_execution(parser: Parser, dry_run: bool = True) -> None:
     add_options(
         parser,
         ("--workers", int, "N", "processes of this machine (default: this one alone)"),
-        ("--scheduler", str, "ADDRESS", "of Dask: tcp://HOST:PORT or its scheduler file (default: "
+        ("--scheduler", str, "ADDRESS", "Dask scheduler, tcp://HOST:PORT or its file (default: "
          "$DASK_SCHEDULER_ADDRESS); extra: cluster", {"default": scheduler}),
-        ("--threads", int, "K", "of each worker (default: cores / N; of Dask 1)"),
+        ("--threads", int, "K", "threads of each worker (default: cores / N; Dask: 1)"),
         *([("--dry-run", bool, None, "list the jobs, their time and memory; run none")] if dry_run else []),
         group="several processes or machines",
     )  # fmt: skip

@@ -32,12 +32,12 @@ _STYLE = (
     "img{max-width:100%}code{background:#f2f4f6;overflow-wrap:anywhere}"
 )
 _INTRO = """\
-Dose factor: the dose that {reference} needs for the same figure, divided by the method's. Brackets: 95 % intervals over
-{n} noise realisations, the same for all methods; figures without brackets are exact. Noise: of a voxel, over
-realisations. Error: root mean square near the bodies. Undershoot: least error beside them without noise; far below 0
-means a dark rim. Slope: contrast that the signal adds over the true one; contrasts are compared at slope 1. Without
-signal: contrast read where there is none. CNR: of the paper's protocol. d′: of an observer who knows the place. Limit:
-an unbiased estimate that knows all outlines."""
+Dose factor: the dose that {reference} needs for the same figure, divided by the dose of the method. Brackets: 95 %
+intervals over {n} noise realisations, the same for all methods; figures without brackets are exact. Noise: standard
+deviation of a voxel. Error: root mean square near the bodies. Undershoot: lowest error beside them, without noise; far
+below 0 means a dark rim. Slope: contrast that the signal adds, over the true one; contrasts are compared at slope 1.
+Without signal: contrast that is read where there is none. CNR: contrast-to-noise ratio by the paper's protocol. d′: how
+well an observer who knows the place detects the signal. Limit: the best that an unbiased estimate can do."""
 
 
 def text_of(evaluation: Evaluation) -> str:

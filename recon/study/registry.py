@@ -28,7 +28,7 @@ STUDIES: dict[str, str] = {
     "motion": "residual motion in PCCT and EID-CT, and reconstruction with the motion known, exactly or not",
     "noise": "FBP with every kernel, voxel size and dose: CNR tables, and which rankings they establish",
     "resolution": "PCCT and EID-CT without noise, blurred step by step: lumen, cap and core by thresholds",
-    "hardcases": "starved, broken, incomplete and wrongly described scans: which results are wrong, and who says so",
+    "hardcases": "scans with too few photons, faults, missing data or a wrong description: which results are wrong",
     "spectral": "energy bins into PE and PVC: monochromatic images, best energy, tissue maps, by FBP and joint MBIR",
 }
 """Name → one line of help. The study ``some-name`` is the module ``recon.study.some_name``."""
