@@ -289,8 +289,14 @@ class Cluster(Executor):
 
     def check(self) -> None:
         """Raise ``ConnectionError`` if the scheduler is gone, or was: it has forgotten what it was given."""
-        lost = any(state.status == "lost" for state in list(self.client.futures.values()))
-        if lost or self.client.status in ("closing", "closed"):
+        # What only a dead worker held is lost as well, but the scheduler knows it and has it computed again.
+        lost = [key for key, state in list(self.client.futures.items()) if state.status == "lost"]
+        if self.client.status in ("closing", "closed") or (
+            lost
+            and self.client.run_on_scheduler(
+                lambda keys, dask_scheduler: any(key not in dask_scheduler.tasks for key in keys), lost
+            )
+        ):
             raise _gone(self)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
