@@ -169,11 +169,6 @@ def _run_study(name: str, settings: Any, arguments: argparse.Namespace, progress
     require_writable(folder)
     names = (name, registry.folder(name).replace("_", "-"))
     check_results(arguments, folder, lambda report: report.get("study") in names, "report.*", "*.png")
-    minutes = {part: seconds / 60 for part, seconds in settings.estimated_seconds().items()}
-    if minutes:
-        listed = ", ".join(f"{part} {value:.1f}" for part, value in minutes.items())
-        total = f"about {sum(minutes.values()):.0f} min on two idle cores if nothing is finished yet"
-        print(f"{total} ({listed})", file=sys.stderr)
     from recon.evaluate.store import Pieces  # loads torch
 
     start = time.perf_counter()

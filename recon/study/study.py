@@ -93,10 +93,6 @@ class StudySettings:
         """Settings of a first look in under a minute, with ``changes`` on top."""
         return cls(**{**cls.QUICK, **changes})
 
-    def estimated_seconds(self) -> dict[str, float]:
-        """Rough time of each part in s on two idle cores, nothing finished yet; empty: not known."""
-        return {}
-
     def check_whole(self, **least: int) -> None:
         """Check fields that count something: field → the least value.
 

@@ -2,11 +2,16 @@
 
 Data are projected from voxels of half the size: what is fitted must not share its painting."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import torch
 from inset_operators import HU, problem
 
 from recon.gram.gram import Gram
+from recon.mbir.mbir import Mbir
+from recon.mbir.network import NetworkConfig
+from recon.mbir.unrolled import Unrolled
 from recon.plaque.data import TissueData
 from torchpcct import Projector, VolumeGrid
 
@@ -68,3 +73,25 @@ def data(gram, volume, seed=None):
     if seed is not None:
         b = b + gram.noise(generator=torch.Generator().manual_seed(seed)) * HU
     return TissueData(b, gram, HU**2)
+
+
+def inset():
+    """What MBIR asks of an inset's problem."""
+    gram = operator()
+    return SimpleNamespace(gram=gram, grid=gram.grid, mu_ref=1000.0 * HU, level=910.0 * HU)
+
+
+def statistic(drawn, seen, seed, exposure_s=1.0):
+    """``(1, z, y, x)`` b of HU on ``gram.finer`` in an :func:`inset`; noise of a seed, None: without noise."""
+    noise = 0.0 if seed is None else drawn.gram.noise(generator=torch.Generator().manual_seed(seed))
+    clean = drawn.gram.statistic((seen / 1000.0 + 1.0) * drawn.mu_ref - drawn.level)
+    return (exposure_s * clean + exposure_s**0.5 * noise)[None]
+
+
+def untrained():
+    """MBIR of an untrained network: the linear start, and the data's low frequencies."""
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        model = Unrolled(NetworkConfig((6, 8, 8), 0.3), 2)
+    model.seen_scale_hu = torch.tensor([1.0, 5000.0])
+    return Mbir(model)

@@ -1,44 +1,29 @@
 """MBIR around the outlines of a vessel: sharper where they fit, the plain reconstruction where they do not."""
 
-from types import SimpleNamespace
-
 import drawn_vessel
 import numpy as np
 import pytest
 import torch
-from inset_operators import HU
 
 from recon.mbir import outlines
-from recon.mbir.mbir import Mbir
-from recon.mbir.network import NetworkConfig
 from recon.mbir.outlines import Drawn, OutlineMbir
-from recon.mbir.unrolled import Unrolled
 
 
 @pytest.fixture(scope="module")
 def drawn():
-    gram = drawn_vessel.operator()
-    return SimpleNamespace(gram=gram, grid=gram.grid, mu_ref=1000.0 * HU, level=910.0 * HU)
+    return drawn_vessel.inset()
 
 
 @pytest.fixture(scope="module")
 def network():
-    """Untrained: the linear start, and the data's low frequencies."""
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        model = Unrolled(NetworkConfig((6, 8, 8), 0.3), 2)
-    model.seen_scale_hu = torch.tensor([1.0, 5000.0])
-    return Mbir(model)
+    return drawn_vessel.untrained()
 
 
 EXPOSURE_S = 0.25
 
 
 def statistic(drawn, image, seed):
-    """Of noise with the seed; None: without noise."""
-    noise = 0.0 if seed is None else drawn.gram.noise(generator=torch.Generator().manual_seed(seed))
-    clean = drawn.gram.statistic((image / 1000.0 + 1.0) * drawn.mu_ref - drawn.level)
-    return (EXPOSURE_S * clean + EXPOSURE_S**0.5 * noise)[None]
+    return drawn_vessel.statistic(drawn, image, seed, EXPOSURE_S)
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import drawn_vessel
 import numpy as np
 import pytest
 import torch
-from inset_operators import HU
+from drawn_vessel import statistic
 from small_scan import GRID
 
 from recon import reconstruct
@@ -24,8 +24,7 @@ BALL = np.s_[2:5, 2:5, 2:5]
 
 @pytest.fixture(scope="module")
 def drawn():
-    gram = drawn_vessel.operator()
-    return SimpleNamespace(gram=gram, grid=gram.grid, mu_ref=1000.0 * HU, level=910.0 * HU)
+    return drawn_vessel.inset()
 
 
 @pytest.fixture(scope="module")
@@ -38,12 +37,7 @@ def fine(drawn):
 
 @pytest.fixture(scope="module")
 def network():
-    """Untrained: the linear start, and the data's low frequencies."""
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        model = Unrolled(NetworkConfig((6, 8, 8), 0.3), 2)
-    model.seen_scale_hu = torch.tensor([1.0, 5000.0])
-    return Mbir(model)
+    return drawn_vessel.untrained()
 
 
 @pytest.fixture(scope="module")
@@ -51,11 +45,6 @@ def truth(drawn):
     image = drawn_vessel.image(drawn.grid, 100.0)
     image[BALL] += 300.0
     return image
-
-
-def statistic(drawn, image, seed):
-    noise = drawn.gram.noise(generator=torch.Generator().manual_seed(seed))
-    return (drawn.gram.statistic((image / 1000.0 + 1.0) * drawn.mu_ref - drawn.level) + noise)[None]
 
 
 @pytest.fixture(scope="module")
