@@ -307,7 +307,7 @@ def add_compare(commands: Commands) -> None:
     )  # fmt: skip
     add_options(
         parser,
-        ("--n", int, "N", "realisations (default 10)"),
+        ("--n", int, "N", "realisations (default 16)"),
         ("--methods", str, "METHOD", "as of evaluate --method", {"nargs": "+"}),
         ("--quick", bool, None, "reduced views and methods: a first look, < 45 s"),
     )

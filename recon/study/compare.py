@@ -53,7 +53,7 @@ class Settings(StudySettings):
     methods: tuple[str, ...] = (
         "fbp:soft", "fbp:standard", "fbp:detail", "fbp:bone", "pwls", "bilateral@fbp:detail", "mbir"
     )  # fmt: skip
-    n: int = 10
+    n: int = 16
     seed: int = 0
     views: int = paper.FULL_VIEWS["PCCT"]
     exposures_s: tuple[float, ...] = (0.35, 2.0)
