@@ -3,14 +3,15 @@
 A network that sees some millimetres about a voxel has to find every piece of a vessel's outline by itself, in the noise
 of that place. A contrast-enhanced vessel has two smooth outlines over its whole length (lumen and outer wall, a dozen
 numbers a centimetre), so the data determine them far better (:mod:`recon.plaque.vessel`). With T the drawn vessel, in
-whose fibrous layer the plain reconstruction x₀ stands,
+whose fibrous layer the best linear estimate of its contents stands (:mod:`recon.plaque.layer`),
 
     u = T + MBIR(β − H T),
 
-so plaque, and whatever else the drawing lacks (a branch, muscle, texture), comes from the data as ever, beside an edge
-that is no longer there to bleed into it.
+so whatever the drawing lacks (a branch, muscle, texture) comes from the data as ever, beside an edge that is no longer
+there to bleed into it.
 
-Where no vessel is found, or a drawn one does not explain the data outside of its fibrous layer, the result is x₀.
+Where no vessel is found, or a drawn one does not explain the data outside of its fibrous layer, the result is the plain
+reconstruction MBIR(β).
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ from torch import Tensor
 from recon.least_squares.inset_problem import InsetProblem
 from recon.mbir.mbir import Mbir, Solution
 from recon.plaque.data import TissueData
+from recon.plaque.layer import LayerEstimate
 from recon.plaque.quality import STRIKING, scores_of
-from recon.plaque.reading import drawn_image, drawn_layer
 from recon.plaque.start import find_vessel
 from recon.plaque.vessel import Vessel
 from recon.plaque.vessel_prior import VesselPrior
@@ -55,7 +56,7 @@ class Drawn:
 class OutlineMbir(Mbir):
     """:class:`recon.mbir.mbir.Mbir` around the outlines of a vessel.
 
-    The fit of the outlines is not differentiated, what the network makes of the rest is.
+    It is differentiable in the statistic; the fit by its linear model (of Gauss and Newton) at the mode.
 
     Args:
         network: gives weights, fidelity and parts.
@@ -68,54 +69,70 @@ class OutlineMbir(Mbir):
 
     def solved(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> Solution:
         """See :meth:`recon.mbir.mbir.Mbir.solved`; the notes hold ``outlines``: whether they were drawn, or why not."""
-        plain = super().solved(problem, b, exposure_s)
-        volumes = self.in_hu(problem, plain.u, plain.normal)
-        found = [self.drawn(problem, b[k], exposure_s, volumes[k]) for k in range(b.shape[0])]
-        at = [k for k, one in enumerate(found) if one.image is not None]
+        found = [self.drawn(problem, own, exposure_s) for own in b]
         notes = [one.note for one in found]
-        if not at:
-            return replace(plain, notes=notes)
-        normal = plain.normal
-        some = replace(normal, beta=normal.beta[at], scale_hu=normal.scale_hu[at], factor=normal.factor[at])
-        images = self.in_noise_units(
-            problem, torch.stack([v for v in (one.image for one in found) if v is not None]), some
-        )
-        u = images + self.model(replace(some, beta=some.beta - some.apply(images)), self.fidelity, **self.parts)
-        explained = []
-        for j, (k, volume) in enumerate(zip(at, self.in_hu(problem, u.detach(), some), strict=True)):
+        images = [one.image for one in found]
+        if all(image is None for image in images):
+            return replace(super().solved(problem, b, exposure_s), notes=notes)
+        normal = self.problem(problem, b, exposure_s)
+        # Nothing is drawn where the volume is that of the surround.
+        nothing = self.in_hu(problem, torch.zeros_like(b), normal)
+        drawn = torch.stack([n if image is None else image for image, n in zip(images, nothing, strict=True)])
+        t = self.in_noise_units(problem, drawn, normal)
+        u = t + self.model(replace(normal, beta=normal.beta - normal.apply(t)), self.fidelity, **self.parts)
+        refused = []
+        for k, volume in enumerate(self.in_hu(problem, u.detach(), normal)):
             highest = found[k].unexplained(volume)
-            if highest <= STRIKING:
-                explained.append(j)
-            else:
+            if highest > STRIKING:
+                refused.append(k)
                 notes[k] |= _unused(f"its outlines leave {highest:.0f} standard deviations of the noise unexplained")
-        places = torch.tensor([at[j] for j in explained], dtype=torch.long)
-        return Solution(normal, plain.u.index_copy(0, places, u[explained]), notes)
+        if refused:
+            places = torch.tensor(refused)
+            u = u.index_copy(0, places, super().solved(problem, b[places], exposure_s).u)
+        return Solution(normal, u, notes)
 
-    def drawn(self, problem: InsetProblem, b: Tensor, exposure_s: float, plain: Tensor) -> Drawn:
+    def drawn(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> Drawn:
         """What is drawn of one scan.
 
         Args:
             problem: of the scan.
             b: its statistic ``(z, y, x)``.
             exposure_s: of b.
-            plain: x₀, HU ``(z, y, x)``.
         """
         data = TissueData.of_statistic(b.detach(), problem, exposure_s)
         try:
             # Many small matrices: BLAS threads would wait for each other.
             with threadpool_limits(limits=1, user_api="blas"):
                 vessel = Vessel(data, find_vessel(data.pilot(), data.grid, None), self.vessel_prior)
-                fit = vessel.fit(vessel.first_guess(), expected=True)
+                estimate = LayerEstimate(vessel.fit(vessel.first_guess(), expected=True))
         except (ValueError, np.linalg.LinAlgError) as error:
             return Drawn(None, _unused(str(error)))
-        image, layer = (torch.from_numpy(v).to(plain) for v in (drawn_image(vessel, fit), drawn_layer(vessel, fit)))
+        fit = estimate.fit
+        outlines, layer = (torch.from_numpy(v).to(b) for v in (fit.image, vessel.on_grid(estimate.share)))
 
         def unexplained(volume: Tensor) -> float:
             # The fibrous layer is not asked: the model has nothing but fibrous tissue there.
-            there = data.apply(layer * (volume - image))
+            there = data.apply(layer * (volume - outlines))
             return float(np.abs(scores_of(vessel, fit, there)).max())
 
-        return Drawn(image + layer * (plain - image), {"outlines": {"used": True}}, unexplained)
+        image = _Linear.apply(b, estimate, problem.mu_ref / 1000.0)
+        return Drawn(image, {"outlines": {"used": True}}, unexplained)
+
+
+class _Linear(torch.autograd.Function):
+    """The image of an estimate, whose change with b is linear and symmetric."""
+
+    @staticmethod
+    def forward(ctx: Any, b: Tensor, estimate: LayerEstimate, mu_per_hu: float) -> Tensor:
+        ctx.kept = estimate, mu_per_hu
+        return torch.from_numpy(estimate.image).to(b)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> Any:
+        estimate, mu_per_hu = ctx.kept
+        with threadpool_limits(limits=1, user_api="blas"):
+            change = estimate.change(grad.detach().double().numpy())
+        return torch.from_numpy(change).to(grad) * mu_per_hu, None, None
 
 
 def _unused(why: str) -> dict[str, Any]:

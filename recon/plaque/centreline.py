@@ -130,6 +130,10 @@ class Centreline:
         around = -np.sin(theta)[:, None] * first + np.cos(theta)[:, None] * second
         return Coordinates(s, np.maximum(rho, 1e-6), theta, np.stack([away, around, t], axis=1))
 
+    def within(self, points: Floats, distance: float) -> NDArray[np.intp]:
+        """Which of the points ``(n, 3)`` lie nearer than ``distance`` mm, to some hundredths of a millimetre."""
+        return np.flatnonzero(np.isfinite(self._tree.query(points, distance_upper_bound=distance)[0]))
+
     @cached_property
     def _tree(self) -> Any:
         return cKDTree(self._samples[1])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -15,6 +14,7 @@ from torch import Tensor
 
 from recon.conjugate_gradient import conjugate_gradient
 from recon.plaque.data import TissueData
+from recon.plaque.layer import correlating
 from recon.plaque.vessel import FAT, FIBROUS, Fit, Vessel
 
 __all__ = ["Leftover", "Texture", "beside", "leftover", "misfit", "scores_of", "texture"]
@@ -208,24 +208,7 @@ def texture(vessel: Vessel, fit: Fit, rng: np.random.Generator) -> Texture:
     soft = np.clip(outer - lumen, 0.0, 1.0)
     for body in fit.bodies[:-1]:
         soft = soft * (1.0 - np.clip(body, 0.0, 1.0))
-    grid = vessel.grid
-    # White noise through a kernel of unit norm and σ = ℓ/√2 has unit variance and the correlation exp(−r²/2ℓ²).
-    sd = [LENGTH_MM / math.sqrt(2.0) / step for step in grid.spacing]
-    spike = np.zeros([2 * math.ceil(4 * s) + 1 for s in sd])
-    spike[tuple(n // 2 for n in spike.shape)] = 1.0
-    norm_of = math.sqrt(float((ndimage.gaussian_filter(spike, sd, mode="constant") ** 2).sum()))
-    low, high = vessel.index.min(0), vessel.index.max(0) + 1
-    box, place = tuple(high - low), tuple((vessel.index - low).T)
-
-    def smooth(v: Any) -> Floats:
-        """Columns ``(n, k)``."""
-        out: Floats = np.empty(v.shape)
-        for k in range(v.shape[1]):
-            volume = np.zeros(box)
-            volume[place] = v[:, k]
-            out[:, k] = ndimage.gaussian_filter(volume, sd, mode="constant")[place] / norm_of
-        return out
-
+    smooth = correlating(vessel, LENGTH_MM)
     signs = rng.integers(0, 2, (len(soft), _PROBES)) * 2.0 - 1.0
     probes = soft[:, None] * smooth(signs)
     single = probes.astype(np.float32)

@@ -18,12 +18,12 @@ from recon.plaque.figures import Estimate, draws_of, estimate
 from recon.plaque.particles import Cloud, lead
 from recon.plaque.quality import STRIKING, Leftover, beside, leftover, misfit, texture
 from recon.plaque.start import find_vessel
-from recon.plaque.vessel import FAT, FIBROUS, Fit, Vessel
+from recon.plaque.vessel import FIBROUS, Fit, Vessel
 from recon.plaque.vessel_prior import VesselPrior
 from torchpcct.geometry import VolumeGrid
 from torchpcct.validate import checked, number, numbers, whole
 
-__all__ = ["CERTAIN", "PlaqueReading", "core_regions", "drawn_image", "drawn_layer", "read_plaque", "read_regions"]
+__all__ = ["CERTAIN", "PlaqueReading", "core_regions", "read_plaque", "read_regions"]
 
 Floats = NDArray[np.float64]
 
@@ -68,8 +68,6 @@ class PlaqueReading:
             the method, not to be quoted where they are refused.
         regions: tissue → ``grid.shape`` float32 share of each voxel (posterior mean; the core's if it is there).
         image: ``grid.shape`` float32 HU, the fitted tissues, the core included.
-        image_without: the same of the vessel fitted without a core.
-        layer: ``grid.shape`` float32, share of each voxel in that vessel's fibrous layer, calcifications left out.
         chi2: mean square of the residual on the vessel's voxels, but for those at its ends inside of the volume, over
             its expectation; chi2_sd: its standard deviation under the model.
         taken_off_hu: largest value beside the vessel that was taken off the data, 0 where nothing was. Otherwise no
@@ -88,8 +86,6 @@ class PlaqueReading:
     given_core: Mapping[str, Estimate]
     regions: Mapping[str, NDArray[np.float32]]
     image: NDArray[np.float32]
-    image_without: NDArray[np.float32]
-    layer: NDArray[np.float32]
     chi2: float
     chi2_sd: float
     left: Leftover
@@ -358,8 +354,8 @@ def _read(
             return both
     reading = PlaqueReading(
         vessel.grid, presence, more if other_core is None else other_core["probability"], calcifications, figures, {},
-        given, _regions(vessel, fit, space, shares, calcifications), drawn_image(vessel, fit),
-        drawn_image(vessel, plain), drawn_layer(vessel, plain), square, spread, left, tau.sd_hu, tau.high_hu,
+        given, _regions(vessel, fit, space, shares, calcifications), fit.image, square, spread, left, tau.sd_hu,
+        tau.high_hu,
         {"particles": particles, "seed": seed, "log_evidence": cloud.log_evidence, "log_evidence_first": first,
          "point": prior_of_core.point, "vessel_prior": asdict(vessel.prior),
          "voxels": len(vessel.index),
@@ -421,12 +417,6 @@ def _core_told(space: CoreSpace, cloud: Cloud, contrast: float, probability: flo
             "volume_mm3": float(seen.volume.mean())}  # fmt: skip
 
 
-def _on_grid(vessel: Vessel, values: Floats, outside: float = 0.0) -> NDArray[np.float32]:
-    out = np.full(vessel.grid.shape, outside, np.float32)
-    out[tuple(vessel.index.T)] = values
-    return out
-
-
 def _regions(
     vessel: Vessel, fit: Fit, space: CoreSpace, shares: NDArray[np.float32], calcifications: int
 ) -> dict[str, NDArray[np.float32]]:
@@ -442,19 +432,6 @@ def _regions(
         parts["calcification"] = hard
     if len(bodies) > calcifications:
         parts["second core"] = bodies[-1]
-    found = {"fat": _on_grid(vessel, 1.0 - outer, 1.0)}
-    found |= {name: _on_grid(vessel, np.clip(part, 0.0, 1.0)) for name, part in parts.items()}
+    found = {"fat": vessel.on_grid(1.0 - outer, 1.0)}
+    found |= {name: vessel.on_grid(np.clip(part, 0.0, 1.0)) for name, part in parts.items()}
     return found
-
-
-def drawn_layer(vessel: Vessel, fit: Fit) -> NDArray[np.float32]:
-    """``grid.shape`` share of each voxel in the fibrous layer, less its bodies."""
-    _, inner, lumen = fit.drawing.shares
-    share: Floats = np.clip(inner - lumen, 0.0, 1.0) * np.clip(1.0 - fit.bodies.sum(0), 0.0, 1.0)
-    return _on_grid(vessel, share)
-
-
-def drawn_image(vessel: Vessel, fit: Fit) -> NDArray[np.float32]:
-    """``grid.shape`` HU, a fitted vessel as means over the voxels."""
-    fat = fit.parameters[FAT]
-    return _on_grid(vessel, fat + vessel.voxel_means(fit.drawing.soft), fat)

@@ -119,7 +119,7 @@ class Fit:
         energy: ½ xᵀGx − bᵀx − log prior, without constants.
         residual: ``(n,)`` b − Gx on the voxels, HU⁻¹.
         gradient: ``(p,)`` of −energy, about 0.
-        hessian: ``(p, p)``; factor: its Cholesky factor.
+        precision: ``(p, p)`` of the prior.
         bodies: shares of the fibrous layer, ``(k, n)``.
         vessel: that was fitted.
     """
@@ -129,10 +129,24 @@ class Fit:
     energy: float
     residual: Floats
     gradient: Floats
-    hessian: Floats
-    factor: Any
+    precision: Floats
     bodies: Floats
     vessel: Vessel
+
+    @cached_property
+    def hessian(self) -> Floats:
+        """``(p, p)``, Gauss and Newton's."""
+        assert self.drawing.jacobian is not None
+        hessian: Floats = (self.drawing.jacobian.T @ self.curved).astype(np.float64)
+        # Fat fills the whole volume.
+        hessian[FAT] += self.vessel.ones @ self.drawing.jacobian
+        hessian[FAT, FAT] += self.vessel.ones_energy
+        return 0.5 * (hessian + hessian.T) + self.precision
+
+    @cached_property
+    def factor(self) -> Any:
+        """Cholesky factor of the Hessian."""
+        return cho_factor(self.hessian, lower=True)
 
     @cached_property
     def curved(self) -> NDArray[np.float32]:
@@ -146,6 +160,19 @@ class Fit:
     def covariance(self) -> Floats:
         """``(p, p)``, of the Laplace approximation."""
         return np.asarray(cho_solve(self.factor, np.eye(len(self.parameters))))
+
+    @property
+    def image(self) -> NDArray[np.float32]:
+        """``grid.shape`` HU, the vessel as means over the voxels."""
+        fat, vessel = self.parameters[FAT], self.vessel
+        return vessel.on_grid(fat + vessel.voxel_means(self.drawing.soft), fat)
+
+    @property
+    def layer(self) -> Floats:
+        """``(n,)`` share of each voxel in the fibrous layer, less its bodies."""
+        _, inner, lumen = self.drawing.shares
+        share: Floats = np.clip(inner - lumen, 0.0, 1.0) * np.clip(1.0 - self.bodies.sum(0), 0.0, 1.0)
+        return share
 
 
 def _behind(distance: Floats, variance: Floats) -> tuple[Floats, Floats]:
@@ -170,18 +197,21 @@ class Vessel:
         low = max(start.ends[0], -1.0) - 1.0
         high = min(start.ends[1], start.lumen.length + 1.0) + 1.0
         points = np.stack(np.meshgrid(*grid.axes, indexing="ij"), -1).reshape(-1, 3)
-        near = start.outer.coordinates(points)
+        close = start.outer.within(points, start.radii[1][1].max() + 1.5 * _MARGIN_MM)
+        near = start.outer.coordinates(points[close])
         reach = np.interp(near.s, *start.radii[1])
         # Voxels of the vessel, and some beyond its ends, if it has any inside.
-        wide = np.flatnonzero(near.rho < reach + _MARGIN_MM)
+        beside = near.rho < reach + _MARGIN_MM
+        wide = close[beside]
         along = start.lumen.coordinates(points[wide]).s
-        flat = wide[(along > start.ends[0] - _MARGIN_MM) & (along < start.ends[1] + _MARGIN_MM)]
+        kept = (along > start.ends[0] - _MARGIN_MM) & (along < start.ends[1] + _MARGIN_MM)
+        flat, own = wide[kept], np.flatnonzero(beside)[kept]
         self.index = np.stack(np.unravel_index(flat, grid.shape), 1).astype(np.int64)
         self.lookup = np.full(grid.shape, -1, np.int64)  # position of each of the grid's voxels in the index
         self.lookup.ravel()[flat] = np.arange(len(flat))
         self.points = points[flat]
         self.sd = SOFT * np.array(grid.spacing)
-        self.outer_at = Coordinates(near.s[flat], near.rho[flat], near.theta[flat], near.frame[flat])
+        self.outer_at = Coordinates(near.s[own], near.rho[own], near.theta[own], near.frame[own])
         self.lumen_at = start.lumen.coordinates(self.points)
         low, high = min(low, float(self.lumen_at.s.min())), max(high, float(self.lumen_at.s.max()))
         self.lumen_outline = Outline(low, high, self.prior.orders)
@@ -264,6 +294,12 @@ class Vessel:
         """Means over the voxels of ``(n,)`` values that are drawn as softly as outlines."""
         return np.asarray(self._less(soft, SOFT**2 - BOX))
 
+    def on_grid(self, values: Floats, outside: float = 0.0) -> NDArray[np.float32]:
+        """``(n,)`` values on the vessel's voxels, ``grid.shape``, with another elsewhere."""
+        out = np.full(self.grid.shape, outside, np.float32)
+        out[tuple(self.index.T)] = values
+        return out
+
     def _less(self, soft: Any, excess: float) -> Any:
         columns = np.ascontiguousarray(soft).reshape(len(soft), -1)
         out = np.empty_like(columns)
@@ -336,8 +372,8 @@ class Vessel:
 
     # -- fitting -------------------------------------------------------------------------------------------------
 
-    def _prior_with(self, bodies: Floats, expected: bool) -> tuple[Floats, Floats]:
-        k = len(bodies)
+    def _prior_with(self, k: int, expected: bool) -> Floats:
+        """``(p, p)`` precision with ``k`` bodies."""
         precision = np.zeros((self.size + k, self.size + k))
         precision[: self.size, : self.size] = self._prior
         if expected:
@@ -346,14 +382,26 @@ class Vessel:
             for part, outline in ((self.lumen_part, self.lumen_outline), (self.outer_part, self.outer_outline)):
                 precision[part, part] += (_EXPECTED_ROUND**2 - 1) * outline.precision(least_order=3)
         precision[range(self.size, self.size + k), range(self.size, self.size + k)] = _BODY_SD**-2.0
-        return np.concatenate([self._prior_mean, np.zeros(k)]), precision
+        return precision
 
-    def _energy(self, parameters: Floats, drawing: Drawing, mean: Floats, precision: Floats) -> tuple[float, Floats]:
-        """Energy, and G times the image above fat on the voxels."""
-        f, v = parameters[FAT], drawing.image
+    def _off(self, parameters: Floats) -> Floats:
+        """``(p,)`` how far the parameters lie from the prior's mean; that of bodies is 0."""
+        off = parameters.copy()
+        off[: self.size] -= self._prior_mean
+        return off
+
+    def energy(self, parameters: Floats, v: Floats, precision: Floats) -> tuple[float, Floats]:
+        """½ xᵀGx − bᵀx − log prior without constants, and G times the image above fat on the voxels, ``(n,)``.
+
+        Args:
+            parameters: ``(p,)``.
+            v: ``(n,)`` HU above fat, as the operator takes it.
+            precision: ``(p, p)`` of the prior.
+        """
+        f = parameters[FAT]
         curved = self.gram.apply(v.astype(np.float32)[:, None])[:, 0].astype(np.float64)
         data = 0.5 * f * f * self.ones_energy + f * (self.ones @ v) + 0.5 * v @ curved - f * self.b_sum - self.b @ v
-        off = parameters - mean
+        off = self._off(parameters)
         return float(data + 0.5 * off @ precision @ off), curved
 
     def fit(
@@ -377,20 +425,20 @@ class Vessel:
             tolerance: stop when a step gains less than this of the log posterior.
         """
         bodies = np.zeros((0, len(self.index))) if bodies is None else bodies
-        mean, precision = self._prior_with(bodies, expected)
-        theta = np.concatenate([parameters, np.zeros(len(mean) - len(parameters))])
+        precision = self._prior_with(len(bodies), expected)
+        theta = np.concatenate([parameters, np.zeros(len(precision) - len(parameters))])
         drawing = self.draw(theta, bodies)
-        energy, curved_image = self._energy(theta, drawing, mean, precision)
+        energy, curved_image = self.energy(theta, drawing.image, precision)
         hessian = self._hessian(drawing, precision)
-        stale, damping = False, 0.0
+        damping = 0.0
         for _ in range(steps):
-            gradient = self._gradient(theta, drawing, curved_image, mean, precision)
+            gradient = self._gradient(theta, drawing, curved_image, precision)
             step = cho_solve(cho_factor(hessian + damping * np.diag(np.diag(hessian)), lower=True), gradient)
             along, share = float(gradient @ step), 1.0
             for _ in range(_SHORTER):
                 tried = theta + share * step
                 other = self.draw(tried, bodies)
-                lower, curved_other = self._energy(tried, other, mean, precision)
+                lower, curved_other = self.energy(tried, other.image, precision)
                 gain = energy - lower
                 if gain > 0.0:
                     break
@@ -400,31 +448,26 @@ class Vessel:
                 damping = max(10.0 * damping, _DAMPING)
                 continue
             damping *= 0.1
-            theta, drawing, energy, curved_image, stale = tried, other, lower, curved_other, True
+            theta, drawing, energy, curved_image = tried, other, lower, curved_other
             if gain < tolerance:
                 break
             if gain > _FAR:
-                hessian, stale = self._hessian(drawing, precision), False
-        if stale:
-            hessian = self._hessian(drawing, precision)
-        gradient = self._gradient(theta, drawing, curved_image, mean, precision)
+                hessian = self._hessian(drawing, precision)
+        gradient = self._gradient(theta, drawing, curved_image, precision)
         residual = self.b - theta[FAT] * self.ones - curved_image
-        factor = cho_factor(hessian, lower=True)
-        return Fit(theta, drawing, energy, residual, gradient, hessian, factor, bodies, self)
+        return Fit(theta, drawing, energy, residual, gradient, precision, bodies, self)
 
-    def _gradient(
-        self, theta: Floats, drawing: Drawing, curved_image: Floats, mean: Floats, precision: Floats
-    ) -> Floats:
+    def _gradient(self, theta: Floats, drawing: Drawing, curved_image: Floats, precision: Floats) -> Floats:
         """Of −energy."""
         assert drawing.jacobian is not None
         residual = self.b - theta[FAT] * self.ones - curved_image
-        gradient: Floats = drawing.jacobian.T @ residual.astype(np.float32) - precision @ (theta - mean)
+        gradient: Floats = drawing.jacobian.T @ residual.astype(np.float32) - precision @ self._off(theta)
         # Fat fills the whole volume, beside what it leaves to the vessel.
         gradient[FAT] += self.b_sum - theta[FAT] * self.ones_energy - self.ones @ drawing.image
         return gradient
 
     def _hessian(self, drawing: Drawing, precision: Floats) -> Floats:
-        """Gauss and Newton's, with the prior's."""
+        """Gauss and Newton's, ``(p, p)``, with the prior's."""
         assert drawing.jacobian is not None
         hessian: Floats = self.gram.curvature(drawing.jacobian)
         across = self.ones.astype(np.float32) @ drawing.jacobian

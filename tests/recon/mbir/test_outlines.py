@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from recon.mbir import outlines
-from recon.mbir.outlines import Drawn, OutlineMbir
+from recon.mbir.outlines import OutlineMbir
 
 
 @pytest.fixture(scope="module")
@@ -76,11 +76,9 @@ def test_scenes_of_a_batch_are_what_they_are_alone(drawn, network, vessel):
     assert [n["outlines"]["used"] for n in both.notes] == [False, True]
 
 
-def test_what_the_network_makes_of_the_rest_is_differentiable(drawn, network, vessel, monkeypatch):
-    """Against a finite difference with the outlines held."""
+def test_it_is_differentiable_with_the_fit(drawn, network, vessel):
+    """Against a finite difference of the whole method, fitted anew on both sides."""
     method = OutlineMbir(network).with_fidelity(1.0)
-    held = method.drawn(drawn, vessel[0], EXPOSURE_S, torch.zeros(drawn.grid.shape)).image
-    monkeypatch.setattr(method, "drawn", lambda *a: Drawn(held + 0.25 * a[3], {}))
     b = vessel.clone().requires_grad_()
     weights = torch.from_numpy(np.random.default_rng(0).standard_normal(vessel.shape)).float()
     direction = statistic(drawn, torch.full(drawn.gram.finer.shape, -910.0), 5) * 0.02
@@ -89,7 +87,7 @@ def test_what_the_network_makes_of_the_rest_is_differentiable(drawn, network, ve
         there = [
             (method(drawn, vessel + s * direction, EXPOSURE_S) * weights).sum(dtype=torch.float64) for s in (0.5, -0.5)
         ]
-    assert float((b.grad * direction).sum()) == pytest.approx(float(there[0] - there[1]), rel=0.03)
+    assert float((b.grad * direction).sum()) == pytest.approx(float(there[0] - there[1]), rel=0.06)
 
 
 def test_what_is_believed_of_the_vessel_reaches_the_fit(drawn, network, vessel, monkeypatch):

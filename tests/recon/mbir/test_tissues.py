@@ -1,7 +1,6 @@
 """MBIR with the tissues of a vessel: sharper than without where they fit, the same where they do not."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import drawn_vessel
 import numpy as np
@@ -14,6 +13,7 @@ from recon import reconstruct
 from recon.mbir import tissues
 from recon.mbir.mbir import Mbir
 from recon.mbir.network import NetworkConfig
+from recon.mbir.outlines import OutlineMbir
 from recon.mbir.tissues import TissueMbir
 from recon.mbir.unrolled import Unrolled
 from recon.plaque import TissueData, VesselPrior, read_plaque
@@ -120,26 +120,14 @@ def test_what_is_believed_of_the_vessel_reaches_the_reading(drawn, network, fine
     assert seen == [None, VesselPrior(wall=(20.0, 5.0))]
 
 
-def test_what_is_not_proven_is_left_as_the_plain_reconstruction_has_it(solved):
-    plain = solved[0]
-    shape = tuple(plain.shape)
-    layer = np.zeros(shape, np.float32)
-    layer[10] = 0.5
-    image, without = (np.full(shape, value, np.float32) for value in (40.0, 100.0))
-    reading = SimpleNamespace(image=image, image_without=without, layer=layer)
-    found = tissues.tissue_image(reading, plain, 0.25)
-    assert torch.allclose(found[9], torch.tensor(0.25 * 40.0 + 0.75 * 100.0))
-    assert torch.allclose(found[10], 10.0 + 0.75 * (50.0 + 0.5 * plain[10]), atol=1e-3)
-
-
 def test_a_core_is_drawn_as_far_as_it_is_probable(drawn, network, fine, monkeypatch):
-    b = statistic(drawn, fine, 1)
-    reading = read_plaque(TissueData.of_statistic(b[0], drawn, 1.0))
-    seen = []
+    b = statistic(drawn, fine, 1)[0]
+    reading = read_plaque(TissueData.of_statistic(b, drawn, 1.0))
     monkeypatch.setattr(tissues, "read_plaque", lambda *arguments, **settings: replace(reading, presence=0.25))
-    monkeypatch.setattr(tissues, "tissue_image", lambda r, plain, share: seen.append(share) or plain)
-    TissueMbir(network).solved(drawn, b, 1.0)
-    assert seen == [0.25]
+    around = OutlineMbir(network).drawn(drawn, b, 1.0).image
+    found = TissueMbir(network).drawn(drawn, b, 1.0).image
+    assert torch.allclose(found, 0.25 * torch.from_numpy(reading.image) + 0.75 * around, atol=1e-3)
+    assert float((around - torch.from_numpy(reading.image)).abs().max()) > 20.0
 
 
 def test_from_a_scan(clean, problem, caplog):
