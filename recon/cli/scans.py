@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import io
+import json
 import math
 import shlex
 from dataclasses import asdict, replace
@@ -28,7 +29,7 @@ from recon.cli.parsing import (
     without_ending,
 )
 from torchpcct import VolumeGrid
-from torchpcct.files import VERSION, WriteError, fingerprint, is_own_hdf5, require_writable
+from torchpcct.files import VERSION, WriteError, atomic_write, fingerprint, is_own_hdf5, require_writable
 from torchpcct.formats.volume_files import check_target, is_own_volume
 from torchpcct.validate import choice
 
@@ -44,6 +45,8 @@ _LENGTH = {"positive": True, "unit": "mm"}
 MOST_VOXELS = 2**31
 """Of a volume, 8 GiB: what is asked for beyond is a slip of the voxel size."""
 _NO_SIZE = " (the file does not know their size: --pitch MM)"
+_DONE = ".done"
+"""Ending of the note beside a finished volume of many."""
 _FBP_RATE = 1e8
 """Voxel updates of the backprojection a second on one core, for a rough estimate."""
 
@@ -363,14 +366,31 @@ def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         for k, job in enumerate(jobs):
             progress("scans", k / len(jobs))
             tell_of(job.name, *(found[job.name] if found else job.function(folder, *job.args)))
+    for out in outs:
+        (folder / f"{out}{_DONE}").unlink(missing_ok=True)
     if refused:
         raise ValueError(f"{len(refused)} of {len(jobs)} scans are not reconstructed: {'; '.join(refused)}")
 
 
 def reconstruct_one(folder: Path, options: dict[str, Any], out: str) -> tuple[list[str], str, str]:
-    """A scan of many, anywhere: warnings, what is printed, and why it is refused."""
+    """A scan of many, anywhere: warnings, what is printed, and why it is refused.
+
+    A note lies beside a finished volume until all are: an interrupted command that is given again goes on, where scan,
+    options and volume are what they were.
+    """
     from recon.study.study import ProgressBars
 
+    noted, scan = folder / f"{out}{_DONE}", options["scan"]
+    asked = {k: str(v) for k, v in options.items() if k not in ("force", "no_progress", "workers", "threads",
+                                                                 "scheduler", "command_line")}  # fmt: skip
+
+    def state() -> dict[str, Any]:
+        return {"torchpcct": VERSION, "asked": asked, "scan": fingerprint(scan), "volume": fingerprint(folder / out)}
+
+    with contextlib.suppress(OSError, ValueError):
+        note = json.loads(noted.read_text(encoding="utf-8"))
+        if note["state"] == state():
+            return note["messages"], f"{note['text']}, already there", ""
     messages: list[str] = []
     arguments = argparse.Namespace(**options, out=folder / out, warn=messages.append)
     with contextlib.redirect_stdout(io.StringIO()) as printed:
@@ -380,7 +400,11 @@ def reconstruct_one(folder: Path, options: dict[str, Any], out: str) -> tuple[li
             raise
         except (ValueError, TypeError, OSError, ImportError, OverflowError) as error:
             return messages, "", str(error)
-    return messages, printed.getvalue().rstrip(), ""
+    text = printed.getvalue().rstrip()
+    if not options["dry_run"]:
+        with atomic_write(noted) as part:
+            part.write_text(json.dumps({"state": state(), "messages": messages, "text": text}), encoding="utf-8")
+    return messages, text, ""
 
 
 def _reconstruct_scan(arguments: argparse.Namespace, progress: ProgressBars) -> None:

@@ -144,6 +144,32 @@ def test_many_scans_are_reconstructed_as_if_each_were_alone(processes, tmp_path,
     assert "4 jobs" in capsys.readouterr().out
 
 
+def test_many_scans_go_on_after_an_interruption(tmp_path, monkeypatch, capsys):
+    g = ConeBeam(full_turn(24), 300.0, 500.0, 24, 4, 1.0)
+    for k in range(3):
+        Scan.from_counts(torch.full(g.shape, 900.0 + k), g, air=1000.0).save(tmp_path / f"s{k}.h5")
+    command = ["reconstruct", *(str(tmp_path / f"s{k}.h5") for k in range(3)), "--out", str(tmp_path / "out")]
+    save, saved = Volume.save, []
+
+    def interrupted(volume, path):
+        if len(saved) == 2:
+            raise KeyboardInterrupt
+        save(volume, path)
+        saved.append(Path(path).name)
+
+    monkeypatch.setattr(Volume, "save", interrupted)
+    with pytest.raises((KeyboardInterrupt, SystemExit)):
+        raise SystemExit(main(command))
+    # One of the two is made again: its scan has changed.
+    Scan.from_counts(torch.full(g.shape, 800.0), g, air=1000.0).save(tmp_path / "s1.h5")
+    monkeypatch.setattr(Volume, "save", lambda volume, path: saved.append(Path(path).name) or save(volume, path))
+    capsys.readouterr()
+    assert main(command) == 0
+    assert saved == [f"s{k}_fbp.nii.gz" for k in (0, 1, 1, 2)]
+    assert capsys.readouterr().out.count("already there") == 1
+    assert not list((tmp_path / "out").glob("*.done"))
+
+
 @pytest.mark.parametrize("where", ["processes", pytest.param("cluster", marks=pytest.mark.cluster)])
 def test_slabs_of_a_volume_are_jobs(where, tmp_path, monkeypatch, request):
     """The same file, to the bit, as slab by slab in one process; what was made is made once."""
