@@ -27,8 +27,9 @@ from torch import Tensor
 
 from recon.least_squares.inset_problem import InsetProblem
 from recon.mbir.mbir import Mbir, Solution
+from recon.mbir.unrolled import DEFAULT_FIDELITY
 from recon.plaque.data import TissueData
-from recon.plaque.layer import LayerEstimate
+from recon.plaque.layer import SD_HU, LayerEstimate
 from recon.plaque.quality import STRIKING, scores_of
 from recon.plaque.start import find_vessel
 from recon.plaque.vessel import Vessel
@@ -51,6 +52,11 @@ class Drawn:
     image: Tensor | None
     note: dict[str, Any]
     unexplained: Callable[[Tensor], float] = lambda volume: 0.0
+
+
+def layer_sd_hu(fidelity: float) -> float:
+    """Prior standard deviation of what the fibrous layer holds, HU: from 50, quiet, to 200, for measuring contrast."""
+    return SD_HU * 4.0 ** (fidelity - DEFAULT_FIDELITY)
 
 
 class OutlineMbir(Mbir):
@@ -104,7 +110,7 @@ class OutlineMbir(Mbir):
             # Many small matrices: BLAS threads would wait for each other.
             with threadpool_limits(limits=1, user_api="blas"):
                 vessel = Vessel(data, find_vessel(data.pilot(), data.grid, None), self.vessel_prior)
-                estimate = LayerEstimate(vessel.fit(vessel.first_guess(), expected=True))
+                estimate = LayerEstimate(vessel.fit(vessel.first_guess(), expected=True), layer_sd_hu(self.fidelity))
         except (ValueError, np.linalg.LinAlgError) as error:
             return Drawn(None, _unused(str(error)))
         fit = estimate.fit

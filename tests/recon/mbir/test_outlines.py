@@ -90,6 +90,22 @@ def test_it_is_differentiable_with_the_fit(drawn, network, vessel):
     assert float((b.grad * direction).sum()) == pytest.approx(float(there[0] - there[1]), rel=0.06)
 
 
+def test_more_fidelity_leaves_more_of_the_contrast_and_of_the_noise(drawn, network):
+    images = [drawn_vessel.image(drawn.gram.finer, c, samples=3) for c in (100.0, 0.0)]
+    core = drawn_vessel.image(drawn.grid, 1000.0) < -880
+    contrast, noise = [], []
+    for fidelity in (0.0, 1.0):
+        method = OutlineMbir(network).with_fidelity(fidelity)
+        clean, without, noisy = (
+            method.drawn(drawn, statistic(drawn, image, seed)[0], EXPOSURE_S).image
+            for image, seed in ((images[0], None), (images[1], None), (images[1], 7))
+        )
+        contrast.append(float((without - clean)[core].mean()))
+        noise.append(float((noisy - without)[core].std()))
+    assert contrast[1] > contrast[0] + 10.0
+    assert noise[1] > 1.2 * noise[0]
+
+
 def test_what_is_believed_of_the_vessel_reaches_the_fit(drawn, network, vessel, monkeypatch):
     seen = []
 

@@ -33,7 +33,7 @@ def fit(data):
 def dense(fit):
     """Of parameters and white field: the joint matrix of the normal equations, its right side, and B = L σ S."""
     vessel, n, p = fit.vessel, len(fit.vessel.index), len(fit.parameters)
-    B = layer._SD_HU * fit.layer[:, None] * layer.correlating(vessel, layer._LENGTH_MM)(np.eye(n))
+    B = layer.SD_HU * fit.layer[:, None] * layer.correlating(vessel, layer._LENGTH_MM)(np.eye(n))
     joint = np.empty((p + n, p + n))
     joint[:p, :p] = fit.hessian
     joint[p:, :p] = B.T @ fit.curved
