@@ -35,7 +35,7 @@ SD_HU = 100.0
 have a contrast slope of the core of 0.75 at 2 s and 0.54 at 0.35 s, 100 HU 0.83 and 0.68; for the same noise of the
 contrast soft FBP needs 1.17 and 1.54 times the dose, or 1.12 and 1.47."""
 _LENGTH_MM = 0.5
-"""ℓ of their correlation exp(−r² / 2ℓ²). Of 0.5 to 1 mm, and of sums of two, none has both more slope and less noise."""
+"""ℓ of their correlation exp(−r² / 2ℓ²). 0.5 to 1 mm and sums of two: none has both more slope and less noise."""
 _STEPS, _TOLERANCE = 60, 3e-3
 """Conjugate gradients at most, and the residual's norm over the first: half an HU of the limit."""
 
