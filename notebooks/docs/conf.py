@@ -36,8 +36,8 @@ html_css_files = ["site.css"]
 html_show_sourcelink = False
 html_copy_source = False
 html_theme_options = {
-    "navbar_end": ["theme-switcher"], "collapse_navigation": True, "show_prev_next": False, "header_links_before_dropdown": 7,
-    "secondary_sidebar_items": ["page-toc"], "footer_start": [], "footer_end": [],
+    "navbar_end": ["theme-switcher"], "collapse_navigation": True, "show_prev_next": False,
+    "header_links_before_dropdown": 7, "secondary_sidebar_items": ["page-toc"], "footer_start": [], "footer_end": [],
 }  # fmt: skip
 html_sidebars = {"index": [], "results": [], "limits": [], "glossary": []}
 html_math_renderer = "mathml"
