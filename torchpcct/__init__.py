@@ -1,4 +1,10 @@
-"""Photon-counting CT in PyTorch: scenes, scanners, scans, projectors, metrics."""
+"""Photon-counting CT in PyTorch: scenes, scanners, scans, projectors, metrics.
+
+Read in the order of the data: :mod:`~torchpcct.geometry` (axes, angles, grids), :mod:`~torchpcct.scene` (what is
+scanned), :mod:`~torchpcct.scanner` (by what), :mod:`~torchpcct.acquisition` (the simulation), :mod:`~torchpcct.scan`
+(its readings), :mod:`~torchpcct.formats` (files of other programs), :mod:`~torchpcct.projector`,
+:mod:`~torchpcct.volume`, :mod:`~torchpcct.metrics`. Reconstruction is the package :mod:`recon`.
+"""
 
 import os
 from typing import TYPE_CHECKING, Any

@@ -36,8 +36,8 @@ html_css_files = ["site.css"]
 html_show_sourcelink = False
 html_copy_source = False
 html_theme_options = {
-    "navbar_end": ["theme-switcher"], "show_prev_next": False, "header_links_before_dropdown": 7,
-    "secondary_sidebar_items": ["page-toc"], "footer_start": [], "footer_end": [],
+    "navbar_end": ["theme-switcher"], "collapse_navigation": True, "show_prev_next": False,
+    "header_links_before_dropdown": 7, "secondary_sidebar_items": ["page-toc"], "footer_start": [], "footer_end": [],
 }  # fmt: skip
 html_sidebars = {"index": [], "results": [], "limits": [], "glossary": []}
 html_math_renderer = "mathml"
@@ -49,7 +49,7 @@ copybutton_prompt_text = r">>> |\.\.\. |\$ "
 copybutton_prompt_is_regexp = True
 
 nitpick_ignore_regex = [  # what other packages and private bases are; no inventory of theirs is downloaded
-    ("py:.*", r"(numpy|torch|collections|concurrent|typing|matplotlib|argparse|pathlib|enum|np|nn)\..*"),
+    ("py:.*", r"(numpy|torch|jinja2|collections|concurrent|typing|matplotlib|argparse|pathlib|enum|np|nn)\..*"),
     ("py:.*", r"(.*\.)?_\w+"),
     ("py:(class|exc)", r"(optional|Module|Exception|Tensor|ndarray|\w+Error|(nbclient|scipy)\..*)"),
 ]  # fmt: skip

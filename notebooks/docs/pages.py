@@ -101,7 +101,7 @@ def write_cli(path):
 
     parser, commands, _ = _parser()
     shown = {c.dest: c.help for c in commands._choices_actions}
-    lines = ["# Command line", "", "Written from the parsers: what `--help` prints.", "", _help(parser)]
+    lines = ["# Command line", "", "What `--help` prints for each command.", "", _help(parser)]
     for name, command in sorted(commands.choices.items(), key=lambda item: item[0] == "train"):
         lines += [f"## torchpcct {name}", "", f"{shown.get(name) or ''}", ""]
         lines += [_help(command)] if name != "train" else []  # it reads its own options

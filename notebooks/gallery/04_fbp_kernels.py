@@ -15,7 +15,7 @@ from torchpcct.scene.plaque import plaque_scene
 
 scene, plaque = plaque_scene()
 inset = VolumeGrid((5, 45, 45), 0.2, plaque.position[::-1])
-scan = acquire(scene, presets.pcct(views=492), exposure_s=2.0, seed=0, region=inset, duty=1 / 4)
+scan = acquire(scene, presets.pcct(views=492, rows=8), exposure_s=2.0, seed=0, region=inset, duty=1 / 4)
 volumes = {kernel: recon.reconstruct(scan, inset, "fbp", kernel=kernel) for kernel in KERNELS}
 noise = {kernel: float(volume.data[:, :10].std()) for kernel, volume in volumes.items()}  # rows of plain fat
 fig, axes = plt.subplots(1, 3, figsize=(10, 3.2), layout="constrained", width_ratios=(1.3, 1, 1))

@@ -14,7 +14,7 @@ from torchpcct.scanner import presets
 from torchpcct.scene.phantoms import water_cylinder
 
 grid = VolumeGrid((1, 48, 48), 0.25, (0.0, 40.0, 0.0))
-clean = acquire(water_cylinder(200.0), presets.pcct(views=246), region=grid, duty=1 / 8)
+clean = acquire(water_cylinder(200.0), presets.pcct(views=246, rows=1), region=grid, duty=1 / 8)
 scans = [clean.with_noise(exposure_s=2.0, seed=k) for k in range(16)]  # the same scan with other photons
 fig, axes = plt.subplots(1, 3, figsize=(10, 3.1), layout="constrained")
 for ax, kernel in zip(axes[1:], ("soft", "bone"), strict=True):

@@ -15,7 +15,7 @@ from torchpcct.scene import Body, EllipticCylinder, Scene
 water = Body("water", EllipticCylinder(100.0), "water")
 rod = Body("rod", EllipticCylinder(4.0, position=(0.0, 40.0, 0.0)), "fibrous_tissue", "water")
 grid = VolumeGrid((1, 80, 80), 0.15, (0.0, 40.0, 0.0))
-scan = acquire(Scene([water, rod]), presets.pcct(views=984), region=grid, duty=1 / 2)  # no exposure: without noise
+scan = acquire(Scene([water, rod]), presets.pcct(views=492, rows=1), region=grid, duty=1 / 4)  # without noise
 distance = ellipsoid_distance(grid.slice, (40.0, 0.0), (4.0, 4.0))  # of every voxel from the rod's edge, mm
 fig, axes = plt.subplots(1, 2, figsize=(8, 3.2), layout="constrained")
 for kernel in ("soft", "bone"):

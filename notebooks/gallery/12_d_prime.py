@@ -16,7 +16,7 @@ from torchpcct.scene import Body, Ellipsoid, EllipticCylinder, Scene
 water = Body("water", EllipticCylinder(100.0), "water")
 sphere = Body("sphere", Ellipsoid((1.5, 1.5, 1.5), position=(0.0, 40.0, 0.0)), "necrotic_core", "water")
 grid = VolumeGrid((1, 40, 40), 0.25, (0.0, 40.0, 0.0))
-clean = [acquire(Scene(b), presets.pcct(123), region=grid, duty=1 / 16) for b in ([water, sphere], [water])]
+clean = [acquire(Scene(b), presets.pcct(123, rows=1), region=grid, duty=1 / 16) for b in ([water, sphere], [water])]
 signal = [recon.reconstruct(c, grid, "fbp").data[0] for c in clean]
 signal = signal[0] - signal[1]  # FBP is linear: a faint sphere adds this to every image, and nothing to the noise
 exposures, found, images = (0.1, 0.3, 1.0), [], {}

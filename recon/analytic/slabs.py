@@ -61,7 +61,7 @@ from torchpcct.scan import Scan
 from torchpcct.validate import checked, choice
 from torchpcct.volume import from_hu, to_hu
 
-__all__ = ["ScanSlices", "SlabPlan", "plan_slabs", "reconstruct_to"]
+__all__ = ["ScanSlices", "SlabPlan", "StackOptions", "plan_slabs", "reconstruct_to"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -78,7 +78,7 @@ _RATE, _READ_RATE = 4e8, 1e8
 
 
 class StackOptions(TypedDict, total=False):
-    """Options of PWLS, see :func:`recon.least_squares.reconstruct.reconstruct_pwls`."""
+    """Options of PWLS in slabs, as :func:`recon.least_squares.reconstruct.reconstruct_pwls` takes them."""
 
     prior: QGGMRF | None
     tolerance: float

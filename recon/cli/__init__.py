@@ -49,13 +49,13 @@ _GROUPS = {
 _BEGIN = """\
 torchpcct {version}: simulate a photon-counting CT scan, reconstruct it, measure how much dose a method really saves.
 
-A first look, 1 min     torchpcct demo
-Does all work here?     torchpcct doctor
-Your own scan           torchpcct info scan.h5
-                        torchpcct reconstruct scan.h5 --find-axis --out volume.nii.gz
-Look at volumes         torchpcct view a.nii.gz b.nii.gz --html view.html
-The main result, 5 min  torchpcct compare
-Your own method         torchpcct evaluate --task nodule --method mylab.nets:reconstruct
+A first look, 1 min      torchpcct demo
+Does all work here?      torchpcct doctor
+Your own scan            torchpcct info scan.h5
+                         torchpcct reconstruct scan.h5 --find-axis --out volume.nii.gz
+Look at volumes          torchpcct view a.nii.gz b.nii.gz --html view.html
+The main result, 13 min  torchpcct compare
+Your own method          torchpcct evaluate --task nodule --method mylab.nets:reconstruct
 
 {groups}
 

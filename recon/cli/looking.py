@@ -194,8 +194,8 @@ def add_view(commands: Commands) -> None:
         ("files", Path, "VOLUME", ".nii, .nii.gz, .mha, .h5, .dcm or a DICOM folder", {"nargs": "+"}),
         ("--html", Path, "FILE", "page to write (.html), of one volume or several"),
         ("--out", Path, "PATH", "picture: .png, .pdf or .svg (default VOLUME.png)"),
-        ("--level", float, None, "centre of the grey scale (default 40 HU, mm⁻¹: of the values)"),
-        ("--window", float, None, "its width (default 400 HU, mm⁻¹: of the values)", {"limits": {"positive": True}}),
+        ("--level", float, None, "centre of the grey scale (default 40 HU; in mm⁻¹ by the values)"),
+        ("--window", float, None, "its width (default 400 HU; in mm⁻¹ by the values)", {"limits": {"positive": True}}),
     )
     add_force(parser)
     add_options(

@@ -228,6 +228,15 @@ def _verify(arguments: argparse.Namespace, progress: ProgressBars) -> None:
 # --- parsing ------------------------------------------------------------------------------------------------------
 
 
+_METHODS_TEXT = """\
+methods: fbp:KERNEL, pwls, mbir, mbir:fidelity=1, mbir:weights=FILE, mbir:tissues,
+         mbir:outlines=no, mbir:outlines=no,prior=bilateral,
+         FILTER@fbp:KERNEL (gaussian, perona_malik, bilateral, nlm, tv, bm4d),
+         package.module:function of (scan, grid), files:FOLDER
+
+"""
+
+
 def add_evaluate(commands: Commands) -> None:
     parser = command(
         commands, "evaluate", _evaluate, "how much dose does a method save at a task?",
@@ -237,10 +246,7 @@ def add_evaluate(commands: Commands) -> None:
         "more methods computes only those.",
         "torchpcct evaluate --task nodule --method mbir --n 20",
         "torchpcct evaluate --task my.yaml --method mylab.nets:reconstruct --denoiser mylab.nets:denoise@fbp:detail",
-        before="methods: fbp:KERNEL, pwls, mbir, mbir:fidelity=1, mbir:weights=FILE, mbir:tissues,\n"
-        "         mbir:outlines=no, mbir:outlines=no,prior=bilateral,\n"
-        "         FILTER@fbp:KERNEL (gaussian, perona_malik, bilateral, nlm, tv, bm4d),\n"
-        "         package.module:function of (scan, grid), files:FOLDER\n\n",
+        before=_METHODS_TEXT,
         out="folder for report.md, .json, .csv, .html and pictures (default out/evaluate)",
     )  # fmt: skip
     parser.set_defaults(tasks=("plaque",), methods=("fbp:soft", "bilateral@fbp:detail", "mbir"))
@@ -249,9 +255,9 @@ def add_evaluate(commands: Commands) -> None:
         parser,
         ("--scans", Path, "FILE", "measured scans instead of tasks: two of one object, or one, which is halved; noise "
          "at equal resolution", {"nargs": "+"}),
-        ("--volumes", Path, "FOLDER", "volumes of two scans of one object instead of tasks: a file of the same name a "
-         "method in each folder", {"nargs": 2}),
-        ("--reference", str, "NAME", "with --volumes: of a linear method, unsmoothed (default fbp)",
+        ("--volumes", Path, "FOLDER", "volumes of two scans of one object instead of tasks: in each folder one file "
+         "per method, of the same name", {"nargs": 2}),
+        ("--reference", str, "NAME", "with --volumes: the one by a linear method that smoothed nothing (default fbp)",
          {"default": "fbp"}),
         ("--voxel", float, "MM", "with --scans: voxel size (default: the detector's)"),
         ("--extent", float, "MM", "with --scans: of the volume, Z Y X", {"nargs": "+"}),
@@ -268,6 +274,7 @@ def add_dose_factor(commands: Commands) -> None:
         "variants, vessels of other directions, a sphere in muscle, line pairs and a low-contrast rod, with 200 "
         "realisations: hours on two cores, kept piece by piece.",
         "torchpcct dose-factor --task plaque --method mbir --method fbp:soft --n 40",
+        before=_METHODS_TEXT,
         out="folder for report.md, .json, .csv, .html and pictures (default out/dose-factor)",
     )  # fmt: skip
     parser.set_defaults(tasks=_STUDY_TASKS, methods=_STUDY_METHODS, scans=None, export=None)
@@ -278,9 +285,9 @@ def _add_common(parser: Parser, n: int) -> None:
     many = {"action": "append"}
     add_options(
         parser,
-        ("--task", str, "TASK", "name or YAML file, repeatable", many),
+        ("--task", str, "TASK", "name (see show-task) or YAML file, repeatable", many),
         ("--method", str, "METHOD", "see below (repeatable)", many),
-        ("--denoiser", str, "FUNCTION@BASE", "a function of (volume) or (volume, sigma) in HU", many),
+        ("--denoiser", str, "FUNCTION@BASE", "function of (volume) or (volume, sigma), HU, after BASE", many),
         ("--exposure", float, "S", "in s (default: those of each task)", {"dest": "exposures_s", "nargs": "+"}),
     )
     add_execution(parser)

@@ -73,17 +73,17 @@ def add_plaque(commands: Commands) -> None:
         out="folder for report.md, report.json, tissues.nii.gz, image.nii.gz and plaque.png (default out/plaque)",
     )  # fmt: skip
     length, place = {"positive": True, "unit": "mm"}, {"nargs": 3, "limits": {"unit": "mm"}}
-    believed = "its value before the data (default: what is usual; the report says it)"
+    believed = "value that is expected of this tissue, and its standard deviation (default: see the report)"
     axes = ("Z", "Y", "X")
     add_options(
         parser,
         ("scan", Path, "SCAN", "scan file written by simulate"),
         ("--point", float, axes, "where a reader sees the plaque, mm", place),
-        ("--point-sd", float, "MM", "its error (default 0.4)", {"default": 0.4, "limits": length}),
-        ("--particles", int, "N", "shapes followed (default 300)", {"default": 300, "limits": {"low": 50}}),
+        ("--point-sd", float, "MM", "its standard deviation (default 0.4)", {"default": 0.4, "limits": length}),
+        ("--particles", int, "N", "vessel shapes to try (default 300)", {"default": 300, "limits": {"low": 50}}),
         ("--wall", float, ("HU", "SD"), believed, {"nargs": 2}),
         ("--fibrous", float, ("HU", "SD"), believed, {"nargs": 2}),
-        ("--beside", str, None, "also read these", {"nargs": "*", "default": [], "choices": ("pwls", "mbir")}),
+        ("--beside", str, None, "read these images, too", {"nargs": "*", "default": [], "choices": ("pwls", "mbir")}),
         ("--voxel", float, "MM", "voxel size (default 0.2)", {"default": 0.2, "limits": length}),
         ("--center", float, axes, "centre in mm (default: the plaque)", place),
         ("--extent", float, axes, "edge lengths in mm (default: the inset)", {"nargs": 3, "limits": length}),

@@ -187,13 +187,13 @@ def _add_reader_options(parser: Parser, many: bool = False) -> None:
                          nargs))  # fmt: skip
     add_options(
         parser,
-        ("--geometry", Path, "YAML", "geometry of files that do not hold it; kind: vectors, rtk, or with pose: in "
-         "place of the file's own"),
-        ("--mu-water", float, "MM⁻¹", "attenuation of water: result in HU"),
-        ("--axis", float, "COLUMN", "that the rotation axis projects onto"),
-        ("--pitch", float, "MM", "cell width of parallel beams (of files that do not know it)"),
-        ("--photons", float, "N", "of an unattenuated reading, of scans given as line integrals"),
-        ("--slices", str, "A:B", "slices of parallel and fan beams, or rows of a cone, to read"),
+        ("--geometry", Path, "YAML", "geometry of files that do not hold it; one with kind: vectors, kind: rtk or "
+         "pose: takes the place of the file's own"),
+        ("--mu-water", float, "MM⁻¹", "attenuation of water; with it the volume is in HU"),
+        ("--axis", float, "COLUMN", "where the rotation axis projects to, counted from 0"),
+        ("--pitch", float, "MM", "cell width of parallel beams, where the file does not hold it"),
+        ("--photons", float, "N", "photons of an unattenuated reading, of scans given as line integrals"),
+        ("--slices", str, "A:B", "read only these slices (parallel, fan) or rows (cone beam)"),
         group="what the file does not know of its scan",
     )  # fmt: skip
 
@@ -556,16 +556,16 @@ def add_reconstruct(commands: Commands) -> None:
         out="folder of many scans; of one, volume to write: .nii, .nii.gz, .mha, .h5, .zarr, or no ending for DICOM "
         "(default SCAN_METHOD.nii.gz)",
     )  # fmt: skip
-    own = "of a scan of slices Y X alone"
+    own = "for separate slices only Y X"
     add_options(
         parser,
         ("--method", str, None, "fbp, pwls or mbir (default fbp)", {"default": "fbp"}),
-        ("--kernel", str, None, "FBP kernel: soft, standard, detail, bone, ram-lak"),
-        ("--fidelity --look", float, "F", "of MBIR: 0, quiet … 1, more contrast and noise (default 0.5)"),
+        ("--kernel", str, None, "of FBP, from quiet to sharp: soft, standard (default), detail, bone, ram-lak"),
+        ("--fidelity --look", float, "F", "of MBIR, from 0 (quiet) to 1 (more contrast and noise; default 0.5)"),
         ("--no-outlines", bool, None, "MBIR of an inset without drawing a vessel's outlines first"),
-        ("--tissues", bool, None, "MBIR with the tissues of the vessel in the inset"),
-        ("--weights", Path, "FILE", "of MBIR: your own (default: those that ship)"),
-        ("--point", float, ("Z", "Y", "X"), "where a reader sees its plaque, mm", {"nargs": 3}),
+        ("--tissues", bool, None, "MBIR that first fits the tissues of the vessel in the inset"),
+        ("--weights", Path, "FILE", "of MBIR, from your own training (default: those that ship)"),
+        ("--point", float, ("Z", "Y", "X"), "with --tissues: where a reader sees the plaque, mm", {"nargs": 3}),
         group="method",
     )
     add_options(
@@ -576,7 +576,7 @@ def add_reconstruct(commands: Commands) -> None:
         ("--extent", _length, "MM", f"edge lengths, Z Y X (default: what is seen); {own}",
          {"nargs": "+", "limits": _LENGTH}),
         ("--memory", str, "SIZE", "limit of a process, e.g. 4GB, for volumes larger than memory: slab by slab, by "
-         "--workers too, to .nii or .zarr (default SCAN_METHOD.nii); what was interrupted goes on"),
+         "--workers too, to .nii or .zarr (default SCAN_METHOD.nii); after an interruption the same command goes on"),
         group="voxels",
     )  # fmt: skip
     _add_reader_options(parser, many=True)

@@ -148,7 +148,7 @@ def _majorize(begin, end, x, v, steps, scales, factors, kind, form, out, work):
 
 @njit(nogil=True, cache=True, fastmath=_FLAGS, error_model="numpy")
 def majorize(begin, end, x, v, steps, scales, factors, kind, form, out):
-    """out = Σ_neighbours factor · ρ'(t)/t · (v_j − v_k), t = scale · |x_j − x_k|, the length over the channels.
+    """out = Σ_neighbours factor · ρ'(t)/t · (v_j − v_k); t = scale · length of x_j − x_k over the channels.
 
     Args:
         x, v: ``(batch, channels, nz, ny, nx)`` contiguous.

@@ -48,7 +48,7 @@ def reconstruct_pwls(
         Volumes in HU with the solver's report (:class:`recon.least_squares.field_problem.Solution`); of noisy scans
         also ``chi2`` (weighted squared residual per reading), ``residual_p`` and ``warnings`` of
         :func:`torchpcct.metrics.residual_test.residual_test`: a volume that does not explain its data (wrong centre,
-        drifting gain, metal or a body beyond the grid) is not given out without a word. A volume whose iteration did
+        drifting gain, metal or a body beyond the grid) carries a warning. A volume whose iteration did
         not reach ``tolerance`` says so in ``warnings``, too, and a :class:`RuntimeWarning` is given.
 
     Raises:

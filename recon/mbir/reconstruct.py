@@ -52,8 +52,8 @@ def reconstruct_mbir(
         network: with its weights; None: those of the package.
         problem: kept from an earlier call with the same scan and (working) grid; None: made here.
         batch: volumes at a time.
-        fidelity: 0, quiet images for viewing, … 1, for measuring: more of the contrast, at more noise
-            (:mod:`recon.mbir.unrolled`); None: that of ``network``, which is 0.5 unless it was loaded with another.
+        fidelity: from 0 (quiet images for viewing) to 1 (for measuring: more of the contrast and more noise), see
+            :mod:`recon.mbir.unrolled`; None: that of ``network``, which is 0.5 unless it was loaded with another.
         noise_map: add an estimate of each voxel's standard deviation, ``report["noise_sd_hu"]``.
         outlines: where an inset holds a contrast-enhanced vessel, fit its outlines first, and let the network
             reconstruct what they leave (:mod:`recon.mbir.outlines`); two seconds a volume longer. Where no vessel is

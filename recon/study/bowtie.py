@@ -98,7 +98,7 @@ class Settings(StudySettings):
         views: of the slices' scans.
         kernel: reconstruction kernel of the slices (the paper does not name it).
         realizations: of the slices' noise.
-        detector: ``"eid"`` as the paper, or ``"silicon"``; see :func:`wide_scanners`.
+        detector: ``"eid"``, the energy-integrating one of the paper, or ``"silicon"``, the photon-counting one.
         map_mm: voxels of the thorax's dose map; that of the phantom has half of them, at least 1 mm.
         histories: photons of each Monte Carlo run; 0: no scatter.
         plaque_views: of the plaque's scans; fewer than the paper's keep the tube load.

@@ -75,7 +75,7 @@ class Settings(StudySettings):
         voxel_mm: of all volumes.
         exposure_s: of the noisy reconstructions.
         seed, realizations: of their noise; realisation i uses ``seed + i``.
-        methods: of the compensation, of :data:`METHODS`.
+        methods: of the compensation, of ``"fbp"`` (always), ``"pwls"``, ``"mbir"``.
 
     Raises:
         TypeError: a value of a wrong type.

@@ -1,4 +1,6 @@
-"""Build the wheel, install it into an empty environment, use it there: ``python tests/bench/wheel.py [PIP OPTION …]``.
+"""Build the source distribution, from it the wheel, and use the wheel in an empty environment.
+
+``python tests/bench/wheel.py [PIP OPTION …]``
 
 Nothing of the repository is on the path of that environment: what the wheel lacks (weights, ``py.typed``, a package, a
 dependency) fails here. Options go to ``pip install``, e.g. ``--extra-index-url https://download.pytorch.org/whl/cpu``.
@@ -11,10 +13,12 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import tomllib
 import venv
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent.parent
+REQUIRES = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["build-system"]["requires"]
 
 SMOKE = """
 import recon, torchpcct, train
@@ -43,12 +47,19 @@ print("reconstructed", tuple(volume.data.shape), f"{float(volume.data.mean()):.0
 
 
 def build(folder: Path) -> Path:
-    """The wheel, in ``folder``, of what git knows: an old ``build`` folder would add modules that are gone."""
+    """The source distribution of what git knows (an old ``build`` folder would add modules that are gone), and the
+    wheel that is built from it, as installing the source distribution would do; both in ``folder``."""
     listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
     for name in (name for name in listed.splitlines() if (ROOT / name).is_file()):
         (folder / "source" / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / name, folder / "source" / name)
-    command = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(folder), str(folder / "source")]
+    venv.create(folder / "builder", with_pip=True)
+    python = folder / "builder" / ("Scripts" if os.name == "nt" else "bin") / "python"
+    subprocess.run([python, "-m", "pip", "install", "-q", *REQUIRES], cwd=folder, check=True)
+    sdist = f"from setuptools import build_meta; build_meta.build_sdist({str(folder)!r})"
+    subprocess.run([python, "-c", sdist], cwd=folder / "source", stdout=subprocess.DEVNULL, check=True)
+    (archive,) = folder.glob("*.tar.gz")
+    command = [python, "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(folder), str(archive)]
     subprocess.run(command, cwd=folder, check=True)
     (wheel,) = folder.glob("*.whl")
     return wheel
@@ -72,7 +83,7 @@ def main(options: list[str]) -> int:
         run(scripts / "torchpcct", "study", "phantom", "--quick", "--no-progress", "--out", "out", folder=folder)
         run(python, "-c", SMOKE, folder=folder)
         run(scripts / "torchpcct", "info", "scan.h5", folder=folder)
-    print("the wheel works in an empty environment")
+    print("the wheel, built from the source distribution, works in an empty environment")
     return 0
 
 
