@@ -88,7 +88,8 @@ TABLE = [
     (full_turn, {"views": 8}, {"views": COUNT}),
     (sd_interval, {"sd": 1.0, "realizations": 10, "level": 0.9},
      {"sd": (*NO_NUMBER, NAN, INF, -1.0), "realizations": (*COUNT, 1), "level": LEVEL}),
-    (cnr_interval, {"foreground_means": [1.0, 2.0, 4.0], "background_means": [4.1, 2.1, 1.1], "level": 0.9}, {"level": LEVEL}),
+    (cnr_interval, {"foreground_means": [1.0, 2.0, 4.0], "background_means": [4.1, 2.1, 1.1], "level": 0.9},
+     {"level": LEVEL}),
     (QGGMRF, {"strength": 0.3, "threshold": 300.0},
      {"strength": (NAN, INF, -1.0, "a"), "threshold": (NAN, -1.0, 0.0, "a")}),
 ]  # fmt: skip
