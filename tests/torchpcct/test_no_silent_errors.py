@@ -53,6 +53,13 @@ def test_a_tolerance_that_compares_with_nothing_is_refused(tolerance):
 @pytest.mark.parametrize(
     ("change", "error", "match"),
     [
+        (lambda s: {"counts": s.counts * 0}, ValueError, "all counts are zero"),
+        (lambda s: {"counts": s.counts * math.nan}, ValueError, "NaN or Inf"),
+        (lambda s: {"counts": -s.counts}, ValueError, "negative"),
+        (lambda s: {"counts": s.counts[1:]}, ValueError, "shape"),
+        (lambda s: {"exposure_s": 0.0}, ValueError, "exposure_s"),
+        (lambda s: {"surround": None}, ValueError, "surround"),
+        (lambda s: {"air": s.air * 0}, ValueError, "air readings"),
         (lambda s: {"air": s.air * math.inf}, ValueError, "air readings must be finite"),
         (lambda s: {"air": s.air * math.nan}, ValueError, "air readings must be finite"),
         (lambda s: {"surround": s.surround * 0}, ValueError, "surround readings must be finite and greater than 0"),

@@ -100,10 +100,3 @@ def test_no_claim_without_both_exposures():
     assert data["claim"] is None
     assert "5.7" not in answer(data)
     assert answer({**data, "records": []}) == ""
-
-
-def test_settings_refuse_too_few_realisations():
-    with pytest.raises(ValueError, match="n must be at least 8"):
-        Settings(n=7)
-    with pytest.raises(ValueError, match="at least one method"):
-        Settings(methods=())
