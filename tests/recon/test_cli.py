@@ -28,7 +28,7 @@ from torchpcct.scene.voxels import VoxelScene
 
 def test_command_line_simulate_and_reconstruct(tmp_path, capsys):
     scan, volume = tmp_path / "scan.h5", tmp_path / "plaque.nii.gz"
-    assert main(["simulate", "--views", "48", "--exposure", "2", "--seed", "3", "--json", "--out", str(scan)]) == 0
+    assert main(["simulate", "--views", "12", "--exposure", "2", "--seed", "3", "--json", "--out", str(scan)]) == 0
     assert json.loads(capsys.readouterr().out)["seed"] == 3
     assert main(["reconstruct", str(scan), "--kernel", "soft", "--voxel", "0.4", "--json", "--out", str(volume)]) == 0
     summary = json.loads(capsys.readouterr().out)

@@ -83,15 +83,6 @@ def test_help_and_refusals_load_neither_torch_nor_numba():
     assert "LOADED []" in run.stdout
 
 
-def test_the_package_is_lazy():
-    code = (
-        "import recon, recon.analytic.inset, recon.least_squares.joint\n"
-        "print(callable(recon.fbp), callable(recon.pwls), recon.METHODS)"
-    )
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
-    assert run.stdout.startswith("True True ('fbp', 'pwls'")
-
-
 def test_what_a_killed_process_left_is_swept_by_the_next_write(tmp_path):
     dead = subprocess.run(
         [sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True

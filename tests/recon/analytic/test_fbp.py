@@ -377,7 +377,7 @@ print(peak() - before, kept, CHUNK_BYTES)
 """
 
 
-@pytest.mark.parametrize("inset", [True, False])
+@pytest.mark.parametrize("inset", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_memory_is_bounded(inset):
     """Filtered data and volumes, and one chunk of views: never a second sinogram."""
     if not Path("/proc/self/clear_refs").exists():
