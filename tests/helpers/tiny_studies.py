@@ -34,7 +34,7 @@ TINY: dict[str, dict[str, Any]] = {
     "resolution": {"thinning": 32, "sigmas_px": (0.0, 3.75, 10.0)},
     "spectral": {
         "views": 60, "voxel_mm": 0.4, "realizations": 2, "mbir_realizations": 1, "noise_levels": (0.0, 1.0),
-        "calibration_views": 16, "transport_photons": 50_000,
+        "calibration_views": 60, "transport_photons": 50_000,
     },
 }  # fmt: skip
 """Study → settings."""
@@ -49,7 +49,7 @@ scene:
     - {name: insert, shape: ellipsoid, semi_axes: 1.5, position: {x: 30, y: 10, z: 0}, material: soft_tissue,
        parent: patient}
 signal: insert
-scanner: {preset: pcct, views: 90, rows: 16, energy_bin_kev: 4}
+scanner: {preset: pcct, views: 90, rows: 24, energy_bin_kev: 4}
 tolerance_hu: 1000
 inset: {size: [6, 8, 8], voxel_mm: 0.4}
 exposures_s: 20
