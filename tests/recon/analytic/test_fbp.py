@@ -25,15 +25,6 @@ MU = 0.02
 pytestmark = pytest.mark.filterwarnings("ignore:the rows end inside the object")
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Small tensors: hand-over between threads would take all the time on a busy machine."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
 def rays(geometry: Any) -> tuple[np.ndarray, np.ndarray]:
     """Origins and unit directions ``(views, rows, columns, 3)`` of all rays, from the conventions alone."""
     b = geometry.angles[:, None, None]

@@ -10,6 +10,7 @@ import pytest
 import torch
 from analytic import Gaussian, line_integrals, rasterize
 from geometries import REGISTRY
+from inset_operators import dense
 
 from torchpcct.detector_window import footprint
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
@@ -274,8 +275,7 @@ def test_modes_and_torch_func(name):
 
 def test_gradient_of_an_unrolled_scheme_equals_the_dense_matrix():
     A = _projector("fan_window")
-    n = math.prod(A.domain_shape)
-    matrix = A(torch.eye(n, dtype=torch.float64).reshape(n, *A.domain_shape)).reshape(n, -1).T
+    matrix, n = dense(A), math.prod(A.domain_shape)
     y = _random(A.range_shape)
 
     def unroll(forward, adjoint, step):
