@@ -272,7 +272,8 @@ def test_commands(tmp_path, capsys, monkeypatch):
 
 
 def test_two_measured_scans(tmp_path):
-    (tmp_path / "insert.yaml").write_text(INSERT.replace("tolerance_hu: 1000\n", ""), encoding="utf-8")  # all effects
+    text = INSERT.replace(", rows: 24, energy_bin_kev: 4}\ntolerance_hu: 1000", "}")  # with all effects
+    (tmp_path / "insert.yaml").write_text(text, encoding="utf-8")
     task = read_task(tmp_path / "insert.yaml")
     present, _ = task.scans(Store(tmp_path))
     scans = [present.with_noise(5000.0, k) for k in range(2)]

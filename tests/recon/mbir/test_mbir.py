@@ -51,7 +51,7 @@ def test_noise_free_values_in_hu(clean, problem):
 
 def test_noise_map_is_the_noise(clean, problem, network):
     """Against the standard deviation over realisations."""
-    scans = [clean.with_noise(2.0, s) for s in range(12)]
+    scans = [clean.with_noise(2.0, s) for s in range(24)]
     volumes = reconstruct(scans, GRID, "mbir", network=network, problem=problem)
     measured = torch.stack([v.data for v in volumes]).var(0).mean().sqrt()
     estimated = network.noise_map(problem, problem.statistic(scans[0]).b, 2.0, draws=16).square().mean().sqrt()
