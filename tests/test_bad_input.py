@@ -29,7 +29,7 @@ from torchpcct import (
     spectral,
 )
 from torchpcct.detector_window import DetectorWindow, footprint
-from torchpcct.metrics import cnr, sd_interval
+from torchpcct.metrics import cnr, cnr_interval, sd_interval
 from torchpcct.metrics.residual_test import residual_test
 from torchpcct.scanner import SiliconDetector, Source, TransportedSilicon, presets
 from torchpcct.scanner.linearisation import WaterLinearisation
@@ -41,6 +41,7 @@ NO_NUMBER = ("a", None, 1j, [1.0], {}, object())
 LENGTH = (*NO_NUMBER, NAN, INF, -INF, 0.0, -1.0)
 PLACE = (*NO_NUMBER, NAN, INF, -INF)
 COUNT = ("a", None, 1j, [1], {}, NAN, INF, 1.5, 0, -1, True, "3")
+LEVEL = (*NO_NUMBER, NAN, -0.5, 0.0, 1.0, 2.0, 95)
 CHOICE = ("round", None, 3, "", ["flat"])
 
 PARALLEL = {"angles": full_turn(8), "columns": 8, "pitch": 1.0, "offset": 0.0}
@@ -48,7 +49,7 @@ FAN = {**PARALLEL, "sod": 500.0, "sdd": 1000.0, "detector": "flat"}
 CONE = {**FAN, "rows": 4}
 WINDOW = {"first_column": [0, 1], "columns": 3, "first_row": 0, "rows": 2}
 WATER = {"coefficients": np.ones((4, 2)), "scale": np.ones(4), "mu_ref": 0.02}
-ANGLES = (None, "a", [], [[0.0]], [NAN], [INF], 1.0, [1j], {})
+ANGLES = (None, "a", [], [[0.0]], [NAN], [INF], 1.0, [1j], {}, [1 + 2j, 0.3], [None, 1.0], [[0.1], [0.2, 0.3]])
 
 TABLE = [
     (ParallelBeam, PARALLEL, {"angles": ANGLES, "columns": COUNT, "pitch": LENGTH, "offset": PLACE}),
@@ -80,12 +81,15 @@ TABLE = [
     (
         WaterLinearisation,
         WATER,
-        {"mu_ref": LENGTH, "scale": (None, "a", [], np.ones(3), -np.ones(4), [1, 1, 1, NAN], np.ones(4) * 1j),
-         "coefficients": (None, "a", [], np.ones(4), np.ones((3, 2)), np.full((4, 2), NAN))},
+        {"mu_ref": LENGTH, "scale": (None, "a", [], np.ones(3), -np.ones(4), [1, 0, 1, 1], [1, 1, 1, NAN], [1j] * 4),
+         "coefficients": (None, "a", [], np.ones(4), np.ones((3, 2)), np.ones((4, 0)), np.full((4, 2), NAN),
+                          np.full((4, 2), INF), np.full((4, 2), 1j))},
     ),
     (full_turn, {"views": 8}, {"views": COUNT}),
     (sd_interval, {"sd": 1.0, "realizations": 10, "level": 0.9},
-     {"sd": (*NO_NUMBER, NAN, INF, -1.0), "realizations": (*COUNT, 1), "level": (*NO_NUMBER, NAN, 0.0, 1.0, 95)}),
+     {"sd": (*NO_NUMBER, NAN, INF, -1.0), "realizations": (*COUNT, 1), "level": LEVEL}),
+    (cnr_interval, {"foreground_means": [1.0, 2.0, 4.0], "background_means": [4.1, 2.1, 1.1], "level": 0.9},
+     {"level": LEVEL}),
     (QGGMRF, {"strength": 0.3, "threshold": 300.0},
      {"strength": (NAN, INF, -1.0, "a"), "threshold": (NAN, -1.0, 0.0, "a")}),
 ]  # fmt: skip
@@ -109,6 +113,7 @@ def test_a_bad_value_is_refused_by_its_name(function, arguments, name):
 
 
 CONE_2 = ConeBeam(full_turn(8), 500.0, 1000.0, 32, 4, 1.0)
+FAN_2 = FanBeam(full_turn(8), 500.0, 1000.0, 32, 1.0)
 GRID = VolumeGrid((2, 4, 4), 0.5)
 A = Projector(CONE_2, GRID)
 Y = torch.zeros(CONE_2.shape)
@@ -125,6 +130,12 @@ CALLS = {
     "projector: window": (lambda: Projector(CONE_2, GRID, "all"), "window"),
     "projector: motion": (lambda: Projector(CONE_2, GRID, motion=np.zeros(3)), "motion"),
     "projector: NaN motion": (lambda: Projector(CONE_2, GRID, motion=np.full((8, 3), NAN)), "motion"),
+    "projector: 3-D grid": (lambda: Projector(FAN_2, GRID), "grid"),
+    "projector: views of the window": (lambda: Projector(FAN_2, GRID.slice, DetectorWindow([0] * 3, 5)), "window"),
+    "projector: columns of the window": (lambda: Projector(FAN_2, GRID.slice, DetectorWindow([30] * 8, 5)), "columns"),
+    "projector: rows of the window": (lambda: Projector(CONE_2, GRID, DetectorWindow([0] * 8, 5, 1, 4)), "rows"),
+    "projector: memory of no batch": (lambda: A.memory_estimate(-1), "batch"),
+    "projector: memory of half precision": (lambda: A.memory_estimate(1, torch.float16), "dtype"),
     "projector: source inside": (lambda: Projector(CONE_2, VolumeGrid((2, 4, 4), 300.0)), "source"),
     "footprint: beyond the field": (
         lambda: footprint(CONE_2, VolumeGrid((1, 1, 1), 1.0, (0, 0, 90.0))),

@@ -137,12 +137,3 @@ def test_continuous_integration_runs_the_readme():
     ]
     assert len(commands) == 2
     assert commands[1] in (ROOT / ".ci" / "run").read_text(encoding="utf-8")
-
-
-def test_library_does_not_print():
-    for package in ("torchpcct", "recon"):
-        for path in (ROOT / package).rglob("*.py"):
-            if path.parent.name == "cli" or path.name == "__main__.py":
-                continue
-            calls = [n for n in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(n, ast.Call)]
-            assert not [c for c in calls if isinstance(c.func, ast.Name) and c.func.id == "print"], path

@@ -66,7 +66,8 @@ _UN, _MB, _READ = "recon/mbir/unrolled.py", "recon/mbir/mbir.py", "recon/plaque/
 _PQ = "tests/recon/plaque/test_quality.py::"
 _METAL = "tests/recon/test_metal.py::"
 _F = "tests/test_precision.py::"
-_WATER = _T + "test_a_bad_water_correction_is_refused"
+_TABLE = "tests/test_bad_input.py::test_a_bad_value_is_refused_by_its_name"
+_DAMAGED = "tests/torchpcct/formats/test_damage.py::test_damaged_files"
 
 FAULTS = (
     Fault("offset sign", _G, "2.0) * pitch + offset", "2.0) * pitch - offset",
@@ -80,24 +81,24 @@ FAULTS = (
     Fault("helix taken for degrees", _G, "_DEGREES_STEP_RAD = 20.0, 0.04", "_DEGREES_STEP_RAD = 20.0, 0.001",
           _T + "test_degrees_for_radians_are_noticed"),
     Fault("complex angles", _G, 'kind not in "fiu"', 'kind not in "fiuc"',
-          _T + "test_angles_that_are_no_real_numbers_are_refused"),
+          _TABLE),
     Fault("coverage of 1", "torchpcct/validate.py", "if not 0.0 < share < 1.0", "if not 0.0 <= share <= 1.0",
-          _T + "test_intervals_refuse_an_impossible_coverage"),
-    Fault("zero is positive", "torchpcct/validate.py", "positive and result <= 0", "positive and result < 0", _WATER),
-    Fault("NaN is a number", "torchpcct/validate.py", "if math.isnan(result) or", "if False or", _WATER),
+          _TABLE),
+    Fault("zero is positive", "torchpcct/validate.py", "positive and result <= 0", "positive and result < 0", _TABLE),
+    Fault("NaN is a number", "torchpcct/validate.py", "if math.isnan(result) or", "if False or", _TABLE),
     Fault("grid beside the rows", "torchpcct/detector_window.py", "if row1 < 0.0 or row0 > geometry.rows - 1:",
           "if False:", _T + "test_a_grid_that_no_row_sees_casts_no_shadow"),
-    Fault("short water table", _L, "coefficients.shape[0] != scale.size", "False", _WATER),
-    Fault("scale 0", _L, "if not (scale > 0).all():", "if False:", _WATER),
-    Fault("infinite water table", _L, "if not np.isfinite(array).all():", "if False:", _WATER),
+    Fault("short water table", _L, "coefficients.shape[0] != scale.size", "False", _TABLE),
+    Fault("scale 0", _L, "if not (scale > 0).all():", "if False:", _TABLE),
+    Fault("infinite water table", _L, "if not np.isfinite(array).all():", "if False:", _TABLE),
     Fault("window beyond the table", _L, "+ columns > self.scale.size:", "+ columns > 9 * self.scale.size:",
           _T + "test_a_window_beyond_the_water_correction_is_refused"),
     Fault("checksum ignored", "torchpcct/files.py", "    if head != (_MAGIC", "    if False and head != (_MAGIC",
-          _T + "test_damaged_volume_files_are_refused"),
+          _DAMAGED),
     Fault("checksum of the first bytes", "torchpcct/files.py",
           '        file.seek(_BLOCK)\n        digest = hashlib.file_digest(file, "sha256").hexdigest()',
           '        file.seek(_BLOCK)\n        digest = hashlib.sha256(file.read(64)).hexdigest()',
-          _T + "test_damaged_volume_files_are_refused"),
+          _DAMAGED),
     Fault("abandoned files stay", "torchpcct/files.py", "if _abandoned(left, _ABANDONED_S):", "if False:",
           _C + "test_what_a_killed_process_left_is_swept_by_the_next_write"),
     Fault("failed write leaves its part", "torchpcct/files.py",

@@ -134,38 +134,13 @@ def _catsim(folder: Path) -> tuple[Path, Callable[[], Any]]:
 
 
 def _clinical(folder: Path) -> tuple[Path, Callable[[], Any]]:
-    import pydicom
-    from pydicom.dataset import FileMetaDataset
-    from pydicom.uid import ExplicitVRLittleEndian, generate_uid
+    from ct_pd import ct_pd
 
     from torchpcct.formats.scans import open_scan
 
     cone, lines = _lines()
-    where = folder / "projections"
-    where.mkdir()
-    for k, view in enumerate(lines):
-        d = pydicom.Dataset()
-        d.file_meta = FileMetaDataset()
-        d.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
-        d.file_meta.MediaStorageSOPClassUID = d.SOPClassUID = "1.2.840.10008.5.1.4.1.1.66"
-        d.file_meta.MediaStorageSOPInstanceUID = d.SOPInstanceUID = generate_uid()
-        d.InstanceNumber, d.Rows, d.Columns = k + 1, cone.columns, cone.rows
-        d.SamplesPerPixel, d.PhotometricInterpretation, d.PixelRepresentation = 1, "MONOCHROME2", 0
-        d.BitsAllocated, d.BitsStored, d.HighBit = 16, 16, 15
-        d.RescaleSlope, d.RescaleIntercept = "0.0001", "-0.1"
-        for group in (0x7029, 0x7031, 0x7033, 0x7041):
-            d.add_new((group, 0x10), "LO", "DICOM-CT-PD")
-        for tag, vr, value in (
-            (0x70291002, "FL", 1.7), (0x70291006, "FL", 1.5), (0x7029100B, "CS", "CYLINDRICAL"),
-            (0x70291010, "US", cone.rows), (0x70291011, "US", cone.columns),
-            (0x70311001, "FL", cone.angles[k] - math.pi / 2), (0x70311002, "FL", 0.0), (0x70311003, "FL", 300.0),
-            (0x70311031, "FL", 500.0), (0x70311033, "FL", [12.5, 2.0]), (0x7033100E, "CS", "FFSNONE"),
-            (0x70411001, "DS", "0.02"),
-        ):  # fmt: skip
-            d.add_new(tag, vr, value)
-        d.PixelData = np.rint((view.T + 0.1) / 0.0001).astype("<u2").tobytes()
-        d.save_as(where / f"{k:03d}.dcm", enforce_file_format=True)
-    return where / "003.dcm", lambda: _scan(open_scan(where))
+    where = ct_pd(folder / "projections", lines, cone)
+    return sorted(where.iterdir())[3], lambda: _scan(open_scan(where))
 
 
 def _rtk(folder: Path) -> tuple[Path, Callable[[], Any]]:
@@ -207,7 +182,7 @@ READERS: dict[str, Callable[[Path], tuple[Path, Callable[[], Any]]]] = {
 }  # fmt: skip
 """File to damage and how it is read, made in a folder."""
 SEALED = ("scan", "weights", "h5")
-"""Our own formats, which carry a checksum: what they give is what was written."""
+"""Our own formats, which carry a checksum: what they give is what was written, or an error that names the file."""
 
 
 def _same(a: Any, b: Any) -> bool:
@@ -245,7 +220,8 @@ def outcomes(name: str, folder: Path, copies: int, seed: int = 0, seconds: float
                 warnings.simplefilter("ignore")
                 found["same" if _same(truth, read()) else "other"] += 1
         except (ValueError, TypeError, FileNotFoundError) as error:
-            found["refused" if len(str(error)) > 10 else f"copy {k} says nothing: {error!r}"] += 1
+            clear = len(str(error)) > 10 and (name not in SEALED or path.name in str(error))
+            found["refused" if clear else f"copy {k} says nothing: {error!r}"] += 1
         except Exception as error:
             found[f"copy {k}, {type(error).__name__}: {str(error)[:200]}"] += 1
         finally:

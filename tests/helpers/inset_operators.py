@@ -30,6 +30,29 @@ def matrix(operator, shape, dtype=torch.float64):
     return operator(torch.eye(n, dtype=dtype).reshape(n, *shape)).reshape(n, n)
 
 
+def dense(A):
+    """A as a float64 matrix, ``(readings, voxels)``."""
+    n = math.prod(A.domain_shape)
+    return A(torch.eye(n, dtype=torch.float64).reshape(n, *A.domain_shape)).reshape(n, -1).T
+
+
+def minimum(H, b, bound, shape, step, start=None):
+    """Of ½ xᵀHx − bᵀx and a prior, by float64 matrices: majorise and minimise until the steps are below ``step``.
+
+    The energy is convex: a start near the end only saves time.
+    """
+    x = torch.zeros_like(b) if start is None else start.double().flatten()
+    for _ in range(2000):
+        at = x.reshape(1, *shape)
+        R = matrix(lambda v, at=at: bound.majorizer(at.expand(len(v), *at.shape[1:]), v), shape)
+        new = torch.linalg.solve(H + R, b)
+        done = float((new - x).abs().max()) < step
+        x = new
+        if done:
+            return x.reshape(shape)
+    raise AssertionError("the reference did not converge")
+
+
 def tissue(grid):
     _, y, x = np.meshgrid(*(a - c for a, c in zip(grid.axes, grid.center, strict=True)), indexing="ij")
     tube = 160.0 * (np.hypot(y, x - 0.3) < 1.7) + 400.0 * (np.hypot(y, x + 0.4) < 1.0)

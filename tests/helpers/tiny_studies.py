@@ -49,7 +49,8 @@ scene:
     - {name: insert, shape: ellipsoid, semi_axes: 1.5, position: {x: 30, y: 10, z: 0}, material: soft_tissue,
        parent: patient}
 signal: insert
-scanner: {preset: pcct, views: 90}
+scanner: {preset: pcct, views: 90, rows: 24, energy_bin_kev: 4}
+tolerance_hu: 1000
 inset: {size: [6, 8, 8], voxel_mm: 0.4}
 exposures_s: 20
 """

@@ -28,7 +28,7 @@ from torchpcct.scene.voxels import VoxelScene
 
 def test_command_line_simulate_and_reconstruct(tmp_path, capsys):
     scan, volume = tmp_path / "scan.h5", tmp_path / "plaque.nii.gz"
-    assert main(["simulate", "--views", "48", "--exposure", "2", "--seed", "3", "--json", "--out", str(scan)]) == 0
+    assert main(["simulate", "--views", "12", "--exposure", "2", "--seed", "3", "--json", "--out", str(scan)]) == 0
     assert json.loads(capsys.readouterr().out)["seed"] == 3
     assert main(["reconstruct", str(scan), "--kernel", "soft", "--voxel", "0.4", "--json", "--out", str(volume)]) == 0
     summary = json.loads(capsys.readouterr().out)
@@ -269,33 +269,6 @@ def test_names_and_grey_scale_of_their_own(tmp_path, capsys, monkeypatch):
     assert sorted(p.name for p in tmp_path.glob("*.png")) == ["series.png", "small.png"]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["simulate", "--out", "{tmp}/a.png"], "unknown ending of 'a.png'"),
-        (["simulate", "--config", "{tmp}/none.yaml", "--out", "{tmp}/a.h5"], "none.yaml"),
-        (["reconstruct", "{tmp}", "--method", "art", "--out", "{tmp}/a.h5"], "unknown method 'art'"),
-        (["view", "{tmp}/none.h5", "--out", "{tmp}/a.bmp"], "unknown ending of 'a.bmp'"),
-        (["info", "{tmp}/none.h5"], "none.h5"),
-        (["simulate", "--exposure", "0", "--out", "{tmp}/a.h5"], "--exposure must be greater than 0 s"),
-        (["simulate", "--seed", "-1", "--exposure", "1", "--out", "{tmp}/a.h5"], "seed"),
-        (["simulate", "--out", "{tmp}/none/a.h5"], "does not exist"),
-        (["reconstruct", "{tmp}/none.h5", "--out", "{tmp}/a.h5"], "none.h5"),
-        (["reconstruct", "{tmp}/none.h5", "--out", "{tmp}/a.png"], "unknown volume format"),
-        (["reconstruct", "{tmp}/none.h5", "--voxel", "0", "--out", "{tmp}/a.h5"], "--voxel must be greater than 0 mm"),
-        (["plaque", "{tmp}/none.h5", "--out", "{tmp}/a"], "none.h5"),
-        (["compare", "--n", "2", "--out", "{tmp}/o"], "n must be at least 8"),
-        (["dose-factor", "--n", "2", "--out", "{tmp}/o"], "n must be at least 8"),
-        (["study", "magic", "--out", "{tmp}/o"], "unknown study 'magic'"),
-        (["study", "noise", "--set", "views", "--out", "{tmp}/o"], "give field=value"),
-    ],
-)
-def test_command_line_refuses_bad_input_and_writes_nothing(tmp_path, capsys, arguments, message):
-    assert main([a.format(tmp=tmp_path) for a in arguments]) == 2
-    assert message in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_lower_dose_of_a_scan_file(tmp_path, capsys):
     """Counts are thinned, the same by the same seed; nothing is made of line integrals of unknown photons."""
     geometry = ParallelBeam(np.arange(60) * np.pi / 60, 40, 0.5)
@@ -316,18 +289,6 @@ def test_a_lower_dose_of_a_scan_file(tmp_path, capsys):
     assert not (tmp_path / "l.h5").exists()
     assert main([*command, "--photons", "1e4"]) == 0
     assert "approximate" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    "command", ["evaluate", "compare", "dose-factor", "study", "simulate", "reconstruct", "lower-dose", "plaque"]
-)
-def test_help(command, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main([command, "--help"])
-    assert stop.value.code == 0
-    text = capsys.readouterr().out
-    for flag in ("--seed", "--device", "--out"):
-        assert flag in text
 
 
 def test_verify_finds_a_stale_readme_and_renders_it(tmp_path, capsys):

@@ -84,7 +84,7 @@ def test_a_slip_is_answered_with_what_was_meant(words, expected_text, capsys, tm
 def test_the_demo_does_what_its_lines_do(quick, tmp_path, capsys, monkeypatch):
     if quick:  # FBP in place of MBIR
         real = recon.api.reconstruct
-        monkeypatch.setattr(starting, "_DEMO_VIEWS", 24)
+        monkeypatch.setattr(starting, "_DEMO_VIEWS", 12)
         monkeypatch.setattr("recon.api.reconstruct", lambda scan, grid, method, **_: real(scan, grid, "fbp"))
     first, second = tmp_path / "first", tmp_path / "second"
     second.mkdir()

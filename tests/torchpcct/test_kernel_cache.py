@@ -57,7 +57,9 @@ def edit(path, text, age):
     os.utime(path, (then, then))
 
 
-@pytest.mark.parametrize(("call", "second"), [("forget_outdated(__name__)", 202), ("", 4)])
+@pytest.mark.parametrize(
+    ("call", "second"), [("forget_outdated(__name__)", 202), pytest.param("", 4, marks=pytest.mark.slow)]
+)
 def test_an_edited_function_reaches_the_kernels_that_call_it(tmp_path, call, second):
     """Without the call numba gives the old result: if that ends, the module is of no use any more."""
     edit(tmp_path / "helper.py", HELPER.format(1), age=-100)

@@ -1,7 +1,6 @@
 """What once gave a wrong result without a word: each is refused, warned of, or right (scenes, scans, operators)."""
 
 import math
-import time
 import warnings
 from dataclasses import replace
 
@@ -11,11 +10,10 @@ import pytest
 import torch
 from small_scan import GRID, SCENE, scanner
 
-from torchpcct import ConeBeam, FanBeam, ParallelBeam, Projector, Scan, Volume, VolumeGrid, acquire, full_turn
+from torchpcct import ConeBeam, FanBeam, ParallelBeam, Projector, Scan, VolumeGrid, acquire, full_turn
 from torchpcct.acquisition.acquire import plan
 from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import view_step
-from torchpcct.metrics import cnr_interval, sd_interval
 from torchpcct.scanner.linearisation import WaterLinearisation
 from torchpcct.scene.materials import material
 from torchpcct.spectral import Basis, vmi_noise
@@ -55,6 +53,13 @@ def test_a_tolerance_that_compares_with_nothing_is_refused(tolerance):
 @pytest.mark.parametrize(
     ("change", "error", "match"),
     [
+        (lambda s: {"counts": s.counts * 0}, ValueError, "all counts are zero"),
+        (lambda s: {"counts": s.counts * math.nan}, ValueError, "NaN or Inf"),
+        (lambda s: {"counts": -s.counts}, ValueError, "negative"),
+        (lambda s: {"counts": s.counts[1:]}, ValueError, "shape"),
+        (lambda s: {"exposure_s": 0.0}, ValueError, "exposure_s"),
+        (lambda s: {"surround": None}, ValueError, "surround"),
+        (lambda s: {"air": s.air * 0}, ValueError, "air readings"),
         (lambda s: {"air": s.air * math.inf}, ValueError, "air readings must be finite"),
         (lambda s: {"air": s.air * math.nan}, ValueError, "air readings must be finite"),
         (lambda s: {"surround": s.surround * 0}, ValueError, "surround readings must be finite and greater than 0"),
@@ -86,27 +91,6 @@ def test_members_of_a_scan_are_checked(clean, change, error, match):
         replace(clean, **change(clean))
 
 
-@pytest.mark.parametrize(
-    ("changes", "error", "match"),
-    [
-        ({"mu_ref": 0.0}, ValueError, "mu_ref must be greater than 0"),
-        ({"mu_ref": math.nan}, ValueError, "mu_ref must be finite"),
-        ({"mu_ref": -0.02}, ValueError, "mu_ref must be greater than 0"),
-        ({"scale": np.ones(3)}, ValueError, "shape"),
-        ({"scale": np.array([1.0, 0.0, 1.0, 1.0])}, ValueError, "column 1 has 0"),
-        ({"coefficients": np.ones((3, 2))}, ValueError, "shape"),
-        ({"coefficients": np.ones((4, 0))}, ValueError, "shape"),
-        ({"coefficients": np.full((4, 2), math.inf)}, ValueError, "8 entries are NaN or Inf"),
-        ({"coefficients": np.ones((4, 2), complex)}, TypeError, "real numbers"),
-        ({"coefficients": "abc"}, TypeError, "real numbers"),
-    ],
-)
-def test_a_bad_water_correction_is_refused(changes, error, match):
-    """Its kernel reads by index: a short table was an access beyond its end."""
-    with pytest.raises(error, match=match):
-        WaterLinearisation(**{"coefficients": np.ones((4, 2)), "scale": np.ones(4), "mu_ref": 0.02, **changes})
-
-
 def test_a_window_beyond_the_water_correction_is_refused():
     correction = WaterLinearisation(np.ones((4, 2)), np.ones(4), 0.02)
     with pytest.raises(ValueError, match="beyond the 4 columns"):
@@ -125,12 +109,6 @@ def test_degrees_for_radians_are_noticed(degrees):
         warnings.simplefilter("error")
         ParallelBeam(np.deg2rad(degrees), 10, 1.0)
         ParallelBeam(np.arange(20 * 984) * (2 * math.pi / 984), 10, 1.0)  # a helix of 20 turns
-
-
-@pytest.mark.parametrize("angles", [[1 + 2j, 0.3], np.array([1j, 2j]), ["a"], None, [None, 1.0], [[0.1], [0.2, 0.3]]])
-def test_angles_that_are_no_real_numbers_are_refused(angles):
-    with pytest.raises(TypeError, match="angles must be real numbers in rad"):
-        ParallelBeam(angles, 10, 1.0)
 
 
 def test_a_windowed_projection_equals_the_whole_one():
@@ -167,24 +145,6 @@ def test_a_grid_that_no_row_sees_casts_no_shadow(z):
         footprint(g, VolumeGrid((4, 4, 4), 0.5, (z, 0.0, 0.0)))
 
 
-@pytest.mark.parametrize("level", [2.0, 1.0, 0.0, -0.5, math.nan, 95])
-def test_intervals_refuse_an_impossible_coverage(level):
-    values = np.array([1.0, 2.0, 4.0])
-    for call in (
-        lambda: sd_interval(1.0, 10, level=level),
-        lambda: cnr_interval(values, values[::-1] + 0.1, level=level),
-    ):
-        with pytest.raises(ValueError, match="level must"):
-            call()
-
-
-def test_intervals_refuse_one_realisation():
-    with pytest.raises(ValueError, match="at least 2"):
-        sd_interval(1.0, 1)
-    with pytest.raises(ValueError, match="sd must be"):
-        sd_interval(math.nan, 10)
-
-
 def test_an_indefinite_covariance_has_no_noise():
     """C12² > C11 C22 gives a negative variance at some energy, which was shown as 0 HU."""
     basis = Basis(material("polyethylene"), material("pvc"))
@@ -193,21 +153,6 @@ def test_an_indefinite_covariance_has_no_noise():
             vmi_noise(torch.tensor(bad), basis)
     singular = torch.tensor([4.0, -6.0, 9.0])
     assert bool(torch.isfinite(vmi_noise(singular, basis)).all())
-
-
-def _damaged(good, rng, kind):
-    """A copy of a file with a flipped bit, an altered stretch, a cut end, or a hole."""
-    content = bytearray(good)
-    at = int(rng.integers(len(good)))
-    if kind == "bit":
-        content[at] ^= 1 << int(rng.integers(8))
-    elif kind == "stretch":
-        content[at : at + 64] = rng.integers(0, 256, len(content[at : at + 64]), dtype=np.uint8).tobytes()
-    elif kind == "cut":
-        del content[at:]
-    else:
-        content[at : at + 512] = bytes(len(content[at : at + 512]))
-    return bytes(content)
 
 
 def same_scan(a, b):
@@ -223,24 +168,6 @@ def same_scan(a, b):
         and np.array_equal(a.linearisation.scale, b.linearisation.scale)
         and a.linearisation.mu_ref == b.linearisation.mu_ref
     )
-
-
-def _fuzz(path, load, same, count, seed=0):
-    """A damaged file gives the same content or a ValueError that names it; how many gave the error."""
-    good, expected = path.read_bytes(), load(path)
-    rng = np.random.default_rng(seed)
-    refused = 0
-    for trial in range(count):
-        path.write_bytes(_damaged(good, rng, ("bit", "bit", "stretch", "cut", "hole")[trial % 5]))
-        try:
-            found = load(path)
-        except ValueError as error:
-            assert str(path) in str(error)  # noqa: PT017 (the other outcome is checked as well)
-            refused += 1
-        else:
-            assert same(found, expected), f"damage {trial} of seed {seed} gave another content"
-    path.write_bytes(good)
-    return refused
 
 
 def _small_scan(tmp_path):
@@ -259,32 +186,6 @@ def _small_scan(tmp_path):
         info={"scanner": "test", "plan": [1, 2.5, None]},
     ).save(tmp_path / "scan.h5")
     return tmp_path / "scan.h5"
-
-
-def test_damaged_scan_files_are_refused(tmp_path):
-    """Of 140 flipped bits, 71 changed counts without a word."""
-    path = _small_scan(tmp_path)
-    assert _fuzz(path, Scan.load, same_scan, 250) > 50
-
-
-def test_damaged_volume_files_are_refused(tmp_path):
-    data = torch.randn(5, 6, 7, generator=torch.Generator().manual_seed(0))
-    path = tmp_path / "volume.h5"
-    Volume(data, VolumeGrid((5, 6, 7), 0.3, (1.0, 2.0, 3.0)), {"method": "fbp", "seconds": 1.5}).save(path)
-
-    def same(a, b):
-        return a.data.dtype == b.data.dtype and torch.equal(a.data, b.data) and (a.grid, a.report) == (b.grid, b.report)
-
-    assert _fuzz(path, Volume.load, same, 250) > 50
-
-
-@pytest.mark.slow
-def test_damaged_files_are_refused_for_ten_minutes(tmp_path):
-    path, seed = _small_scan(tmp_path), 1
-    end = time.monotonic() + 600.0
-    while time.monotonic() < end:
-        _fuzz(path, Scan.load, same_scan, 500, seed)
-        seed += 1
 
 
 def test_files_of_earlier_versions_still_load(tmp_path):

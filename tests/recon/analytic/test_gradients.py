@@ -44,15 +44,6 @@ CASES: dict[str, tuple[Geometry, VolumeGrid]] = {
 }
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    """The tensors here are tiny: hand-over between threads would take all the time on a busy machine."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
 @pytest.fixture(params=CASES, ids=list(CASES))
 def case(request: pytest.FixtureRequest) -> tuple[Geometry, VolumeGrid]:
     return CASES[request.param]

@@ -35,15 +35,6 @@ SCANS: dict[str, tuple[Any, VolumeGrid]] = {
 }
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Small tensors: hand-over between threads would take all the time on a busy machine."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
 def _path(axes: int, views: int = 12) -> np.ndarray:
     return np.random.default_rng(3).uniform(-2, 2, (views, axes))
 

@@ -271,7 +271,10 @@ def test_commands(tmp_path, capsys, monkeypatch):
     assert "is a file" in capsys.readouterr().err
 
 
-def test_two_measured_scans(task, tmp_path):
+def test_two_measured_scans(tmp_path):
+    text = INSERT.replace(", rows: 24, energy_bin_kev: 4}\ntolerance_hu: 1000", "}")  # with all effects
+    (tmp_path / "insert.yaml").write_text(text, encoding="utf-8")
+    task = read_task(tmp_path / "insert.yaml")
     present, _ = task.scans(Store(tmp_path))
     scans = [present.with_noise(5000.0, k) for k in range(2)]
     soft, bone = evaluate_scans(scans, task.grid, ["fbp:soft", "fbp:bone"])

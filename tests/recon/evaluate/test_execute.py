@@ -92,7 +92,7 @@ def test_processes_give_the_same_figures(task, serial, processes, tmp_path, monk
 
 
 @pytest.mark.cluster
-@pytest.mark.parametrize("shared", [True, False])
+@pytest.mark.parametrize("shared", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_a_cluster_gives_the_same_figures(task, serial, cluster, tmp_path, monkeypatch, shared):
     if not shared:  # a marker that no worker sees: they compute on a disk of their own
         monkeypatch.setattr(execute, "marker", lambda folder: contextlib.nullcontext(folder / "not" / f"{shared}"))
@@ -103,8 +103,8 @@ def test_a_cluster_gives_the_same_figures(task, serial, cluster, tmp_path, monke
 
 @pytest.mark.parametrize(
     "name",
-    ["hardcases", *(pytest.param(n, marks=pytest.mark.slow) for n in ("bowtie", "motion", "resolution", "spectral",
-                                                                      "detector", "compare"))],
+    ["detector", *(pytest.param(n, marks=pytest.mark.slow) for n in ("bowtie", "motion", "resolution", "spectral",
+                                                                     "hardcases", "compare"))],
 )  # fmt: skip
 def test_a_study_gives_the_same_report(name, processes, tmp_path):
     settings = {**TINY[name], **({"cases": ("dead-column", "metal")} if name == "hardcases" else {})}

@@ -2,10 +2,11 @@
 
 import math
 
+import inset_operators
 import numpy as np
 import pytest
 import torch
-from inset_operators import matrix, problem
+from inset_operators import minimum, problem
 
 from recon.gram.gram import Gram
 from recon.least_squares.joint import joint_pwls, mean_weights, weigh
@@ -55,9 +56,7 @@ def inset():
 
 @pytest.fixture(scope="module")
 def dense(inset):
-    A = inset[0]
-    n = math.prod(A.domain_shape)
-    return A(torch.eye(n, dtype=torch.float64).reshape(n, *A.domain_shape)).reshape(n, -1).T
+    return inset_operators.dense(inset[0])
 
 
 def normal_matrix(dense, f):
@@ -69,25 +68,10 @@ def normal_matrix(dense, f):
 
 
 def reference(dense, f, y, bound, shape, start):
-    """The minimum with dense float64 matrices: majorise and minimise until the steps are below 1e-8 HU.
-
-    The energy is convex: the start, near the end where the solver under test is right, only saves time.
-    """
-    data = y.double().reshape(2, -1)
-    weighted = weigh(f.double().reshape(3, -1), data, 1)
+    """The minimum with dense float64 matrices, to 1e-8 HU."""
+    weighted = weigh(f.double().reshape(3, -1), y.double().reshape(2, -1), 1)
     b = torch.cat([dense.T @ weighted[0], dense.T @ weighted[1]])
-    H = normal_matrix(dense, f)
-    x = start.double().flatten()
-    for _ in range(2000):
-        at = x.reshape(1, 2, *shape)
-        R = matrix(lambda v, at=at: bound.majorizer(at.expand(len(v), -1, -1, -1, -1), v), (2, *shape))
-        new = torch.linalg.solve(H + R, b)
-        done = float((new - x).abs().max()) < 1e-8
-        x = new
-        if done:
-            break
-    assert done
-    return x.reshape(2, *shape)
+    return minimum(normal_matrix(dense, f), b, bound, (2, *shape), 1e-8, start)
 
 
 def rms(a, b):

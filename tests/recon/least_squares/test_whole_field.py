@@ -5,7 +5,7 @@ import math
 
 import pytest
 import torch
-from inset_operators import HU, problem
+from inset_operators import HU, dense, minimum, problem
 
 from recon.gram.gram import Gram
 from recon.least_squares import field_model
@@ -41,9 +41,7 @@ def scan(request):
     if request.param == "parallel":
         w[:, 9] = 0
     data = lines + torch.randn(lines.shape, generator=torch.Generator().manual_seed(3)) / w.clamp_min(1).sqrt()
-    n = math.prod(A.domain_shape)
-    matrix = A(torch.eye(n, dtype=torch.float64).reshape(n, *A.domain_shape)).reshape(n, -1).T
-    return A, data, w, matrix
+    return A, data, w, dense(A)
 
 
 def test_voxels_too_large_for_the_reference_frequency():
@@ -56,21 +54,11 @@ def test_voxels_too_large_for_the_reference_frequency():
     assert 0.5 < small / large < 1.0
 
 
-def minimum(matrix, A, y, w, bound):
-    """With dense float64 matrices: majorise and minimise until the steps are below 1e-6 HU."""
+def exact_minimum(matrix, A, y, w, bound):
+    """With dense float64 matrices, to 1e-6 HU."""
     weights = w.double().flatten()
     H, b = matrix.T @ (weights[:, None] * matrix), matrix.T @ (weights * y.double().flatten())
-    shape, n = A.domain_shape, len(b)
-    unit = torch.eye(n, dtype=torch.float64).reshape(n, *shape)
-    x = torch.zeros_like(b)
-    for _ in range(300):
-        R = bound.majorizer(x.reshape(1, *shape).expand(n, *shape), unit).reshape(n, n)
-        new = torch.linalg.solve(H + R, b)
-        done = float((new - x).abs().max()) < 1e-6 * HU
-        x = new
-        if done:
-            return x.reshape(shape)
-    raise AssertionError("the reference did not converge")
+    return minimum(H, b, bound, A.domain_shape, 1e-6 * HU)
 
 
 def energy(matrix, y, w, bound, x):
@@ -86,7 +74,7 @@ def hu_rms(a, b):
 def test_finds_the_dense_minimum(scan, prior):
     A, y, w, matrix = scan
     bound = prior.bind(FieldModel(A, w).information(HU), A.grid.spacing, HU)
-    exact = minimum(matrix, A, y, w, bound)
+    exact = exact_minimum(matrix, A, y, w, bound)
     found = pwls(A, y, w, prior, mu_per_hu=HU, tolerance=0.5)
     assert found.report["converged"]
     assert found.report["model"] == "gradient"
@@ -100,7 +88,7 @@ def test_every_pair_lowers_the_objective(scan):
     """From a start that is far, from one that is near, and from the minimum itself."""
     A, y, w, matrix = scan
     bound = EDGE.bind(FieldModel(A, w).information(HU), A.grid.spacing, HU)
-    exact = minimum(matrix, A, y, w, bound)
+    exact = exact_minimum(matrix, A, y, w, bound)
     noise = torch.randn(A.domain_shape, generator=torch.Generator().manual_seed(1))
     model = FieldModel(A, w)
     for start in (3000 * HU * noise, exact.float() + 5 * HU * noise, exact.float()):
@@ -134,10 +122,9 @@ def test_voxels_that_some_views_miss_converge_last_and_that_is_said():
     r = torch.hypot(*torch.meshgrid(*[torch.from_numpy(a) for a in A.grid.axes], indexing="ij"))
     y = A((0.02 * (r < 10)).float())
     w = 4e4 * torch.exp(-4 * y / y.max())
-    n = math.prod(A.domain_shape)
-    matrix = A(torch.eye(n, dtype=torch.float64).reshape(n, *A.domain_shape)).reshape(n, -1).T
+    matrix = dense(A)
     bound = EDGE.bind(FieldModel(A, w).information(HU), A.grid.spacing, HU)
-    exact = minimum(matrix, A, y, w, bound)
+    exact = exact_minimum(matrix, A, y, w, bound)
     found = pwls(A, y, w, bound, mu_per_hu=HU, tolerance=1.0)
     assert hu_rms(found.x[r < 11], exact[r < 11]) < 2.0
     assert found.report["rmsd_hu"][-1] > hu_rms(found.x, exact) / 3
@@ -146,7 +133,7 @@ def test_voxels_that_some_views_miss_converge_last_and_that_is_said():
 def test_a_flat_prior_is_not_called_converged_before_it_is(scan):
     A, y, w, matrix = scan
     bound = FLAT.bind(FieldModel(A, w).information(HU), A.grid.spacing, HU)
-    exact = minimum(matrix, A, y, w, bound)
+    exact = exact_minimum(matrix, A, y, w, bound)
     for pairs in (20, 60):
         found = pwls(A, y, w, bound, mu_per_hu=HU, tolerance=1.0, max_exact=pairs)
         assert found.report["rmsd_hu"][-1] > hu_rms(found.x, exact) / 3

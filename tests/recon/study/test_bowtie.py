@@ -11,7 +11,6 @@ import torch
 from tiny_studies import assert_report_is_whole
 
 from recon.study.bowtie import (
-    Settings,
     dose_maps,
     polynomial_linearisation,
     radial_profile,
@@ -137,24 +136,6 @@ def test_ratios_and_regions():
     assert np.nanmin(roi[large > 0] / large[large > 0]) > 0.3
     with pytest.raises(ValueError, match="voxels"):
         region_ratio(maps, scene, ("bone",))
-
-
-@pytest.mark.parametrize(
-    ("change", "match"),
-    [
-        ({"views": 4}, "views"),
-        ({"realizations": 1}, "realizations"),
-        ({"histories": 10}, "histories"),
-        ({"exposure_s": 0.0}, "exposure_s"),
-        ({"map_mm": math.nan}, "map_mm"),
-        ({"plaque_doses": ()}, "plaque_doses"),
-        ({"plaque_realizations": 7}, "plaque_realizations"),
-        ({"detector": "film"}, "detector"),
-    ],
-)
-def test_bad_settings(change, match):
-    with pytest.raises(ValueError, match=match):
-        Settings(**change)
 
 
 @pytest.mark.slow

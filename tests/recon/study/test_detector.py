@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from tiny_studies import assert_report_is_whole
 
-from recon.study.detector import Settings
 from torchpcct.scanner import SiliconDetector
 from torchpcct.scanner.compton import recoil
 
@@ -26,19 +25,6 @@ def test_report(tiny, tmp_path):
     text = tiny("detector").report.text
     assert f"raise the counts by {shared['counts_percent']:.1f} %" in text
     assert f"{-shared['photons_percent']:.2f} % fewer photons count, and the DQE falls by" in text
-
-
-@pytest.mark.parametrize(
-    ("change", "match"),
-    [
-        ({"photons": 10}, "photons"),
-        ({"dead_times_ns": ()}, "dead_times"),
-        ({"charge_sharing": (0.0,)}, "charge_sharing"),
-    ],
-)
-def test_bad_settings(change, match):
-    with pytest.raises(ValueError, match=match):
-        Settings(**change)
 
 
 def test_photons_of_which_a_part_counts_are_those_of_drawn_splits():

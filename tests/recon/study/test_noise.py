@@ -127,22 +127,6 @@ def test_settings():
     assert settings.axes[:3] == [("soft", 0.2), ("standard", 0.2), ("soft", 0.25)]
 
 
-@pytest.mark.parametrize(
-    ("changes", "match"),
-    [
-        ({"realizations": 9}, "realizations"),
-        ({"views": 4}, "views"),
-        ({"doses": {"1x": 1.0}}, "two exposures"),
-        ({"kernels": ("soft",), "voxels_mm": (0.2,)}, "two settings"),
-        ({"experiments": 1}, "experiments"),
-        ({"reconstructed": 0}, "reconstructed"),
-    ],
-)
-def test_bad_settings(changes, match):
-    with pytest.raises(ValueError, match=match):
-        Settings(**changes)
-
-
 # --- statistics ---------------------------------------------------------------------------------------------------
 
 MEAN = np.array([[40.0, 90.0], [45.0, 95.0], [50.0, 85.0]])

@@ -8,7 +8,7 @@ import pytest
 from tiny_studies import assert_report_is_whole
 
 from recon.study.paper import facts as paper
-from recon.study.phantom import TRANSMITTED, Settings, analytic_lengths, checks, raster_lengths
+from recon.study.phantom import TRANSMITTED, analytic_lengths, checks, raster_lengths
 from torchpcct.scene.materials import MATERIALS
 from torchpcct.scene.plaque import plaque_scene
 
@@ -72,11 +72,3 @@ def test_the_library_s_table_is_the_published_one():
         total = sum(fractions.values())
         assert MATERIALS[name].density_g_cm3 == density
         assert dict(MATERIALS[name].mass_fractions) == pytest.approx({k: v / total for k, v in fractions.items()})
-
-
-@pytest.mark.parametrize(
-    ("change", "match"), [({"voxel_mm": 0.5}, "voxel_mm"), ({"energies_kev": (10.0,)}, "energies_kev")]
-)
-def test_bad_settings(change, match):
-    with pytest.raises(ValueError, match=match):
-        Settings(**change)

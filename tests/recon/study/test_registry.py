@@ -92,6 +92,49 @@ def test_settings_of_every_study(name):
         registry.run(name, other)
 
 
+BAD = {
+    "compare": [({"n": 7}, "n must be at least 8"), ({"methods": ()}, "at least one method")],
+    "phantom": [({"voxel_mm": 0.5}, "voxel_mm"), ({"energies_kev": (10.0,)}, "energies_kev")],
+    "detector": [
+        ({"photons": 10}, "photons"), ({"dead_times_ns": ()}, "dead_times"),
+        ({"charge_sharing": (0.0,)}, "charge_sharing"),
+    ],
+    "bowtie": [
+        ({"views": 4}, "views"), ({"realizations": 1}, "realizations"), ({"histories": 10}, "histories"),
+        ({"exposure_s": 0.0}, "exposure_s"), ({"map_mm": math.nan}, "map_mm"), ({"plaque_doses": ()}, "plaque_doses"),
+        ({"plaque_realizations": 7}, "plaque_realizations"), ({"detector": "film"}, "detector"),
+    ],
+    "hardcases": [({"cases": ("x",)}, "unknown case 'x'"), ({"methods": "fbp"}, "methods must be one name or more")],
+    "motion": [
+        ({"voxel_mm": 0.0}, "voxel_mm"), ({"fractions": (0.4, 0.2)}, "fractions must rise"),
+        ({"fractions": ()}, "at least one"), ({"errors": (1.5,)}, "errors must rise"),
+        ({"methods": ("pwls",)}, "must hold fbp"), ({"methods": ("fbp", "tv")}, "must hold fbp"),
+    ],
+    "noise": [
+        ({"realizations": 9}, "realizations"), ({"views": 4}, "views"), ({"doses": {"1x": 1.0}}, "two exposures"),
+        ({"kernels": ("soft",), "voxels_mm": (0.2,)}, "two settings"), ({"experiments": 1}, "experiments"),
+        ({"reconstructed": 0}, "reconstructed"),
+    ],
+    "resolution": [
+        ({"sigmas_px": (1.0, 2.0, 3.0)}, "rise from 0"), ({"sigmas_px": (0.0, 2.0, 1.0)}, "rise from 0"),
+        ({"tolerance": 1.5}, "tolerance"), ({"exposure_s": 0.0}, "exposure_s"),
+    ],
+    "spectral": [
+        ({"exposure_s": 0.0}, "exposure_s"), ({"realizations": 0}, "realizations"), ({"views": 10}, "views"),
+        ({"mbir_realizations": 9}, "mbir_realizations"), ({"noise_levels": (0.25, 1.0)}, "ascend from 0"),
+        ({"noise_levels": (0.0, 1.0, 0.5)}, "ascend from 0"), ({"calibration_views": 8}, "calibration_views"),
+        ({"transport_photons": 10}, "transport_photons"), ({"threshold_error_kev": 9.0}, "threshold_error_kev"),
+    ],
+}  # fmt: skip
+"""Study → changes of its settings that it refuses, and in which words."""
+
+
+@pytest.mark.parametrize(("name", "change", "match"), [(n, *case) for n, cases in BAD.items() for case in cases])
+def test_bad_settings(name, change, match):
+    with pytest.raises(ValueError, match=match):
+        registry.part(name).Settings(**change)
+
+
 def test_changes_from_the_command_line():
     settings = registry.build_settings("compare", quick=True, changes=["views=96", "methods=['fbp:bone']"])
     assert (settings.views, settings.methods) == (96, ("fbp:bone",))

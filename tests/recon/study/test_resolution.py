@@ -11,7 +11,7 @@ from plaque_image import tissue_volume
 from tiny_studies import assert_report_is_whole
 
 from recon.study.paper.measures import Truth, measure_plaque
-from recon.study.resolution import FWHM_PER_SIGMA, Settings, blur, blur_series, crossing, limits, point_width
+from recon.study.resolution import FWHM_PER_SIGMA, blur, blur_series, crossing, limits, point_width
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.resolution import ellipsoid_distance
 from torchpcct.metrics.roi import axial_grid
@@ -140,14 +140,3 @@ def test_report(tiny, tmp_path):
     excess = data["scanners"]["PCCT"]["blurred"][0]["cap_line_mm"] / data["truth"]["cap_mm"] - 1.0
     assert data["cap_excess"] == pytest.approx(excess)
     assert f"{100 * abs(excess):.0f} % too {'thick' if excess > 0 else 'thin'}" in study.report.text
-
-
-def test_settings():
-    for change, message in (
-        ({"sigmas_px": (1.0, 2.0, 3.0)}, "rise from 0"),
-        ({"sigmas_px": (0.0, 2.0, 1.0)}, "rise from 0"),
-        ({"tolerance": 1.5}, "tolerance"),
-        ({"exposure_s": 0.0}, "exposure_s"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            Settings(**change)

@@ -140,25 +140,6 @@ def test_vmi_of_the_corners_is_the_tissue():
     assert contrast.tolist() == pytest.approx([64, 60], abs=2)
 
 
-@pytest.mark.parametrize(
-    ("change", "match"),
-    [
-        ({"exposure_s": 0.0}, "exposure_s"),
-        ({"realizations": 0}, "realizations"),
-        ({"mbir_realizations": 9}, "mbir_realizations"),
-        ({"noise_levels": (0.25, 1.0)}, "ascend from 0"),
-        ({"noise_levels": (0.0, 1.0, 0.5)}, "ascend from 0"),
-        ({"views": 10}, "views"),
-        ({"calibration_views": 8}, "calibration_views"),
-        ({"transport_photons": 10}, "transport_photons"),
-        ({"threshold_error_kev": 9.0}, "threshold_error_kev"),
-    ],
-)
-def test_bad_settings(change, match):
-    with pytest.raises(ValueError, match=match):
-        Settings(**change)
-
-
 def test_what_joint_mbir_does_to_the_contrast_is_said_by_its_sign(tiny):
     data = json.loads(tiny("spectral").report.json)
     clean = data["mbir"]["at_best_energy"][0]

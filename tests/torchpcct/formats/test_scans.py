@@ -7,14 +7,12 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-import pydicom
 import pytest
 import tifffile
 import torch
 import yaml
 from analytic import Ellipsoid, line_integrals
-from pydicom.dataset import FileMetaDataset
-from pydicom.uid import ExplicitVRLittleEndian, generate_uid
+from ct_pd import ct_pd
 
 from recon import reconstruct
 from recon.cli import main
@@ -35,35 +33,6 @@ BODY = [Ellipsoid((2.0, -3.0), (14.0, 18.0), value=MU), Ellipsoid((6.0, 5.0), 3.
 PARALLEL = ParallelBeam(np.arange(91) * math.pi / 90, 64, 1.0, -1.75)
 CONE = ConeBeam(full_turn(40), 300.0, 500.0, 64, 3, (1.5, 1.7))
 CURVED = ConeBeam(full_turn(72, 0.3), 300.0, 500.0, 64, 4, (1.5, 1.7), (0.25, 0.6), "curved")
-
-
-def damaged(path: Path, copies: int, seed: int = 0):
-    """Copies of a file that were cut off, or have flipped bits; half of the flips within the first kilobyte."""
-    content, rng = path.read_bytes(), np.random.default_rng(seed)
-    for k in range(copies):
-        broken = bytearray(content)
-        if k % 3 == 0:
-            broken = broken[: int(rng.integers(0, len(content)))]
-        else:
-            end = min(1024, len(content)) if k % 3 == 1 else len(content)
-            for at in rng.integers(0, end, 8):
-                broken[at] ^= 1 << int(rng.integers(0, 8))
-        yield bytes(broken)
-
-
-def survive(path: Path, read, copies: int = 60):
-    """Every damaged copy gives a clear error that names the file, or a scan; nothing else, and most are found."""
-    refused, content = 0, path.read_bytes()
-    for broken in damaged(path, copies):
-        path.write_bytes(broken)
-        try:
-            read()
-        except (ValueError, TypeError) as error:
-            refused += bool(str(error))
-        except OSError as error:
-            pytest.fail(f"a bare {type(error).__name__}: {error}")
-    path.write_bytes(content)
-    assert refused >= copies // 3  # all that were cut off
 
 
 def data_exchange(path: Path, **more):
@@ -250,13 +219,6 @@ def test_cleaned_keeps_the_scan_and_its_weights(tmp_path):
         cleaned(Scan.from_line_integrals(np.zeros(CONE.shape) + 0.1, CONE, photons=1e5))
 
 
-def test_damaged_data_exchange(tmp_path):
-    path = data_exchange(tmp_path / "scan.h5")
-    survive(path, lambda: open_scan(path))
-    with pytest.raises(FileNotFoundError, match=r"none\.h5"):
-        open_scan(tmp_path / "none.h5")
-
-
 @pytest.mark.parametrize("form", ["tif", "stack.tif", "npy"])
 def test_stacks_with_a_description(tmp_path, form):
     lines = line_integrals(CONE, [Ellipsoid((2.0, -3.0), 15.0, value=MU)], sub=1)
@@ -280,9 +242,6 @@ def test_stacks_with_a_description(tmp_path, form):
     scan = open_scan(path)
     np.testing.assert_allclose(scan.geometry.angles, CONE.angles, atol=1e-12)
     np.testing.assert_allclose(scan.line_integrals().numpy(), lines, atol=1e-4)
-    part = sorted((tmp_path / "p").iterdir())[0]
-    survive(part, lambda: open_scan(path), copies=30)
-    survive(path, lambda: open_scan(path), copies=30)
     path.write_text(yaml.safe_dump(text | {"gian": 3}), encoding="utf-8")
     with pytest.raises(ValueError, match="unknown in a scan of counts: gian"):
         open_scan(path)
@@ -319,36 +278,6 @@ def test_catsim(tmp_path):
         open_scan(tmp_path / "a.prep", CONE)
 
 
-def ct_pd(folder: Path, lines, geometry, climb: float = 0.0, spot: str = "FFSNONE"):
-    """DICOM-CT-PD by pydicom: focal spot at (−ρ sin φ, ρ cos φ), element i at φ + (i − i₀)Δ / d."""
-    folder.mkdir()
-    g, n, rows = geometry, geometry.columns, geometry.rows
-    centre = ((n + 1) / 2 + g.offset[1] / g.pitch[1], (rows + 1) / 2 - g.offset[0] / g.pitch[0])
-    for k, view in enumerate(lines):
-        d = pydicom.Dataset()
-        d.file_meta = FileMetaDataset()
-        d.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
-        d.file_meta.MediaStorageSOPClassUID = "1.2.840.10008.5.1.4.1.1.66"
-        d.file_meta.MediaStorageSOPInstanceUID = d.SOPInstanceUID = generate_uid()
-        d.SOPClassUID, d.InstanceNumber = "1.2.840.10008.5.1.4.1.1.66", k + 1
-        d.Rows, d.Columns = n, rows  # channels are image rows
-        d.SamplesPerPixel, d.PhotometricInterpretation, d.PixelRepresentation = 1, "MONOCHROME2", 0
-        d.BitsAllocated, d.BitsStored, d.HighBit = 16, 16, 15
-        d.RescaleSlope, d.RescaleIntercept = "0.0001", "-0.1"
-        for group in (0x7029, 0x7031, 0x7033, 0x7041):
-            d.add_new((group, 0x10), "LO", "DICOM-CT-PD")
-        for tag, vr, value in (
-            (0x70291002, "FL", g.pitch[1]), (0x70291006, "FL", g.pitch[0]), (0x7029100B, "CS", "CYLINDRICAL"),
-            (0x70291010, "US", rows), (0x70291011, "US", n), (0x70311001, "FL", g.angles[k] - math.pi / 2),
-            (0x70311002, "FL", climb * k), (0x70311003, "FL", g.sod), (0x70311031, "FL", g.sdd),
-            (0x70311033, "FL", list(centre)), (0x7033100E, "CS", spot), (0x70411001, "DS", str(MU)),
-        ):  # fmt: skip
-            d.add_new(tag, vr, value)
-        d.PixelData = np.rint((view[:, ::-1].T + 0.1) / 0.0001).astype("<u2").tobytes()
-        d.save_as(folder / f"{len(lines) - k:04d}.dcm", enforce_file_format=True)  # names in the other order
-    return folder
-
-
 def test_dicom_ct_pd(tmp_path):
     lines = line_integrals(CURVED, BODY, sub=1)
     folder = ct_pd(tmp_path / "axial", lines, CURVED)
@@ -359,9 +288,7 @@ def test_dicom_ct_pd(tmp_path):
     np.testing.assert_allclose(scan.line_integrals().numpy(), lines, atol=1e-4)
     inside = reconstruct(scan, VolumeGrid((1, 6, 6), 1.0, (0.0, -2.0, -6.0)), "fbp").data
     assert float(inside.mean().abs()) < 15
-    sample = sorted(folder.iterdir())[3]
-    survive(sample, lambda: read_dicom_ct_pd(folder), copies=18)
-    sample.unlink()
+    sorted(folder.iterdir())[3].unlink()
     with pytest.raises(ValueError, match="instance numbers have gaps"):
         read_dicom_ct_pd(folder)
 
@@ -397,7 +324,6 @@ def test_rtk_matrices(tmp_path):
     circular = geometry.as_circular()
     assert circular is not None
     np.testing.assert_allclose(circular[0].angles % (2 * math.pi), CONE.angles, atol=1e-9)
-    survive(path, lambda: read_rtk(path, CONE.columns, CONE.rows, CONE.pitch))
 
 
 def test_unknown_endings_are_refused_first(tmp_path):

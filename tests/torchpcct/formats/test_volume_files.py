@@ -188,27 +188,6 @@ def test_a_clinical_slice_reads_as_pydicom_says(tmp_path):
     np.testing.assert_array_equal(volume.data[0].numpy(), expected[::-1, ::-1])
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_damaged_volumes_give_a_clear_error_or_a_volume(tmp_path, name):
-    Volume(DATA, GRID).save(tmp_path / name)
-    target = tmp_path / name
-    path = sorted(target.iterdir())[1] if target.is_dir() else target
-    content, rng, refused = path.read_bytes(), np.random.default_rng(0), 0
-    for k in range(60):
-        broken = bytearray(content)
-        if k % 2:
-            broken = broken[: int(rng.integers(0, len(content)))]
-        else:
-            for at in rng.integers(0, min(len(content), 400), 6):
-                broken[at] ^= 1 << int(rng.integers(0, 8))
-        path.write_bytes(bytes(broken))
-        try:
-            Volume.load(target)
-        except ValueError as error:
-            refused += path.name.split(".")[0] in str(error) or str(target) in str(error)
-    assert refused >= 25
-
-
 def test_unknown_endings_and_oblique_axes(tmp_path):
     with pytest.raises(ValueError, match=r"unknown volume format 'v\.png': use \.nii"):
         Volume(DATA, GRID).save(tmp_path / "v.png")

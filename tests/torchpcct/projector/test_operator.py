@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from geometries import REGISTRY
+from inset_operators import dense
 
 from torchpcct import Projector
 
@@ -20,11 +21,6 @@ CASES = ["parallel_half_turn", "fan_curved_short_scan", "cone_window"]
 @pytest.fixture(params=CASES)
 def A(request):
     return Projector(*REGISTRY[request.param]())
-
-
-def dense(A):
-    n = int(np.prod(A.domain_shape))
-    return A(torch.eye(n, dtype=torch.float64).reshape(n, *A.domain_shape)).reshape(n, -1).T
 
 
 def test_product_and_adjoint(A):

@@ -170,17 +170,6 @@ def test_bad_input_is_refused_with_a_remedy(make, message):
         make()
 
 
-def test_repeated_attenuation_is_fast():
-    import time
-
-    m, energies = material("blood_iodine"), np.arange(10.5, 100)
-    m.attenuation(energies)
-    start = time.perf_counter()
-    for _ in range(100):
-        m.attenuation(energies)
-    assert (time.perf_counter() - start) / 100 < 5e-3
-
-
 def test_a_concentration_of_iodine_by_its_name():
     """10 mg in every ml; volumes add, so 1 - 0.01 / 4.93 of the ml is blood. About 30 HU for 1 mg/ml at 65 keV."""
     blood, mixed = material("blood"), material("iodine 10 mg/ml in blood")

@@ -1,7 +1,5 @@
 """Projection-domain decomposition against exact inverses, the Cramér–Rao bound and starved rays."""
 
-import time
-
 import numpy as np
 import pytest
 import torch
@@ -266,26 +264,3 @@ def test_another_basis(model):
 def test_empty_input(model):
     found = decompose(torch.zeros(8, 0, 4), model)
     assert found.line_integrals.shape == (2, 0, 4)
-
-
-@pytest.mark.bench
-def test_speed():
-    """Rays per second of a body scan at 0.35 s, on all threads numba has."""
-    scanner = presets.pcct(mode="spectral")
-    model = SpectralModel.of(scanner, 0.35)
-    gamma = scanner.geometry.fan_angles
-    fat = 2 * np.sqrt(np.clip(120.0**2 - (626 * np.sin(gamma)) ** 2, 0, None))
-    a = torch.from_numpy(np.stack([0.9655 * fat, 0.0233 * fat]))
-    mean = model.expected(a)[:, None].expand(8, 400, 1500)
-    counts = torch.poisson(mean.contiguous(), generator=torch.Generator().manual_seed(0)).float()
-    decompose(counts[:, :1], model)
-    best = min(_timed(lambda: decompose(counts, model)) for _ in range(3))
-    rate = counts[0].numel() / best
-    print(f"{rate / 1e6:.2f} M rays/s")
-    assert rate > 1e6
-
-
-def _timed(function):
-    start = time.perf_counter()
-    function()
-    return time.perf_counter() - start
