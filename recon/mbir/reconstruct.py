@@ -56,7 +56,7 @@ def reconstruct_mbir(
             :mod:`recon.mbir.unrolled`; None: that of ``network``, which is 0.5 unless it was loaded with another.
         noise_map: add an estimate of each voxel's standard deviation, ``report["noise_sd_hu"]``.
         outlines: where an inset holds a contrast-enhanced vessel, fit its outlines first, and let the network
-            reconstruct what they leave (:mod:`recon.mbir.outlines`); two seconds a volume longer. Where no vessel is
+            reconstruct what they leave (:mod:`recon.mbir.outlines`); twice as long. Where no vessel is
             found, or its outlines do not explain the data, the volume is the one without; the report says why.
         tissues: draw the tissues' values and a core as well (:mod:`recon.mbir.tissues`), at full contrast where the
             data prove it; a few seconds a volume longer. Where they do not explain the data, the volume is the one
