@@ -45,7 +45,7 @@ _ABANDONED_S = 60.0
 _MAGIC = b"torchpcct, HDF5 from byte 512, SHA-256 of it: "
 _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
-VERSION = "0.1.0"
+VERSION = "0.2.0"
 """Version of this software. pyproject.toml reads it from here; files carry it."""
 
 

@@ -57,6 +57,7 @@ _SC, _ALL = "tests/torchpcct/formats/test_scans.py::", "tests/train/test_data.py
 _VOX = "tests/torchpcct/acquisition/test_voxels.py::"
 _TISSUE = "recon/mbir/tissues.py"
 _M = "tests/recon/mbir/test_tissues.py::"
+_LAYER, _LAYER_TESTS = "recon/plaque/layer.py", "tests/recon/plaque/test_layer.py::"
 _SHIPPED = "tests/recon/mbir/test_shipped_prior.py"
 _STEP = _SHIPPED + "::test_the_network_is_given_a_step_towards_the_data_and_where_it_is"
 _SHARE = _SHIPPED + "::test_the_error_is_that_share_of_the_rivals"
@@ -209,12 +210,17 @@ FAULTS = (
     Fault("the outer outline moves inwards for outwards", "recon/plaque/vessel.py",
           "self._outer.spread(outward, single[:, self.outer_part])",
           "self._outer.spread(-outward, single[:, self.outer_part])", "tests/recon/plaque/test_vessel.py"),
-    Fault("tissues counted twice", "recon/mbir/outlines.py", "some.beta - some.apply(images)", "some.beta",
+    Fault("tissues counted twice", "recon/mbir/outlines.py", "normal.beta - normal.apply(t)", "normal.beta",
           _M + "test_the_vessel_is_sharper_and_its_core_at_full_contrast"),
-    Fault("a core drawn that is not proven", _TISSUE, "return share * with_core", "return 1.0 * with_core",
-          _M + "test_what_is_not_proven_is_left_as_the_plain_reconstruction_has_it"),
-    Fault("the core's probability is not asked", _TISSUE, "plain, reading.presence)", "plain, 1.0)",
+    Fault("a core drawn that is not proven", _TISSUE, "share * image + (1.0 - share) * around", "image",
           _M + "test_a_core_is_drawn_as_far_as_it_is_probable"),
+    Fault("what a layer holds bends no outline", _LAYER,
+          "v - fit.curved @ cho_solve(fit.factor, pull).astype(np.float32) if moves else v", "v",
+          _LAYER_TESTS + "test_contents_and_step_are_those_of_the_joint_mode"),
+    Fault("a step of outlines that leads up", _LAYER, "if energy < fit.energy:", "if True:",
+          _LAYER_TESTS + "test_a_step_that_leads_up_is_not_taken"),
+    Fault("a changed scan counts as reconstructed", "recon/cli/scans.py", 'if note["state"] == state():', "if True:",
+          "tests/recon/evaluate/test_execute.py::test_many_scans_go_on_after_an_interruption"),
     Fault("the middle's starved directions are taken for everybody's", "recon/mbir/field.py", "return mean[..., index]",
           "return spectrum.reshape(-1, index.numel())",
           "tests/recon/mbir/test_field.py::"
