@@ -54,7 +54,7 @@ Does all work here?      torchpcct doctor
 Your own scan            torchpcct info scan.h5
                          torchpcct reconstruct scan.h5 --find-axis --out volume.nii.gz
 Look at volumes          torchpcct view a.nii.gz b.nii.gz --html view.html
-The main result, 13 min  torchpcct compare
+The main result, 8 min   torchpcct compare --workers 2
 Your own method          torchpcct evaluate --task nodule --method mylab.nets:reconstruct
 
 {groups}
