@@ -99,7 +99,7 @@ class LayerEstimate:
         self.image = self.fit.image + vessel.on_grid(contents)
 
     def change(self, b: Floats) -> Floats:
-        """The map from a small change of b to that of :attr:`image`, ``grid.shape`` float64; it is symmetric.
+        """The map from a small change of b to that of ``image``, ``grid.shape`` float64; it is symmetric.
 
         (But for the difference between voxel means and what the operator takes, of a voxel's size.)
 
