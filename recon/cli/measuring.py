@@ -316,7 +316,7 @@ def add_compare(commands: Commands) -> None:
         parser,
         ("--n", int, "N", "realisations (default 16)"),
         ("--methods", str, "METHOD", "as of evaluate --method", {"nargs": "+"}),
-        ("--quick", bool, None, "reduced views and methods: a first look, < 45 s"),
+        ("--quick", bool, None, "reduced views and methods: a first look, some minutes"),
     )
     add_execution(parser)
 

@@ -77,7 +77,7 @@ class LayerEstimate:
         sd_hu: prior standard deviation of the contents, HU.
 
     Attributes:
-        fit: moved.
+        fit: with parameters and drawing moved; its other attributes are those of the fit that was given.
         image: ``grid.shape`` float32 HU, the vessel with the contents.
         share: ``(n,)`` of each of the vessel's voxels in the layer, L.
     """

@@ -136,12 +136,7 @@ class Fit:
     @cached_property
     def hessian(self) -> Floats:
         """``(p, p)``, Gauss and Newton's."""
-        assert self.drawing.jacobian is not None
-        hessian: Floats = (self.drawing.jacobian.T @ self.curved).astype(np.float64)
-        # Fat fills the whole volume.
-        hessian[FAT] += self.vessel.ones @ self.drawing.jacobian
-        hessian[FAT, FAT] += self.vessel.ones_energy
-        return 0.5 * (hessian + hessian.T) + self.precision
+        return self.vessel.hessian(self.drawing, self.precision, self._seen)
 
     @cached_property
     def factor(self) -> Any:
@@ -149,10 +144,15 @@ class Fit:
         return cho_factor(self.hessian, lower=True)
 
     @cached_property
+    def _seen(self) -> NDArray[np.float32]:
+        """``(n, p)``, G times the Jacobian on the vessel's voxels."""
+        assert self.drawing.jacobian is not None
+        return np.asarray(self.vessel.gram.apply(self.drawing.jacobian))
+
+    @cached_property
     def curved(self) -> NDArray[np.float32]:
         """``(n, p)``, G times the Jacobian (that of fat: of the whole volume)."""
-        assert self.drawing.jacobian is not None
-        curved: NDArray[np.float32] = self.vessel.gram.apply(self.drawing.jacobian)
+        curved = self._seen.copy()
         curved[:, FAT] += self.vessel.ones.astype(np.float32)
         return curved
 
@@ -429,7 +429,7 @@ class Vessel:
         theta = np.concatenate([parameters, np.zeros(len(precision) - len(parameters))])
         drawing = self.draw(theta, bodies)
         energy, curved_image = self.energy(theta, drawing.image, precision)
-        hessian = self._hessian(drawing, precision)
+        hessian = self.hessian(drawing, precision)
         damping = 0.0
         for _ in range(steps):
             gradient = self._gradient(theta, drawing, curved_image, precision)
@@ -452,7 +452,7 @@ class Vessel:
             if gain < tolerance:
                 break
             if gain > _FAR:
-                hessian = self._hessian(drawing, precision)
+                hessian = self.hessian(drawing, precision)
         gradient = self._gradient(theta, drawing, curved_image, precision)
         residual = self.b - theta[FAT] * self.ones - curved_image
         return Fit(theta, drawing, energy, residual, gradient, precision, bodies, self)
@@ -466,12 +466,20 @@ class Vessel:
         gradient[FAT] += self.b_sum - theta[FAT] * self.ones_energy - self.ones @ drawing.image
         return gradient
 
-    def _hessian(self, drawing: Drawing, precision: Floats) -> Floats:
-        """Gauss and Newton's, ``(p, p)``, with the prior's."""
-        assert drawing.jacobian is not None
-        hessian: Floats = self.gram.curvature(drawing.jacobian)
-        across = self.ones.astype(np.float32) @ drawing.jacobian
+    def hessian(self, drawing: Drawing, precision: Floats, seen: NDArray[np.float32] | None = None) -> Floats:
+        """Gauss and Newton's, ``(p, p)``, with the prior's.
+
+        Args:
+            drawing: with its Jacobian.
+            precision: ``(p, p)`` of the prior.
+            seen: G times the Jacobian on the vessel's voxels, where it is known already.
+        """
+        jacobian = drawing.jacobian
+        assert jacobian is not None
+        hessian = (self.gram.curvature(jacobian) if seen is None else jacobian.T @ seen).astype(np.float64)
+        # Fat fills the whole volume.
+        across = self.ones.astype(np.float32) @ jacobian
         hessian[FAT] += across
         hessian[:, FAT] += across
         hessian[FAT, FAT] += self.ones_energy
-        return 0.5 * (hessian + hessian.T) + precision
+        return np.asarray(0.5 * (hessian + hessian.T) + precision)

@@ -58,7 +58,7 @@ class Settings(StudySettings):
     views: int = paper.FULL_VIEWS["PCCT"]
     exposures_s: tuple[float, ...] = (0.35, 2.0)
 
-    # An eighth of the views, 8 realisations, no PWLS: ≤ 45 s.
+    # An eighth of the views, 8 realisations, no PWLS: some minutes on two slow cores.
     QUICK: ClassVar[Mapping[str, Any]] = {"views": 246, "n": 8, "methods": ("fbp:soft", "bilateral@fbp:detail", "mbir")}
 
     def __post_init__(self) -> None:
