@@ -103,13 +103,21 @@ class Network(nn.Module):
         # The layout that processors convolve fastest in (the overload is missing in torch's types).
         self.to(memory_format=torch.channels_last_3d)  # type: ignore[call-overload]
 
-    def forward(self, estimate: Tensor, towards: Tensor, condition: Tensor, smoothed: Tensor | None = None) -> Tensor:
+    def forward(
+        self,
+        estimate: Tensor,
+        towards: Tensor,
+        condition: Tensor,
+        smoothed: Tensor | None = None,
+        mirrored: bool = True,
+    ) -> Tensor:
         """The new estimate, ``(batch, z, y, x)``.
 
         Args:
             estimate, towards: ``(batch, z, y, x)`` in noise units.
             condition: ``(batch, 3)``: ln(noise scale / 200 HU), fidelity − ½, number of the step.
             smoothed: :func:`edge_preserved` of ``towards``, for a network with ``bilateral``.
+            mirrored: average over the mirror images too, if over turns.
         """
         views = [estimate, towards]
         if self.config.bilateral:
@@ -117,21 +125,22 @@ class Network(nn.Module):
                 raise ValueError("a network with a bilateral filter needs the smoothed view of the data")
             views.append(smoothed)
         if not self.config.local_mm:
-            return self._symmetric(views, condition)
+            return self._symmetric(views, condition, mirrored)
         level = local_mean(estimate, self.config.local_mm / self.config.voxel_mm)
-        return level + self._symmetric([v - level for v in views], condition)
+        return level + self._symmetric([v - level for v in views], condition, mirrored)
 
-    def _symmetric(self, views: list[Tensor], condition: Tensor) -> Tensor:
+    def _symmetric(self, views: list[Tensor], condition: Tensor, mirrored: bool) -> Tensor:
         # Scenes of the training are turned at random: it does not need all eight of each.
         if self.training or not self.config.turns:
             return self._convolved(views, condition)
         out = torch.zeros_like(views[0])
-        # Four volumes at a time: one alone convolves at a quarter of the speed.
-        for group in (_TURNS[::2], _TURNS[1::2]):
+        turns = _TURNS if mirrored else _TURNS[:4]
+        # Some volumes at a time: one alone convolves at a quarter of the speed.
+        for group in (turns[::2], turns[1::2]):
             turned = [torch.cat([there(v) for there, _ in group]) for v in views]
             found = self._convolved(turned, condition.repeat(len(group), 1)).chunk(len(group))
             out += sum(back(v) for (_, back), v in zip(group, found, strict=True))
-        return out / len(_TURNS)
+        return out / len(turns)
 
     def _convolved(self, views: list[Tensor], condition: Tensor) -> Tensor:
         shape = views[0].shape[-3:]

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -85,7 +86,9 @@ class OutlineMbir(Mbir):
         nothing = self.in_hu(problem, torch.zeros_like(b), normal)
         drawn = torch.stack([n if image is None else image for image, n in zip(images, nothing, strict=True)])
         t = self.in_noise_units(problem, drawn, normal)
-        u = t + self.model(replace(normal, beta=normal.beta - normal.apply(t)), self.fidelity, **self.parts)
+        # Without the outlines four turns leave the noise of eight: 0.7 HU root mean square apart on the paper's plaque.
+        parts = {"prior": partial(self.model.network, mirrored=False), **self.parts}
+        u = t + self.model(replace(normal, beta=normal.beta - normal.apply(t)), self.fidelity, **parts)
         refused = []
         for k, volume in enumerate(self.in_hu(problem, u.detach(), normal)):
             highest = found[k].unexplained(volume)

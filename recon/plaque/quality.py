@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,7 +16,6 @@ from torch import Tensor
 
 from recon.conjugate_gradient import conjugate_gradient
 from recon.plaque.data import TissueData
-from recon.plaque.layer import correlating
 from recon.plaque.vessel import FAT, FIBROUS, Fit, Vessel
 
 __all__ = ["Leftover", "Texture", "beside", "leftover", "misfit", "scores_of", "texture"]
@@ -208,7 +209,7 @@ def texture(vessel: Vessel, fit: Fit, rng: np.random.Generator) -> Texture:
     soft = np.clip(outer - lumen, 0.0, 1.0)
     for body in fit.bodies[:-1]:
         soft = soft * (1.0 - np.clip(body, 0.0, 1.0))
-    smooth = correlating(vessel, LENGTH_MM)
+    smooth = _correlating(vessel, LENGTH_MM)
     signs = rng.integers(0, 2, (len(soft), _PROBES)) * 2.0 - 1.0
     probes = soft[:, None] * smooth(signs)
     single = probes.astype(np.float32)
@@ -238,3 +239,32 @@ def texture(vessel: Vessel, fit: Fit, rng: np.random.Generator) -> Texture:
         response = fit.curved @ (fit.covariance @ v).astype(np.float32)
         responses[name] = float(np.linalg.norm(smooth((soft * response)[:, None])))
     return Texture(max(float(mean), 0.0), max(float(top), 0.0), responses)
+
+
+def _correlating(vessel: Vessel, length_mm: float) -> Callable[[NDArray[Any]], NDArray[Any]]:
+    """A symmetric function that makes of white noise one of unit variance with the correlation exp(−r² / 2ℓ²).
+
+    Args:
+        vessel: whose voxels are meant.
+        length_mm: ℓ.
+
+    Returns:
+        From columns ``(n, k)`` to the same.
+    """
+    # White noise through a kernel of unit norm and σ = ℓ/√2.
+    sd = [length_mm / math.sqrt(2.0) / step for step in vessel.grid.spacing]
+    spike = np.zeros([2 * math.ceil(4 * s) + 1 for s in sd])
+    spike[tuple(n // 2 for n in spike.shape)] = 1.0
+    norm_of = math.sqrt(float((ndimage.gaussian_filter(spike, sd, mode="constant") ** 2).sum()))
+    low, high = vessel.index.min(0), vessel.index.max(0) + 1
+    box, place = tuple(high - low), tuple((vessel.index - low).T)
+
+    def smooth(v: NDArray[Any]) -> NDArray[Any]:
+        out: Floats = np.empty(v.shape)
+        for k in range(v.shape[1]):
+            volume = np.zeros(box)
+            volume[place] = v[:, k]
+            out[:, k] = ndimage.gaussian_filter(volume, sd, mode="constant")[place] / norm_of
+        return out
+
+    return smooth

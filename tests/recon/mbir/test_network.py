@@ -1,6 +1,7 @@
 """The network: homogeneous, blind to nothing that it should see, any shape."""
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -151,11 +152,11 @@ def test_local_mean_by_hand():
     assert float(local_mean(torch.ones(1, 1, 1, 1), 8.0)) == 1.0
 
 
-@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize(("mirrored", "mean_over"), [(False, False), (False, True), (True, True)])
 @pytest.mark.parametrize("quarters", range(4))
-def test_a_turned_scene_gives_the_turned_volume(network, quarters, mirrored):
+def test_a_turned_scene_gives_the_turned_volume(network, quarters, mirrored, mean_over):
     u, towards = volumes((2, 4, 8, 8))
-    symmetric = with_config(network, turns=True)
+    symmetric = partial(with_config(network, turns=True), mirrored=mean_over)
 
     def turned(v):
         return torch.rot90(v.flip(-2) if mirrored else v, quarters, (-2, -1))

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from recon.plaque import layer
-from recon.plaque.layer import LayerEstimate
+from recon.plaque.layer import LENGTHS_MM, LayerEstimate, LayerField
 from recon.plaque.start import find_vessel
 from recon.plaque.vessel import Vessel
 
@@ -32,14 +32,39 @@ def fit(data):
 @pytest.fixture(scope="module")
 def dense(fit):
     """Of parameters and white field: the joint matrix of the normal equations, its right side, and B = L σ S."""
-    vessel, n, p = fit.vessel, len(fit.vessel.index), len(fit.parameters)
-    B = layer.SD_HU * fit.layer[:, None] * layer.correlating(vessel, layer._LENGTH_MM)(np.eye(n))
+    vessel, p, field = fit.vessel, len(fit.parameters), LayerField(fit.vessel, fit.layer)
+    n = field.size
+    B = layer.SD_HU * fit.layer[:, None] * np.stack([field.of(w) for w in np.eye(n)], 1)
     joint = np.empty((p + n, p + n))
     joint[:p, :p] = fit.hessian
     joint[p:, :p] = B.T @ fit.curved
     joint[:p, p:] = joint[p:, :p].T
     joint[p:, p:] = np.eye(n) + B.T @ vessel.gram.apply(B.astype(np.float32))
     return joint, np.append(fit.gradient, B.T @ fit.residual), B
+
+
+def test_field_has_unit_variance_and_correlations_along_around_and_across(fit):
+    vessel, field = fit.vessel, LayerField(fit.vessel, fit.layer)
+    F = np.stack([field.of(w) for w in np.eye(field.size)], 1)
+    values = np.random.default_rng(0).normal(size=F.shape[0])
+    assert np.allclose(field.adjoint(values), F.T @ values)
+    inside = np.flatnonzero(fit.layer > 0.1)[::5]
+    c, K = vessel.outer_at, F[inside] @ F[inside].T
+    assert np.abs(np.diag(K) - 1.0).max() < 0.01  # a circle's correlation is not quite a Gaussian
+    s, rho = c.s[inside], c.rho[inside]
+    radius = np.average(c.rho[fit.layer > 1e-3], weights=fit.layer[fit.layer > 1e-3])
+    turn = (c.theta[inside, None] - c.theta[inside] + np.pi) % (2 * np.pi) - np.pi
+    squares = [
+        ((x / length) ** 2)
+        for x, length in zip((s[:, None] - s, turn * radius, rho[:, None] - rho), LENGTHS_MM, strict=True)
+    ]
+    # Interpolation between nodes half a length apart.
+    assert np.abs(K - np.exp(-0.5 * sum(squares))).max() < 0.05
+
+
+def test_a_vessel_without_a_layer_holds_nothing(fit):
+    field = LayerField(fit.vessel, np.zeros(len(fit.layer)))
+    assert np.isfinite(field.of(np.ones(field.size))).all()
 
 
 def test_contents_and_step_are_those_of_the_joint_mode(fit, dense):
