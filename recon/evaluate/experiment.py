@@ -158,7 +158,7 @@ def _jobs(
     task: Task, methods: Sequence[Method], exposures: Sequence[float] | None, n: int, seed: int, folder: Path,
     executor: Executor,
 ) -> list[Job]:  # fmt: skip
-    """What :func:`_task` would compute and is not there yet: scan and facts, then every block of realisations.
+    """What :func:`_task` would compute and is not there yet: scans and facts, then every block of realisations.
 
     A job draws its realisations for several methods: for all of them, if there are jobs enough for all workers.
     """
@@ -178,7 +178,8 @@ def _jobs(
     first = f"{task.name}: scan"
     jobs = []
     if not store.has("facts", f"1 {task.fingerprint}"):
-        jobs.append(Job(first, _facts, (bench,), (f"{place}facts.npz",)))
+        jobs += [Job(f"{first}, signal {s}", _scan, (bench, s)) for s in ("present", "absent")]
+        jobs.append(Job(first, _facts, (bench,), (f"{place}facts.npz",), tuple(job.name for job in jobs)))
     for kernel in dict.fromkeys(m.kernels[0] for m in sent if m.is_fbp):
         if not store.has(f"exact_{kernel}", f"1 {task.fingerprint}"):
             name = f"{task.name}: exact noise, {kernel}"
@@ -232,6 +233,11 @@ def _bench(folder: Path, packed: bytes) -> tuple[Draws, Reader, dict[str, Method
     task, methods, seed, kernels = pickle.loads(zlib.decompress(packed))
     draws = Draws(task, Store(folder / task.name), seed, kernels)
     return draws, Reader(task, task.truth(draws.facts)), {m.name: m for m in methods}
+
+
+def _scan(folder: Path, bench: bytes, signal: str) -> None:
+    task = pickle.loads(zlib.decompress(bench))[0]
+    task.scan(Store(folder / task.name), signal)
 
 
 def _facts(folder: Path, bench: bytes) -> None:

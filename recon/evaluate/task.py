@@ -156,19 +156,21 @@ class Task:
 
     def scans(self, store: Store) -> tuple[Scan, Scan]:
         """Noise-free scans with and without the signal, kept in ``store``."""
-        found = []
-        for name, scene in (("present", self.scene), ("absent", self.absent)):
-            path = self.scan_file(store, name)
-            if not path.exists():
-                try:
-                    scan = acquire(scene, self.scanner, region=self.grid, tolerance_hu=self.tolerance_hu)
-                except ValueError as error:
-                    raise ValueError(
-                        f"task {self.name}: {error} (outside of the inset a task's scene must be round about the axis)"
-                    ) from error
-                scan.save(path)
-            found.append(Scan.load(path))
-        return found[0], found[1]
+        return self.scan(store, "present"), self.scan(store, "absent")
+
+    def scan(self, store: Store, signal: str) -> Scan:
+        """Noise-free scan of the scene with the signal ``"present"`` or ``"absent"``, kept in ``store``."""
+        path = self.scan_file(store, signal)
+        if not path.exists():
+            scene = self.scene if signal == "present" else self.absent
+            try:
+                made = acquire(scene, self.scanner, region=self.grid, tolerance_hu=self.tolerance_hu)
+            except ValueError as error:
+                raise ValueError(
+                    f"task {self.name}: {error} (outside of the inset a task's scene must be round about the axis)"
+                ) from error
+            made.save(path)
+        return Scan.load(path)
 
     def scan_file(self, store: Store, name: str) -> Path:
         """Where a noise-free scan is kept; those of the task before it was changed are removed."""

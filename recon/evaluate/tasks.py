@@ -161,15 +161,15 @@ class VesselTask(Task):
         line, branch = SHAPES[self.direction]
         return Vessel(line, self.grid.center, branch)
 
-    def _straight(self, store: Store) -> tuple[Scan, Scan]:
-        """The same plaque along z, on the same scanner."""
-        return super().scans(Store(store.folder / "straight"))
+    def scan(self, store: Store, signal: str) -> Scan:
+        """See :meth:`Task.scan`: of the same plaque along z, on the same scanner."""
+        return super().scan(Store(store.folder / "straight"), signal)
 
     def scans(self, store: Store) -> tuple[Scan, Scan]:
         """See :meth:`Task.scans`."""
         paths = [self.scan_file(store, name) for name in ("present", "absent")]
         if not all(p.exists() for p in paths):
-            straight = self._straight(store)
+            straight = super().scans(store)
             facts = self._facts_of(*straight)
             values = {("core" if t == "signal" else t): v for t, v in zip(facts.tissues, facts.values_hu, strict=True)}
             plain = _without_inset(straight[1])
@@ -184,7 +184,7 @@ class VesselTask(Task):
 
     def facts(self, store: Store) -> Facts:
         """Of the vessel along z: values and limit of other directions differ little."""
-        return self._facts_of(*self._straight(store))
+        return self._facts_of(*super().scans(store))
 
     @cached_property
     def shares(self) -> dict[str, Floats]:

@@ -22,6 +22,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import torch
 import yaml
@@ -30,7 +31,8 @@ from torch import Tensor
 
 from recon.mbir.mbir import Mbir
 from recon.mbir.network import bilateral_prior
-from recon.mbir.outlines import OutlineMbir
+from recon.mbir.outlines import Drawn, OutlineMbir
+from recon.plaque.layer import LayerField
 
 HERE = Path(__file__).parent
 DEFAULT = HERE.parents[1] / "train" / "configs" / "default.yaml"
@@ -57,8 +59,18 @@ def _one_orientation(network: Mbir) -> Mbir:
     return network
 
 
+class _OneLength(OutlineMbir):
+    """What the layer holds is correlated over 0.5 mm in every direction."""
+
+    def drawn(self, *scan: Any) -> Drawn:
+        with mock.patch.object(LayerField.__init__, "__defaults__", ((0.5, 0.5, 0.5),)):
+            return super().drawn(*scan)
+
+
 USES: dict[str, Callable[[Mbir], Mbir]] = {
     "as it ships, around a vessel's outlines": OutlineMbir,
+    "outlines, what is in the layer correlated over 0.5 mm in every direction": _OneLength,
+    "outlines, eight turns of the network instead of four": lambda n: OutlineMbir(Mbir(n.model, prior=n.model.network)),
     "outlines, and the filtered view in place of the network": lambda n: OutlineMbir(
         Mbir(n.model, prior=bilateral_prior)
     ),
