@@ -32,11 +32,12 @@ Floats = NDArray[Any]
 
 SD_HU = 100.0
 """Prior standard deviation of the contents; larger: more of the contrast, at more noise. In four held-out vessels 60 HU
-have a contrast slope of the core of 0.75 at 2 s and 0.54 at 0.35 s, 100 HU 0.83 and 0.68; for the same noise of the
-contrast soft FBP needs 1.17 and 1.54 times the dose, or 1.12 and 1.47."""
+have a contrast slope of the core of 0.75 at 2 s and 0.54 at 0.35 s, 100 HU 0.82 and 0.68; for the same noise of the
+contrast soft FBP needs 1.14 and 1.52 times the dose, or 1.09 and 1.44."""
 LENGTHS_MM = (0.7, 0.7, 0.4)
 """Of their correlation along the vessel, around it and across the layer: a core is flat. In the held-out vessels 0.5 mm
-in all directions have the same slope, but 1.19 (2 s) and 1.10 times the noise of a core's centre."""
+in all directions have the same slope, but need 1.23 (2 s) and 1.15 times (0.35 s) the dose for the same noise of a
+core's centre."""
 _LEAST_SHARE = 1e-3
 _STEPS, _TOLERANCE = 60, 2e-3
 """Conjugate gradients at most, and the residual's norm over the first: half an HU of the limit."""
