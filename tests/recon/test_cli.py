@@ -199,23 +199,6 @@ def test_what_is_above_muscle_in_a_volume_is_said_and_chosen(tmp_path, capsys):
             read_config(path)
 
 
-def test_a_foreign_scan_in_one_command(tmp_path):
-    """A Data Exchange file to a volume, the axis found on the way."""
-    geometry = ParallelBeam(np.arange(121) * np.pi / 120, 96, 0.5, -1.0)
-    lines = line_integrals(geometry, [Ellipsoid((2.0, -3.0), 12.0, value=0.02), Ellipsoid((6.0, 5.0), 3.0, value=0.02)])
-    with h5py.File(tmp_path / "tooth.h5", "w") as file:
-        file["exchange/data"] = np.rint(4e4 * np.exp(-lines[:, None])).astype(np.uint16)
-        file["exchange/data_white"] = np.full((1, 1, 96), 40000, np.uint16)
-        file["exchange/theta"] = np.rad2deg(geometry.angles)
-    out = tmp_path / "v.h5"
-    command = ["reconstruct", str(tmp_path / "tooth.h5"), "--pitch", "0.5", "--find-axis", "--mu-water", "0.02"]
-    assert main([*command, "--out", str(out)]) == 0
-    volume = Volume.load(out)
-    assert volume.grid.shape[0] == 1
-    y, x = (np.abs(a - c).argmin() for a, c in zip(volume.grid.axes[1:], (0.0, -6.0), strict=True))
-    assert float(volume.data[0, y - 2 : y + 3, x - 2 : x + 3].mean()) == pytest.approx(0.0, abs=15)
-
-
 def test_a_foreign_scan_without_pixel_size(tmp_path, capsys):
     """README's own command on the best known file of the format; every refusal names options of the command line."""
     geometry = ParallelBeam(np.arange(31) * np.pi / 30, 48, 1.0)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from recon.evaluate.store import Store
-from torchpcct.files import WriteError, atomic_write, clear_folder, require_folder, write_hdf5
+from torchpcct.files import WriteError, atomic_write, clear_folder, write_hdf5
 
 FULL = """
 import os, resource, sys
@@ -135,8 +135,3 @@ def test_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
         write("new")
     assert path.read_text() == "old"
     assert [p.name for p in tmp_path.iterdir()] == ["f"]
-
-
-def test_missing_folder_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match="create it first"):
-        require_folder(tmp_path / "none" / "f")

@@ -89,3 +89,32 @@ def test_every_module_whose_kernels_hold_others_forgets_outdated_ones():
     assert not missing
     held = {p.name for p in sources("torchpcct.projector.cpu.plane_kernels")}
     assert {"cone_kernels.py", "simd.py", "simd_interpolation.py"} <= held
+
+
+SCRIPT = """
+import hashlib, sys
+import numba
+import torch
+from torchpcct import FanBeam, Projector, VolumeGrid, full_turn
+
+numba.njit(lambda x: x)(1)  # of no concern to ours
+print("theirs", file=sys.stderr, flush=True)
+A = Projector(FanBeam(full_turn(50), 400.0, 700.0, 64, 2.0), VolumeGrid((40, 40), 1.0))
+x = torch.rand(A.domain_shape, generator=torch.Generator().manual_seed(0))
+y = A(x)
+print([hashlib.sha256(v.numpy().tobytes()).hexdigest() for v in (y, A.T(y))])
+"""
+
+
+def test_a_fresh_process_and_later_ones(tmp_path):
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    found = [
+        subprocess.run(
+            [sys.executable, "-c", SCRIPT], env=environment, capture_output=True, text=True, timeout=300, check=True
+        )
+        for _ in range(2)
+    ]
+    theirs, _, ours = found[0].stderr.partition("theirs")
+    assert (theirs.count("compiling kernels"), ours.count("compiling kernels")) == (0, 1)
+    assert "compiling kernels" not in found[1].stderr
+    assert found[0].stdout == found[1].stdout
