@@ -14,13 +14,9 @@ from recon import fbp, reconstruct
 from recon.analytic.angular_weights import angular_weights
 from recon.analytic.coverage import check_rows, consistency_warnings, sampling_warnings
 from recon.analytic.fbp import interleave
+from recon.metal import metal_warnings
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, VolumeGrid, acquire, full_turn
 from torchpcct.scene import Body, EllipticCylinder, Scene
-import numpy as np
-import torch
-from recon import reconstruct
-from recon.metal import metal_warnings
-from torchpcct import ParallelBeam, Scan, VolumeGrid
 
 
 @pytest.mark.parametrize("method", ["fbp", "pwls"])

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from fresh_python import run_python
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -231,27 +230,6 @@ def test_interleaved_gain_and_cone():
     assert fine_cone.row_positions == pytest.approx(cone.row_positions)
 
 
-def test_error_is_no_worse_than_scikit_image():
-    """The same exact data, the same ramp: root-mean-square error inside a disc."""
-    from skimage.transform import iradon
-
-    n, views = 128, 180
-    geometry = ParallelBeam(np.arange(views) * math.pi / views, n, 1.0)
-    data = project(geometry, (10.0, -5.0), 40.0)
-    grid = VolumeGrid((n, n), 1.0)
-    ours = fbp(data, geometry, grid, "ram-lak").numpy()
-    # scikit-image: rotation axis at pixel n // 2, angles in degrees, rows downwards
-    shifted = project(replace(geometry, offset=-0.5), (10.0, -5.0), 40.0)
-    theirs = iradon(shifted.numpy().T, theta=np.degrees(geometry.angles), filter_name="ramp", circle=True)
-    y, x = grid.axes
-    inside = np.hypot(x[None, :] - 10, y[:, None] + 5) < 35
-    inside_theirs = np.hypot(x[None, :] - 0.5 - 10, -(y[:, None] - 0.5) + 5) < 35
-    our_error = np.sqrt(np.mean((ours[inside] / MU - 1) ** 2))
-    their_error = np.sqrt(np.mean((theirs[inside_theirs] / MU - 1) ** 2))
-    assert our_error <= their_error
-    assert our_error < 4e-3
-
-
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("columns", [40, 400], ids=["fft", "matrix"])
 def test_nan_and_inf_reach_the_filtered_rows_and_fbp_bridges_them(bad, columns):
@@ -338,8 +316,7 @@ def test_memory_is_bounded(inset):
     """Filtered data and volumes, and one chunk of views: never a second sinogram."""
     if not Path("/proc/self/clear_refs").exists():
         pytest.skip("the peak of a process can be reset on Linux only")
-    out = subprocess.run([sys.executable, "-c", _PEAK.format(inset=inset)], capture_output=True, text=True, check=True)
-    measured, kept, chunk = map(int, out.stdout.split())
+    measured, kept, chunk = map(int, run_python(_PEAK.format(inset=inset)).stdout.split())
     assert 0.4 * kept < measured < 1.15 * (kept + chunk) + 8e6
 
 

@@ -86,8 +86,6 @@ def test_fast_length(n):
 def test_bad_kernels_name_the_options():
     with pytest.raises(ValueError, match=r"unknown kernel 'sharp': use one of soft, standard, detail, bone, ram-lak"):
         ramp_kernel(3, 1.0, "sharp")
-    with pytest.raises(TypeError, match=r"kernel must be a text, got 3 \(int\)"):
-        apodization(3, 0.5)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="at least 1 sample"):
         ramp_kernel(0, 1.0)
     with pytest.raises(ValueError, match="greater than 0"):
