@@ -14,11 +14,9 @@ import numpy as np
 import pytest
 import torch
 
+import recon
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Projector, VolumeGrid
 from torchpcct.vector_geometry import to_vectors
-import doctest
-import pytest
-import recon
 
 ROOT = Path(__file__).parents[1]
 DOCS, GALLERY = ROOT / "notebooks" / "docs", sorted((ROOT / "notebooks" / "gallery").glob("[0-9]*.py"))

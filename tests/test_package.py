@@ -4,7 +4,6 @@ import ast
 import importlib.util
 import json
 import re
-import subprocess
 import sys
 import tomllib
 import zipfile
@@ -12,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from fresh_python import run_python
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
@@ -49,8 +49,7 @@ SLOW = {
 def test_importing_loads_nothing_that_is_used_later(package, more):
     """Kernels, figures, files and spectra come with their first use: ``import torchpcct`` not even needs torch."""
     code = f"import sys, {package}; print(*sys.modules)"
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    loaded = set(run.stdout.split())
+    loaded = set(run_python(code).stdout.split())
     assert not loaded & (SLOW | more)
     assert not {m for m in loaded if m.startswith(("torchpcct.", "recon.", "train.")) and "kernel" in m}
 

@@ -163,7 +163,7 @@ FAULTS = (
     Fault("hot cells pass", "torchpcct/checks/defects.py", "lost | (dead | hot)[part]", "lost | dead[part]",
           _D + "test_every_kind_of_defect_is_found_and_nothing_else"),
     Fault("bridged from the wrong side", "torchpcct/readings.py", "share = (place - left)", "share = (right - place)",
-          "tests/torchpcct/test_readings.py::test_lost_columns_rows_and_views_of_linear_data_come_back"),
+          "tests/torchpcct/checks/test_readings.py::test_lost_columns_rows_and_views_of_linear_data_come_back"),
     Fault("window ignored", "torchpcct/checks/defects.py", "parts = [np.s_[:, c : c + columns] for c in first]",
           "parts = [np.s_[:, 0:columns] for c in first]", _D + "test_cells_are_followed_through_a_window"),
     Fault("damaged pieces pass", "recon/evaluate/store.py", "if mark and digest !=", "if False and digest !=",

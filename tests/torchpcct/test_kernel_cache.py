@@ -3,13 +3,12 @@
 import importlib
 import os
 import pkgutil
-import subprocess
-import sys
 import textwrap
 import time
 from pathlib import Path
 
 import pytest
+from fresh_python import run_python
 
 import recon
 import torchpcct
@@ -42,12 +41,7 @@ RUN = """
 
 
 def run(folder):
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "cache")}
-    done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(RUN), str(folder)], env=environment, capture_output=True, text=True,
-        check=True,
-    )  # fmt: skip
-    value, hits = done.stdout.split()
+    value, hits = run_python(textwrap.dedent(RUN), folder, NUMBA_CACHE_DIR=str(folder / "cache")).stdout.split()
     return int(value), int(hits)
 
 
@@ -107,13 +101,7 @@ print([hashlib.sha256(v.numpy().tobytes()).hexdigest() for v in (y, A.T(y))])
 
 
 def test_a_fresh_process_and_later_ones(tmp_path):
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
-    found = [
-        subprocess.run(
-            [sys.executable, "-c", SCRIPT], env=environment, capture_output=True, text=True, timeout=300, check=True
-        )
-        for _ in range(2)
-    ]
+    found = [run_python(SCRIPT, NUMBA_CACHE_DIR=str(tmp_path)) for _ in range(2)]
     theirs, _, ours = found[0].stderr.partition("theirs")
     assert (theirs.count("compiling kernels"), ours.count("compiling kernels")) == (0, 1)
     assert "compiling kernels" not in found[1].stderr

@@ -4,17 +4,14 @@ from dataclasses import replace
 
 import pytest
 import torch
+from safetensors.torch import save_file
 from torch import nn
 
 from recon.mbir.unrolled import start
-from train.config import DataConfig, ObjectiveConfig, Situation
+from train.config import DataConfig, ObjectiveConfig, Situation, packaged_config
 from train.data import Data
-from train.objective import Objective, _edges
-import pytest
-from safetensors.torch import save_file
-from train.config import packaged_config
 from train.fidelity import fidelity_table, main
-from train.objective import Validation
+from train.objective import Objective, Validation, _edges
 
 CONFIG = DataConfig(shape=(24, 20, 20), voxel_mm=0.4, views=120, pool=10, situations=(Situation(42.0, 0.0),))
 

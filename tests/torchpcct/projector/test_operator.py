@@ -2,12 +2,11 @@
 
 import copy
 import os
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 import torch
+from fresh_python import run_python
 from geometries import REGISTRY
 from inset_operators import dense
 
@@ -174,6 +173,5 @@ for _ in range(5):
 @pytest.mark.parametrize("used", ["before", "meanwhile", pytest.param("never", marks=pytest.mark.slow)])
 def test_a_forked_process_computes_on_threads_of_its_own(used):
     """After its parent has projected; while another thread of the parent projects; with a parent that never did."""
-    command = [sys.executable, "-W", "ignore", "-c", CHILD, used]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    done = run_python(CHILD, used, check=False, PYTHONWARNINGS="ignore")
     assert done.stdout.splitlines() == ["status 0"] * 5, done.stdout + done.stderr
