@@ -18,19 +18,6 @@ from packaging.utils import canonicalize_name
 ROOT = Path(__file__).parent.parent
 
 
-def test_public_names():
-    import recon
-    import torchpcct
-
-    for name in torchpcct.__all__:
-        assert getattr(torchpcct, name) is not None
-    assert callable(torchpcct.acquire)
-    assert callable(recon.fbp)
-    assert callable(recon.reconstruct)
-    with pytest.raises(AttributeError, match="no attribute"):
-        _ = torchpcct.nonsense
-
-
 SLOW = {
     "matplotlib",
     "h5py",

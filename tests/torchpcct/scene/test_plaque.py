@@ -116,14 +116,6 @@ def test_contrast_is_exactly_linear():
         interpolate_material("impossible", "water", "blood_iodine", -1.0)
 
 
-def test_motion(paper):
-    scene, _ = plaque_scene(motion_amplitude=2.0)
-    assert scene.moving.tolist() == [False, True, True, True, True]
-    offsets = scene.offsets(np.linspace(0.0, 0.35, 500))
-    assert (offsets[1, :, 0].min(), offsets[1, :, 0].max()) == pytest.approx((0.0, 2.0), abs=1e-4)
-    assert paper[0].is_static
-
-
 @pytest.mark.parametrize(
     ("make", "error", "message"),
     [
