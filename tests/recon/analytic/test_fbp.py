@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from analytic import Ellipsoid, line_integrals
 from fresh_python import run_python
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -24,40 +25,13 @@ MU = 0.02
 pytestmark = pytest.mark.filterwarnings("ignore:the rows end inside the object")
 
 
-def rays(geometry: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Origins and unit directions ``(views, rows, columns, 3)`` of all rays, from the conventions alone."""
-    b = geometry.angles[:, None, None]
-    er = np.stack([np.cos(b), np.sin(b), 0 * b], -1)
-    et = np.stack([-np.sin(b), np.cos(b), 0 * b], -1)
-    ez = np.array([0.0, 0.0, 1.0])
-    u = geometry.column_positions[None, None, :, None]
-    if isinstance(geometry, ParallelBeam):
-        origin = u * et + 1000.0 * er
-        return origin, np.broadcast_to(-er, origin.shape)
-    v = geometry.row_positions[None, :, None, None] if isinstance(geometry, ConeBeam) else np.zeros((1, 1, 1, 1))
-    if geometry.detector == "flat":
-        d = -geometry.sdd * er + u * et + v * ez
-    else:
-        gamma = u / geometry.sdd
-        d = geometry.sdd * (-np.cos(gamma) * er + np.sin(gamma) * et) + v * ez
-    return np.broadcast_to(geometry.sod * er, d.shape), d / np.linalg.norm(d, axis=-1, keepdims=True)
-
-
-def project(geometry: Any, center: tuple[float, ...], radius: float, half_height: float | None = None) -> torch.Tensor:
-    """Exact line integrals of an ellipsoid of revolution about z (``half_height=None``: a cylinder), value MU."""
-    origin, d = rays(geometry)
-    scale = np.array([1 / radius, 1 / radius, 0.0 if half_height is None else 1 / half_height])
-    x, y, z = (*center, 0.0)[:3]
-    p, q = (origin - np.array([x, y, z])) * scale, d * scale
-    a, b, c = (q * q).sum(-1), (p * q).sum(-1), (p * p).sum(-1) - 1
-    chord = 2 * np.sqrt(np.maximum(b * b - a * c, 0)) / a
-    return torch.from_numpy(MU * chord.reshape(geometry.shape))
-
-
-def averaged(geometry: Any, center: tuple[float, float], radius: float, sub: int = 16) -> torch.Tensor:
-    """Projections averaged over the width of a cell."""
-    parts = [replace(geometry, offset=geometry.offset + ((j + 0.5) / sub - 0.5) * geometry.pitch) for j in range(sub)]
-    return torch.stack([project(g, center, radius) for g in parts]).mean(0)
+def project(geometry: Any, center: tuple[float, ...], radius: float, half_height: float | None = None, sub: int = 1):
+    """Exact line integrals of an ellipsoid of revolution about z at (x, y, z); of a cylinder without a height; MU."""
+    x, y, *z = center
+    body = Ellipsoid((y, x), radius, value=MU)
+    if half_height is not None:
+        body = Ellipsoid((z[0], y, x), (half_height, radius, radius), value=MU)
+    return torch.from_numpy(line_integrals(geometry, [body], sub=sub))
 
 
 @settings(max_examples=15, deadline=None)
@@ -185,7 +159,7 @@ def test_invariances(detector):
 
 def bead(geometry: FanBeam, at: tuple[float, float]) -> np.ndarray:
     grid = VolumeGrid((41, 41), 0.05, (at[1], at[0]))
-    return fbp(averaged(geometry, at, 0.05), geometry, grid, "standard").numpy()
+    return fbp(project(geometry, at, 0.05, sub=16), geometry, grid, "standard").numpy()
 
 
 @pytest.mark.parametrize("detector", ["flat", "curved"])
@@ -206,7 +180,7 @@ def test_interleaving_resolves_what_single_views_alias(at):
 
     def modulation(offset: float, interleaved: bool) -> float:
         geometry = FanBeam(full_turn(360), 626, 1098, 80, 1.0, offset, "curved")
-        data = torch.stack([averaged(geometry, (at[0] + i * period, at[1]), 0.1) for i in range(-3, 4)]).sum(0)
+        data = torch.stack([project(geometry, (at[0] + i * period, at[1]), 0.1, sub=16) for i in range(-3, 4)]).sum(0)
         if interleaved:
             data, geometry = interleave(data, geometry)
         half = VolumeGrid((1, 5), (1.0, period / 2), (at[1], at[0]))
