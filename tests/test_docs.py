@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 
+import recon
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Projector, VolumeGrid
 from torchpcct.vector_geometry import to_vectors
 
@@ -241,3 +242,12 @@ def test_the_angles_of_astra(kind):
     mine = Projector(ours, VolumeGrid((32, 32), 1.0))(torch.from_numpy(image)).numpy()
     assert np.abs(mine - sinogram).max() < 0.15 * mine.max()
     assert np.linalg.norm(mine - sinogram) < 0.03 * np.linalg.norm(mine)
+
+
+@pytest.mark.parametrize("name", [n for n in recon.__all__ if callable(getattr(recon, n))])
+def test_the_example_of_a_public_function_runs(name):
+    function = getattr(recon, name)
+    (found,) = doctest.DocTestFinder(recurse=False).find(function, name, globs={name: function})
+    outcome = doctest.DocTestRunner().run(found)
+    assert outcome.attempted > 4
+    assert not outcome.failed

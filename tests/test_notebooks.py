@@ -6,7 +6,6 @@ import re
 import shutil
 import subprocess
 import sys
-from importlib import resources
 from pathlib import Path
 
 import nbformat
@@ -14,11 +13,6 @@ import pytest
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
 NAMES = sorted(p.name for p in FOLDER.glob("*.ipynb"))
-
-needs_weights = pytest.mark.skipif(
-    not resources.files("recon").joinpath("mbir", "weights", "mbir.safetensors").is_file(),
-    reason="the package has no weights yet",
-)
 
 
 def outputs(notebook):
@@ -112,7 +106,6 @@ def test_no_example_of_the_readme_writes_onto_its_input():
         assert not read & set(re.findall(r"save\(\"(.*?)\"", block))
 
 
-@needs_weights
 @pytest.mark.parametrize("name", NAMES)
 def test_stored_notebook_is_of_the_shipped_weights(name):
     """A picture of old weights once stood there, in which MBIR was noisier than FBP."""
@@ -129,7 +122,6 @@ def test_first_scan_is_short():
 
 
 @pytest.mark.slow
-@needs_weights
 def test_first_scan_runs(tmp_path):
     assert len(pictures(run("first_scan.ipynb", tmp_path, 600))) == 1
 
@@ -150,7 +142,6 @@ def test_your_own_data_runs(tmp_path):
 
 
 @pytest.mark.slow
-@needs_weights
 def test_benchmark_runs(tmp_path):
     notebook = run("fbp_vs_mbir.ipynb", tmp_path, 3600)
     assert len(pictures(notebook)) == 3
@@ -166,7 +157,6 @@ def test_reading_a_plaque_runs(tmp_path):
 
 
 @pytest.mark.slow
-@needs_weights
 def test_train_your_own_prior_runs(tmp_path):
     notebook = run("train_your_own_prior.ipynb", tmp_path, 3600)
     texts = [o.data["text/markdown"] for o in outputs(notebook) if "text/markdown" in o.get("data", {})]

@@ -65,7 +65,6 @@ _KEPT = _SHIPPED + "::test_fat_and_lumen_keep_their_values"
 _WORD = _SHIPPED + "::test_final_data_consistency_makes_the_network_s_volume_explain_the_data"
 _UN, _MB, _READ = "recon/mbir/unrolled.py", "recon/mbir/mbir.py", "recon/plaque/reading.py"
 _PQ = "tests/recon/plaque/test_quality.py::"
-_METAL = "tests/recon/test_metal.py::"
 _F = "tests/test_precision.py::"
 _TABLE = "tests/test_bad_input.py::test_a_bad_value_is_refused_by_its_name"
 _DAMAGED = "tests/torchpcct/formats/test_damage.py::test_damaged_files"
@@ -164,7 +163,7 @@ FAULTS = (
     Fault("hot cells pass", "torchpcct/checks/defects.py", "lost | (dead | hot)[part]", "lost | dead[part]",
           _D + "test_every_kind_of_defect_is_found_and_nothing_else"),
     Fault("bridged from the wrong side", "torchpcct/readings.py", "share = (place - left)", "share = (right - place)",
-          "tests/torchpcct/test_readings.py::test_lost_columns_rows_and_views_of_linear_data_come_back"),
+          "tests/torchpcct/checks/test_readings.py::test_lost_columns_rows_and_views_of_linear_data_come_back"),
     Fault("window ignored", "torchpcct/checks/defects.py", "parts = [np.s_[:, c : c + columns] for c in first]",
           "parts = [np.s_[:, 0:columns] for c in first]", _D + "test_cells_are_followed_through_a_window"),
     Fault("damaged pieces pass", "recon/evaluate/store.py", "if mark and digest !=", "if False and digest !=",
@@ -174,9 +173,10 @@ FAULTS = (
     Fault("ends of pieces forgotten", "torchpcct/threads.py", "kernel(begin, end, *given",
           "kernel(begin, end - 1, *given", "tests/torchpcct/test_threads.py::test_every_index_once"),
     Fault("kernels with two copies of a function", "torchpcct/projector/cpu/cone_kernels.py", '"forceinline": True',
-          '"forceinline": False', "tests/torchpcct/projector/test_fresh_kernels.py"),
+          '"forceinline": False', "tests/torchpcct/test_kernel_cache.py::test_a_fresh_process_and_later_ones"),
     Fault("rows by the wrong gain", "torchpcct/projector/cpu/cone_kernels.py", "real(1.0 / step), out, out.size)",
-          "real(step), out, out.size)", "tests/torchpcct/projector/test_accuracy.py"),
+          "real(step), out, out.size)",
+          "tests/torchpcct/projector/test_accuracy.py::test_small_inset_far_from_the_axis"),
     Fault("layers of the window", "torchpcct/projector/tables.py",
           "self.grid, self.rays.row_edge, self.rays.row_pitch, rows)",
           "self.grid, self.heights[2], self.rays.row_pitch, self.rays.rows)",
@@ -240,9 +240,9 @@ FAULTS = (
           '@threadpool_limits.wrap(limits=1, user_api="blas")', '@threadpool_limits.wrap(limits=2, user_api="blas")',
           "tests/recon/plaque/test_reading.py::test_one_blas_thread_reads_the_tissues"),
     Fault("noise taken for metal", "recon/metal.py", "DENSEST_HU + _SIGMAS * noise", "DENSEST_HU",
-          _METAL + "test_noise_and_bone_are_no_metal"),
+          _R + "test_noise_and_bone_are_no_metal"),
     Fault("metal in other units", "recon/api.py", 'method == "mbir" or s.unit != "HU"', 'method == "mbir"',
-          _METAL + "test_fbp_names_metal_in_hu_and_knows_nothing_of_it_in_other_units"),
+          _R + "test_fbp_names_metal_in_hu_and_knows_nothing_of_it_in_other_units"),
     Fault("rows flipped with the columns", _V, "-self.poses[:, 3] if rows else None", "-self.poses[:, 3]",
           _VG + "test_flips_and_shifts_are_those_of_the_readings"),
     Fault("detector shifted the other way", _V, "+ r * poses[:, 3]", "- r * poses[:, 3]",

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 import torch
 from results import write_results
-from rod_values import ROD_HU
+from rival_scenes import ROD_HU
 from scipy import ndimage
 from scipy.stats import beta, chi2
 
@@ -81,8 +81,6 @@ TEXTURE_HU, TEXTURE_MM, SOFT_MM = 10.0, 0.3, 0.12
 _FINER, _POINTS = 2, 3
 """Voxels of a painting along each edge of one of the reader's, and points along each edge of one of those."""
 PLAQUE_ONLY = ("core", "contrast", "core volume", "cap thickness")
-FBP_PAPER_SD_HU = 28.2
-"""Of soft FBP's contrast in the paper's ROIs at 2.0 s, exact."""
 
 
 def truth(plaque: Plaque, **changed: float) -> dict[str, float]:

@@ -86,19 +86,14 @@ def _scan(scan: Any) -> list[Any]:
 
 
 def _data_exchange(folder: Path) -> tuple[Path, Callable[[], Any]]:
-    import h5py
+    from foreign_files import data_exchange
 
     from torchpcct.formats.scans import open_scan
 
     path, rng = folder / "beamline.h5", np.random.default_rng(0)
-    with h5py.File(path, "w") as file:
-        file.create_dataset("exchange/data", data=rng.integers(900, 40000, (20, 3, 24)).astype(np.uint16),
-                            chunks=(5, 3, 24), compression="gzip")  # fmt: skip
-        file["exchange/data_white"] = rng.integers(39000, 41000, (4, 3, 24)).astype(np.uint16)
-        file["exchange/data_dark"] = rng.integers(99, 102, (2, 3, 24)).astype(np.uint16)
-        file["exchange/theta"] = np.linspace(0, 180, 20)
-        file["measurement/instrument/detector/pixel_size"] = 40.0
-        file["measurement/instrument/detector/pixel_size"].attrs["units"] = "um"
+    data, white = rng.integers(900, 40000, (20, 3, 24)), rng.integers(39000, 41000, (4, 3, 24))
+    dark, angles = rng.integers(99, 102, (2, 3, 24)), np.linspace(0, math.pi, 20)
+    data_exchange(path, data, white, angles, dark, 40.0, chunks=(5, 3, 24), compression="gzip")
     return path, lambda: _scan(open_scan(path))
 
 
@@ -134,7 +129,7 @@ def _catsim(folder: Path) -> tuple[Path, Callable[[], Any]]:
 
 
 def _clinical(folder: Path) -> tuple[Path, Callable[[], Any]]:
-    from ct_pd import ct_pd
+    from foreign_files import ct_pd
 
     from torchpcct.formats.scans import open_scan
 

@@ -8,12 +8,12 @@ import shlex
 import warnings
 from dataclasses import replace
 
-import h5py
 import numpy as np
 import pytest
 import torch
 import yaml
 from analytic import Ellipsoid, line_integrals
+from foreign_files import data_exchange
 
 from recon.cli import main
 from recon.cli.parsing import as_options, saying
@@ -24,21 +24,6 @@ from torchpcct.formats.geometry_yaml import geometry_of
 from torchpcct.formats.stack import _COUNTS, _LINES
 from torchpcct.scene.scene import Scene
 from torchpcct.scene.voxels import VoxelScene
-
-
-def test_command_line_simulate_and_reconstruct(tmp_path, capsys):
-    scan, volume = tmp_path / "scan.h5", tmp_path / "plaque.nii.gz"
-    assert main(["simulate", "--views", "12", "--exposure", "2", "--seed", "3", "--json", "--out", str(scan)]) == 0
-    assert json.loads(capsys.readouterr().out)["seed"] == 3
-    assert main(["reconstruct", str(scan), "--kernel", "soft", "--voxel", "0.4", "--json", "--out", str(volume)]) == 0
-    summary = json.loads(capsys.readouterr().out)
-    assert summary["method"] == "fbp"
-    assert json.loads((tmp_path / "plaque.nii.gz.json").read_text()) == summary
-    assert volume.exists()
-    h5 = tmp_path / "plaque.h5"
-    assert main(["reconstruct", str(scan), "--voxel", "0.4", "--out", str(h5)]) == 0
-    assert Volume.load(h5).grid.spacing == (0.4, 0.4, 0.4)
-
 
 CONFIG = """
 scene: {kind: bodies, bodies: [{name: a, shape: cylinder, semi_axes: 20, material: water}]}
@@ -199,32 +184,12 @@ def test_what_is_above_muscle_in_a_volume_is_said_and_chosen(tmp_path, capsys):
             read_config(path)
 
 
-def test_a_foreign_scan_in_one_command(tmp_path):
-    """A Data Exchange file to a volume, the axis found on the way."""
-    geometry = ParallelBeam(np.arange(121) * np.pi / 120, 96, 0.5, -1.0)
-    lines = line_integrals(geometry, [Ellipsoid((2.0, -3.0), 12.0, value=0.02), Ellipsoid((6.0, 5.0), 3.0, value=0.02)])
-    with h5py.File(tmp_path / "tooth.h5", "w") as file:
-        file["exchange/data"] = np.rint(4e4 * np.exp(-lines[:, None])).astype(np.uint16)
-        file["exchange/data_white"] = np.full((1, 1, 96), 40000, np.uint16)
-        file["exchange/theta"] = np.rad2deg(geometry.angles)
-    out = tmp_path / "v.h5"
-    command = ["reconstruct", str(tmp_path / "tooth.h5"), "--pitch", "0.5", "--find-axis", "--mu-water", "0.02"]
-    assert main([*command, "--out", str(out)]) == 0
-    volume = Volume.load(out)
-    assert volume.grid.shape[0] == 1
-    y, x = (np.abs(a - c).argmin() for a, c in zip(volume.grid.axes[1:], (0.0, -6.0), strict=True))
-    assert float(volume.data[0, y - 2 : y + 3, x - 2 : x + 3].mean()) == pytest.approx(0.0, abs=15)
-
-
 def test_a_foreign_scan_without_pixel_size(tmp_path, capsys):
     """README's own command on the best known file of the format; every refusal names options of the command line."""
     geometry = ParallelBeam(np.arange(31) * np.pi / 30, 48, 1.0)
     lines = line_integrals(geometry, [Ellipsoid((2.0, -3.0), 12.0, value=0.02)])
     path = str(tmp_path / "tooth.h5")
-    with h5py.File(path, "w") as file:
-        file["exchange/data"] = np.rint(4e4 * np.exp(-lines[:, None])).astype(np.uint16)
-        file["exchange/data_white"] = np.full((5, 1, 48), 40000, np.uint16)
-        file["exchange/theta"] = np.rad2deg(geometry.angles)
+    data_exchange(path, 4e4 * np.exp(-lines[:, None]), np.full((5, 1, 48), 4e4), geometry.angles)
     assert main(["info", path]) == 0
     assert "unit: pixel^-1" in capsys.readouterr().out
     command = ["reconstruct", path, "--find-axis", "--out", str(tmp_path / "tooth.nii.gz")]

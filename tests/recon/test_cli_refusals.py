@@ -5,10 +5,7 @@ import json
 import os
 import resource
 import shutil
-import subprocess
-import sys
 import time
-from pathlib import Path
 from types import SimpleNamespace
 
 import h5py
@@ -16,20 +13,18 @@ import nibabel
 import numpy as np
 import pytest
 import torch
+from fresh_python import run_python
 
 from recon.cli import main
 from recon.evaluate.store import Store
 from torchpcct import ParallelBeam, Scan, Volume, VolumeGrid
 from torchpcct.files import _part, atomic_write, require_writable
 
-ROOT = Path(__file__).parent.parent.parent
-
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["reconstruct", "{tmp}/f", "--voxel", "1e-9", "--out", "{tmp}/a.h5"], "--voxel makes 1000000000"),
-        (["reconstruct", "{tmp}/f", "--voxel", "nan", "--out", "{tmp}/a.h5"], "--voxel must be finite"),
         (["reconstruct", "{tmp}/f", "--extent", "inf", "1", "1", "--out", "{tmp}/a.h5"], "--extent[0] must be finite"),
         (["reconstruct", "{tmp}/f", "--extent", "1", "-1", "1", "--out", "{tmp}/a.h5"], "--extent[1] must be greater"),
         (["reconstruct", "{tmp}/f", "--center", "1", "nan", "1", "--out", "{tmp}/a.h5"], "--center[1] must be finite"),
@@ -39,10 +34,7 @@ ROOT = Path(__file__).parent.parent.parent
         (["reconstruct", "{tmp}/f", "--method", "pwls", "--fidelity", "0", "--out", "{tmp}/a.h5"], "not of pwls"),
         (["simulate", "--views", "0", "--out", "{tmp}/a.h5"], "--views must be at least 1"),
         (["simulate", "--exposure", "nan", "--out", "{tmp}/a.h5"], "--exposure must be finite"),
-        (["simulate", "--exposure", "-1", "--out", "{tmp}/a.h5"], "--exposure must be greater than 0"),
-        (["compare", "--seed", "-1", "--out", "{tmp}/o"], "seed must be at least 0"),
         (["compare", "--out", "{tmp}/f"], "is a file"),
-        (["dose-factor", "--out", "{tmp}/f"], "is a file"),
         (["study", "noise", "--seed", "-3", "--out", "{tmp}/o"], "seed must be at least 0"),
         (["study", "noise", "--out", "{tmp}/f/g"], "cannot write into"),
         (["compare", "--device", "cuda", "--out", "{tmp}/o"], "use --device cpu"),
@@ -53,15 +45,9 @@ ROOT = Path(__file__).parent.parent.parent
         (["info", "{tmp}/none.h5"], "none.h5"),
         (["simulate", "--exposure", "0", "--out", "{tmp}/a.h5"], "--exposure must be greater than 0 s"),
         (["simulate", "--seed", "-1", "--exposure", "1", "--out", "{tmp}/a.h5"], "seed"),
-        (["simulate", "--out", "{tmp}/none/a.h5"], "does not exist"),
-        (["reconstruct", "{tmp}/none.h5", "--out", "{tmp}/a.h5"], "none.h5"),
         (["reconstruct", "{tmp}/none.h5", "--out", "{tmp}/a.png"], "unknown volume format"),
         (["reconstruct", "{tmp}/none.h5", "--voxel", "0", "--out", "{tmp}/a.h5"], "--voxel must be greater than 0 mm"),
         (["plaque", "{tmp}/none.h5", "--out", "{tmp}/a"], "none.h5"),
-        (["compare", "--n", "2", "--out", "{tmp}/o"], "n must be at least 8"),
-        (["dose-factor", "--n", "2", "--out", "{tmp}/o"], "n must be at least 8"),
-        (["study", "magic", "--out", "{tmp}/o"], "unknown study 'magic'"),
-        (["study", "noise", "--set", "views", "--out", "{tmp}/o"], "give field=value"),
     ],
 )
 def test_refusals_name_value_and_remedy_and_leave_nothing(tmp_path, capsys, arguments, message):
@@ -79,15 +65,11 @@ def test_help_and_refusals_load_neither_torch_nor_numba():
         "    with contextlib.suppress(SystemExit): main(a)\n"
         "print('LOADED', sorted({'torch', 'numba', 'scipy'} & set(sys.modules)))"
     )
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
-    assert "LOADED []" in run.stdout
+    assert "LOADED []" in run_python(code).stdout
 
 
 def test_what_a_killed_process_left_is_swept_by_the_next_write(tmp_path):
-    dead = subprocess.run(
-        [sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True
-    ).stdout
-    process = int(dead)
+    process = int(run_python("import os; print(os.getpid())").stdout)
     old, mine, other = (_part(tmp_path / "v.h5", n) for n in (process, os.getppid(), 1))
     elsewhere = tmp_path / f".{process}-ffffff-00000000.part.v.h5"  # of another machine: who knows whether it lives?
     for part in (old, mine, other, elsewhere):

@@ -7,12 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from analytic import Ellipsoid, line_integrals
 from small_scan import CENTER, GRID, SCENE, scanner
 
 from recon import fbp, reconstruct
 from recon.analytic.angular_weights import angular_weights
 from recon.analytic.coverage import check_rows, consistency_warnings, sampling_warnings
 from recon.analytic.fbp import interleave
+from recon.metal import metal_warnings
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, VolumeGrid, acquire, full_turn
 from torchpcct.scene import Body, EllipticCylinder, Scene
 
@@ -161,20 +163,17 @@ def test_a_dead_column_and_a_dead_view_are_repaired_and_named(clean, method):
     assert float((repaired.data - good.data).square().mean().sqrt()) < noise
 
 
-BODIES = ((90.0, 60.0, 8.0, -5.0, 0.02), (12.0, 9.0, 50.0, 10.0, 0.03), (20.0, 15.0, -30.0, 8.0, -0.015))
+BODIES = [
+    Ellipsoid((y, x), (b, a), value=mu)
+    for a, b, x, y, mu in ((90, 60, 8, -5, 0.02), (12, 9, 50, 10, 0.03), (20, 15, -30, 8, -0.015))
+]
 
 
 def _ellipse_scan(views, columns):
     """A fan-beam scan of an ellipse with a bone and a hole in it, 1e5 photons."""
     g = FanBeam(full_turn(views), 500.0, 900.0, columns, 480.0 / columns)
-    direction = g.angles[:, None] + math.pi - g.fan_angles
-    total = np.zeros(direction.shape)
-    for a, b, x, y, mu in BODIES:
-        dx, dy = x - g.sod * np.cos(g.angles)[:, None], y - g.sod * np.sin(g.angles)[:, None]
-        distance = np.cos(direction) * dy - np.sin(direction) * dx
-        width = (a * np.sin(direction)) ** 2 + (b * np.cos(direction)) ** 2
-        total += 2 * mu * a * b * np.sqrt(np.maximum(width - distance**2, 0.0)) / width
-    return g, np.random.default_rng(0).poisson(1e5 * np.exp(-total)).astype(np.float32)
+    shone = np.exp(-line_integrals(g, BODIES, sub=1))
+    return g, np.random.default_rng(0).poisson(1e5 * shone).astype(np.float32)
 
 
 def _warnings_of(readings, geometry, method):
@@ -243,3 +242,37 @@ def test_a_window_that_does_not_read_its_surround_is_named(clean, change, expect
     lost = torch.rand(few.counts.shape, generator=torch.Generator().manual_seed(1)) < 0.1
     for scan in (few, replace(clean.with_noise(4.0, 0), counts=clean.with_noise(4.0, 0).counts.masked_fill(lost, 0.0))):
         assert not [t for t in consistency_warnings(scan, GRID) if "surround" in t]
+
+
+def _noise(sd):
+    return sd * torch.randn((16, 24, 24), generator=torch.Generator().manual_seed(0))
+
+
+def test_noise_and_bone_are_no_metal():
+    assert metal_warnings(_noise(900.0)) == []  # its largest value is 3500 HU
+    assert float(_noise(900.0).max()) > 3000
+    bone = _noise(50.0)
+    bone[4:8, 4:8, 4:8] += 2200
+    assert metal_warnings(bone) == []
+
+
+def test_a_rod_of_titanium_is_metal_whatever_the_noise():
+    for sd in (0.0, 50.0, 900.0):
+        volume = _noise(sd)
+        volume[:, 10:13, 10:13] += 16000.0
+        (text,) = metal_warnings(volume)
+        assert "metal" in text
+
+
+def test_fbp_names_metal_in_hu_and_knows_nothing_of_it_in_other_units():
+    columns = (np.arange(64) - 31.5) * 0.5
+    geometry = ParallelBeam(np.arange(90) * np.pi / 90, 64, 0.5)
+
+    def disc(radius):
+        return 2 * np.sqrt(np.clip(radius**2 - columns**2, 0, None))
+
+    grid = VolumeGrid((40, 40), 0.5)
+    for pin, unit, warned in ((0.0, {"mu_water": 0.02}, False), (0.4, {"mu_water": 0.02}, True), (0.4, {}, False)):
+        lines = np.broadcast_to(0.02 * disc(12) + pin * disc(1.5), geometry.shape)
+        volume = reconstruct(Scan.from_line_integrals(lines, geometry, photons=1e5, **unit), grid, "fbp")
+        assert any("metal" in text for text in volume.report["warnings"]) is warned

@@ -6,7 +6,6 @@ from small_scan import GRID
 
 from recon import reconstruct
 from recon.analytic.fbp import fbp
-from torchpcct import Projector
 from torchpcct.threads import get_num_threads, set_num_threads
 
 TOLERANCE_HU = {"fbp": 0.0, "pwls": 0.0, "mbir": 0.01}
@@ -26,14 +25,6 @@ def _on(threads, compute):
 
 def _both(compute):
     return _on(1, compute), _on(2, compute)
-
-
-def test_projector_and_its_adjoint(clean):
-    A = Projector(clean.geometry, GRID)
-    x = torch.rand(GRID.shape, generator=torch.Generator().manual_seed(0))
-    forward = _both(lambda: A(x))
-    assert torch.equal(*forward)
-    assert torch.equal(*_both(lambda: A.T(forward[0])))
 
 
 def test_fbp_of_line_integrals(clean):

@@ -10,11 +10,13 @@ import pytest
 import torch
 import yaml
 from analytic import Ellipsoid, Gaussian, rasterize, vector_lines
+from refusals import refused
 
 from recon import reconstruct
 from recon.cli import main
 from recon.least_squares.field_problem import larger_grid
-from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, VectorGeometry, Volume, VolumeGrid, full_turn
+from recon.least_squares.qggmrf import QGGMRF
+from torchpcct import ConeBeam, ParallelBeam, Projector, Scan, VectorGeometry, Volume, VolumeGrid, full_turn
 from torchpcct.formats.geometry_yaml import geometry_of, geometry_values
 from torchpcct.formats.scans import open_scan
 from torchpcct.metrics.half_split import halves
@@ -28,8 +30,8 @@ WOBBLING = VectorGeometry.of(CONE).turned(ROLL, TILT).shifted(np.tile([0.5, -0.5
 HELIX = VectorGeometry.of(CONE, helical_motion(CONE, 30.0, -15.0))
 
 
-def scan_of(geometry, bodies=BALL, **options):
-    return Scan.from_line_integrals(vector_lines(geometry, bodies, 1), geometry, photons=1e6, mu_water=MU, **options)
+def scan_of(geometry, bodies=BALL, sub=1):
+    return Scan.from_line_integrals(vector_lines(geometry, bodies, sub), geometry, photons=1e6, mu_water=MU)
 
 
 def test_one_ray_by_hand():
@@ -52,31 +54,43 @@ def test_one_ray_by_hand():
         Scan.from_counts(np.ones((2, 3, 4)), geometry, air=1.0)
 
 
-@pytest.mark.parametrize("geometry", [WOBBLING, VectorGeometry.of(FanBeam(full_turn(8), 150.0, 250.0, 12, 2.0))])
-def test_files_keep_every_view(geometry, tmp_path):
-    scan = scan_of(geometry)
-    scan.save(tmp_path / "scan.h5")
-    back = Scan.load(tmp_path / "scan.h5")
-    assert back.geometry == geometry
-    assert torch.equal(back.counts, scan.counts)
-    assert geometry_of(geometry_values(geometry)) == geometry
-
-
-def test_fbp_and_pwls_of_a_wobbling_detector():
-    """The ball reads 0 HU in both; on the ideal circle that the detector is not, it does not."""
+def test_fbp_of_a_wobbling_detector():
+    """The ball reads 0 HU; on the ideal circle that the detector is not, it does not."""
     grid = VolumeGrid((3, 20, 20), (1.0, 2.0, 2.0), (0.5, 0.0, 0.0))
-    scan = scan_of(WOBBLING)
     inside = rasterize(grid, [Ellipsoid((1.0, -2.0, 0.5), 5.0, value=1.0)]) > 0
-    volume = reconstruct(scan, grid, "fbp")
+    volume = reconstruct(scan_of(WOBBLING), grid, "fbp")
     assert float(volume.data[torch.from_numpy(inside)].mean()) == pytest.approx(0.0, abs=25.0)
     assert volume.report["warnings"] == []
-    coarse = VolumeGrid((12, 12, 12), 2.0)
+
+
+def helix():
+    """Rows that see 8 of the grid's 24 mm at a time, over three turns of 8 mm."""
+    cone = ConeBeam(np.linspace(0, 6 * math.pi, 72, endpoint=False), 150.0, 250.0, 28, 6, (2.2, 2.0))
+    return VectorGeometry.of(cone, helical_motion(cone, 8.0, -12.0))
+
+
+def wobbling():
+    """A detector that rolls by 10° and tilts by 5°, and jitters by a cell."""
+    rng = np.random.default_rng(0)
+    cone = ConeBeam(full_turn(36), 150.0, 250.0, 28, 24, (2.2, 2.0))
+    g = VectorGeometry.of(cone).turned(np.radians(rng.uniform(-10, 10, 36)), np.radians(5.0))
+    return g.shifted(rng.uniform(-1, 1, 36), rng.uniform(-1, 1, 36))
+
+
+@pytest.mark.parametrize("make", [helix, wobbling])
+def test_pwls_of_what_fbp_refuses_or_bends(make):
+    geometry, grid = make(), VolumeGrid((12, 12, 12), 2.0)
     body = [Gaussian((1.0, 2.0, -1.0), (5.0, 3.5, 4.0), value=MU)]
-    found = reconstruct(scan_of(WOBBLING, body), coarse, "pwls", tolerance=4.0)
-    truth = 1000.0 * (rasterize(coarse, body, 3) / MU - 1.0)
-    error = (found.data.numpy() - truth)[1:-1, 1:-1, 1:-1]
-    assert np.sqrt((error**2).mean()) < 40.0
+    scan = scan_of(geometry, body, 2)
+    found = reconstruct(scan, grid, "pwls", prior=QGGMRF(strength=0.02, threshold=3000.0), tolerance=2.0)
     assert found.report["converged"]
+    error = (found.data.numpy() - 1000.0 * (rasterize(grid, body, 3) / MU - 1.0))[1:-1, 1:-1, 1:-1]
+    assert np.sqrt((error**2).mean()) < 20.0  # of the body itself: 170 HU
+    # Taken for the ideal circle, the same data are not explained.
+    x, lines = MU * (1 + found.data / 1000.0), scan.line_integrals()
+    circle = ConeBeam(geometry.angles, 150.0, 250.0, 28, geometry.rows, (2.2, 2.0))
+    off = [float((Projector(g, grid)(x) - lines).norm()) for g in (circle, geometry)]
+    assert off[0] > 3 * off[1]
 
 
 def test_parallel_rays_with_rows():
@@ -134,14 +148,12 @@ def test_geometries_in_yaml(tmp_path):
     np.save(tmp_path / "poses.npy", WOBBLING.vectors)
     given = {"kind": "vectors", "vectors": "poses.npy", "columns": 44}
     assert geometry_of({**given, "rows": 36}, tmp_path) == WOBBLING
-    with pytest.raises(ValueError, match="12 numbers per view need rows"):
-        geometry_of(given, tmp_path)
-    with pytest.raises(ValueError, match="geometry needs columns"):
-        geometry_of({"kind": "vectors", "vectors": []})
-    with pytest.raises(ValueError, match=r"geometry\.pose must be a mapping of roll_deg"):
-        geometry_of({**circle, "pose": {"roll": 3.0}})
-    with pytest.raises(ValueError, match="first height of a helix: give feed"):
-        geometry_of({**circle, "pose": {"start": 3.0}})
+    refused(
+        ("12 numbers per view need rows", lambda: geometry_of(given, tmp_path)),
+        ("geometry needs columns", lambda: geometry_of({"kind": "vectors", "vectors": []})),
+        (r"geometry\.pose must be a mapping of roll_deg", lambda: geometry_of({**circle, "pose": {"roll": 3.0}})),
+        ("first height of a helix: give feed", lambda: geometry_of({**circle, "pose": {"start": 3.0}})),
+    )
 
 
 def test_the_command_line_takes_vectors(tmp_path, capsys):

@@ -2,17 +2,16 @@
 
 import os
 import signal
-import subprocess
-import sys
 import threading
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
+from fresh_python import run_python
 
 from recon.evaluate.store import Store
-from torchpcct.files import WriteError, atomic_write, clear_folder, require_folder, write_hdf5
+from torchpcct.files import WriteError, atomic_write, clear_folder, write_hdf5
 
 FULL = """
 import os, resource, sys
@@ -50,12 +49,7 @@ for size in (600, 5000, 40000):
 
 def test_what_cannot_be_written_is_an_error_in_one_sentence_and_leaves_nothing(tmp_path):
     """A limit on the size of files, for a full disk: every writer fails at several moments, HDF5 not at the end."""
-    path = os.pathsep.join([str(Path(__file__).parents[2]), *sys.path])
-    run = subprocess.run(
-        [sys.executable, "-c", FULL, str(tmp_path)],
-        capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path}, check=False,
-    )  # fmt: skip
-    assert run.returncode == 0, run.stderr[-3000:]
+    run = run_python(FULL, tmp_path)
     output = run.stdout.splitlines()
     assert len(output) == 3 * 10 - 3
     assert [s for s in output if not (s.startswith("cannot write ") and s.endswith("File too large"))] == []
@@ -135,8 +129,3 @@ def test_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
         write("new")
     assert path.read_text() == "old"
     assert [p.name for p in tmp_path.iterdir()] == ["f"]
-
-
-def test_missing_folder_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match="create it first"):
-        require_folder(tmp_path / "none" / "f")

@@ -51,17 +51,13 @@ def test_raw_readings_give_back_their_line_integrals(kind, lines):
 
 
 @pytest.mark.parametrize("kind", GEOMETRIES)
-def test_line_integrals_stay_what_they_are(kind, lines, tmp_path):
+def test_line_integrals_stay_what_they_are(kind, lines):
     g, p = GEOMETRIES[kind], lines[kind].copy()
     p[0, ..., 0] = -0.01  # noise in air
     scan = Scan.from_line_integrals(p, g, photons=1e5, mu_water=MU)
     np.testing.assert_allclose(scan.line_integrals().numpy(), p, atol=1e-6)
     np.testing.assert_allclose(scan.weights().numpy()[5:-5], (1e5 * np.exp(-p))[5:-5], rtol=0.35)
-    scan.save(tmp_path / "scan.h5")
-    back = Scan.load(tmp_path / "scan.h5")
-    assert back.geometry == g
-    assert (back.unit, back.logged) == ("HU", True)
-    assert torch.equal(back.line_integrals(), scan.line_integrals())
+    assert (scan.unit, scan.logged) == ("HU", True)
 
 
 def test_slices_are_reconstructed_one_by_one(lines):

@@ -3,13 +3,12 @@
 import importlib
 import os
 import pkgutil
-import subprocess
-import sys
 import textwrap
 import time
 from pathlib import Path
 
 import pytest
+from fresh_python import run_python
 
 import recon
 import torchpcct
@@ -42,12 +41,7 @@ RUN = """
 
 
 def run(folder):
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "cache")}
-    done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(RUN), str(folder)], env=environment, capture_output=True, text=True,
-        check=True,
-    )  # fmt: skip
-    value, hits = done.stdout.split()
+    value, hits = run_python(textwrap.dedent(RUN), folder, NUMBA_CACHE_DIR=str(folder / "cache")).stdout.split()
     return int(value), int(hits)
 
 
@@ -89,3 +83,26 @@ def test_every_module_whose_kernels_hold_others_forgets_outdated_ones():
     assert not missing
     held = {p.name for p in sources("torchpcct.projector.cpu.plane_kernels")}
     assert {"cone_kernels.py", "simd.py", "simd_interpolation.py"} <= held
+
+
+SCRIPT = """
+import hashlib, sys
+import numba
+import torch
+from torchpcct import FanBeam, Projector, VolumeGrid, full_turn
+
+numba.njit(lambda x: x)(1)  # of no concern to ours
+print("theirs", file=sys.stderr, flush=True)
+A = Projector(FanBeam(full_turn(50), 400.0, 700.0, 64, 2.0), VolumeGrid((40, 40), 1.0))
+x = torch.rand(A.domain_shape, generator=torch.Generator().manual_seed(0))
+y = A(x)
+print([hashlib.sha256(v.numpy().tobytes()).hexdigest() for v in (y, A.T(y))])
+"""
+
+
+def test_a_fresh_process_and_later_ones(tmp_path):
+    found = [run_python(SCRIPT, NUMBA_CACHE_DIR=str(tmp_path)) for _ in range(2)]
+    theirs, _, ours = found[0].stderr.partition("theirs")
+    assert (theirs.count("compiling kernels"), ours.count("compiling kernels")) == (0, 1)
+    assert "compiling kernels" not in found[1].stderr
+    assert found[0].stdout == found[1].stdout

@@ -4,13 +4,12 @@ import math
 import warnings
 from dataclasses import replace
 
-import h5py
 import numpy as np
 import pytest
 import torch
 from small_scan import GRID, SCENE, scanner
 
-from torchpcct import ConeBeam, FanBeam, ParallelBeam, Projector, Scan, VolumeGrid, acquire, full_turn
+from torchpcct import ConeBeam, FanBeam, ParallelBeam, Projector, VolumeGrid, acquire, full_turn
 from torchpcct.acquisition.acquire import plan
 from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import view_step
@@ -153,52 +152,3 @@ def test_an_indefinite_covariance_has_no_noise():
             vmi_noise(torch.tensor(bad), basis)
     singular = torch.tensor([4.0, -6.0, 9.0])
     assert bool(torch.isfinite(vmi_noise(singular, basis)).all())
-
-
-def same_scan(a, b):
-    tensors = ("counts", "air", "surround", "quantum")
-    return (
-        all(
-            (x is None) == (y is None) and (x is None or (x.dtype == y.dtype and torch.equal(x, y)))
-            for x, y in ((getattr(a, n), getattr(b, n)) for n in tensors)
-        )
-        and (a.geometry, a.window, a.exposure_s, a.seed, a.counting, a.info, a.electronic_noise)
-        == (b.geometry, b.window, b.exposure_s, b.seed, b.counting, b.info, b.electronic_noise)
-        and np.array_equal(a.linearisation.coefficients, b.linearisation.coefficients)
-        and np.array_equal(a.linearisation.scale, b.linearisation.scale)
-        and a.linearisation.mu_ref == b.linearisation.mu_ref
-    )
-
-
-def _small_scan(tmp_path):
-    g = ConeBeam(full_turn(12), 626.0, 1098.0, 30, 6, (1.0, 1.1), (0.2, 0.3), "curved")
-    window = DetectorWindow(np.arange(12) % 3 + 4, 20, 1, 4)
-    rng = torch.Generator().manual_seed(0)
-    Scan(
-        counts=torch.poisson(torch.full(window.shape, 900.0), generator=rng),
-        air=1e4 + 100 * torch.rand(6, 30, generator=rng),
-        geometry=g,
-        linearisation=WaterLinearisation(np.random.default_rng(0).uniform(0.9, 1.1, (30, 3)), np.ones(30), 0.0193),
-        exposure_s=0.35,
-        seed=3,
-        window=window,
-        surround=1e3 + 10 * torch.rand(6, 30, generator=rng),
-        info={"scanner": "test", "plan": [1, 2.5, None]},
-    ).save(tmp_path / "scan.h5")
-    return tmp_path / "scan.h5"
-
-
-def test_files_of_earlier_versions_still_load(tmp_path):
-    """They are plain HDF5 from the first byte, without a checksum."""
-    path = _small_scan(tmp_path)
-    expected = Scan.load(path)
-    old = tmp_path / "old.h5"
-    old.write_bytes(path.read_bytes()[512:])
-    with h5py.File(old, "a") as file:
-        file.attrs["version"] = 1
-    assert same_scan(Scan.load(old), expected)
-
-
-def test_sealed_files_are_plain_hdf5_for_others(tmp_path):
-    with h5py.File(_small_scan(tmp_path), "r") as file:
-        assert file["counts"].shape == (12, 4, 20)

@@ -6,6 +6,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from refusals import refused
 
 import torchpcct
 from recon import reconstruct
@@ -37,35 +38,57 @@ def whole():
     return acquire(SCENE, scanner(), duty=0.03, sub_rays=16)
 
 
-@pytest.mark.parametrize("noisy", [False, True])
-def test_round_trip(tmp_path, clean, noisy):
-    scan = clean.with_noise(0.35, 7) if noisy else clean
+def same_scan(a, b):
+    tensors = ("counts", "air", "surround", "quantum", "dead")
+    plain = ("geometry", "window", "exposure_s", "seed", "counting", "logged", "unit", "info", "electronic_noise")
+    return (
+        all(
+            (x is None) == (y is None) and (x is None or (x.dtype == y.dtype and torch.equal(x, y)))
+            for x, y in ((getattr(a, n), getattr(b, n)) for n in tensors)
+        )
+        and [getattr(a, n) for n in plain] == [getattr(b, n) for n in plain]
+        and np.array_equal(a.linearisation.coefficients, b.linearisation.coefficients)
+        and np.array_equal(a.linearisation.scale, b.linearisation.scale)
+        and a.linearisation.mu_ref == b.linearisation.mu_ref
+        and torch.equal(a.line_integrals(), b.line_integrals())
+    )
+
+
+CONE, FAN = ConeBeam(full_turn(12), 150.0, 250.0, 14, 6, 1.3), FanBeam(full_turn(8), 150.0, 250.0, 12, 2.0)
+SCANS = {
+    "windowed": lambda clean: clean,
+    "noisy": lambda clean: clean.with_noise(0.35, 7),
+    "whole": lambda clean: acquire(SCENE, presets.pcct(views=4, rows=2), duty=0.03, sub_rays=16),
+    "energy-integrating": lambda clean: acquire(SCENE, presets.eid(views=4, rows=2), exposure_s=0.35, sub_rays=16),
+    "line integrals": lambda clean: Scan.from_line_integrals(np.full(FAN.shape, 0.3), FAN, photons=1e5, mu_water=0.02),
+    "view by view": lambda clean: Scan.from_counts(
+        np.full(CONE.shape, 7.0), VectorGeometry.of(CONE).turned(0.05, 0.07).shifted(0.25, 0.5), air=9.0,
+        dead=np.arange(14) == 3,
+    ),
+    "a plane view by view": lambda clean: Scan.from_line_integrals(np.full(FAN.shape, 0.3), VectorGeometry.of(FAN)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", SCANS)
+def test_files_keep_every_scan(tmp_path, clean, kind):
+    """What was saved comes back to the bit, and so does what is made of it; files are plain HDF5 for others."""
+    scan = SCANS[kind](clean)
     scan.save(tmp_path / "scan.h5")
     back = Scan.load(tmp_path / "scan.h5")
-    assert torch.equal(back.counts, scan.counts)
-    assert torch.equal(back.air, scan.air)
-    assert torch.equal(back.surround, scan.surround)
-    assert back.window == scan.window
-    assert back.geometry == scan.geometry
-    assert (back.exposure_s, back.seed) == (scan.exposure_s, scan.seed)
-    assert back.info["scanner"] == scan.info["scanner"]
-    assert torch.equal(back.line_integrals(), scan.line_integrals())
+    assert same_scan(back, scan)
+    if scan.exposure_s is None and scan.surround is not None:
+        assert torch.equal(back.with_noise(0.7, 1).counts, scan.with_noise(0.7, 1).counts)
+    with h5py.File(tmp_path / "scan.h5", "r") as file:
+        assert file["counts"].shape == scan.counts.shape
 
 
-def test_whole_scan_round_trip(tmp_path, whole):
-    whole.save(tmp_path / "scan.h5")
-    back = Scan.load(tmp_path / "scan.h5")
-    assert back.window is None
-    assert torch.equal(back.counts, whole.counts)
-
-
-def test_truncated_foreign_and_newer_files(tmp_path, clean):
+def test_earlier_foreign_and_newer_files(tmp_path, clean):
+    """Files of earlier versions are plain HDF5 from the first byte, without a checksum."""
     clean.save(tmp_path / "scan.h5")
-    content = (tmp_path / "scan.h5").read_bytes()
-    for share in (0.1, 0.5, 0.99):
-        (tmp_path / "cut.h5").write_bytes(content[: int(share * len(content))])
-        with pytest.raises(ValueError, match=r"cut\.h5"):
-            Scan.load(tmp_path / "cut.h5")
+    (tmp_path / "old.h5").write_bytes((tmp_path / "scan.h5").read_bytes()[512:])
+    with h5py.File(tmp_path / "old.h5", "a") as file:
+        file.attrs["version"] = 1
+    assert same_scan(Scan.load(tmp_path / "old.h5"), clean)
     with h5py.File(tmp_path / "foreign.h5", "w") as file:
         file["counts"] = np.zeros(3)
     with pytest.raises(ValueError, match="not a torchpcct scan"):
@@ -77,16 +100,6 @@ def test_truncated_foreign_and_newer_files(tmp_path, clean):
         Scan.load(tmp_path / "scan.h5")
     with pytest.raises(FileNotFoundError):
         Scan.load(tmp_path / "none.h5")
-
-
-def test_nothing_is_half_written(tmp_path, clean, monkeypatch):
-    def fail(self, group):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(type(clean.linearisation), "save", fail)
-    with pytest.raises(KeyboardInterrupt):
-        clean.save(tmp_path / "scan.h5")
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_noise_on_noise_is_refused(clean):
@@ -135,64 +148,12 @@ def test_noise_beyond_the_window_does_not_matter(clean, whole):
 
 
 def test_refusals_of_reconstruct(clean):
-    with pytest.raises(ValueError, match="unknown method"):
-        reconstruct(clean, INSET, "magic")
-    with pytest.raises(ValueError, match="kernel"):
-        reconstruct(clean, INSET, "fbp", kernel="hard")
-    with pytest.raises(ValueError, match=r"field of view|region"):
-        reconstruct(clean, VolumeGrid((4, 4, 4), 0.2, (0, 0, 400.0)), "fbp")
-    with pytest.raises(ValueError, match="region"):
-        reconstruct(clean, VolumeGrid((4, 4, 4), 0.2, (0, 0, 60.0)), "fbp")
-    with pytest.raises(ValueError, match="too few photons"):
-        reconstruct(clean.with_noise(1e-5, 0), INSET, "fbp")
-    with pytest.raises(TypeError, match="Scan"):
-        reconstruct("scan.h5", INSET)
-
-
-def test_noise_falls_with_the_square_root_of_dose():
-    """log σ against log exposure over the inset's voxels: slope −0.50 ± 0.015 from 0.35 to 2.8 s."""
-    clean = acquire(SCENE, scanner(240), region=REGION, duty=0.1, sub_rays=16)
-    fbp = InsetFbp(clean, [INSET], ["soft"])
-    truth = fbp(clean)[0]
-    exposures = np.array([0.35, 0.7, 2.0, 2.8])
-    sd = [np.sqrt(np.mean([float((fbp(clean.with_noise(e, s))[0] - truth).square().mean()) for s in range(4)]))
-          for e in exposures]  # fmt: skip
-    assert np.polyfit(np.log(exposures), np.log(sd), 1)[0] == pytest.approx(-0.5, abs=0.015)
-
-
-def test_exact_roi_covariance_matches_monte_carlo():
-    from recon.analytic.exact_noise import roi_covariance
-    from torchpcct.metrics.roi import RoiMean, axial_grid
-
-    clean = acquire(SCENE, scanner(120), region=REGION, duty=0.05, sub_rays=16)
-    fbp = InsetFbp(clean, [INSET], ["soft", "bone"])
-    image = axial_grid(INSET.center)
-    y, x = np.meshgrid(image.axes[1] - INSET.center[1], image.axes[2] - INSET.center[2], indexing="ij")
-    rois = [RoiMean(INSET, image, np.hypot(y, x - c) < 0.5) for c in (1.5, 0.0)]
-    exact = roi_covariance(clean, fbp, [rois], 2.0)[0]
-    runs = []
-    for seed in range(60):
-        volumes = fbp(clean.with_noise(2.0, seed))[0]
-        runs.append([[float(roi(v)) for roi in rois] for v in volumes])
-    runs = np.array(runs)
-    expected = np.array([[float(roi(v)) for roi in rois] for v in fbp(clean)[0]])
-    for k in range(2):
-        sd = np.sqrt(np.diag(exact[k]))
-        # Four standard errors of a mean and of an SD from 60 runs.
-        assert (np.abs(runs[:, k].mean(0) - expected[k]) < 4 * sd / np.sqrt(60)).all()
-        np.testing.assert_allclose(runs[:, k].std(0, ddof=1), sd, rtol=4 / np.sqrt(120))
-        correlation = exact[k, 0, 1] / sd.prod()
-        assert np.corrcoef(runs[:, k].T)[0, 1] == pytest.approx(correlation, abs=0.5)
-
-
-def test_views_in_any_order_give_the_same_volume(clean):
-    g = clean.geometry
-    order = np.random.default_rng(0).permutation(g.views)
-    window = replace(clean.window, first_column=clean.window.first_column[order])
-    shuffled = replace(clean, geometry=g.select(order), counts=clean.counts[order], window=window)
-    a, b = reconstruct(clean, INSET, "fbp").data, reconstruct(shuffled, INSET, "fbp").data
-    torch.testing.assert_close(a, b, atol=0.02, rtol=0)
-    assert full_turn(g.views).shape == (g.views,)
+    refused(
+        ("kernel", lambda: reconstruct(clean, INSET, "fbp", kernel="hard")),
+        (r"field of view|region", lambda: reconstruct(clean, VolumeGrid((4, 4, 4), 0.2, (0, 0, 400.0)), "fbp")),
+        ("region", lambda: reconstruct(clean, VolumeGrid((4, 4, 4), 0.2, (0, 0, 60.0)), "fbp")),
+        ("too few photons", lambda: reconstruct(clean.with_noise(1e-5, 0), INSET, "fbp")),
+    )
 
 
 def test_a_lower_dose_of_a_measured_scan(clean):

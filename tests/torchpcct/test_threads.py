@@ -1,14 +1,13 @@
 """Sharing of kernels among threads: every index once, whoever calls and whatever goes wrong (forks: test_operator)."""
 
 import gc
-import subprocess
-import sys
 import threading
 import time
 import weakref
 
 import numpy as np
 import pytest
+from fresh_python import run_python
 from numba import njit
 
 from torchpcct import threads
@@ -131,5 +130,4 @@ def test_fewer_than_one_is_refused(number_asked):
 
 def test_the_environment_sets_the_number():
     code = "from torchpcct.threads import get_num_threads; print(get_num_threads())"
-    run = subprocess.run([sys.executable, "-c", code], env={"NUMBA_NUM_THREADS": "3"}, capture_output=True, text=True)
-    assert run.stdout.strip() == "3", run.stderr
+    assert run_python(code, NUMBA_NUM_THREADS="3").stdout.strip() == "3"

@@ -2,12 +2,11 @@
 
 import json
 import signal
-import subprocess
-import sys
 
 import pytest
 import torch
-from tiny_training import ROOT, StubData, StubObjective, assert_same_run, send, stub_model
+from fresh_python import run_python
+from tiny_training import StubData, StubObjective, assert_same_run, send, stub_model
 
 from recon.mbir.network import NetworkConfig
 from recon.mbir.unrolled import Unrolled
@@ -71,8 +70,7 @@ def test_refusals(tmp_path, objective, capsys):
 
 def test_nothing_heavy_is_loaded_before_the_numbers_of_threads_are_set():
     code = "import sys, train.__main__; print({'torch', 'numpy', 'numba'} & set(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
-    assert done.stdout == "set()\n"
+    assert run_python(code).stdout == "set()\n"
 
 
 def test_a_wider_network_starts_where_the_narrower_one_stood():

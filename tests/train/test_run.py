@@ -46,14 +46,6 @@ def test_resumed_run_is_bit_for_bit_the_uninterrupted_one(tmp_path, uninterrupte
     assert_same_run(tmp_path / "x", uninterrupted)
 
 
-def test_validation_due_at_an_interruption_is_made_up(tmp_path, uninterrupted):
-    state, _ = run(tmp_path / "x", objective=StubObjective({8: send(signal.SIGTERM)}))
-    assert state.step == 10
-    assert len(rows(tmp_path / "x" / "validation.csv")) == 1
-    run(tmp_path / "x", resume=True)
-    assert_same_run(tmp_path / "x", uninterrupted)
-
-
 def test_finished_run_resumed_changes_nothing(tmp_path, uninterrupted):
     run(tmp_path / "x")
     objective = StubObjective()
@@ -180,15 +172,6 @@ def test_damaged_checkpoint_falls_back_to_the_previous_one(tmp_path, uninterrupt
         run(out, resume=True)
     assert "continuing from the previous checkpoint" in caplog.text
     assert_same_run(out, uninterrupted)
-
-
-def test_previous_checkpoint_is_the_one_before(tmp_path):
-    store = Store(tmp_path)
-    for n in range(3):
-        store.save({"x": torch.full((2,), float(n))}, {"n": n})
-    assert store.load()[1:] == ({"n": 2}, None)
-    assert read_tensors(store.previous, CHECKPOINT_FORMAT)[1] == {"n": 1}
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["checkpoint.previous.safetensors", "checkpoint.safetensors"]
 
 
 def test_resume_refuses_another_configuration_or_model(tmp_path, caplog):

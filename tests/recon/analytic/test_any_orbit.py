@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from analytic import Ellipsoid, Gaussian
+from analytic import Ellipsoid, Gaussian, vector_lines
 
 from recon.analytic.any_orbit import rebin_to_circle
 from recon.analytic.fbp import fbp
@@ -25,18 +25,7 @@ FAN = FanBeam(full_turn(180), 400.0, 650.0, 110, 1.5)
 
 def lines(vectors, columns, rows=None, parallel=False):
     """Exact line integrals along the rays that the vectors themselves describe."""
-    v = np.asarray(vectors)
-    if rows is None:
-        zero = np.zeros((len(v), 1))
-        v = np.concatenate([v[:, :2], zero, v[:, 2:4], zero, v[:, 4:], zero, zero, zero, zero], 1)
-    source, centre, across, up = (x[:, None, None] for x in v.reshape(-1, 4, 3).transpose(1, 0, 2))
-    a = (np.arange(columns) - (columns - 1) / 2)[:, None]
-    b = (np.arange(rows or 1) - ((rows or 1) - 1) / 2)[:, None, None]
-    cell = centre + a * across + b * up
-    d = np.broadcast_to(source, cell.shape) if parallel else cell - source
-    d = d / np.linalg.norm(d, axis=-1, keepdims=True)
-    out = sum(body.along(cell, d) for body in BODY)
-    return torch.from_numpy(out if rows else out[:, 0])
+    return torch.from_numpy(vector_lines(VectorGeometry(vectors, columns, rows, parallel), BODY, 1))
 
 
 def worst(image, grid):

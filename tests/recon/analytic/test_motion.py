@@ -62,7 +62,7 @@ def test_each_view_sees_the_grid_where_it_is_then(name, dtype, tolerance):
 
 
 @pytest.mark.parametrize("name", sorted(SCANS))
-def test_window_and_transpose(name):
+def test_transpose_through_a_window(name):
     geometry, grid = SCANS[name]
     motion = _path(grid.ndim)
     window = footprint(geometry, grid, margin=1, motion=motion)
@@ -74,14 +74,6 @@ def test_window_and_transpose(name):
     forward, transpose = plan.forward(y), plan.transpose(x)
     scale = forward.norm() * x.norm() + transpose.norm() * y.norm()
     assert abs((forward * x).sum() - (transpose * y).sum()) <= 1e-13 * scale
-    whole = torch.randn(geometry.shape, dtype=torch.float64, generator=generator)
-    cut = window.take(whole[0]) if grid.ndim == 3 else None
-    if cut is not None:  # every view the same data: the window takes its part of each
-        same = whole[:1].expand(geometry.shape).contiguous()
-        torch.testing.assert_close(
-            backproject(cut, geometry, grid, window, motion=motion),
-            backproject(same, geometry, grid, motion=motion), rtol=0, atol=1e-12,
-        )  # fmt: skip
 
 
 @pytest.mark.parametrize("name", sorted(set(SCANS) - {"steep"}))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -31,15 +29,6 @@ def test_detail_lies_midway_between_standard_and_bone():
     f = np.linspace(0, 1, 101)
     middle = (apodization("standard", f) + apodization("bone", f)) / 2
     np.testing.assert_allclose(apodization("detail", f), middle, atol=1e-12)
-
-
-def test_kernels_are_ordered_from_smooth_to_sharp_without_overshoot_at_zero():
-    f = np.linspace(0.01, 1, 100)
-    values = [apodization(k, f) for k in ("soft", "standard", "detail", "bone")]
-    assert all((b > a).all() for a, b in pairwise(values))
-    assert apodization("soft", f).max() < 1
-    assert apodization("standard", f).max() < 1
-    assert apodization("soft", f).min() > -1e-12
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -97,8 +86,6 @@ def test_fast_length(n):
 def test_bad_kernels_name_the_options():
     with pytest.raises(ValueError, match=r"unknown kernel 'sharp': use one of soft, standard, detail, bone, ram-lak"):
         ramp_kernel(3, 1.0, "sharp")
-    with pytest.raises(TypeError, match=r"kernel must be a text, got 3 \(int\)"):
-        apodization(3, 0.5)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="at least 1 sample"):
         ramp_kernel(0, 1.0)
     with pytest.raises(ValueError, match="greater than 0"):

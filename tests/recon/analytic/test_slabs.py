@@ -3,19 +3,17 @@
 import errno
 import math
 import re
-import subprocess
-import sys
 import warnings
 from dataclasses import replace
-from pathlib import Path
 
-import h5py
 import nibabel
 import numpy as np
 import pytest
 import tifffile
 import torch
 import zarr
+from foreign_files import data_exchange
+from fresh_python import run_python
 
 import recon
 from recon.analytic import slabs
@@ -105,10 +103,7 @@ def _files(scan, folder):
     """The same parallel-beam readings in every format that is read in parts, with their options."""
     images = scan.counts.movedim(0, 1).numpy().astype(np.uint16)  # as a camera takes them, view by view
     scan.save(folder / "own.h5")
-    with h5py.File(folder / "exchange.h5", "w") as file:
-        file["exchange/data"], file["exchange/theta"] = images, np.rad2deg(PARALLEL.angles)
-        file["exchange/data_white"] = np.full((1, *images.shape[1:]), 20000, np.uint16)
-        file["measurement/instrument/detector/pixel_size"] = 1e-3
+    data_exchange(folder / "exchange.h5", images, np.full((1, *images.shape[1:]), 2e4), PARALLEL.angles, None, 1000.0)
     np.save(folder / "images.npy", images)
     tifffile.imwrite(folder / "images.tif", images, photometric="minisblack")
     zarr.create_array(folder / "images.zarr", data=images)
@@ -352,10 +347,7 @@ def test_512_cubed_within_a_gigabyte(tmp_path):
     scan = Scan.from_counts(counts, geometry, air=3e4, gain=1.0, mu_water=0.02)
     scan.save(tmp_path / "scan.h5")
     del counts
-    done = subprocess.run(
-        [sys.executable, "-c", LIMITED, tmp_path / "scan.h5", tmp_path / "v.nii"], capture_output=True, text=True,
-        cwd=Path(__file__).parents[3], check=True,
-    )  # fmt: skip
+    done = run_python(LIMITED, tmp_path / "scan.h5", tmp_path / "v.nii")
     assert 1024 * int(done.stdout) <= 1e9
     whole = recon.reconstruct(scan, VolumeGrid((512, 512, 512), 0.155))
     assert float((Volume.load(tmp_path / "v.nii").data - whole.data).abs().max()) <= 1e-4

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from fresh_python import run_python
 from some_jobs import compiles, dies, full, noted, refuses, set_version, threads, waits
 from tiny_studies import INSERT, TINY
 
@@ -432,11 +433,7 @@ def test_a_digest_covers_all_that_a_piece_runs(task, tmp_path):
     """Every function that is called while a piece is computed stands in a module that the digest has read, and the
     digest reads neither studies nor the command line."""
     (tmp_path / "given").write_bytes(pickle.dumps((task, [method_of(m) for m in METHODS])))
-    path = os.pathsep.join([p for p in sys.path if p])
-    called = subprocess.run(
-        [sys.executable, "-c", CALLED, tmp_path / "given", tmp_path / "store"], check=True, capture_output=True,
-        text=True, env={**os.environ, "PYTHONPATH": path},
-    ).stdout.split()  # fmt: skip
+    called = run_python(CALLED, tmp_path / "given", tmp_path / "store").stdout.split()
     packages = {"recon", "torchpcct"}  # where lazy names are looked up
     assert set(called) - packages == set()
     seen = set()

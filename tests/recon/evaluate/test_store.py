@@ -4,8 +4,6 @@ import io
 import json
 import os
 import signal
-import subprocess
-import sys
 import time
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -13,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from fresh_python import run_python
 from tiny_studies import run_tiny
 
 import recon.evaluate.store as store_module
@@ -173,14 +172,12 @@ run_tiny(sys.argv[1], Path(sys.argv[3]))
 @pytest.mark.parametrize("name", ["noise", "motion", "resolution", "hardcases", "detector", "bowtie", "spectral"])
 def test_a_killed_study_goes_on_where_it_was(name, tmp_path, monkeypatch):
     """Killed at a random piece, again and again: the report is that of a run in one go, and no piece is made twice."""
-    path = os.pathsep.join([str(Path(__file__).parents[2] / "helpers"), *sys.path])
     kills = np.random.default_rng(0).integers(1, 4, 4)
     for after in kills:
-        command = [sys.executable, "-c", _KILLED, name, str(after), str(tmp_path / "killed")]
-        run = subprocess.run(command, env={**os.environ, "PYTHONPATH": path}, capture_output=True, check=False)
+        run = run_python(_KILLED, name, after, tmp_path / "killed", check=False)
         if run.returncode == 0:
             break
-        assert run.returncode == -signal.SIGKILL, run.stderr.decode()
+        assert run.returncode == -signal.SIGKILL, run.stderr
     # What an evaluation keeps of its own is not the study's.
     kept = (tmp_path / "killed").rglob("pieces/**/*.npz")
     finished = len([path for path in kept if "evaluate" not in path.parts])

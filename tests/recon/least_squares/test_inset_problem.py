@@ -30,10 +30,10 @@ def test_noise_free_values_in_hu(clean, problem):
 
 
 def test_batch_equals_single(clean, problem):
-    scans = [clean.with_noise(2.0, s) for s in range(2)]
+    scans, seen = [clean.with_noise(2.0, s) for s in range(3)], []
     options = {"prior": WEAK, "problem": problem, "tolerance": 0.02, "max_exact": 30}
-    together = reconstruct(scans, GRID, "pwls", **options)
-    assert len(together) == 2
+    together = reconstruct(scans, GRID, "pwls", **options, batch=2, progress=seen.append)
+    assert seen == [pytest.approx(2 / 3), 1.0]
     for scan, volume in zip(scans, together, strict=True):
         alone = reconstruct(scan, GRID, "pwls", **options)
         assert float((alone.data - volume.data).square().mean().sqrt()) < 0.1
@@ -70,15 +70,6 @@ def test_refusals(clean):
         reconstruct(spectral, GRID, "pwls")
     with pytest.raises(ValueError, match="region"):
         reconstruct(clean, VolumeGrid((8, 18, 18), 0.4, (0.0, 0.0, 60.0)), "pwls")
-
-
-def test_progress_reaches_one(clean, problem):
-    seen: list[float] = []
-    reconstruct(
-        [clean.with_noise(2.0, s) for s in range(3)], GRID, "pwls", prior=WEAK, problem=problem, batch=2,
-        progress=seen.append,
-    )  # fmt: skip
-    assert seen == [pytest.approx(2 / 3), 1.0]
 
 
 def test_the_default_prior_follows_the_noise(clean, problem):

@@ -4,6 +4,7 @@ import inset_operators
 import pytest
 import torch
 from inset_operators import HU, minimum, problem, tissue
+from refusals import refused
 
 from recon.gram.gram import Gram
 from recon.least_squares.pwls import pwls, solve_normal
@@ -73,26 +74,6 @@ def test_exact_minimum_within_three_pairs(inset, dense, prior):
     assert tight.report["gradient"][-1] < 1e-4
 
 
-def test_double_precision_converges_further(inset, dense):
-    A, w, gram, y = inset
-    x = reference(dense, A, w, y, EDGE, gram.information(HU))
-    result = pwls(A, y.double(), w.double(), EDGE, mu_per_hu=HU, gram=gram, tolerance=1e-5, max_exact=40)
-    assert result.x.dtype == torch.float64
-    assert hu_rms(result.x, x) < 1e-4
-
-
-@pytest.mark.parametrize("start", ["noise", "10^4 HU"])
-def test_any_start_gives_the_same_volume(inset, start):
-    A, w, gram, y = inset
-    first = torch.full(A.domain_shape, 1e4 * HU)
-    if start == "noise":
-        first = torch.randn(A.domain_shape, generator=torch.Generator().manual_seed(2)) * 1000 * HU
-    plain = pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, tolerance=0.05)
-    other = pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, tolerance=0.05, start=first, max_exact=30)
-    assert other.report["converged"]
-    assert hu_rms(plain.x, other.x) < 0.15
-
-
 def test_batch_of_realisations(inset):
     A, w, gram, _ = inset
     y = noisy(A, w, 7, (2, 2))
@@ -131,16 +112,6 @@ def test_lost_readings(inset, dense, case):
     assert hu_rms(result.x, x) < 1.0
 
 
-def test_a_gram_of_other_weights_only_costs_pairs(inset):
-    A, w, gram, y = inset
-    lost = masked(w, 0.05)
-    prior = EDGE.bind(gram.information(HU), A.grid.spacing, HU)
-    right = pwls(A, y, lost, prior, mu_per_hu=HU, tolerance=0.05, max_exact=30)
-    wrong = pwls(A, y, lost, prior, mu_per_hu=HU, gram=gram, tolerance=0.05, max_exact=30)
-    assert wrong.report["converged"]
-    assert hu_rms(right.x, wrong.x) < 0.2
-
-
 def test_low_dose_is_the_same_problem_scaled(inset):
     """1/100 of the dose with the noise in the same units: strength is noise-normalised, so x is the same."""
     A, w, gram, y = inset
@@ -149,7 +120,7 @@ def test_low_dose_is_the_same_problem_scaled(inset):
     assert hu_rms(full.x, low.x) < 0.1
 
 
-def test_report_and_callback(inset, caplog):
+def test_report_and_callback(inset):
     A, w, gram, y = inset
     seen = []
     result = pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, callback=seen.append)
@@ -157,10 +128,6 @@ def test_report_and_callback(inset, caplog):
     assert result.report["gradient"][0] == pytest.approx(1.0)
     assert len(result.report["inner_iterations"]) == len(seen)
     assert result.report["strength"] == EDGE.strength
-    with caplog.at_level("WARNING"):
-        short = pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, tolerance=1e-6, max_exact=1)
-    assert not short.report["converged"]
-    assert "raise max_exact" in caplog.text
 
 
 def test_from_the_sufficient_statistic(inset):
@@ -175,45 +142,9 @@ def test_from_the_sufficient_statistic(inset):
 
 def test_refusals(inset):
     A, w, gram, y = inset
-    with pytest.raises(ValueError, match="y must have shape"):
-        pwls(A, y[:-1], w, EDGE, mu_per_hu=HU, gram=gram)
-    with pytest.raises(TypeError, match="float"):
-        pwls(A, y.int(), w, EDGE, mu_per_hu=HU, gram=gram)
-    with pytest.raises(ValueError, match="weight 0"):
-        pwls(A, torch.full_like(y, torch.nan), w, EDGE, mu_per_hu=HU, gram=gram)
-    with pytest.raises(ValueError, match="tolerance"):
-        pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, tolerance=0.0)
-    with pytest.raises(ValueError, match="start"):
-        pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, start=torch.full(A.domain_shape, torch.nan))
-    with pytest.raises(ValueError, match="max_exact"):
-        pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, max_exact=0)
-
-
-@pytest.mark.parametrize("value_hu", [1500.0, 8000.0])
-def test_calcification_and_metal_at_the_border(inset, dense, value_hu):
-    """Bright voxels in a corner of the inset, half of them cut off by it."""
-    A, w, gram, y = inset
-    bright = torch.zeros(A.domain_shape)
-    bright[1:3, :2, :2] = value_hu * HU
-    y = y + A(bright)
-    exact = reference(dense, A, w, y, EDGE, gram.information(HU))
-    result = pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, tolerance=0.2, max_exact=30)
-    assert result.report["converged"]
-    assert hu_rms(result.x, exact) < 1.0
-
-
-def test_wrong_centre_is_solved_as_stated(inset):
-    """Data of a detector shifted by half a column: the solver finds the minimum of the problem it was given."""
-    from dataclasses import replace
-
-    from torchpcct import Projector
-
-    A, w, gram, _ = inset
-    g = A.geometry
-    other = replace(g, offset=(g.offset[0], g.offset[1] + g.pitch[1] / 2))
-    y = Projector(other, A.grid, A.window)(tissue(A.grid))
-    result = pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, tolerance=0.1, max_exact=30)
-    assert result.report["converged"]
-    assert torch.isfinite(result.x).all()
-    shift = hu_rms(result.x, pwls(A, A(tissue(A.grid)), w, EDGE, mu_per_hu=HU, gram=gram, tolerance=0.1).x)
-    assert 1.0 < shift < 200.0
+    refused(
+        ("weight 0", lambda: pwls(A, torch.full_like(y, torch.nan), w, EDGE, mu_per_hu=HU, gram=gram)),
+        ("tolerance", lambda: pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, tolerance=0.0)),
+        ("start", lambda: pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, start=torch.full(A.domain_shape, torch.nan))),
+        ("max_exact", lambda: pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, max_exact=0)),
+    )

@@ -6,6 +6,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import refused
 
 from recon.least_squares.qggmrf import QGGMRF, BoundPrior, quadratic
 
@@ -162,15 +163,11 @@ def test_binding_scales_with_the_noise():
 
 
 def test_refusals():
-    with pytest.raises(ValueError, match="exponents"):
-        QGGMRF(1.0, 1.0, p=1.0, q=1.5)
-    with pytest.raises(ValueError, match="neighbors"):
-        QGGMRF(1.0, 1.0, neighbors=18)
-    with pytest.raises(ValueError, match="information"):
-        QGGMRF(1.0, 1.0).bind(0.0, (0.2,) * 3, HU)
-    with pytest.raises(ValueError, match="mu_per_hu"):
-        QGGMRF(1.0, 1.0).bind(1.0, (0.2,) * 3, 0.0)
-    with pytest.raises(ValueError, match="axes"):
-        bound().value(torch.zeros(3, 3))
-    with pytest.raises(ValueError, match="4 axes"):
-        both(EDGE, (0.5,) * 3).gradient(torch.zeros(3, 3, 3))
+    refused(
+        ("exponents", lambda: QGGMRF(1.0, 1.0, p=1.0, q=1.5)),
+        ("neighbors", lambda: QGGMRF(1.0, 1.0, neighbors=18)),
+        ("information", lambda: QGGMRF(1.0, 1.0).bind(0.0, (0.2,) * 3, HU)),
+        ("mu_per_hu", lambda: QGGMRF(1.0, 1.0).bind(1.0, (0.2,) * 3, 0.0)),
+        ("axes", lambda: bound().value(torch.zeros(3, 3))),
+        ("4 axes", lambda: both(EDGE, (0.5,) * 3).gradient(torch.zeros(3, 3, 3))),
+    )

@@ -108,14 +108,6 @@ def test_batch_is_each_alone(scan):
         assert hu_rms(x, pwls(A, data, w, EDGE, mu_per_hu=HU, tolerance=0.3).x) < 1.0
 
 
-def test_a_stop_that_was_not_reached_is_said(scan, caplog):
-    A, y, w, _ = scan
-    with caplog.at_level("WARNING"):
-        short = pwls(A, y, w, EDGE, mu_per_hu=HU, max_exact=2)
-    assert not short.report["converged"]
-    assert "raise max_exact" in caplog.text
-
-
 def test_voxels_that_some_views_miss_converge_last_and_that_is_said():
     """Corners beyond the field of view hang on the prior alone; inside, the volume is at the minimum long before."""
     A = Projector(ParallelBeam(torch.arange(40).numpy() * math.pi / 40, 26, 1.0), VolumeGrid((24, 24), 1.0))

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import pytest
 from plaque_image import tissue_volume
 from tiny_studies import assert_report_is_whole
 
-from recon.study import registry
-from recon.study.motion import Reference, Settings, observe
+from recon.study.motion import Reference, observe
 from recon.study.paper.plaque_scan import inset_grid
 from torchpcct.scene.plaque import plaque_scene
 
@@ -61,11 +59,6 @@ def test_motion_spoils_and_its_knowledge_repairs(tiny):
     assert ("pwls", 0.2, False) not in m.compensated  # to its certified minimum with the true motion only
 
 
-def test_eid_is_less_sensitive(tiny):
-    residual = tiny("motion").measured.seen.residual
-    assert residual["EID-CT", 0.2][0].nrmse < residual["PCCT", 0.2][0].nrmse
-
-
 def test_report(tiny, tmp_path):
     study = tiny("motion")
     sections = ("one view in 24", "wrong by 20 %", "## Agreement with the paper", "## What was modelled")
@@ -77,9 +70,3 @@ def test_report(tiny, tmp_path):
     first = data["residual"][0]["in_place"]
     here = study.measured.seen.residual["PCCT", 0.2][0]
     assert (first["nrmse"], first["lumen_mm2"]) == (here.nrmse, here.segmentation.lumen_area)
-
-
-def test_settings():
-    motion = registry.build_settings("motion", quick=True).motion
-    assert np.allclose(motion.displacement([0.25]), [[2.0, 0.0, 0.0]])
-    assert Settings(fractions=(0.2, 0.6)).worst == 0.6

@@ -11,7 +11,6 @@ from tiny_studies import TINY, assert_report_is_whole
 from recon.analytic.exact_noise import roi_adjoints, roi_covariance, voxel_covariance
 from recon.analytic.inset import InsetFbp
 from recon.evaluate.draws import Functional
-from recon.study import registry
 from recon.study.noise import (
     Settings,
     Table,
@@ -118,13 +117,6 @@ def test_report(tiny, tmp_path):
     row = data["doses"]["5.7x"][1]["ten_runs"]
     assert row["cnr"] == pytest.approx((means[:, 1] - means[:, 0]).mean() / np.hypot(*means.std(0, ddof=1)))
     assert row["cnr_interval"][0] < row["cnr"] < row["cnr_interval"][1]
-
-
-def test_settings():
-    settings = registry.build_settings("noise", quick=True, changes=["realizations=12"])
-    assert settings.realizations == 12
-    assert settings.table_exposure_s == 2.0
-    assert settings.axes[:3] == [("soft", 0.2), ("standard", 0.2), ("soft", 0.25)]
 
 
 # --- statistics ---------------------------------------------------------------------------------------------------

@@ -83,8 +83,9 @@ def test_settings_of_every_study(name):
         kind(**{COUNTS[name]: 0})
     with pytest.raises(TypeError, match=COUNTS[name]):
         kind(**{COUNTS[name]: 48.5})
-    with pytest.raises(ValueError, match="nonsense=1: give field=value"):
-        registry.build_settings(name, changes=["nonsense=1"])
+    for bad in ("nonsense=1", "=", "views"):
+        with pytest.raises(ValueError, match=f"{bad}.*: give field=value"):
+            registry.build_settings(name, changes=[bad])
     with pytest.raises(FrozenInstanceError):
         setattr(full, COUNTS[name], 9)
     other = registry.build_settings("compare" if name != "compare" else "noise")
@@ -138,8 +139,6 @@ def test_bad_settings(name, change, match):
 def test_changes_from_the_command_line():
     settings = registry.build_settings("compare", quick=True, changes=["views=96", "methods=['fbp:bone']"])
     assert (settings.views, settings.methods) == (96, ("fbp:bone",))
-    with pytest.raises(ValueError, match="give field=value"):
-        registry.build_settings("compare", changes=["views"])
 
 
 def test_names():

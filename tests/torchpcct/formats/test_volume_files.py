@@ -30,18 +30,14 @@ def sitk_read(path):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_round_trip(tmp_path, name):
-    Volume(DATA, GRID).save(tmp_path / name)
+    unit = "HU" if name == "series" else "mm^-1"
+    Volume(DATA, GRID, {"method": "fbp", "kernel": "soft"}, unit).save(tmp_path / name)
     back = Volume.load(tmp_path / name)
+    if name == "v.h5":
+        assert (back.grid, back.report) == (GRID, {"method": "fbp", "kernel": "soft"})
     assert torch.equal(back.data, DATA)
-    assert back.grid.shape == GRID.shape
+    assert (back.grid.shape, back.unit) == (GRID.shape, unit)
     np.testing.assert_allclose([*back.grid.spacing, *back.grid.center], [*GRID.spacing, *GRID.center], atol=1e-5)
-
-
-@pytest.mark.parametrize("name", ["v.nii.gz", "v.mha", "v.h5"])
-@pytest.mark.parametrize("unit", ["HU", "mm^-1"])
-def test_the_unit_comes_back(tmp_path, name, unit):
-    Volume(DATA, GRID, unit=unit).save(tmp_path / name)
-    assert Volume.load(tmp_path / name).unit == unit
 
 
 def test_units_of_other_files(tmp_path):
@@ -156,9 +152,6 @@ def test_dicom_series_are_in_hu_and_whole(tmp_path):
     assert (first.RescaleType, first.Modality, len(list((tmp_path / "s").iterdir()))) == ("HU", "CT", 4)
     with pytest.raises(ValueError, match="is not empty"):
         Volume(DATA, GRID).save(tmp_path / "s")
-    (tmp_path / "s" / "0002.dcm").unlink()
-    with pytest.raises(ValueError, match="slices lack or repeat between z"):
-        Volume.load(tmp_path / "s")
     with pytest.raises(ValueError, match=r"holds HU, this volume is in mm\^-1"):
         Volume(DATA, GRID, unit="mm^-1").save(tmp_path / "t")
 

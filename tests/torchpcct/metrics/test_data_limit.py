@@ -49,20 +49,6 @@ def test_limit_is_the_pseudo_inverse_of_the_weighted_system():
         _ = limit.contrast_sd
 
 
-def test_limit_is_reached_by_simulated_least_squares():
-    maps, weight = system(2, tissues=3)
-    a, w = maps.reshape(3, -1).T, weight.ravel()
-    f = information_matrix(maps, weight)
-    rng = np.random.default_rng(3)
-    c = np.array([40.0, 100.0, 500.0])
-    y = a @ c + rng.standard_normal((4000, w.size)) / np.sqrt(w)
-    estimates = np.linalg.solve(f, (a.T * w) @ y.T)
-    limit = ceiling(f, [-1, 1, 0])
-    contrast = estimates[1] - estimates[0]
-    assert contrast.std() == pytest.approx(limit.contrast_sd, rel=0.05)
-    assert contrast.mean() == pytest.approx(60, abs=5 * limit.contrast_sd / math.sqrt(4000))
-
-
 @settings(max_examples=30, deadline=None)
 @given(st.floats(0.01, 100), st.integers(0, 1000))
 def test_scaling_with_dose_and_more_unknowns(dose, seed):

@@ -42,18 +42,6 @@ def test_gaussian_disk(sigma, contrast):
     assert edge.edge_width == pytest.approx(2 * 1.28155 * sigma, rel=0.01)
 
 
-def test_true_convolution_of_a_disk():
-    """The same from pixels: a finely sampled disk, blurred by a Gaussian filter and read at every pixel."""
-    from scipy.ndimage import gaussian_filter
-
-    fine = VolumeGrid((400, 400), 0.03)
-    distance = np.hypot(fine.axes[0][:, None], fine.axes[1]) - 4.0
-    disk = np.clip(0.5 - distance / 0.03, 0, 1) * -60 + 100
-    edge = task_transfer(gaussian_filter(disk, 0.25 / 0.03), distance, (1.2, 1.2), 0.02)
-    assert edge.f50 == pytest.approx(math.sqrt(math.log(2) / 2) / (math.pi * 0.25), rel=0.01)
-    assert edge.f10 == pytest.approx(math.sqrt(math.log(10) / 2) / (math.pi * 0.25), rel=0.02)
-
-
 def test_bins_do_not_blur():
     f50 = [task_transfer(blurred(DISK, 0.2), DISK, (1.4, 1.4), width).f50 for width in (0.02, 0.1)]
     assert f50[1] == pytest.approx(f50[0], rel=0.01)

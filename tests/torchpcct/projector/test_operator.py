@@ -1,15 +1,12 @@
 """Operators as other libraries call them, narrow dtypes, forks and the notice of compilation."""
 
 import copy
-import logging
 import os
-import subprocess
-import sys
-import warnings
 
 import numpy as np
 import pytest
 import torch
+from fresh_python import run_python
 from geometries import REGISTRY
 from inset_operators import dense
 
@@ -20,7 +17,7 @@ CASES = ["parallel_half_turn", "fan_curved_short_scan", "cone_window"]
 
 @pytest.fixture(params=CASES)
 def A(request):
-    return Projector(*REGISTRY[request.param]())
+    return Projector(*REGISTRY[request.param])
 
 
 def test_product_and_adjoint(A):
@@ -176,57 +173,5 @@ for _ in range(5):
 @pytest.mark.parametrize("used", ["before", "meanwhile", pytest.param("never", marks=pytest.mark.slow)])
 def test_a_forked_process_computes_on_threads_of_its_own(used):
     """After its parent has projected; while another thread of the parent projects; with a parent that never did."""
-    command = [sys.executable, "-W", "ignore", "-c", CHILD, used]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    done = run_python(CHILD, used, check=False, PYTHONWARNINGS="ignore")
     assert done.stdout.splitlines() == ["status 0"] * 5, done.stdout + done.stderr
-
-
-class _Projections(torch.utils.data.Dataset):
-    """What a training might compute in the workers of its loader."""
-
-    def __init__(self, A):
-        self.A = A
-
-    def __len__(self):
-        return 4
-
-    def __getitem__(self, n):
-        return self.A(torch.full(self.A.domain_shape, n + 1.0))
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this platform")
-def test_forked_workers_of_a_data_loader_project(A):
-    data = _Projections(A)
-    expected = torch.stack([data[n] for n in range(len(data))])
-    loader = torch.utils.data.DataLoader(data, batch_size=4, num_workers=1, multiprocessing_context="fork", timeout=60)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # Python's, of a fork of a process with threads
-        assert torch.equal(next(iter(loader)), expected)
-
-
-def test_a_word_while_kernels_compile(caplog):
-    """Only for the package's own functions, and once."""
-    from numba.core import event
-
-    from torchpcct.kernel_cache import announce_compilation
-
-    announce_compilation()
-
-    class Dispatcher:
-        @staticmethod
-        def py_func():
-            pass
-
-    def compiled(module):
-        Dispatcher.py_func.__module__ = module
-        with event.trigger_event("numba:compile", data={"dispatcher": Dispatcher()}):
-            pass
-
-    listener = next(k for k in event._registered["numba:compile"] if type(k).__name__ == "Announce")
-    type(listener).announced = False
-    with caplog.at_level(logging.WARNING):
-        compiled("somebody.else")
-        assert not caplog.records
-        compiled("torchpcct.projector.cpu.cone_kernels")
-        compiled("recon.gram.kernels")
-    assert [r.message for r in caplog.records if "compiling" in r.message] == [caplog.records[0].message]

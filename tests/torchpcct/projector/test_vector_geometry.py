@@ -154,13 +154,6 @@ def test_roll_tilt_and_slant_turn_right_handed():
         np.testing.assert_allclose(geometry_of({**cone, "pose": {f"{name}_deg": 20}}).vectors, turned.vectors)
 
 
-def test_a_whole_turn_of_roll_is_none():
-    g = VectorGeometry.of(CONE)
-    np.testing.assert_allclose(g.turned(2 * math.pi, 2 * math.pi, 2 * math.pi).vectors, g.vectors, atol=1e-9)
-    half = g.turned(roll=math.pi)
-    np.testing.assert_allclose(half.vectors, g.flipped(columns=True, rows=True).vectors, atol=1e-9)
-
-
 @pytest.mark.parametrize("curved", [False, True])
 def test_a_helix_takes_the_native_passes(curved):
     """Exact chords of a source that climbs by 6 mm a turn; the same scan by vectors is recognised as such."""
@@ -226,8 +219,6 @@ def test_refusals():
         Projector(wobbling(CONE), VolumeGrid((4, 70, 70), 2.0))
     with pytest.raises(ValueError, match="window belongs to a circular scan"):
         Projector(wobbling(CONE), GRID, DetectorWindow.full(CONE))
-    with pytest.raises(TypeError, match="geometry must be a ConeBeam"):
-        helical_motion(FAN, 3.0)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

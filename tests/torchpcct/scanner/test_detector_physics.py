@@ -4,12 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from torchpcct import acquire
 from torchpcct.scanner import SiliconDetector, presets
 from torchpcct.scanner.compton import mean_recoil_fraction
-from torchpcct.scanner.pileup import pulse_heights, recorded_rates
+from torchpcct.scanner.pileup import recorded_rates
 from torchpcct.scanner.silicon_transport import Stack, efficiency, follow
 from torchpcct.scene.materials import material
 from torchpcct.scene.phantoms.quality import water_cylinder
@@ -27,14 +26,6 @@ def test_without_dead_time_rates_are_quanta_times_response():
         np.testing.assert_allclose(
             recorded_rates(detector, ENERGIES, QUANTA), detector.response(ENERGIES) @ QUANTA, rtol=1e-12
         )
-
-
-def test_pulse_heights_add_up_to_the_counts_above_any_threshold():
-    detector = SiliconDetector(charge_sharing=0.2)
-    heights = pulse_heights(detector, ENERGIES, 256)
-    for threshold in (0, 5, 12, 60):
-        expected = detector.above(ENERGIES, [threshold if threshold else -np.inf])[0]
-        np.testing.assert_allclose(heights[:, threshold:].sum(1), expected, atol=1e-9)
 
 
 def test_one_segment_is_non_paralysable():
@@ -123,29 +114,6 @@ def test_scans_with_pile_up_lose_counts_and_stay_linear_in_water():
     # With the ideal detector's correction the same readings would be far off.
     wrong = replace(scan, linearisation=free.linearisation).line_integrals()[0, 0].double().numpy()
     assert (wrong[740:760] / (free.linearisation.mu_ref * chord[740:760]) < 0.9).all()
-
-
-def test_a_window_sees_the_pile_up_of_the_whole():
-    from torchpcct import VolumeGrid
-    from torchpcct.scene.plaque import plaque_scene
-
-    scene, _ = plaque_scene(vessel_length=4.0)
-    system = presets.pcct(views=6, mode="spectral", detector=SiliconDetector("spectral", dead_time_ns=50.0))
-    system = system.replace(geometry=replace(system.geometry, rows=2))
-    region = VolumeGrid((1, 1, 1), (4.2, 9.0, 9.0), (0.0, -30.38, -29.63))
-    part, whole = acquire(scene, system, region=region, sub_rays=1), acquire(scene, system, sub_rays=1)
-    w = part.window
-    for v in range(6):
-        cut = whole.counts[:, v, :, w.first_column[v] : w.first_column[v] + w.columns]
-        torch.testing.assert_close(part.counts[:, v], cut, rtol=1e-6, atol=0)
-    torch.testing.assert_close(part.air, whole.air, rtol=1e-6, atol=0)
-
-
-def test_bad_merging_time():
-    with pytest.raises(ValueError, match="merge_ns must lie"):
-        SiliconDetector(dead_time_ns=20.0, merge_ns=30.0)
-    with pytest.raises(ValueError, match="single energy bins"):
-        presets.pcct(columns=4, detector=SiliconDetector("spectral", dead_time_ns=20.0)).water_linearisation(bin=1)
 
 
 # --- photons followed ---------------------------------------------------------------------------------------------
@@ -241,15 +209,3 @@ def test_charge_sharing_of_followed_pulses_doubles_counts_without_a_threshold(fo
     rng = np.random.default_rng(7)
     plain = deposits.counts(-1e9, 1.0, rng).mean()
     assert deposits.counts(-1e9, 1.0, rng, charge_sharing=1.0).mean() == pytest.approx(2 * plain)
-
-
-def test_refusals():
-    rng = np.random.default_rng(0)
-    with pytest.raises(ValueError, match="photons must be"):
-        follow(SiliconDetector(), [60.0], [1.0], 0, rng)
-    with pytest.raises(ValueError, match="weights must be"):
-        follow(SiliconDetector(), [60.0], [0.0], 10, rng)
-    with pytest.raises(ValueError, match="foil_mm"):
-        Stack(foil_mm=0.6)
-    with pytest.raises(ValueError, match="unknown pulses"):
-        follow(SiliconDetector(), [60.0], [1.0], 10, rng).counts(5.0, 1.0, rng, "pixel")

@@ -8,10 +8,8 @@ import pytest
 import torch
 
 from torchpcct.geometry import ConeBeam
-from torchpcct.scanner import Scanner, SiliconDetector, Source, presets
+from torchpcct.scanner import Source, presets
 from torchpcct.scene.materials import PLAQUE_MATERIALS, material
-
-FAT_MM = 240.0
 
 
 @pytest.fixture(scope="module")
@@ -29,23 +27,11 @@ def test_published_geometry(pcct, eid):
     assert (g.sod, g.sdd, g.columns, g.rows, g.views, g.detector) == (626.0, 1098.0, 1500, 40, 1968, "curved")
     assert (g.pitch, pcct.source.focal_spot, pcct.source.kvp) == ((0.50, 0.35), (0.5, 0.5), 100.0)
     assert 2 * g.fov_radius == pytest.approx(296, abs=1)
+    assert presets.pcct(quarter_offset=True).geometry.offset[1] == pytest.approx(0.35 / 4)
     g = eid.geometry
     assert (g.sod, g.sdd, g.columns, g.rows, g.views, g.detector) == (541.0, 949.0, 888, 64, 984, "curved")
     assert (g.pitch, eid.source.focal_spot, eid.source.current_ma) == ((1.0988, 1.0239), (0.9, 0.7), 1000.0)
     assert g.offset == (0.0, pytest.approx(-1.25 * 1.0239))
-
-
-def test_photons_per_cell_and_view(pcct):
-    """Quanta of a CatSim-like beam at 0.35 s: 16 070 in air, 161 behind 24 cm of fat, of which 115 are counted."""
-    energies, quanta = pcct.quanta()
-    load = pcct.mas_per_view(0.35)
-    assert load == pytest.approx(1000 * 0.35 / 1968)
-    fat = np.exp(-material("pericoronary_fat").attenuation(energies) * FAT_MM)
-    centre = pcct.geometry.columns // 2
-    assert load * quanta[centre].sum() == pytest.approx(16_070, rel=0.02)
-    assert load * (quanta[centre] * fat).sum() == pytest.approx(161, rel=0.02)
-    counted = load * pcct.behind({material("pericoronary_fat"): FAT_MM})[0, centre].sum()
-    assert counted == pytest.approx(115, rel=0.03)
 
 
 def test_quanta_from_first_principles(pcct):
@@ -66,13 +52,6 @@ def test_a_flat_detector_loses_by_the_cube_of_the_cosine(pcct):
     flat = bare.replace(geometry=ConeBeam((0.0,), g.sod, g.sdd, 501, 1, (0.5, 1.0)))
     quanta = flat.quanta()[1].sum(1)
     np.testing.assert_allclose(quanta / quanta[250], np.cos(flat.geometry.fan_angles) ** 3, rtol=1e-12)
-
-
-def test_ct_numbers_of_the_plaque_for_the_transmitted_spectrum(pcct):
-    energies, quanta = pcct.quanta()
-    behind = quanta[750] * np.exp(-material("pericoronary_fat").attenuation(energies) * FAT_MM)
-    for name, hu in zip(PLAQUE_MATERIALS, (58, 97, 36, 464, -94), strict=True):
-        assert material(name).hu(energies, behind) == pytest.approx(hu, abs=4), name
 
 
 def test_row_factor_is_inverse_square_times_obliquity(pcct):
@@ -96,11 +75,6 @@ def test_weights_are_quanta_times_response(make):
     assert (weights.sum(-1) > 0).all()
 
 
-def test_counting_is_the_sum_of_the_energy_bins(pcct):
-    spectral = presets.pcct(mode="spectral")
-    np.testing.assert_allclose(spectral.weights()[1].sum(0), pcct.weights()[1][0], rtol=1e-10)
-
-
 def test_noise_weights(pcct, eid):
     np.testing.assert_array_equal(pcct.noise_weights()[1], pcct.weights()[1])
     energies, weights = eid.weights()
@@ -120,27 +94,18 @@ def test_arrays_are_read_only(pcct):
         pcct.weights()[1][0, 0, 0] = 1.0
 
 
-@pytest.mark.parametrize("make", [presets.pcct, presets.eid])
+@pytest.mark.parametrize("make", [presets.pcct, presets.eid, lambda: presets.pcct(mode="spectral", columns=8)])
 def test_water_reads_linear_from_0_to_380_mm(make):
+    """Of every energy bin, where there are several."""
     scanner = make()
-    lin = scanner.water_linearisation()
     energies, weights = scanner.weights()
     mu = material("water").attenuation(energies)
-    for t in (0.01, 1.0, 7.0, 33.0, 100.0, 171.0, 240.0, 333.0, 380.0):
-        p = -np.log((weights[0] * np.exp(-mu * t)).sum(-1) / weights[0].sum(-1))
-        linear = lin.apply(torch.from_numpy(p)).numpy() / (lin.mu_ref * t)
-        np.testing.assert_allclose(linear, 1.0, atol=2e-5, err_msg=f"{t} mm")
-
-
-def test_the_water_correction_of_each_energy_bin():
-    scanner = presets.pcct(mode="spectral", columns=8)
-    energies, weights = scanner.weights()
-    mu = material("water").attenuation(energies)
-    for b in range(8):
-        lin = scanner.water_linearisation(bin=b)
-        for t in (0.01, 5.0, 50.0, 100.0, 200.0, 300.0, 380.0):
-            p = -np.log((weights[b] * np.exp(-mu * t)).sum(-1) / weights[b].sum(-1))
-            np.testing.assert_allclose(lin.apply(torch.from_numpy(p)).numpy() / (lin.mu_ref * t), 1.0, atol=2e-5)
+    for b, w in enumerate(weights):
+        lin = scanner.water_linearisation(**({"bin": b} if len(weights) > 1 else {}))
+        for t in (0.01, 1.0, 7.0, 33.0, 100.0, 171.0, 240.0, 333.0, 380.0):
+            p = -np.log((w * np.exp(-mu * t)).sum(-1) / w.sum(-1))
+            linear = lin.apply(torch.from_numpy(p)).numpy() / (lin.mu_ref * t)
+            np.testing.assert_allclose(linear, 1.0, atol=2e-5, err_msg=f"{t} mm")
 
 
 def test_the_water_correction_is_tame_outside_its_range(pcct):
@@ -164,14 +129,6 @@ def test_coarser_energy_bins_change_little(pcct):
     assert coarse.weights()[1][0, 750].sum() == pytest.approx(pcct.weights()[1][0, 750].sum(), rel=0.01)
 
 
-def test_the_roi_bowtie_leaves_the_region_and_darkens_the_rest(pcct):
-    roi = presets.pcct(bowtie="large+roi")
-    gamma = np.abs(pcct.geometry.fan_angles)
-    ratio = roi.weights()[1][0].sum(-1) / pcct.weights()[1][0].sum(-1)
-    np.testing.assert_allclose(ratio[gamma < np.arcsin(50 / 626)], 1.0, rtol=1e-12)
-    assert ratio[gamma > 0.2].max() < 0.25
-
-
 def test_scanners_are_values(pcct):
     assert presets.pcct() == pcct
     assert hash(presets.pcct()) == hash(pcct)
@@ -179,41 +136,3 @@ def test_scanners_are_values(pcct):
     assert pcct.replace(source=Source(kvp=120.0)) != pcct
     with pytest.raises(dataclasses.FrozenInstanceError):
         pcct.name = "x"
-
-
-def test_quarter_offset():
-    assert presets.pcct(quarter_offset=True).geometry.offset[1] == pytest.approx(0.35 / 4)
-
-
-def test_description_is_json(pcct, eid):
-    import json
-
-    for scanner in (pcct, eid):
-        assert json.loads(json.dumps(scanner.describe()))["name"] == scanner.name
-
-
-@pytest.mark.parametrize(
-    ("change", "error", "message"),
-    [
-        ({"geometry": None}, TypeError, "geometry must be a ConeBeam"),
-        ({"source": 100.0}, TypeError, "source must be a Source"),
-        ({"detector": "silicon"}, TypeError, "detector must be a Detector"),
-        ({"bowties": ("large",)}, TypeError, "Bowtie objects"),
-        ({"filters": (("aluminium", 3.0),)}, TypeError, "Material, mm"),
-        ({"filters": ((material("aluminium"), -3.0),)}, ValueError, "must be at least 0 mm"),
-        ({"energy_bin_kev": 0.0}, ValueError, "energy_bin_kev"),
-    ],
-)
-def test_bad_parts_are_refused(pcct, change, error, message):
-    with pytest.raises(error, match=message):
-        pcct.replace(**change)
-
-
-def test_bad_presets_are_refused():
-    with pytest.raises(ValueError, match="unknown bowtie 'medium'"):
-        presets.pcct(bowtie="medium")
-    with pytest.raises(ValueError, match="unknown mode 'integrating'"):
-        presets.pcct(mode="integrating")
-    with pytest.raises(ValueError, match="bin must lie in"):
-        presets.pcct(columns=4).water_linearisation(bin=1)
-    assert isinstance(presets.pcct(detector=SiliconDetector("spectral")), Scanner)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from torchpcct.scanner import SiliconDetector, TransportedSilicon, presets
-from torchpcct.scanner.silicon_transport import Stack, follow
+from torchpcct.scanner.silicon_transport import follow
 
 
 @pytest.fixture(scope="module")
@@ -55,13 +55,3 @@ def test_in_a_scanner(detector):
     assert followed.detector.bins == 8
     ratio = followed.weights()[1].sum((0, 2)) / plain.weights()[1].sum((0, 2))
     assert 1.03 < ratio.min() <= ratio.max() < 1.15
-
-
-def test_what_cannot_be_followed_is_refused():
-    with pytest.raises(ValueError, match="fill_factor"):
-        TransportedSilicon(fill_factor=0.9)
-    with pytest.raises(ValueError, match="charge sharing"):
-        TransportedSilicon(charge_sharing=0.1)
-    with pytest.raises(ValueError, match="photons"):
-        TransportedSilicon(photons=10)
-    TransportedSilicon(fill_factor=1.0, stack=Stack(foil_mm=0.0))

@@ -5,50 +5,14 @@ import math
 import numpy as np
 import pytest
 
-from torchpcct.geometry import VolumeGrid
 from torchpcct.scene.materials import MATERIALS
 from torchpcct.scene.plaque import Plaque, interpolate_material, plaque_scene
 from torchpcct.scene.plaque.variants import VARIANTS, plaque_variant, stent_bodies, textured
-
-PIXEL = 0.021
 
 
 @pytest.fixture(scope="module")
 def paper():
     return plaque_scene()
-
-
-def run_length(labels, body):
-    """Length in mm of the run of one label on a line sampled at PIXEL."""
-    return PIXEL * int((labels == body).sum())
-
-
-def line(scene, plaque, start, end):
-    n = round(float(np.linalg.norm(np.subtract(end, start))) / PIXEL)
-    s = (np.arange(n) + 0.5) / n
-    points = np.array(start) + s[:, None] * np.subtract(end, start)
-    return scene.labels(plaque.to_scanner(points))
-
-
-def test_dimensions_on_the_label_grid(paper):
-    scene, plaque = paper
-    wall, fibrous, lumen, core = (scene.index(n) for n in ("wall", "fibrous", "lumen", "core"))
-    x, _, z = plaque.core_center
-    assert run_length(line(scene, plaque, (x, -3, z), (x, 3, z)), core) == pytest.approx(1.97, abs=0.0211)
-    assert run_length(line(scene, plaque, (x, 0, -3), (x, 0, 3)), core) == pytest.approx(1.97, abs=0.0211)
-    across = line(scene, plaque, (-3, 0, 0), (3, 0, 0))
-    assert run_length(across, core) == pytest.approx(1.2, abs=0.0211)
-    first, last = np.flatnonzero(across == lumen)[-1], np.flatnonzero(across == core)[0]
-    assert (across[first + 1 : last] == fibrous).all()
-    assert PIXEL * (last - first - 1) == pytest.approx(0.17, abs=0.0211)
-    assert run_length(across, lumen) == pytest.approx(2.29, abs=0.0211)
-    # The wall on either side, and the undisturbed vessel beyond the bulge.
-    assert run_length(across, wall) == pytest.approx(2 * 0.19, abs=0.0421)
-    outside = line(scene, plaque, (-3, 0, 4), (3, 0, 4))
-    assert PIXEL * np.isin(outside, [wall, fibrous, lumen]).sum() == pytest.approx(3.36, abs=0.0211)
-    assert run_length(outside, lumen) == pytest.approx(3.36 - 2 * 0.19, abs=0.0211)
-    # Elliptical outer section at the plaque.
-    assert PIXEL * np.isin(across, [wall, fibrous, lumen, core]).sum() == pytest.approx(2 * (1.68 + 0.45), abs=0.0211)
 
 
 def test_place_and_size(paper):
@@ -150,26 +114,6 @@ def test_contrast_is_exactly_linear():
         )
     with pytest.raises(ValueError, match="negative amount of"):
         interpolate_material("impossible", "water", "blood_iodine", -1.0)
-
-
-def test_motion(paper):
-    scene, _ = plaque_scene(motion_amplitude=2.0)
-    assert scene.moving.tolist() == [False, True, True, True, True]
-    offsets = scene.offsets(np.linspace(0.0, 0.35, 500))
-    assert (offsets[1, :, 0].min(), offsets[1, :, 0].max()) == pytest.approx((0.0, 2.0), abs=1e-4)
-    assert paper[0].is_static
-
-
-def test_volume_fractions_of_the_inset(paper):
-    scene, plaque = paper
-    x, y, _ = plaque.position
-    grid = VolumeGrid((56, 45, 45), 0.2, (0.0, y, x))
-    fractions = scene.volume_fractions(grid)
-    np.testing.assert_allclose(fractions.sum(axis=0), 1.0, atol=1e-9)
-    volumes = fractions.sum(axis=(1, 2, 3)) * 0.2**3
-    lumen, core = plaque.lumen.volume, plaque.core.volume
-    expected = [plaque.outer.volume - plaque.inner.volume, plaque.inner.volume - lumen - core, lumen, core]
-    assert volumes[1:] == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,10 @@
 """Shapes, the tree of bodies, motion, labels and volume fractions."""
 
 import math
-import subprocess
-import sys
 
 import numpy as np
 import pytest
+from fresh_python import run_python
 
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scene import (
@@ -290,4 +289,4 @@ def test_ctdi():
 
 def test_import_does_not_load_numba():
     code = "import sys, torchpcct.scene; assert not {'numba', 'scipy', 'xraydb'} & set(sys.modules)"
-    subprocess.run([sys.executable, "-c", code], check=True)
+    run_python(code)

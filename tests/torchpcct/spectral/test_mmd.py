@@ -7,6 +7,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import refused
 
 from torchpcct.spectral import MMD_TISSUES, clean, dice, label, mmd, nearest, pe_pvc
 
@@ -142,19 +143,13 @@ def test_dice_of_known_masks():
 
 def test_errors():
     x = torch.rand(2, 4)
-    with pytest.raises(ValueError, match="floating-point"):
-        mmd(torch.zeros(3, 4), BASIS)
-    with pytest.raises(ValueError, match="NaN"):
-        mmd(x * torch.nan, BASIS)
-    with pytest.raises(ValueError, match="3 or more"):
-        mmd(x, BASIS, ("water", "adipose"))
-    with pytest.raises(ValueError, match="one line"):
-        mmd(x, BASIS, np.array([[0.0, 1.0, 2.0], [0.0, 1.0, 2.0]]))
-    with pytest.raises(ValueError, match="positive definite"):
-        mmd(x, BASIS, covariance=(1.0, 2.0, 1.0))
-    with pytest.raises(ValueError, match="odd"):
-        clean(torch.rand(4, 5, 5), window=2)
-    with pytest.raises(ValueError, match=r"\(K, y, x\)"):
-        clean(torch.rand(4, 5))
-    with pytest.raises(ValueError, match="same shape"):
-        dice(torch.zeros(3), torch.zeros(4))
+    refused(
+        ("floating-point", lambda: mmd(torch.zeros(3, 4), BASIS)),
+        ("NaN", lambda: mmd(x * torch.nan, BASIS)),
+        ("3 or more", lambda: mmd(x, BASIS, ("water", "adipose"))),
+        ("one line", lambda: mmd(x, BASIS, np.array([[0.0, 1.0, 2.0], [0.0, 1.0, 2.0]]))),
+        ("positive definite", lambda: mmd(x, BASIS, covariance=(1.0, 2.0, 1.0))),
+        ("odd", lambda: clean(torch.rand(4, 5, 5), window=2)),
+        (r"\(K, y, x\)", lambda: clean(torch.rand(4, 5))),
+        ("same shape", lambda: dice(torch.zeros(3), torch.zeros(4))),
+    )

@@ -1,13 +1,29 @@
-"""A folder of DICOM-CT-PD projections, written by pydicom alone."""
+"""Files of other scanners, written by h5py and pydicom alone."""
 
 import math
 from pathlib import Path
 
+import h5py
 import numpy as np
 
 
+def data_exchange(path: Path, data, white, angles, dark=None, pixel_um=None, **storage) -> Path:
+    """A scan as beamlines write it: uint16 frames ``(views, rows, columns)``, theta in degrees, pixel size in µm."""
+    with h5py.File(path, "w") as file:
+        file.create_dataset("exchange/data", data=np.rint(data).astype(np.uint16), **storage)
+        file["exchange/data_white"] = np.asarray(white).astype(np.uint16)
+        if dark is not None:
+            file["exchange/data_dark"] = np.asarray(dark).astype(np.uint16)
+        file["exchange/theta"] = np.rad2deg(angles)
+        file["exchange/theta"].attrs["units"] = "deg"
+        if pixel_um is not None:
+            file["measurement/instrument/detector/pixel_size"] = pixel_um
+            file["measurement/instrument/detector/pixel_size"].attrs["units"] = "um"
+    return path
+
+
 def ct_pd(folder: Path, lines, geometry, climb: float = 0.0, spot: str = "FFSNONE") -> Path:
-    """Focal spot at (−ρ sin φ, ρ cos φ), element i at φ + (i − i₀)Δ / d; μ of water 0.02 mm⁻¹."""
+    """A folder of DICOM-CT-PD: focal spot at (−ρ sin φ, ρ cos φ), element i at φ + (i − i₀)Δ / d; water 0.02 mm⁻¹."""
     import pydicom
     from pydicom.dataset import FileMetaDataset
     from pydicom.uid import ExplicitVRLittleEndian, generate_uid
