@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from recon.study.results import README_MARKS, differences, lookup, render
+from recon.study.results import README_MARKS, differences, render
 
 DATA = {"rows": [{"m": "a", "s": 2.0, "v": 1.234}, {"m": "b", "s": 2.0, "v": [5.0, 6.6]}], "n": {"k": 200}}
 RECORD = {"task": "plaque", "method": "mbir", "exposure_s": 2.0, "figure": "CNR", "where": "small", "value": 1.531,
@@ -39,11 +39,10 @@ def rendered(root, text):
 @pytest.mark.parametrize(
     ("text", "expected_text"),
     [
-        ("{{r: rows[m=a]/v | .1f}}× of {{r/report.json: n/k | }}", "1.2× of 200"),
-        ("{{r: plaque, mbir, 2, CNR, small | .1f}}", "1.5"),
-        ("{{r: plaque, mbir, 2, CNR, small | interval .2f}}", "1.53 [1.47, 1.59]"),
-        ("it {{r: shift ? gains | loses}} {{r: shift | abs .1f}} %", "it loses 4.6 %"),
-        ("{{r: n/k > 199 ? many | few}}, {{r: plaque, mbir, 2, CNR, small > 1.6 ? more | less}}", "many, less"),
+        ('{{ (r.rows|row(m="a")).v|f(".1f") }}× of {{ r.n.k }}', "1.2× of 200"),
+        ('{{ r|record("plaque", "mbir", 2, "CNR", "small")|f(".1f") }}', "1.5"),
+        ('{{ r|record("plaque", "mbir", 2, "CNR", "small")|interval }}', "1.53 [1.47, 1.59]"),
+        ('it {{ "gains" if r.shift > 0 else "loses" }} {{ r.shift|abs|f(".1f") }} %', "it loses 4.6 %"),
     ],
 )
 def test_fields(root, text, expected_text):
@@ -53,10 +52,11 @@ def test_fields(root, text, expected_text):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("{{x: n/k | .1f}}", "cannot read"),
-        ("{{r: n/x | .1f}}", "no /n/x"),
-        ("{{r: plaque, mbir, 3, CNR, small | .1f}}", "0 rows fit"),
-        ("{{r: rows[m=a]/m | .1f}}", "no figure that"),
+        ("{{ x.n.k }}", "'x' is undefined"),
+        ('{{ r.n.x|f(".1f") }}', "no attribute 'x'"),
+        ('{{ r|record("plaque", "mbir", 3, "CNR", "small")|f(".1f") }}', "0 rows have"),
+        ("{{ (r.rows|row(s=2)).v }}", "2 rows have"),
+        ('{{ (r.rows|row(m="a")).m|f(".1f") }}', "must be real number"),
         (FIRST, "once"),
     ],
 )
@@ -69,14 +69,6 @@ def test_the_repository_is_rendered():
     root = Path(__file__).parents[3]
     for name, text in render(root).items():
         assert (root / name).read_text(encoding="utf-8") == text, f"{name}: torchpcct verify --write"
-
-
-def test_lookup_by_key_row_and_index():
-    assert lookup(DATA, "rows[m=b]/v/0") == 5.0
-    assert lookup(DATA, "n/k") == 200
-    for path, message in (("n/x", "no /n/x"), ("rows[s=2]/v", "2 rows fit"), ("rows[m=c]/v", "0 rows fit")):
-        with pytest.raises(ValueError, match=message):
-            lookup(DATA, path)
 
 
 def test_differences_are_named_and_runs_may_take_another_time():
