@@ -22,9 +22,7 @@ import torch
 
 from recon import reconstruct
 from recon.evaluate.store import Pieces
-from recon.study.hardcases.body import GRID, body_scan, body_truth
-from recon.study.hardcases.case import Case, untouched
-from recon.study.hardcases.cases import CASES
+from recon.study.hardcases.cases import CASES, GRID, Case, body_scan, body_truth, untouched
 from recon.study.paper.rods import rod_values
 from recon.study.study import Clock, Measured, Progress, StudySettings, silent
 from torchpcct.acquisition.acquire import acquire
