@@ -16,15 +16,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
 
 from torchpcct.geometry import VolumeGrid
-from torchpcct.metrics.placement import RoiPair, RoiRule
 from torchpcct.scene import Scene
 from torchpcct.scene.plaque import Plaque, plaque_scene
 from torchpcct.scene.scene import voxel_centres
 
-__all__ = ["LENGTH_MM", "SHAPES", "Branch", "Centreline", "Vessel", "vessel"]
+__all__ = ["LENGTH_MM", "SHAPES", "Branch", "Centreline", "Vessel"]
 
 Floats = NDArray[np.float64]
 
@@ -35,15 +33,6 @@ _PLAQUE = Plaque(position=(0.0, 0.0, 0.0), vessel_length=LENGTH_MM)
 
 _SLAB = 8
 """Slices painted at a time."""
-
-_ROI_MM, _ROI_STEP_MM = 4.4, 0.05
-"""Edge and voxel size of the cube about the core in which the ROIs are placed."""
-
-_SECTION_MM = 0.1
-"""Thickness of the section across the vessel."""
-
-_ROI_ACROSS_MM = 1.6
-"""The fibrous ROI ends this far from the core's centre across the vessel, as that of the wide ROI "tissue"."""
 
 
 @dataclass(frozen=True)
@@ -167,53 +156,6 @@ class Vessel:
             result[first : first + count] = blocks.mean((1, 3, 5))
         return result
 
-    def rois(self, name: str) -> RoiPair:
-        """Core and fibrous tissue beside it, but for a margin at their edges; they follow the vessel.
-
-        Args:
-            name: ``"tissue"``: all of the core, and the fibrous tissue in its slab, as
-                :func:`torchpcct.metrics.placement.whole_rois` takes them; ``"section"``: the paper's ROIs in the
-                section across the vessel, as :func:`torchpcct.metrics.placement.place_rois` does. Distances in space.
-        """
-        center = self.plaque.core_center
-        x, y, z = self.line.point(center) + np.array(self.center[::-1])
-        count = round(_ROI_MM / _ROI_STEP_MM)
-        image = VolumeGrid((count, count, count), _ROI_STEP_MM, (float(z), float(y), float(x)))
-        points = voxel_centres(image)
-        labels, local = self.labels(points), self.local(points) - np.array(center)
-        off = np.abs(local)
-
-        def depth(mask: Any) -> Any:
-            return ndimage.distance_transform_edt(mask, sampling=image.spacing)
-
-        index = self.straight.index
-        in_core, in_tissue = labels == index("core"), labels == index("fibrous")
-        section = name == "section"
-        rule = RoiRule() if section else RoiRule(0.10, 0.10, math.inf, 0.30)
-        slab = off[..., 2] <= (_SECTION_MM / 2 if section else self.plaque.core.semi_axes[2])
-        foreground = (depth(in_core) > rule.core_margin) & slab
-        background = (
-            (off[..., :2] <= _ROI_ACROSS_MM).all(-1)
-            & slab
-            & (depth(in_tissue) > rule.background_margin)
-            & (depth(labels != index("lumen")) > rule.lumen_margin)
-        )
-        if section:
-            # Of the two alike regions beside the core the paper's; in a bend it lies outside.
-            background &= (depth(~in_core) < rule.background_reach) & (local[..., 1] < 0)
-        return RoiPair(foreground, background, image, rule)
-
-    def plain_fat(self, grid: VolumeGrid, distance: float = 1.5, edge: float = 0.8) -> Any:
-        """Mask ``grid.shape`` of the voxels farther than ``distance`` mm from the vessel and ``edge`` mm from the
-        grid's faces."""
-        outside = self.labels(voxel_centres(grid)) == self.straight.index("patient")
-        mask = ndimage.distance_transform_edt(outside, sampling=grid.spacing) > distance
-        for axis, step in enumerate(grid.spacing):
-            kept = np.moveaxis(mask, axis, 0)
-            width = math.ceil(edge / step - 1e-9)
-            kept[:width] = kept[len(kept) - width :] = False
-        return mask
-
 
 _X, _Y, _Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 _HALF = math.sqrt(0.5)
@@ -228,14 +170,3 @@ SHAPES: dict[str, tuple[Centreline, Branch | None]] = {
     "bifurcating": (Centreline(_Z, _X), Branch()),
 }
 """Centreline and side branch of every vessel; ``in_plane_x`` is ``in_plane_y`` turned by a right angle about z."""
-
-
-def vessel(name: str, center: tuple[float, float, float]) -> Vessel:
-    """A vessel of :data:`SHAPES`.
-
-    Args:
-        name: of the vessel.
-        center: ``(z, y, x)`` mm.
-    """
-    line, branch = SHAPES[name]
-    return Vessel(line, center, branch)
