@@ -32,7 +32,7 @@ from recon.study.paper import facts as paper
 from recon.study.paper.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM, PlaqueScan, prepare
 from recon.study.report import Check, around
 from recon.study.study import Clock, Measured, Progress, StudySettings, silent
-from torchpcct.metrics.cnr import cnr_interval, cnr_range, sd_interval
+from torchpcct.metrics.cnr import cnr_from_moments, cnr_interval, cnr_range, sd_interval
 from torchpcct.metrics.intervals import bca_interval, leave_one_out, resampling
 from torchpcct.metrics.roi import sample_axial
 from torchpcct.scan import Scan
@@ -346,12 +346,7 @@ class Table:
     @property
     def cnr(self) -> Floats:
         """``(..., settings)``."""
-        return np.asarray((self.mean[..., 1] - self.mean[..., 0]) / self.noise)
-
-    @property
-    def noise(self) -> Floats:
-        """The CNR's denominator in HU, ``(..., settings)``."""
-        return np.asarray(np.hypot(self.sd[..., 0], self.sd[..., 1]))
+        return np.asarray(cnr_from_moments(self.mean[..., 0], self.sd[..., 0], self.mean[..., 1], self.sd[..., 1]))
 
 
 def measured_table(means: Any) -> Table:
