@@ -120,6 +120,14 @@ class SpectralScan:
         """FBP of the two basis images."""
         return InsetFbp(self.clean, [self.grid], [self.settings.kernel], surround=self.surround)
 
+    @cached_property
+    def fat(self) -> Tensor:
+        """Mask ``grid.shape`` of voxels of fat, in the slices about the middle."""
+        _, y, x = (a - c for a, c in zip(self.grid.axes, self.grid.center, strict=True))
+        middle, mask = self.grid.shape[0] // 2, torch.zeros(self.grid.shape, dtype=torch.bool)
+        mask[middle - 4 : middle + 4] = torch.from_numpy(np.hypot(y[:, None], x) > FAT_MM)
+        return mask
+
     def covariance(self, exposure_s: float) -> Tensor:
         """Cramér–Rao covariance ``(3, views, rows, columns)`` in mm² of every ray."""
         return self.exact.covariance * (NOISE_FREE_EXPOSURE_S / exposure_s)
