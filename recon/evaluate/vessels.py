@@ -139,10 +139,20 @@ class Vessel:
             labels[blood & (labels != index("core"))] = index("lumen")
         return labels
 
-    def painted(self, grid: VolumeGrid, values: Mapping[str, float], samples: int = 2) -> Floats:
-        """``grid.shape``: mean over each voxel of ``values`` of the tissues, from ``samples ** 3`` points; others 0."""
-        table = np.array([values.get(name, 0.0) for name in self.straight.names])
-        result = np.empty(grid.shape)
+    def painted(self, grid: VolumeGrid, values: Mapping[str, Any], samples: int = 2) -> Floats:
+        """Mean over each voxel of ``values`` of the tissues, from ``samples ** 3`` points; of other tissues 0.
+
+        Args:
+            grid: ``(z, y, x)``.
+            values: tissue → a number, or ``(n,)`` of them.
+            samples: along each axis.
+
+        Returns:
+            ``grid.shape``, or ``(*grid.shape, n)``.
+        """
+        none = np.zeros_like(next(iter(values.values())), dtype=np.float64)
+        table = np.array([values.get(name, none) for name in self.straight.names], dtype=np.float64)
+        result = np.empty((*grid.shape, *none.shape))
         for first in range(0, grid.shape[0], _SLAB):
             count = min(_SLAB, grid.shape[0] - first)
             shape = (count, *grid.shape[1:])
@@ -150,9 +160,8 @@ class Vessel:
             fine = VolumeGrid(
                 tuple(samples * n for n in shape), tuple(s / samples for s in grid.spacing), (middle, *grid.center[1:])
             )
-            blocks = table[self.labels(voxel_centres(fine))].reshape(
-                count, samples, shape[1], samples, shape[2], samples
-            )
+            split = [m for n in shape for m in (n, samples)]
+            blocks = table[self.labels(voxel_centres(fine))].reshape(*split, *none.shape)
             result[first : first + count] = blocks.mean((1, 3, 5))
         return result
 

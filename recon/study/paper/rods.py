@@ -40,21 +40,15 @@ _MARGIN_MM = 1.0
 
 @dataclass(frozen=True)
 class RodValues:
-    """True values of tissues, and how they were found.
+    """True values of tissues.
 
     Attributes:
         hu: tissue → HU.
         flatness_hu: tissue → SD over the voxels that were read: how even the plateau is.
-        diameter_mm, views, kernel, voxel_mm, position_mm: of the rods (position x, y; z is the middle of the detector).
     """
 
     hu: dict[str, float]
     flatness_hu: dict[str, float]
-    diameter_mm: float
-    views: int
-    kernel: str
-    voxel_mm: float
-    position_mm: tuple[float, float]
 
     def contrast(self, tissue: str = "fibrous", core: str = "core") -> float:
         """HU of ``tissue`` minus HU of ``core``."""
@@ -116,7 +110,7 @@ def rod_values(
         hu[str(name)], flatness[str(name)] = float(values.mean()), float(values.std())
         if progress is not None:
             progress((k + 1) / len(materials))
-    return RodValues(hu, flatness, diameter, count, kernel, voxel, (x, y))
+    return RodValues(hu, flatness)
 
 
 def _disc(grid: VolumeGrid, radius: float) -> NDArray[np.bool_]:
