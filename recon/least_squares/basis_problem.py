@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from recon.analytic.inset import static_fbp
 from recon.gram.gram import Gram
 from recon.least_squares.joint import joint_pwls, mean_weights
 from recon.least_squares.qggmrf import DEFAULT_PRIOR, QGGMRF
-from recon.least_squares.whitening import Whitening
 from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import VolumeGrid
 from torchpcct.projector import Projector
@@ -19,7 +21,75 @@ from torchpcct.scan import Scan
 from torchpcct.spectral import SpectralModel, cramer_rao, decompose_surround, inverse, vmi_weights
 from torchpcct.validate import number
 
-__all__ = ["REFERENCE_KEV", "BasisProblem"]
+__all__ = ["REFERENCE_KEV", "BasisProblem", "Whitening"]
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Whitening:
+    """Mixes two channels into two of equal, uncorrelated noise.
+
+    Attributes:
+        forward: ``(2, 2)``: whitened = forward @ channels. Its first row is the gain that was asked for.
+        backward: ``(2, 2)``, the inverse.
+    """
+
+    forward: Floats
+    backward: Floats
+
+    @classmethod
+    def of(cls, information: ArrayLike, gain: ArrayLike) -> Whitening:
+        """From the mean information of the channels.
+
+        Args:
+            information: ``(3,)`` F₁₁, F₁₂, F₂₂, positive definite.
+            gain: ``(2,)`` combination of the channels that becomes the first whitened channel and sets the unit of
+                both: e.g. HU per basis coefficient at one energy (:func:`torchpcct.spectral.vmi_weights`).
+
+        Raises:
+            ValueError: information that is not positive definite, a gain of 0, wrong shapes.
+        """
+        f, g = np.asarray(information, np.float64), np.asarray(gain, np.float64)
+        if f.shape != (3,) or g.shape != (2,) or not (np.isfinite(f).all() and np.isfinite(g).all()):
+            raise ValueError(f"information must hold 3, gain 2 finite numbers, got {information!r} and {gain!r}")
+        if not (f[0] > 0 and f[2] > 0 and f[0] * f[2] > f[1] ** 2):
+            raise ValueError(f"information must be positive definite, packed as F11, F12, F22, got {f}")
+        if not g.any():
+            raise ValueError("gain must not be 0")
+        covariance = np.linalg.inv([[f[0], f[1]], [f[1], f[2]]])
+        toward = covariance @ g
+        other = np.array([-toward[1], toward[0]])  # uncorrelated with the first
+        other *= np.sqrt((g @ toward) / (other @ covariance @ other))
+        forward = np.stack([g, other])
+        return cls(forward, np.linalg.inv(forward))
+
+    def apply(self, channels: Tensor) -> Tensor:
+        """Whitened channels, ``(..., 2, *shape)`` with 3 trailing axes."""
+        return _mix(self.forward, channels)
+
+    def undo(self, whitened: Tensor) -> Tensor:
+        """The channels, ``(..., 2, *shape)`` with 3 trailing axes."""
+        return _mix(self.backward, whitened)
+
+    def information(self, packed: Tensor) -> Tensor:
+        """Information ``(3, ...)`` of the channels → of the whitened channels."""
+        (a, b), (c, d) = self.backward
+        f11, f12, f22 = packed
+        return torch.stack([
+            a * a * f11 + 2 * a * c * f12 + c * c * f22,
+            a * b * f11 + (a * d + b * c) * f12 + c * d * f22,
+            b * b * f11 + 2 * b * d * f12 + d * d * f22,
+        ])  # fmt: skip
+
+
+def _mix(matrix: Floats, x: Tensor) -> Tensor:
+    if x.ndim < 4 or x.shape[-4] != 2:
+        raise ValueError(f"expected two channels (..., 2, n, n, n), got the shape {tuple(x.shape)}")
+    first, second = x.unbind(-4)
+    (a, b), (c, d) = matrix.tolist()
+    return torch.stack([a * first + b * second, c * first + d * second], dim=-4)
+
 
 REFERENCE_KEV = 52.0
 """The prior's gradients are in HU of the virtual monochromatic image at this energy, the best one for a necrotic core

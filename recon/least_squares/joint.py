@@ -7,7 +7,7 @@ itself throws away what one says about the other. F is the information matrix of
 (:class:`torchpcct.spectral.Decomposition`), R the q-GGMRF of both channels (:mod:`recon.least_squares.qggmrf`).
 
 The channels are mixed first so that the mean of F over the rays is a multiple of the identity
-(:mod:`recon.least_squares.whitening`). In these coordinates noise is isotropic, which is what R needs, and AᵀFA is
+(:mod:`recon.least_squares.basis_problem`). In these coordinates noise is isotropic, which is what R needs, and AᵀFA is
 nearly the same scalar operator in each channel: one FFT model (:class:`recon.gram.gram.Gram`) with the weights ½ tr F
 serves as the preconditioner of all. What it leaves out (F's change from ray to ray) the exact projections repair, as in
 :mod:`recon.least_squares.pwls`, whose iteration this is.
@@ -73,8 +73,8 @@ def joint_pwls(
         y: whitened line integrals with the background taken off, ``(..., 2, *A.range_shape)`` float32 or float64; rays
             of information 0 may hold anything. Leading dimensions are independent realisations.
         information: F of the whitened channels, ``(3, *A.range_shape)`` (F₁₁, F₁₂, F₂₂), from smooth expected counts.
-            It should be near a multiple of the identity (:class:`recon.least_squares.whitening.Whitening`): that is for
-            speed alone.
+            It should be near a multiple of the identity (:class:`recon.least_squares.basis_problem.Whitening`): that is
+            for speed alone.
         prior: in noise-normalised units, or bound already.
         mu_per_hu: the value of the channels that counts as 1 HU.
         gram: FFT model of Aᵀ diag(½ tr F) A, kept from an earlier call; None: made here.

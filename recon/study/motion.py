@@ -27,8 +27,15 @@ from recon.least_squares.reconstruct import reconstruct_pwls
 from recon.mbir.mbir import Mbir
 from recon.study.figures import curve_axes, middle_panel, plaque_panel
 from recon.study.paper import facts as paper
-from recon.study.paper.measures import PlaqueImage, Truth, measure_plaque
-from recon.study.paper.plaque_scan import REFERENCE_KERNEL, SCANNERS, duty, inset_grid
+from recon.study.paper.plaque_scan import (
+    REFERENCE_KERNEL,
+    SCANNERS,
+    PlaqueImage,
+    Truth,
+    duty,
+    inset_grid,
+    measure_plaque,
+)
 from recon.study.report import Check
 from recon.study.study import Clock, Measured, Progress, StudySettings, silent
 from torchpcct.acquisition.acquire import acquire

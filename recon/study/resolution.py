@@ -29,14 +29,16 @@ from recon.analytic.inset import InsetFbp
 from recon.evaluate.store import Pieces
 from recon.study.figures import curve_axes, middle_panel, plaque_panel
 from recon.study.paper import facts as paper
-from recon.study.paper.measures import PlaqueImage, Truth, measure_plaque
 from recon.study.paper.plaque_scan import (
     REFERENCE_KERNEL,
     REFERENCE_VOXEL_MM,
     SCANNERS,
+    PlaqueImage,
     PlaqueScan,
+    Truth,
     duty,
     equal_dose,
+    measure_plaque,
     prepare,
 )
 from recon.study.report import Check, around

@@ -6,8 +6,7 @@ import pytest
 import torch
 from inset_operators import CENTER, HU, matrix, problem, tissue
 
-from recon.gram.gram import Gram
-from recon.gram.positive_definite import make_definite
+from recon.gram.gram import Gram, make_definite
 from torchpcct import FanBeam, Projector, VolumeGrid
 from torchpcct.detector_window import footprint
 from torchpcct.geometry import full_turn

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from recon.least_squares.whitening import Whitening
+from recon.least_squares.basis_problem import Whitening
 
 
 def test_whitening_makes_noise_equal_and_uncorrelated():
