@@ -6,9 +6,9 @@ a banded matrix along z for every frequency (see :mod:`recon.gram.impulse_respon
 
     G x = K₀x + ½ Σ_c [ b_c · (K_c x) + K_c (b_c · x) ],      b = y, x (, y², yx, x²),
 
-with the K_c fitted to exact impulse responses at a few nodes. The form is self-adjoint. What it cannot hold is the irregular
-beat of the voxel lattice with the detector's cells: 2–3 % on white noise at 0.2 mm voxels, 0.1 % on tissue shapes. It is
-a model: who needs the exact operator removes its error with exact projections.
+with the K_c fitted to exact impulse responses at a few nodes. The form is self-adjoint. What it cannot hold is the
+irregular beat of the voxel lattice with the detector's cells: 2–3 % on white noise at 0.2 mm voxels, 0.1 % on tissue
+shapes. It is a model: who needs the exact operator removes its error with exact projections.
 
 Exact impulse responses carry that beat, and the square of lags is cut off: at a few per mille of the frequencies the
 fitted spectrum is indefinite, which would let a weakly regularised solution escape there. :func:`make_definite` keeps
