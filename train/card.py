@@ -17,6 +17,7 @@ import safetensors
 import torch
 from torch import Tensor
 
+from recon.evaluate.report import filled
 from recon.mbir.mbir import WEIGHTS_FORMAT
 from recon.mbir.weights_io import digest, write_tensors
 from recon.study.study import environment
@@ -87,31 +88,8 @@ def export(folder: Path, weights: Mapping[str, Tensor], config: TrainConfig, sta
         "score": best["score"],
     }
     write_tensors(folder / "weights.safetensors", WEIGHTS_FORMAT, stored, header)
-    texts = {"card.json": json.dumps(card, indent=2, ensure_ascii=False) + "\n", "training.md": _markdown(card, config)}
+    record = filled(Path(__file__).parent / "templates" / "training.md.j2", {**card, "yaml": config.to_yaml()}) + "\n"
+    texts = {"card.json": json.dumps(card, indent=2, ensure_ascii=False) + "\n", "training.md": record}
     for name, text in texts.items():
         with atomic_write(folder / name) as part:
             part.write_text(text, encoding="utf-8")
-
-
-def _markdown(card: Mapping[str, Any], config: TrainConfig) -> str:
-    machine = card["hardware"]
-    rows = {
-        "Weights": f"`weights.safetensors`, {card['parameters']} values, sha256 of tensors "
-        f"`{card['sha256_of_tensors'][:16]}…`",
-        "Chosen at": f"step {card['step']} of {config.steps} ({card['steps_done']} done, {card['steps_skipped']} "
-        f"skipped), the best validation score, averaged weights",
-        "Time": f"{card['seconds_to_these_weights'] / 60:.1f} min to these weights, {card['seconds'] / 60:.1f} min in "
-        "all, validations included",
-        "Hardware": f"{machine['cpu']}, {machine['cores']} cores, {card['threads']} threads × {card['processes']} "
-        f"processes, {machine['system']}",
-        "Versions": ", ".join(f"{k} {v}" for k, v in card["versions"].items()),
-        "Seed": str(card["seed"]),
-        "Written": card["written"],
-    }
-    lines = ["# Training record", "", "| | |", "|---|---|", *(f"| {k} | {v} |" for k, v in rows.items())]
-    lines += ["", "## Validation", "", "| figure | value |", "|---|---|"]
-    lines += [f"| {k} | {v:.6g} |" if isinstance(v, float) else f"| {k} | {v} |" for k, v in card["validation"].items()]
-    lines += ["", "## Command", "", "```"]
-    lines += [f"{s['command']}  # from step {s['first_step']}" for s in card["sessions"]]
-    lines += ["```", "", "## Configuration", "", "```yaml", config.to_yaml().rstrip(), "```", ""]
-    return "\n".join(lines)
