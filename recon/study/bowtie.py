@@ -151,7 +151,11 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     doses: dict[str, dict[str, CtdiDose]] = _kept(s, pieces, "ctdi")
     progress("dose", 0.3)
     data["ctdi_ratios"] = {k: ratios(v) for k, v in doses.items()}
-    data["ctdi_mgy"] = {k: {b: _dose_values(d) for b, d in v.items()} for k, v in doses.items()}
+    more = ("total_peripheral", "total_central", "weighted", "weighted_error")
+    data["ctdi_mgy"] = {
+        k: {b: {**asdict(d), **{name: float(getattr(d, name)) for name in more}} for b, d in v.items()}
+        for k, v in doses.items()
+    }
     maps = {}
     for k, name in enumerate(("ctdi", "thorax")):
         maps[name] = _kept(s, pieces, f"map_{name}")
@@ -200,11 +204,6 @@ def _kept(settings: Settings, pieces: Pieces, name: str) -> Any:
         return dose_maps(phantoms()[scene], scanners, grid, s.exposure_s, histories, s.seed)
 
     return pieces(name, compute)
-
-
-def _dose_values(dose: CtdiDose) -> dict[str, float]:
-    more = ("total_peripheral", "total_central", "weighted", "weighted_error")
-    return {**asdict(dose), **{name: float(getattr(dose, name)) for name in more}}
 
 
 # --- slices ---------------------------------------------------------------------------------------------------------
@@ -308,14 +307,6 @@ def phantom_grid(name: str, spacing: float) -> VolumeGrid:
     return VolumeGrid(tuple(math.ceil(e / spacing) for e in extent), spacing, center)
 
 
-def noise_regions(name: str, grid: VolumeGrid) -> dict[str, Any]:
-    """Where the noise of a phantom of :func:`phantoms` is measured: region → mask."""
-    r = _radius(grid)
-    if name == "ctdi":
-        return {region: (r >= low) & (r < high) for region, (low, high) in CTDI_REGIONS_MM.items()}
-    return {"heart": r < HEART_DISC_MM}
-
-
 def noise(
     name: str, scene: Scene, scanners: dict[str, Scanner], exposure_s: float, kernel: str, seeds: range
 ) -> tuple[dict[str, Any], Floats]:
@@ -334,7 +325,10 @@ def noise(
     """
     scans, grid = slice_scans(scene, scanners), phantom_grid(name, PIXEL_MM)
     clean = np.stack([slice_image(scan, grid, kernel) for scan in scans.values()])
-    regions = noise_regions(name, grid)
+    r = _radius(grid)
+    regions: dict[str, Any] = {"heart": r < HEART_DISC_MM}
+    if name == "ctdi":
+        regions = {region: (r >= low) & (r < high) for region, (low, high) in CTDI_REGIONS_MM.items()}
     first, rings = clean, []
     squares: list[list[list[float]]] = []
     for seed in seeds:

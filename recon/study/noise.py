@@ -134,10 +134,6 @@ class Moments:
         """The truth at an exposure."""
         return Table(self.expected, np.sqrt(np.diag(self.covariance) / exposure_s).reshape(self.expected.shape))
 
-    def block(self, i: int, exposure_s: float) -> Any:
-        """``(2, 2)`` HU², the exact covariance of the two ROI means of setting ``i`` at an exposure."""
-        return self.covariance[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] / exposure_s
-
 
 def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
     """Simulate, take exact moments, draw realisations, reconstruct a few in full, in resumable pieces."""
@@ -251,7 +247,8 @@ def _dose_table(s: Settings, m: Moments, exposure: float) -> list[dict[str, Any]
     for i, (kernel, voxel) in enumerate(s.axes):
         measured, ten = sampled(values, i), sampled(values[:_TEN], i)
         measured["sd_interval"] = [list(sd_interval(float(v), len(values))) for v in measured["sd_hu"]]
-        ten["cnr_range"] = list(cnr_range(exact.mean[i], m.block(i, exposure), _TEN))
+        both = slice(2 * i, 2 * i + 2)
+        ten["cnr_range"] = list(cnr_range(exact.mean[i], m.covariance[both, both] / exposure, _TEN))
         theirs = [published(t, kernel, voxel, exposure) for t in (paper.FOREGROUND, paper.BACKGROUND, paper.CNR)]
         rows.append(
             {

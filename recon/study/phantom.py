@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from recon.study.paper import facts as paper
@@ -182,7 +181,7 @@ def raster_lengths(scene: Scene, plaque: Plaque, voxel_mm: float, sections: int)
     labels = _raster(scene, plaque, plaque.core_center, around, voxel_mm)[0]
     inside, lumen = (labels == scene.index(name) for name in ("core", "lumen"))
     cap = distance_transform_edt(~lumen, sampling=voxel_mm)[inside].min() - voxel_mm if lumen.any() else math.nan
-    width, depth, length = (_extent(inside, axis, voxel_mm) for axis in (2, 1, 0))
+    extents = [float(inside.any(axes).sum() * voxel_mm) for axes in ((0, 1), (0, 2), (1, 2))]
     low, high = 0.5 * plaque.bulge_length, 0.5 * plaque.vessel_length
     heights = low + (np.arange(sections) + 0.5) * (high - low) / sections
     diameters, walls, centres = [], [], []
@@ -200,8 +199,8 @@ def raster_lengths(scene: Scene, plaque: Plaque, voxel_mm: float, sections: int)
     line = np.zeros((n, 3))
     line[:, 0] = (np.arange(n) - (n - 1) / 2) * voxel_mm
     return {
-        "core, major axis": max(width, depth, length),
-        "core, minor axis": min(width, depth, length),
+        "core, major axis": max(extents),
+        "core, minor axis": min(extents),
         "fibrous cap": float(cap),
         "wall": float(np.mean(walls)),
         "vessel diameter": float(np.mean(diameters)),
@@ -217,11 +216,6 @@ def _raster(scene: Scene, plaque: Plaque, center: Any, half: Any, voxel_mm: floa
     zz, yy, xx = np.meshgrid(z, y, x, indexing="ij")
     points = plaque.to_scanner(np.stack([xx, yy, zz], -1))
     return scene.labels(points), points
-
-
-def _extent(inside: NDArray[np.bool_], axis: int, voxel_mm: float) -> float:
-    other = tuple(k for k in range(3) if k != axis)
-    return float(np.flatnonzero(inside.any(other)).size * voxel_mm)
 
 
 # --- the report -----------------------------------------------------------------------------------------------------
