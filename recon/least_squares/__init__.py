@@ -6,6 +6,5 @@ Read :mod:`~recon.least_squares.reconstruct` (from a scan to HU) and what it is 
 :mod:`~recon.least_squares.pwls` (exact pairs; steps proposed by :mod:`~recon.least_squares.model_solver` for an inset,
 by :mod:`~recon.least_squares.field_model` for a whole field; :mod:`~recon.least_squares.memory` first) and the prior,
 :mod:`~recon.least_squares.qggmrf` (CPU passes beside it in ``qggmrf_kernels``). Two channels with correlated noise:
-:mod:`~recon.least_squares.basis_problem` (from a spectral scan to basis images, whitened),
-:mod:`~recon.least_squares.joint`.
+:mod:`~recon.least_squares.basis_problem` (from a spectral scan to basis images).
 """

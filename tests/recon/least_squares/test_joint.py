@@ -9,7 +9,7 @@ import torch
 from inset_operators import minimum, problem
 
 from recon.gram.gram import Gram
-from recon.least_squares.joint import joint_pwls, mean_weights, weigh
+from recon.least_squares.basis_problem import joint_pwls, mean_weights, weigh
 from recon.least_squares.pwls import pwls
 from recon.least_squares.qggmrf import QGGMRF, quadratic
 
