@@ -1,4 +1,4 @@
-"""CT numbers of 4 mm rods of each tissue at the plaque's place (:mod:`recon.study.paper.rods`)."""
+"""CT numbers of 4 mm rods of each tissue at the plaque's place (:mod:`recon.study.paper.plaque_scan`)."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ from recon import reconstruct
 from recon.evaluate.execute import heard
 from recon.evaluate.store import Pieces
 from recon.study.hardcases.cases import CASES, GRID, Case, body_scan, body_truth, untouched
-from recon.study.paper.rods import rod_values
+from recon.study.paper.plaque_scan import rod_values
 from recon.study.study import Clock, Measured, Progress, StudySettings, silent
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.geometry import VolumeGrid
