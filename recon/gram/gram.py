@@ -28,6 +28,7 @@ from scipy.fft import next_fast_len
 from torch import Tensor
 
 from recon.gram.impulse_response import Nodes, kernel_at, node_positions, slice_reach
+from torchpcct.projector.operator import apply_linear
 from torchpcct.threads import run
 from torchpcct.validate import number
 
@@ -175,8 +176,7 @@ class Gram:
         """
         if tuple(x.shape[-self.grid.ndim :]) != self.grid.shape:
             raise ValueError(f"x must have shape (..., {', '.join(map(str, self.grid.shape))}), got {tuple(x.shape)}")
-        out: Tensor = _SelfAdjoint.apply(x, self)
-        return out
+        return apply_linear(x, self._apply, self._apply)  # it is its own adjoint
 
     __call__ = apply
 
@@ -265,19 +265,6 @@ class Gram:
             mixed[..., b:, :, :] += lower[b, : nz - b] * spectrum[..., : nz - b, :, :]
         out = torch.fft.irfft2(mixed, s=self.padded)[..., :ny, :nx] * math.sqrt(self.factor)
         return out.squeeze(-3) if self._flat else out
-
-
-class _SelfAdjoint(torch.autograd.Function):
-    """G is its own adjoint, so nothing is kept for the backward pass."""
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor, gram: Gram) -> Tensor:
-        ctx.gram = gram
-        return gram._apply(x)
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Any) -> tuple[Tensor, None]:
-        return ctx.gram.apply(grads[0]), None
 
 
 def information_at_reference(

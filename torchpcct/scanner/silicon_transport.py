@@ -26,6 +26,7 @@ from torchpcct.validate import checked, choice, number, whole
 __all__ = ["Deposits", "Stack", "TransportedSilicon", "efficiency", "follow"]
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 _NODES_KEV = np.arange(10.0, 151.0, 2.0)
 """Photon energies that are followed; the difference is smooth between them."""
@@ -360,7 +361,3 @@ def _further(detector: TransportedSilicon) -> Floats:
 
     difference = histogram(pulses[:, 0], heights) - histogram(d.photon[first], d.energy_kev[first])
     return np.asarray(difference / np.bincount(node, minlength=shape[0])[:, None])
-
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
