@@ -110,11 +110,7 @@ def _views(title: str, keep: Callable[[int], NDArray[Any]]) -> Case:
     """Only some of the views."""
 
     def apply(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
-        kept = keep(scan.geometry.views)
-        return replace(
-            scan, counts=scan.counts[torch.from_numpy(kept)], geometry=scan.geometry.select(kept),
-            window=None if scan.window is None else scan.window.select(kept),
-        )  # fmt: skip
+        return scan.select(keep(scan.geometry.views))
 
     return Case(title, apply, (720 / keep(720).size) ** 0.5)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -150,8 +149,7 @@ class SpectralScan:
         """
         clean, views = self.clean, slice(None, None, step)
         if step > 1:
-            geometry, counts = clean.geometry.select(views), clean.counts[:, views].contiguous()
-            clean = replace(clean, counts=counts, geometry=geometry, window=self.window.select(views))
+            clean = clean.select(views)
         scan, model = clean.with_noise(exposure_s, seed), self.model(exposure_s)
         start, spent = time.perf_counter(), time.process_time()
         found = decompose_scan(scan, model)
