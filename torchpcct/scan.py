@@ -277,6 +277,20 @@ class Scan:
             window=window,
         )
 
+    def select(self, views: Any) -> Scan:
+        """The same scan with a subset (or reordering) of the views: an index array, mask or slice."""
+        at = views if isinstance(views, slice) else torch.as_tensor(views)
+        axes = (..., at, *(slice(None),) * (len(self.geometry.shape) - 1))
+        held = {name: getattr(self, name) for name in ("counts", "quantum", "dead")}
+        kept: dict[str, Any] = {name: None if v is None else v[axes].contiguous() for name, v in held.items()}
+        return replace(
+            self,
+            geometry=self.geometry.select(views),
+            window=None if self.window is None else self.window.select(views),
+            flux=None if self.flux is None else self.flux[at],
+            **kept,
+        )
+
     def _require_noise_model(self) -> None:
         if not self.counting and self.quantum is None:
             raise ValueError(

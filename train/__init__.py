@@ -2,5 +2,5 @@
 
 Reading order: :mod:`train.config` (what a run is); :mod:`train.scenes`, :mod:`train.data` and :mod:`train.objective`
 (what it sees and minimises); :mod:`train.loop`, which drives a :mod:`train.run` with the gradients of
-:mod:`train.processes`; :mod:`train.checkpoint`, :mod:`train.logs` and :mod:`train.card` (what it leaves behind).
+:mod:`train.processes`; :mod:`train.checkpoint` and :mod:`train.logs` (what it leaves behind beside its weights).
 """

@@ -11,9 +11,9 @@ from numpy.polynomial import Chebyshev, Polynomial
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.linear_operator import apply_linear
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
+from torchpcct.projector.operator import apply_linear
 from torchpcct.threads import run
 from torchpcct.validate import checked
 from torchpcct.vector_geometry import check_motion
@@ -298,4 +298,4 @@ def backproject(
         window = DetectorWindow.full(geometry)
     check_data("filtered", filtered, data_shape(geometry, window))
     plan = BackprojectionPlan(geometry, grid, window, motion)
-    return apply_linear(filtered, plan.forward, plan.transpose)
+    return apply_linear(filtered.cpu(), plan.forward, plan.transpose).to(filtered.device)

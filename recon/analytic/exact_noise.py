@@ -74,8 +74,8 @@ class RoiAdjoints:
         """All vectors as rows, ``(grids · kernels · rois, readings)``: the grid varies slowest, the ROI fastest."""
         return torch.cat([v.flatten(0, 1).flatten(1) for v in self.vectors])
 
-    def covariance(self, clean: Scan, exposure_s: float) -> list[NDArray[np.float64]]:
-        """Covariance of the ROI means in HU² at an exposure, for every grid ``(kernels, rois, rois)``.
+    def joint_covariance(self, clean: Scan, exposure_s: float) -> NDArray[np.float64]:
+        """Covariance in HU² of all ROI means with each other, ``(M, M)``, ordered as the rows of :attr:`matrix`.
 
         Args:
             clean: the noise-free windowed scan.
@@ -83,14 +83,6 @@ class RoiAdjoints:
 
         Raises:
             ValueError: a scan that is noisy or not windowed, or whose window does not hold the ROIs' readings.
-        """
-        variance = line_integral_variance(clean.crop(self.window), exposure_s)
-        return [np.array([_gram(rois, variance) for rois in vectors]) for vectors in self.vectors]
-
-    def joint_covariance(self, clean: Scan, exposure_s: float) -> NDArray[np.float64]:
-        """Covariance in HU² of all ROI means with each other, ``(M, M)``, ordered as the rows of :attr:`matrix`.
-
-        Arguments and errors as :meth:`covariance`.
         """
         return self.covariance_of(line_integral_variance(clean.crop(self.window), exposure_s))
 

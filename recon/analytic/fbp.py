@@ -20,9 +20,9 @@ from recon.analytic.backproject import BackprojectionPlan, backproject, check_da
 from recon.analytic.coverage import check_rows, refuse_helix
 from recon.analytic.detector_edges import Rows, continued, cut_off, mirrored
 from recon.analytic.filter_plan import FilterPlan, kernel_names
-from recon.linear_operator import apply_linear
 from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid, view_step
+from torchpcct.projector.operator import apply_linear
 from torchpcct.readings import bridge
 from torchpcct.validate import checked, number, reals
 from torchpcct.vector_geometry import VectorGeometry
@@ -53,7 +53,8 @@ def _filter(
     names, several = kernel_names(kernel)
     plan = FilterPlan(geometry, names, _check_weights(weights, geometry), a, b)
     flat = not isinstance(geometry, ConeBeam)
-    out = apply_linear(data.unsqueeze(-2) if flat else data, plan.forward, plan.transpose)
+    given = (data.unsqueeze(-2) if flat else data).cpu()  # the kernels are CPU code
+    out = apply_linear(given, plan.forward, plan.transpose).to(data.device)
     out = out.squeeze(-2) if flat else out
     kernel_axis = -3 if flat else -4
     return out.movedim(kernel_axis, 0) if several else out.squeeze(kernel_axis)
@@ -262,7 +263,7 @@ def fbp(
     window = _read_window(rows, grid, window, motion)
     filtered = filter_sinogram(rows.lines, rows.geometry, kernel, window, weights=rows.weights)
     plan = BackprojectionPlan(rows.geometry, grid, window, motion)
-    return apply_linear(filtered, plan.forward, plan.transpose)
+    return apply_linear(filtered.cpu(), plan.forward, plan.transpose).to(filtered.device)
 
 
 @checked

@@ -52,6 +52,7 @@ __all__ = [
     "Unfit",
     "Unportable",
     "current",
+    "heard",
     "packed_call",
     "run",
     "using",
@@ -376,20 +377,25 @@ def _compiling(own: bool) -> Iterator[list[float]]:
 
 
 @contextlib.contextmanager
-def _heard(own: bool) -> Iterator[list[str]]:
-    """Warnings that a worker logs, which the client says instead; of its own process it has heard them."""
+def heard(*loggers: str, alone: bool = False) -> Iterator[list[str]]:
+    """The warnings that loggers are given meanwhile; ``""`` is the root. ``alone``: nobody else hears them."""
     said: list[str] = []
 
     class Listener(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:
             said.append(record.getMessage())
 
-    listener = logging.NullHandler() if own else Listener(logging.WARNING)
-    logging.getLogger().addHandler(listener)
+    listener, watched = Listener(logging.WARNING), [logging.getLogger(name) for name in loggers]
+    before = [logger.propagate for logger in watched]
+    for logger in watched:
+        logger.addHandler(listener)
+        logger.propagate = logger.propagate and not alone
     try:
         yield said
     finally:
-        logging.getLogger().removeHandler(listener)
+        for logger, propagate in zip(watched, before, strict=True):
+            logger.removeHandler(listener)
+            logger.propagate = propagate
 
 
 def _work(call: bytes, module: str, digest: str, makes: tuple[str, ...], of: _Run) -> _Done:
@@ -414,7 +420,8 @@ def _work(call: bytes, module: str, digest: str, makes: tuple[str, ...], of: _Ru
     start = time.perf_counter()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with _compiling(own) as compiled, _heard(own) as said:
+        # What a worker logs the client says instead; of its own process it has heard it.
+        with _compiling(own) as compiled, heard(*([] if own else [""])) as said:
             value = function(folder, *args)
     except OSError as error:
         if scratch is None or (error.errno not in _DISK and not isinstance(error, WriteError)):

@@ -50,7 +50,7 @@ class Readings:
         channels: observer → ``(n, 2, channels)``.
         square: ``(n,)`` mean square error with the signal near the bodies, HU².
         flat: tissue → ``(n, voxels)`` HU, with the signal.
-        clean_rois: ``(2, rois, 2)`` of noise-free data; clean_square; clean_channels: likewise; clean_rim: least error
+        clean_rois: ``(2, rois, 2)`` of noise-free data; clean_square: likewise; clean_rim: least error
             there in the rim of the largest tissue, HU.
         control: ``(n, 2, rois, 2)`` HU: linear functionals of the same draws that follow ``rois``, with their mean
             ``(2, rois, 2)`` and covariance ``(rois, 2, rois, 2)``; None: the reference's ROI means serve.
@@ -65,7 +65,6 @@ class Readings:
     clean_rois: Floats
     clean_square: float
     clean_rim: float
-    clean_channels: dict[str, Floats]
     control: tuple[Floats, Floats, Floats] | None
     first: NDArray[np.float16]
     first_clean: NDArray[np.float16]
@@ -235,8 +234,7 @@ class Measurement:
         return Readings(
             joined["rois"], {o: joined[f"channels_{o}"] for o in OBSERVERS}, joined["square"],
             {t: joined[f"flat_{t}"] for t in self.reader.task.flat}, clean["rois"][0], float(clean["square"][0]),
-            float(clean["rim"][0]), {o: clean[f"channels_{o}"][0] for o in OBSERVERS},
-            None if known is None else (joined["control"], known["mean"], known["covariance"]),
+            float(clean["rim"][0]), None if known is None else (joined["control"], known["mean"], known["covariance"]),
             pieces[0]["first"], clean["first"], float(np.mean([p["seconds"] for p in pieces])),
         )  # fmt: skip
 

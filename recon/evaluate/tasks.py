@@ -24,7 +24,7 @@ from torchpcct.metrics.roi import axial_grid
 from torchpcct.scan import Scan
 from torchpcct.scene.plaque import plaque_scene
 from torchpcct.scene.plaque.plaque import Plaque
-from torchpcct.scene.scene import Scene, voxel_centres
+from torchpcct.scene.scene import Scene
 from torchpcct.validate import choice, number, numbers
 
 __all__ = ["TASKS", "VesselTask", "read_task", "task_text"]
@@ -189,17 +189,10 @@ class VesselTask(Task):
     @cached_property
     def shares(self) -> dict[str, Floats]:
         """See :attr:`Task.shares`."""
-        n = 3
-        fine = VolumeGrid(tuple(n * k for k in self.grid.shape), self.grid.spacing[0] / n, self.grid.center)
-        z, y, x = self.grid.shape
-        labels = np.concatenate([self._vessel.labels(p) for p in np.array_split(voxel_centres(fine), 9)])
-        names = self._vessel.straight.names
-
-        def share(body: str) -> Floats:
-            inside = labels == names.index("core" if body == "signal" else body)
-            return np.asarray(inside.reshape(z, n, y, n, x, n).mean((1, 3, 5)), np.float64)
-
-        return {tissue: share(tissue) for tissue in self._groups}
+        tissues = list(self._groups)
+        own = {"core" if t == "signal" else t: row for t, row in zip(tissues, np.eye(len(tissues)), strict=True)}
+        found = np.ascontiguousarray(np.moveaxis(self._vessel.painted(self.grid, own, samples=3), -1, 0))
+        return dict(zip(tissues, found, strict=True))
 
     @property
     def _beside(self) -> Floats:

@@ -16,15 +16,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
 
 from torchpcct.geometry import VolumeGrid
-from torchpcct.metrics.placement import RoiPair, RoiRule
 from torchpcct.scene import Scene
 from torchpcct.scene.plaque import Plaque, plaque_scene
 from torchpcct.scene.scene import voxel_centres
 
-__all__ = ["LENGTH_MM", "SHAPES", "Branch", "Centreline", "Vessel", "vessel"]
+__all__ = ["LENGTH_MM", "SHAPES", "Branch", "Centreline", "Vessel"]
 
 Floats = NDArray[np.float64]
 
@@ -35,15 +33,6 @@ _PLAQUE = Plaque(position=(0.0, 0.0, 0.0), vessel_length=LENGTH_MM)
 
 _SLAB = 8
 """Slices painted at a time."""
-
-_ROI_MM, _ROI_STEP_MM = 4.4, 0.05
-"""Edge and voxel size of the cube about the core in which the ROIs are placed."""
-
-_SECTION_MM = 0.1
-"""Thickness of the section across the vessel."""
-
-_ROI_ACROSS_MM = 1.6
-"""The fibrous ROI ends this far from the core's centre across the vessel, as that of the wide ROI "tissue"."""
 
 
 @dataclass(frozen=True)
@@ -150,10 +139,20 @@ class Vessel:
             labels[blood & (labels != index("core"))] = index("lumen")
         return labels
 
-    def painted(self, grid: VolumeGrid, values: Mapping[str, float], samples: int = 2) -> Floats:
-        """``grid.shape``: mean over each voxel of ``values`` of the tissues, from ``samples ** 3`` points; others 0."""
-        table = np.array([values.get(name, 0.0) for name in self.straight.names])
-        result = np.empty(grid.shape)
+    def painted(self, grid: VolumeGrid, values: Mapping[str, Any], samples: int = 2) -> Floats:
+        """Mean over each voxel of ``values`` of the tissues, from ``samples ** 3`` points; of other tissues 0.
+
+        Args:
+            grid: ``(z, y, x)``.
+            values: tissue → a number, or ``(n,)`` of them.
+            samples: along each axis.
+
+        Returns:
+            ``grid.shape``, or ``(*grid.shape, n)``.
+        """
+        none = np.zeros_like(next(iter(values.values())), dtype=np.float64)
+        table = np.array([values.get(name, none) for name in self.straight.names], dtype=np.float64)
+        result = np.empty((*grid.shape, *none.shape))
         for first in range(0, grid.shape[0], _SLAB):
             count = min(_SLAB, grid.shape[0] - first)
             shape = (count, *grid.shape[1:])
@@ -161,58 +160,10 @@ class Vessel:
             fine = VolumeGrid(
                 tuple(samples * n for n in shape), tuple(s / samples for s in grid.spacing), (middle, *grid.center[1:])
             )
-            blocks = table[self.labels(voxel_centres(fine))].reshape(
-                count, samples, shape[1], samples, shape[2], samples
-            )
+            split = [m for n in shape for m in (n, samples)]
+            blocks = table[self.labels(voxel_centres(fine))].reshape(*split, *none.shape)
             result[first : first + count] = blocks.mean((1, 3, 5))
         return result
-
-    def rois(self, name: str) -> RoiPair:
-        """Core and fibrous tissue beside it, but for a margin at their edges; they follow the vessel.
-
-        Args:
-            name: ``"tissue"``: all of the core, and the fibrous tissue in its slab, as
-                :func:`torchpcct.metrics.placement.whole_rois` takes them; ``"section"``: the paper's ROIs in the
-                section across the vessel, as :func:`torchpcct.metrics.placement.place_rois` does. Distances in space.
-        """
-        center = self.plaque.core_center
-        x, y, z = self.line.point(center) + np.array(self.center[::-1])
-        count = round(_ROI_MM / _ROI_STEP_MM)
-        image = VolumeGrid((count, count, count), _ROI_STEP_MM, (float(z), float(y), float(x)))
-        points = voxel_centres(image)
-        labels, local = self.labels(points), self.local(points) - np.array(center)
-        off = np.abs(local)
-
-        def depth(mask: Any) -> Any:
-            return ndimage.distance_transform_edt(mask, sampling=image.spacing)
-
-        index = self.straight.index
-        in_core, in_tissue = labels == index("core"), labels == index("fibrous")
-        section = name == "section"
-        rule = RoiRule() if section else RoiRule(0.10, 0.10, math.inf, 0.30)
-        slab = off[..., 2] <= (_SECTION_MM / 2 if section else self.plaque.core.semi_axes[2])
-        foreground = (depth(in_core) > rule.core_margin) & slab
-        background = (
-            (off[..., :2] <= _ROI_ACROSS_MM).all(-1)
-            & slab
-            & (depth(in_tissue) > rule.background_margin)
-            & (depth(labels != index("lumen")) > rule.lumen_margin)
-        )
-        if section:
-            # Of the two alike regions beside the core the paper's; in a bend it lies outside.
-            background &= (depth(~in_core) < rule.background_reach) & (local[..., 1] < 0)
-        return RoiPair(foreground, background, image, rule)
-
-    def plain_fat(self, grid: VolumeGrid, distance: float = 1.5, edge: float = 0.8) -> Any:
-        """Mask ``grid.shape`` of the voxels farther than ``distance`` mm from the vessel and ``edge`` mm from the
-        grid's faces."""
-        outside = self.labels(voxel_centres(grid)) == self.straight.index("patient")
-        mask = ndimage.distance_transform_edt(outside, sampling=grid.spacing) > distance
-        for axis, step in enumerate(grid.spacing):
-            kept = np.moveaxis(mask, axis, 0)
-            width = math.ceil(edge / step - 1e-9)
-            kept[:width] = kept[len(kept) - width :] = False
-        return mask
 
 
 _X, _Y, _Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
@@ -228,14 +179,3 @@ SHAPES: dict[str, tuple[Centreline, Branch | None]] = {
     "bifurcating": (Centreline(_Z, _X), Branch()),
 }
 """Centreline and side branch of every vessel; ``in_plane_x`` is ``in_plane_y`` turned by a right angle about z."""
-
-
-def vessel(name: str, center: tuple[float, float, float]) -> Vessel:
-    """A vessel of :data:`SHAPES`.
-
-    Args:
-        name: of the vessel.
-        center: ``(z, y, x)`` mm.
-    """
-    line, branch = SHAPES[name]
-    return Vessel(line, center, branch)

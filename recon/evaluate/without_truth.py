@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -73,29 +72,6 @@ class MeasuredDraw:
         return float(self.noise(method, smooths))
 
 
-@dataclass(frozen=True, eq=False)
-class _Pair:
-    """Two scans of one object."""
-
-    scans: tuple[Scan, Scan]
-    grid: VolumeGrid
-
-    @cached_property
-    def _kept(self) -> dict[str, tuple[Tensor, Tensor]]:
-        return {}
-
-    def volumes(self, method: Method) -> tuple[Tensor, Tensor]:
-        """Of both scans."""
-        if method.name not in self._kept:
-            draws = [MeasuredDraw(s, self.grid, self._noise) for s in self.scans]
-            self._kept[method.name] = (volume_of(method, draws[0]), volume_of(method, draws[1]))
-        return self._kept[method.name]
-
-    def _noise(self, method: Method, smooths: float) -> float:
-        first, second = self.volumes(method)
-        return noise_of((first - second) / math.sqrt(2.0), torch.arange(first.numel()), smooths)
-
-
 @checked
 def evaluate_scans(scans: Any, grid: VolumeGrid, methods: Any, region: Any = None) -> list[dict[str, Any]]:
     """Methods on two scans of one object, or on one scan of the whole detector in two halves of its views.
@@ -122,10 +98,20 @@ def evaluate_scans(scans: Any, grid: VolumeGrid, methods: Any, region: Any = Non
             f"the scans have {tuple(given[0].counts.shape)} and {tuple(given[1].counts.shape)} readings: two scans of "
             "one object by one scanner are needed"
         )
-    pair = _Pair((given[0], given[1]), grid)
+    kept: dict[str, list[Tensor]] = {}
+
+    def volumes(method: Method) -> list[Tensor]:
+        if method.name not in kept:
+            kept[method.name] = [volume_of(method, MeasuredDraw(scan, grid, noise)) for scan in given]
+        return kept[method.name]
+
+    def noise(method: Method, smooths: float) -> float:
+        first, second = volumes(method)
+        return noise_of((first - second) / math.sqrt(2.0), torch.arange(first.numel()), smooths)
+
     names = methods if isinstance(methods, list | tuple) else [methods]
-    found = {m.name: pair.volumes(m) for m in map(method_of, names)}
-    return evaluate_volumes(found, pair.volumes(method_of(_REFERENCE)), grid.spacing[-1], region)
+    found = {m.name: volumes(m) for m in map(method_of, names)}
+    return evaluate_volumes(found, volumes(method_of(_REFERENCE)), grid.spacing[-1], region)
 
 
 @checked

@@ -4,8 +4,7 @@ Read :mod:`~recon.least_squares.reconstruct` (from a scan to HU) and what it is 
 :mod:`~recon.least_squares.inset_problem` (surround unknown: :mod:`~recon.least_squares.surround`) or
 :mod:`~recon.least_squares.field_problem` (whole field); then
 :mod:`~recon.least_squares.pwls` (exact pairs; steps proposed by :mod:`~recon.least_squares.model_solver` for an inset,
-by :mod:`~recon.least_squares.field_model` for a whole field; stopped by :mod:`~recon.least_squares.approach`;
-:mod:`~recon.least_squares.memory` first) and the prior, :mod:`~recon.least_squares.qggmrf` (CPU passes beside it in
-``qggmrf_kernels``). Two channels with correlated noise: :mod:`~recon.least_squares.basis_problem` (from a spectral scan
-to basis images), :mod:`~recon.least_squares.joint`, :mod:`~recon.least_squares.whitening`.
+by :mod:`~recon.least_squares.field_model` for a whole field; :mod:`~recon.least_squares.memory` first) and the prior,
+:mod:`~recon.least_squares.qggmrf` (CPU passes beside it in ``qggmrf_kernels``). Two channels with correlated noise:
+:mod:`~recon.least_squares.basis_problem` (from a spectral scan to basis images).
 """

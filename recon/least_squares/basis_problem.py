@@ -1,17 +1,34 @@
-"""Joint model-based reconstruction of two basis images of a small inset from a spectral scan."""
+"""Joint model-based reconstruction of two basis images of a small inset from a spectral scan.
+
+    Φ(x) = ½ Σ_rays (a − A x)ᵀ F (a − A x) + R(x),          a, x: two channels; F: 2 × 2 Fisher information of each ray
+
+The line integrals of two basis materials, decomposed ray by ray, are strongly anticorrelated: reconstructing each by
+itself throws away what one says about the other. F is the information matrix of the decomposition
+(:class:`torchpcct.spectral.Decomposition`), R the q-GGMRF of both channels (:mod:`recon.least_squares.qggmrf`).
+
+The channels are mixed first so that the mean of F over the rays is a multiple of the identity (:class:`Whitening`). In
+these coordinates noise is isotropic, which is what R needs, and AᵀFA is nearly the same scalar operator in each
+channel: one FFT model (:class:`recon.gram.gram.Gram`) with the weights ½ tr F serves as the preconditioner of all. What
+it leaves out (F's change from ray to ray) the exact projections repair, as in :mod:`recon.least_squares.pwls`, whose
+iteration this is.
+"""
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from recon.analytic.inset import static_fbp
 from recon.gram.gram import Gram
-from recon.least_squares.joint import joint_pwls, mean_weights
-from recon.least_squares.qggmrf import DEFAULT_PRIOR, QGGMRF
-from recon.least_squares.whitening import Whitening
+from recon.least_squares.pwls import PwlsResult, solve_normal, weighted_data
+from recon.least_squares.qggmrf import DEFAULT_PRIOR, QGGMRF, BoundPrior
 from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import VolumeGrid
 from torchpcct.projector import Projector
@@ -19,7 +36,162 @@ from torchpcct.scan import Scan
 from torchpcct.spectral import SpectralModel, cramer_rao, decompose_surround, inverse, vmi_weights
 from torchpcct.validate import number
 
-__all__ = ["REFERENCE_KEV", "BasisProblem"]
+__all__ = ["REFERENCE_KEV", "BasisProblem", "Whitening", "joint_pwls", "mean_weights"]
+
+
+def weigh(information: Tensor, y: Tensor, axes: int) -> Tensor:
+    """F y of every ray: ``(3, *range)`` times ``(..., 2, *range)``, ``axes`` axes of rays."""
+    first, second = y.unbind(-axes - 1)
+    f11, f12, f22 = information
+    return torch.stack([f11 * first + f12 * second, f12 * first + f22 * second], dim=-axes - 1)
+
+
+def check_information(information: Any, shape: tuple[int, ...]) -> None:
+    """Refuse information matrices that are not finite and positive semi-definite, of a wrong shape, or all 0."""
+    if not isinstance(information, Tensor) or information.dtype not in (torch.float32, torch.float64):
+        kind = getattr(information, "dtype", type(information).__name__)
+        raise TypeError(f"information must be a float32 or float64 tensor, got {kind}")
+    if tuple(information.shape) != (3, *shape):
+        raise ValueError(f"information must have the shape {(3, *shape)} (F11, F12, F22), got "
+                         f"{tuple(information.shape)}")  # fmt: skip
+    if not torch.isfinite(information).all():
+        raise ValueError("information must be finite: give rays that hold none the matrix 0")
+    f11, f12, f22 = information
+    slack = 1e-5 * (f11 * f22).clamp_min(0)
+    if bool((f11 < 0).any()) or bool((f22 < 0).any()) or bool((f12 * f12 > f11 * f22 + slack).any()):
+        raise ValueError("information must be positive semi-definite on every ray, packed as F11, F12, F22")
+    if not bool((f11 + f22 > 0).any()):
+        raise ValueError("all information is 0: no ray says anything about the inset")
+
+
+def joint_pwls(
+    A: Any,
+    y: Tensor,
+    information: Tensor,
+    prior: QGGMRF | BoundPrior,
+    *,
+    mu_per_hu: float = 1.0,
+    gram: Gram | None = None,
+    tolerance: float = 0.2,
+    max_exact: int = 20,
+    callback: Callable[[dict[str, Any]], None] | None = None,
+) -> PwlsResult:
+    """Minimise ½ Σ (y − A x)ᵀ F (y − A x) + R(x) over two channels.
+
+    Args:
+        A: the exact operator (:class:`torchpcct.projector.Projector`).
+        y: whitened line integrals with the background taken off, ``(..., 2, *A.range_shape)`` float32 or float64; rays
+            of information 0 may hold anything. Leading dimensions are independent realisations.
+        information: F of the whitened channels, ``(3, *A.range_shape)`` (F₁₁, F₁₂, F₂₂), from smooth expected counts.
+            It should be near a multiple of the identity (:class:`recon.least_squares.basis_problem.Whitening`): that is
+            for speed alone.
+        prior: in noise-normalised units, or bound already.
+        mu_per_hu: the value of the channels that counts as 1 HU.
+        gram: FFT model of Aᵀ diag(½ tr F) A, kept from an earlier call; None: made here.
+        tolerance: stop when the images are this close to the minimum: root mean square over both channels, in HU.
+        max_exact: largest number of exact projection pairs (each of two channels).
+        callback: see :func:`recon.least_squares.pwls.pwls`.
+
+    Returns:
+        Images ``(..., 2, *grid.shape)`` in the dtype of y, and the report of :func:`recon.least_squares.pwls.pwls`:
+        ``gradient`` is the norm of the exact gradient of Φ over that of the zero images.
+
+    Raises:
+        ValueError: shapes that do not fit, data that are not finite, F not positive semi-definite or all 0, a
+            tolerance ≤ 0.
+        TypeError: data or information that are not float tensors.
+    """
+    started = time.perf_counter()
+    n = len(A.range_shape)
+    check_information(information, tuple(A.range_shape))
+    known = information[0] + information[2] > 0
+    weighted = weighted_data(y, (2, *A.range_shape), known, lambda v: weigh(information.to(v.dtype), v, n))
+    f = information.to(weighted.dtype)
+
+    def exact(x: Tensor) -> Tensor:
+        out: Tensor = A.T(weigh(f, A(x), n))
+        return out
+
+    result = solve_normal(
+        A.T(weighted), exact, gram if gram is not None else Gram(A, mean_weights(information)), prior,
+        mu_per_hu=mu_per_hu,
+        spacing=A.grid.spacing, channels=True, tolerance=tolerance, max_exact=max_exact, callback=callback,
+    )  # fmt: skip
+    return PwlsResult(result.x, {**result.report, "method": "joint-pwls", "seconds": time.perf_counter() - started})
+
+
+def mean_weights(information: Tensor) -> Tensor:
+    """½ tr F of every ray: the weights of the FFT model."""
+    return (0.5 * (information[0] + information[2])).contiguous()
+
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Whitening:
+    """Mixes two channels into two of equal, uncorrelated noise.
+
+    Attributes:
+        forward: ``(2, 2)``: whitened = forward @ channels. Its first row is the gain that was asked for.
+        backward: ``(2, 2)``, the inverse.
+    """
+
+    forward: Floats
+    backward: Floats
+
+    @classmethod
+    def of(cls, information: ArrayLike, gain: ArrayLike) -> Whitening:
+        """From the mean information of the channels.
+
+        Args:
+            information: ``(3,)`` F₁₁, F₁₂, F₂₂, positive definite.
+            gain: ``(2,)`` combination of the channels that becomes the first whitened channel and sets the unit of
+                both: e.g. HU per basis coefficient at one energy (:func:`torchpcct.spectral.vmi_weights`).
+
+        Raises:
+            ValueError: information that is not positive definite, a gain of 0, wrong shapes.
+        """
+        f, g = np.asarray(information, np.float64), np.asarray(gain, np.float64)
+        if f.shape != (3,) or g.shape != (2,) or not (np.isfinite(f).all() and np.isfinite(g).all()):
+            raise ValueError(f"information must hold 3, gain 2 finite numbers, got {information!r} and {gain!r}")
+        if not (f[0] > 0 and f[2] > 0 and f[0] * f[2] > f[1] ** 2):
+            raise ValueError(f"information must be positive definite, packed as F11, F12, F22, got {f}")
+        if not g.any():
+            raise ValueError("gain must not be 0")
+        covariance = np.linalg.inv([[f[0], f[1]], [f[1], f[2]]])
+        toward = covariance @ g
+        other = np.array([-toward[1], toward[0]])  # uncorrelated with the first
+        other *= np.sqrt((g @ toward) / (other @ covariance @ other))
+        forward = np.stack([g, other])
+        return cls(forward, np.linalg.inv(forward))
+
+    def apply(self, channels: Tensor) -> Tensor:
+        """Whitened channels, ``(..., 2, *shape)`` with 3 trailing axes."""
+        return _mix(self.forward, channels)
+
+    def undo(self, whitened: Tensor) -> Tensor:
+        """The channels, ``(..., 2, *shape)`` with 3 trailing axes."""
+        return _mix(self.backward, whitened)
+
+    def information(self, packed: Tensor) -> Tensor:
+        """Information ``(3, ...)`` of the channels → of the whitened channels."""
+        (a, b), (c, d) = self.backward
+        f11, f12, f22 = packed
+        return torch.stack([
+            a * a * f11 + 2 * a * c * f12 + c * c * f22,
+            a * b * f11 + (a * d + b * c) * f12 + c * d * f22,
+            b * b * f11 + 2 * b * d * f12 + d * d * f22,
+        ])  # fmt: skip
+
+
+def _mix(matrix: Floats, x: Tensor) -> Tensor:
+    if x.ndim < 4 or x.shape[-4] != 2:
+        raise ValueError(f"expected two channels (..., 2, n, n, n), got the shape {tuple(x.shape)}")
+    first, second = x.unbind(-4)
+    (a, b), (c, d) = matrix.tolist()
+    return torch.stack([a * first + b * second, c * first + d * second], dim=-4)
+
 
 REFERENCE_KEV = 52.0
 """The prior's gradients are in HU of the virtual monochromatic image at this energy, the best one for a necrotic core
@@ -91,7 +263,7 @@ class BasisProblem:
             lines, window: decomposed line integrals, see :meth:`data`.
             prior: None: :data:`recon.least_squares.qggmrf.DEFAULT_PRIOR`.
             dose: of the data relative to the model's exposure; it scales the information.
-            tolerance, max_exact: of :func:`recon.least_squares.joint.joint_pwls`.
+            tolerance, max_exact: of :func:`joint_pwls`.
 
         Returns:
             ``(..., 2, z, y, x)`` basis coefficients (dimensionless), and the solver's report.

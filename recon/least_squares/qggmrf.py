@@ -19,7 +19,7 @@ For several channels at once t is the Euclidean length of their common gradient,
 edge in one channel relaxes the penalty of all channels there, as basis images share the edges of the tissues (vectorial
 regularisation, Sapiro and Ringach 1996; for spectral CT Rigie and La Rivière 2015). The length treats all directions in
 the space of channels alike, so the channels must be of equal, uncorrelated noise
-(:class:`recon.least_squares.whitening.Whitening`).
+(:class:`recon.least_squares.basis_problem.Whitening`).
 """
 
 from __future__ import annotations

@@ -13,7 +13,6 @@ with the large one is the first times the ratio of FBP's two figures.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -152,7 +151,11 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     doses: dict[str, dict[str, CtdiDose]] = _kept(s, pieces, "ctdi")
     progress("dose", 0.3)
     data["ctdi_ratios"] = {k: ratios(v) for k, v in doses.items()}
-    data["ctdi_mgy"] = {k: {b: _dose_values(d) for b, d in v.items()} for k, v in doses.items()}
+    more = ("total_peripheral", "total_central", "weighted", "weighted_error")
+    data["ctdi_mgy"] = {
+        k: {b: {**asdict(d), **{name: float(getattr(d, name)) for name in more}} for b, d in v.items()}
+        for k, v in doses.items()
+    }
     maps = {}
     for k, name in enumerate(("ctdi", "thorax")):
         maps[name] = _kept(s, pieces, f"map_{name}")
@@ -169,19 +172,20 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     data["noise"] = {name: values for name, (values, _) in found.items()}
     clock.lap("noise")
 
-    step = "plaque: MBIR and ROI bowtie"
     saved: dict[str, float] = {k: 1.0 / data["ctdi_ratios"][k]["weighted"] for k in ("plane", "total") if k in doses}
-    data["combined"] = combine(
-        s.plaque_doses, s.plaque_realizations, s.plaque_views, s.seed, saved, pieces.folder("evaluate"), progress
-    )
-    clock.lap(step)
+    data["combined"] = _combined(s, saved, pieces.folder("evaluate"), progress)
+    clock.lap("plaque: MBIR and ROI bowtie")
     images = {name: image for name, (_, image) in found.items()}
     return Measured(s, data, clock.seconds, (maps, images))
 
 
 def _kept(settings: Settings, pieces: Pieces, name: str) -> Any:
-    """A piece of the study by its name."""
+    """A piece of the study by its name; of the CTDI phantom the doses in its bores, by four readings of "dose"."""
     s, (kind, _, scene) = settings, name.partition("_")
+    asked: dict[str, dict[str, Any]] = {
+        "plane": {"axial": "plane"}, "contiguous": {}, "interacted": {"quantity": "interacted"},
+        **({"total": {"histories": s.histories, "seed": s.seed}} if s.histories else {}),
+    }  # fmt: skip
 
     def compute() -> Any:
         if kind == "noise":
@@ -189,9 +193,11 @@ def _kept(settings: Settings, pieces: Pieces, name: str) -> Any:
             return noise(scene, phantoms()[scene], scanners, s.exposure_s, s.kernel, seeds)
         scanners = wide_scanners(8)
         if kind == "ctdi":
-            return ctdi_figures(scanners, s.exposure_s, s.histories, s.seed)
-        if kind == "patient":
-            return patient_ratio(scanners, s.exposure_s, s.histories // 2, s.seed)
+            return {k: {b: ctdi_dose(d, s.exposure_s, **how) for b, d in scanners.items()} for k, how in asked.items()}
+        if kind == "patient":  # the plaque's own, 24 cm of fat
+            fat, grid = water_cylinder(240.0, material="pericoronary_fat"), VolumeGrid((64, 64), 4.0)
+            maps = dose_maps(fat, scanners, grid, s.exposure_s, s.histories // 2, s.seed)
+            return {k: float(dose[1].sum() / dose[0].sum()) for k, dose in maps.doses.items()}
         # The CTDI phantom's map is drawn only, its doses are those in the bores: no scatter.
         spacing, histories = (max(s.map_mm / 2, 1.0), 0) if scene == "ctdi" else (s.map_mm, s.histories)
         grid = phantom_grid(scene, spacing)
@@ -200,20 +206,14 @@ def _kept(settings: Settings, pieces: Pieces, name: str) -> Any:
     return pieces(name, compute)
 
 
-def _dose_values(dose: CtdiDose) -> dict[str, float]:
-    more = ("total_peripheral", "total_central", "weighted", "weighted_error")
-    return {**asdict(dose), **{name: float(getattr(dose, name)) for name in more}}
-
-
 # --- slices ---------------------------------------------------------------------------------------------------------
 
 
-def wide_scanners(views: int, detector: str = "eid", half_fan_rad: float = HALF_FAN_RAD) -> dict[str, Scanner]:
+def wide_scanners(views: int, detector: str = "eid") -> dict[str, Scanner]:
     """The paper's scanner of the dose study, one detector row, with each of :data:`BOWTIES`.
 
     Args:
         views: per rotation.
-        half_fan_rad: half-angle of the fan.
         detector: ``"eid"``: energy-integrating cells of 1.02 × 1.10 mm without electronic noise; ``"silicon"``: the
             PCCT's counting cells of 0.35 × 0.5 mm.
 
@@ -225,7 +225,7 @@ def wide_scanners(views: int, detector: str = "eid", half_fan_rad: float = HALF_
     scanners = {b: presets.pcct(views=views, bowtie=b, rows=1) for b in BOWTIES}
     pitch = presets.EID_PITCH_MM if integrating else presets.PCCT_PITCH_MM
     geometry = scanners["large"].geometry
-    columns = 2 * math.ceil(half_fan_rad * geometry.sdd / pitch[1])
+    columns = 2 * math.ceil(HALF_FAN_RAD * geometry.sdd / pitch[1])
     changes: dict[str, Any] = {"geometry": replace(geometry, columns=columns, pitch=pitch)}
     if integrating:
         changes["detector"] = Scintillator(electronic_noise_kev=0.0)
@@ -307,26 +307,9 @@ def phantom_grid(name: str, spacing: float) -> VolumeGrid:
     return VolumeGrid(tuple(math.ceil(e / spacing) for e in extent), spacing, center)
 
 
-def noise_regions(name: str, grid: VolumeGrid) -> dict[str, Any]:
-    """Where the noise of a phantom of :func:`phantoms` is measured: region → mask."""
-    r = _radius(grid)
-    if name == "ctdi":
-        return {region: (r >= low) & (r < high) for region, (low, high) in CTDI_REGIONS_MM.items()}
-    return {"heart": r < HEART_DISC_MM}
-
-
-@dataclass(frozen=True)
-class Images:
-    """Images of one slice with both bowties, HU: ``clean`` and one ``noisy`` realisation, ``(2, y, x)``."""
-
-    grid: VolumeGrid
-    clean: Floats
-    noisy: Floats
-
-
 def noise(
     name: str, scene: Scene, scanners: dict[str, Scanner], exposure_s: float, kernel: str, seeds: range
-) -> tuple[dict[str, Any], Images]:
+) -> tuple[dict[str, Any], Floats]:
     """Mean and noise of a phantom's regions with both bowties.
 
     Args:
@@ -337,12 +320,15 @@ def noise(
         seeds: of the noise, one realisation each.
 
     Returns:
-        JSON values by region (and of the CTDI phantom the noise against the radius), and images of the first
-        realisation.
+        JSON values by region (and of the CTDI phantom the noise against the radius), and the first realisation's
+        images in HU on :func:`phantom_grid`, ``(2, y, x)``.
     """
     scans, grid = slice_scans(scene, scanners), phantom_grid(name, PIXEL_MM)
     clean = np.stack([slice_image(scan, grid, kernel) for scan in scans.values()])
-    regions = noise_regions(name, grid)
+    r = _radius(grid)
+    regions: dict[str, Any] = {"heart": r < HEART_DISC_MM}
+    if name == "ctdi":
+        regions = {region: (r >= low) & (r < high) for region, (low, high) in CTDI_REGIONS_MM.items()}
     first, rings = clean, []
     squares: list[list[list[float]]] = []
     for seed in seeds:
@@ -350,7 +336,9 @@ def noise(
         first, error = (first if squares else noisy), noisy - clean
         squares.append([[float(e[mask].var()) for e in error] for mask in regions.values()])
         rings.append([radial_profile(e**2, grid, 155.0) for e in error])
-    found: dict[str, Any] = {"quanta_per_reading": {b: _fewest_quanta(s, exposure_s) for b, s in scans.items()}}
+    # Expected, of the darkest reading.
+    quanta = {b: s.counts if s.quantum is None else s.counts / s.quantum for b, s in scans.items()}
+    found: dict[str, Any] = {"quanta_per_reading": {b: float(q.min()) * exposure_s for b, q in quanta.items()}}
     variances = np.array(squares)  # (realisations, regions, bowties)
     for k, (region, mask) in enumerate(regions.items()):
         sd, ratio = np.sqrt(variances[:, k].mean(0)), np.sqrt(variances[:, k, 1] / variances[:, k, 0])
@@ -363,13 +351,7 @@ def noise(
     if name == "ctdi":
         profile = np.mean(rings, axis=0)
         found["profile"] = {"radius_mm": profile[0, :, 0], "sd_hu": np.sqrt(profile[..., 1])}
-    return found, Images(grid, clean, first)
-
-
-def _fewest_quanta(scan: Scan, exposure_s: float) -> float:
-    """Expected quanta of the darkest reading."""
-    quanta = scan.counts if scan.quantum is None else scan.counts / scan.quantum
-    return float(quanta.min()) * exposure_s
+    return found, first
 
 
 # --- dose -----------------------------------------------------------------------------------------------------------
@@ -416,33 +398,6 @@ def region_ratio(maps: DoseMaps, scene: Scene, begins: tuple[str, ...]) -> dict[
     return {kind: float(dose[1][inside].mean() / dose[0][inside].mean()) for kind, dose in maps.doses.items()}
 
 
-def patient_ratio(scanners: dict[str, Scanner], exposure_s: float, histories: int, seed: int) -> dict[str, float]:
-    """Mean dose with over without the ROI bowtie of the plaque's own patient, 24 cm of fat."""
-    fat = water_cylinder(240.0, material="pericoronary_fat")
-    maps = dose_maps(fat, scanners, VolumeGrid((64, 64), 4.0), exposure_s, histories, seed)
-    return {kind: float(dose[1].sum() / dose[0].sum()) for kind, dose in maps.doses.items()}
-
-
-def ctdi_figures(
-    scanners: dict[str, Scanner], exposure_s: float, histories: int, seed: int
-) -> dict[str, dict[str, CtdiDose]]:
-    """Doses in the bores of the 32 cm phantom for both bowties, by four readings of "dose".
-
-    Returns:
-        ``"plane"``: unscattered, in the plane; ``"contiguous"``: unscattered part of CTDI100; ``"interacted"``: all
-        energy of the first interaction; ``"total"``: with scatter (only with histories); each bowtie → dose.
-    """
-    asked: dict[str, dict[str, Any]] = {
-        "plane": {"axial": "plane"}, "contiguous": {}, "interacted": {"quantity": "interacted"},
-    }  # fmt: skip
-    if histories:
-        asked["total"] = {"histories": histories, "seed": seed}
-    return {
-        kind: {b: ctdi_dose(scanner, exposure_s, **how) for b, scanner in scanners.items()}
-        for kind, how in asked.items()
-    }
-
-
 def ratios(doses: dict[str, CtdiDose]) -> dict[str, float]:
     """With over without the ROI bowtie: peripheral, central, weighted."""
     large, roi = (doses[b] for b in BOWTIES)
@@ -474,20 +429,14 @@ def transmission(scanners: dict[str, Scanner]) -> dict[str, Any]:
 # --- MBIR and ROI bowtie --------------------------------------------------------------------------------------------
 
 
-def combine(
-    doses: tuple[float, ...], n: int, views: int, seed: int, saved: dict[str, float], folder: Path | None,
-    progress: Callable[[str, float], None] | None = None,
-) -> list[dict[str, Any]]:  # fmt: skip
+def _combined(s: Settings, saved: dict[str, float], folder: Path | None, progress: Progress) -> list[dict[str, Any]]:
     """Scan, reconstruct, measure.
 
     Args:
-        doses: exposures in s.
-        n: realisations.
-        views: per rotation.
-        seed: of the first realisation.
+        s: of the study.
         saved: kind of dose → factor that the ROI bowtie saves at equal exposure.
         folder: keeps what is finished; None: nothing is kept.
-        progress: called with a text and the finished fraction of it.
+        progress: of the evaluation.
 
     Returns:
         JSON values of each exposure. Factors ``[value, low, high]`` in the paper's ROIs: of MBIR with either bowtie
@@ -495,10 +444,12 @@ def combine(
         (``product_…``); FBP's own ratio, with over without the ROI bowtie; MBIR's contrast slope.
     """
     plain = read_task("plaque")
-    tasks = {b: replace(plain, name=f"plaque behind {b}", scanner=presets.pcct(views=views, bowtie=b)) for b in BOWTIES}
+    scanners = {b: presets.pcct(views=s.plaque_views, bowtie=b) for b in BOWTIES}
+    tasks = {b: replace(plain, name=f"plaque behind {b}", scanner=scanner) for b, scanner in scanners.items()}
     found = evaluate(
-        list(tasks.values()), ["fbp:soft", "mbir"], exposures_s=doses, n=n, seed=seed, folder=folder, progress=progress
-    )
+        list(tasks.values()), ["fbp:soft", "mbir"], exposures_s=s.plaque_doses, n=s.plaque_realizations, seed=s.seed,
+        folder=folder, progress=progress,
+    )  # fmt: skip
     large, roi = (tasks[b].name for b in BOWTIES)
 
     def record(task: str, method: str, dose: float, figure: str) -> Any:
@@ -506,7 +457,7 @@ def combine(
         return next((r for r in found.records if wanted.items() <= r.items()), dict.fromkeys(_KEYS, 0.0))
 
     results: list[dict[str, Any]] = []
-    for dose in doses:
+    for dose in s.plaque_doses:
         slope = record(large, "mbir", dose, "slope")
         row: dict[str, Any] = {"exposure_s": dose, "mbir_contrast_slope": [slope[k] for k in _KEYS]}
         for figure, (name, power, saving) in _RECORDS.items():
@@ -598,7 +549,7 @@ def figures(measured: Measured) -> dict[str, Any]:
     twin.tick_params(labelsize=6)
     for row, (name, centre) in enumerate((("ctdi", 0.0), ("thorax", -100.0)), start=1):
         maps, images = (part[name] for part in measured.seen)
-        unscattered = maps.doses["unscattered"]
+        unscattered, grid = maps.doses["unscattered"], phantom_grid(name, PIXEL_MM)
         body = maps.labels >= 0
         high = float(np.nanpercentile(unscattered[0][body], 95.0))
         dose = np.where(body, unscattered, np.nan)
@@ -606,7 +557,7 @@ def figures(measured: Measured) -> dict[str, Any]:
             label = f"{name}, {bowtie}: dose, mGy"
             _picture(axes[row, k], dose[k], maps.grid, label, "inferno", 0.0, high)
             label = f"{name}, {bowtie}: image, HU"
-            _picture(axes[row, 2 + k], images.noisy[k], images.grid, label, "gray", centre - 250.0, centre + 250.0)
+            _picture(axes[row, 2 + k], images[k], grid, label, "gray", centre - 250.0, centre + 250.0)
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = unscattered[1] / unscattered[0]
         _picture(axes[0, row], ratio, maps.grid, f"{name}: dose with / without", "viridis", 0.3, 1.05)

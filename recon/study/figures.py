@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from recon.study.paper.measures import PlaqueImage
+from recon.study.paper.plaque_scan import PlaqueImage
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.placement import RoiPair
 from torchpcct.metrics.roi import PROTOCOL_PIXEL_MM

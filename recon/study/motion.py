@@ -27,8 +27,15 @@ from recon.least_squares.reconstruct import reconstruct_pwls
 from recon.mbir.mbir import Mbir
 from recon.study.figures import curve_axes, middle_panel, plaque_panel
 from recon.study.paper import facts as paper
-from recon.study.paper.measures import PlaqueImage, Truth, measure_plaque
-from recon.study.paper.plaque_scan import REFERENCE_KERNEL, SCANNERS, duty, inset_grid
+from recon.study.paper.plaque_scan import (
+    REFERENCE_KERNEL,
+    SCANNERS,
+    PlaqueImage,
+    Truth,
+    duty,
+    inset_grid,
+    measure_plaque,
+)
 from recon.study.report import Check
 from recon.study.study import Clock, Measured, Progress, StudySettings, silent
 from torchpcct.acquisition.acquire import acquire
@@ -158,11 +165,11 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     scene, plaque = plaque_scene()
     reference = Reference.of(scene, plaque, inset_grid(plaque, s.voxel_mm))
     fractions = {"PCCT": (0.0, *s.fractions), "EID-CT": (0.0, *s.eid_fractions)}
-    pieces.ahead(_scan_ahead, *((name, f) for name in SCANNERS for f in dict.fromkeys(fractions[name])))
+    pieces.ahead(_scan, *((name, f) for name in SCANNERS for f in dict.fromkeys(fractions[name])))
     plan: dict[str, Any] = {}
     for name in SCANNERS:
         with clock.step(f"{name}, residual motion"):
-            still, moving = _residual(s, m, name, reference, pieces.within(name), progress)
+            still, moving = _residual(s, m, name, reference, pieces, progress)
         if name == "PCCT":
             plan = dict(moving.info["plan"])
             with clock.step("compensation"):
@@ -216,11 +223,7 @@ def _scan(s: Settings, pieces: Pieces, name: str, fraction: float) -> Scan:
         acquire, scene, scanner, region=inset_grid(plaque, s.voxel_mm), rotation_s=s.rotation_s,
         duty=duty(scanner, paper.FULL_VIEWS[name]),
     )  # fmt: skip
-    return pieces(f"scan_{fraction:g}", run)
-
-
-def _scan_ahead(settings: Settings, pieces: Pieces, name: str, fraction: float) -> None:
-    _scan(settings, pieces.within(name), name, fraction)
+    return pieces.within(name)(f"scan_{fraction:g}", run)
 
 
 # --- what one image yields ------------------------------------------------------------------------------------------
@@ -284,11 +287,6 @@ def observe(volume: Tensor, reference: Reference, rest: Tensor) -> Observed:
 
 
 # --- motion known ---------------------------------------------------------------------------------------------------
-
-
-def estimate_name(error: float | None) -> str:
-    """What a report calls an estimate of the motion; see :data:`Key`."""
-    return "at rest" if error is None else f"wrong by {100 * error:.0f} %" if error else "true motion"
 
 
 def reconstruct_fbp(scan: Scan, grid: VolumeGrid, motion: Any = None) -> Tensor:
@@ -454,6 +452,10 @@ def _images(m: Found) -> Any:
     """PCCT and EID-CT with residual motion and their error maps; then the compensated images."""
     rows: list[list[Panel]] = []
     labels = []
+
+    def title_of(error: float | None) -> str:
+        return "at rest" if error is None else f"wrong by {100 * error:.0f} %" if error else "true motion"
+
     for name, rest in m.at_rest.items():
         found = {"at rest": rest, **{f"{100 * f:.0f} %": here for f, (here, _) in m.residuals(name).items()}}
         rows += [[plaque_panel(o, title) for title, o in found.items()], [_error_map(o, rest) for o in found.values()]]
@@ -461,7 +463,7 @@ def _images(m: Found) -> Any:
     for noisy in (False, True):
         for method, title in METHODS.items():
             row = [
-                plaque_panel(found[0], estimate_name(error))
+                plaque_panel(found[0], title_of(error))
                 for (name, error, with_noise), found in m.compensated.items()
                 if name == method and with_noise == noisy
             ]

@@ -32,7 +32,7 @@ from recon.study.paper import facts as paper
 from recon.study.paper.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM, PlaqueScan, prepare
 from recon.study.report import Check, around
 from recon.study.study import Clock, Measured, Progress, StudySettings, silent
-from torchpcct.metrics.cnr import cnr_interval, cnr_range, sd_interval
+from torchpcct.metrics.cnr import cnr_from_moments, cnr_interval, cnr_range, sd_interval
 from torchpcct.metrics.intervals import bca_interval, leave_one_out, resampling
 from torchpcct.metrics.roi import sample_axial
 from torchpcct.scan import Scan
@@ -133,10 +133,6 @@ class Moments:
     def exact(self, exposure_s: float) -> Table:
         """The truth at an exposure."""
         return Table(self.expected, np.sqrt(np.diag(self.covariance) / exposure_s).reshape(self.expected.shape))
-
-    def block(self, i: int, exposure_s: float) -> Any:
-        """``(2, 2)`` HU², the exact covariance of the two ROI means of setting ``i`` at an exposure."""
-        return self.covariance[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] / exposure_s
 
 
 def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
@@ -251,7 +247,8 @@ def _dose_table(s: Settings, m: Moments, exposure: float) -> list[dict[str, Any]
     for i, (kernel, voxel) in enumerate(s.axes):
         measured, ten = sampled(values, i), sampled(values[:_TEN], i)
         measured["sd_interval"] = [list(sd_interval(float(v), len(values))) for v in measured["sd_hu"]]
-        ten["cnr_range"] = list(cnr_range(exact.mean[i], m.block(i, exposure), _TEN))
+        both = slice(2 * i, 2 * i + 2)
+        ten["cnr_range"] = list(cnr_range(exact.mean[i], m.covariance[both, both] / exposure, _TEN))
         theirs = [published(t, kernel, voxel, exposure) for t in (paper.FOREGROUND, paper.BACKGROUND, paper.CNR)]
         rows.append(
             {
@@ -346,12 +343,7 @@ class Table:
     @property
     def cnr(self) -> Floats:
         """``(..., settings)``."""
-        return np.asarray((self.mean[..., 1] - self.mean[..., 0]) / self.noise)
-
-    @property
-    def noise(self) -> Floats:
-        """The CNR's denominator in HU, ``(..., settings)``."""
-        return np.asarray(np.hypot(self.sd[..., 0], self.sd[..., 1]))
+        return np.asarray(cnr_from_moments(self.mean[..., 0], self.sd[..., 0], self.mean[..., 1], self.sd[..., 1]))
 
 
 def measured_table(means: Any) -> Table:

@@ -12,9 +12,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.ndimage import binary_erosion
-from scipy.spatial import cKDTree
+from scipy.ndimage import distance_transform_edt
 
 from recon.study.paper import facts as paper
 from recon.study.report import Check, around
@@ -179,15 +177,11 @@ def raster_lengths(scene: Scene, plaque: Plaque, voxel_mm: float, sections: int)
     wall: extents of their voxels across the plaque's direction, mean over sections beyond the plaque; distance from the
     isocentre: of the vessel's centre of mass there. Patient: voxels on a line through the isocentre.
     """
-    core = _raster(
-        scene,
-        plaque,
-        plaque.core_center,
-        tuple(a + plaque.minimum_cap + _MARGIN_MM for a in plaque.core.semi_axes),
-        voxel_mm,
-    )
-    inside = core[0] == scene.index("core")
-    width, depth, length = (_extent(inside, axis, voxel_mm) for axis in (2, 1, 0))
+    around = tuple(a + plaque.minimum_cap + _MARGIN_MM for a in plaque.core.semi_axes)
+    labels = _raster(scene, plaque, plaque.core_center, around, voxel_mm)[0]
+    inside, lumen = (labels == scene.index(name) for name in ("core", "lumen"))
+    cap = distance_transform_edt(~lumen, sampling=voxel_mm)[inside].min() - voxel_mm if lumen.any() else math.nan
+    extents = [float(inside.any(axes).sum() * voxel_mm) for axes in ((0, 1), (0, 2), (1, 2))]
     low, high = 0.5 * plaque.bulge_length, 0.5 * plaque.vessel_length
     heights = low + (np.arange(sections) + 0.5) * (high - low) / sections
     diameters, walls, centres = [], [], []
@@ -205,9 +199,9 @@ def raster_lengths(scene: Scene, plaque: Plaque, voxel_mm: float, sections: int)
     line = np.zeros((n, 3))
     line[:, 0] = (np.arange(n) - (n - 1) / 2) * voxel_mm
     return {
-        "core, major axis": max(width, depth, length),
-        "core, minor axis": min(width, depth, length),
-        "fibrous cap": _cap(scene, core, voxel_mm),
+        "core, major axis": max(extents),
+        "core, minor axis": min(extents),
+        "fibrous cap": float(cap),
         "wall": float(np.mean(walls)),
         "vessel diameter": float(np.mean(diameters)),
         "distance from the isocentre": float(np.mean(centres)),
@@ -222,23 +216,6 @@ def _raster(scene: Scene, plaque: Plaque, center: Any, half: Any, voxel_mm: floa
     zz, yy, xx = np.meshgrid(z, y, x, indexing="ij")
     points = plaque.to_scanner(np.stack([xx, yy, zz], -1))
     return scene.labels(points), points
-
-
-def _extent(inside: NDArray[np.bool_], axis: int, voxel_mm: float) -> float:
-    other = tuple(k for k in range(3) if k != axis)
-    return float(np.flatnonzero(inside.any(other)).size * voxel_mm)
-
-
-def _cap(scene: Scene, raster: tuple[Any, Any], voxel_mm: float) -> float:
-    labels, points = raster
-    lumen, core = (points[_surface(labels == scene.index(name))] for name in ("lumen", "core"))
-    if not len(lumen):
-        return math.nan
-    return float(cKDTree(lumen).query(core)[0].min() - voxel_mm)
-
-
-def _surface(inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    return np.asarray(inside & ~binary_erosion(inside))
 
 
 # --- the report -----------------------------------------------------------------------------------------------------

@@ -7,23 +7,23 @@ them. A word that hinges on a figure is chosen there by the figure's sign.
 
 from __future__ import annotations
 
-import io
 import json
 import math
 import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from recon.evaluate.report import page
-from torchpcct.files import atomic_write
+from recon.evaluate.report import filled, write_report
 
-__all__ = ["Check", "Report", "aligned", "around", "render"]
+__all__ = ["TEMPLATES", "Check", "Report", "aligned", "around", "render"]
+
+TEMPLATES = Path(__file__).parent / "templates"
+"""Of the studies' texts."""
 
 
 @dataclass(frozen=True)
@@ -78,30 +78,8 @@ def render(name: str, data: Mapping[str, Any]) -> str:
     Raises:
         jinja2.UndefinedError: a value that the template asks for is missing.
     """
-    text = _templates().get_template(f"{name}.md.j2").render(data)
+    text = filled(TEMPLATES / f"{name}.md.j2", data)
     return aligned(re.sub(r"\n{3,}", "\n\n", text).strip())
-
-
-@cache
-def _templates() -> Any:
-    import jinja2
-
-    folder = jinja2.FileSystemLoader(Path(__file__).parent / "templates")
-    made = jinja2.Environment(loader=folder, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    made.filters |= {"f": _figure, "interval": _interval, "cell": lambda text: str(text).replace("|", "\\|")}
-    return made
-
-
-def _figure(value: float | None, spec: str) -> str:
-    """A figure by Python's format; a dash where there is none."""
-    return "–" if value is None or math.isnan(value) else format(value, spec)
-
-
-def _interval(value: Any, spec: str = ".2f") -> str:
-    """``[value, low, high]`` or a record of an evaluation, as ``1.53 [1.47, 1.59]``; the value alone if it is exact."""
-    middle, low, high = (value[k] for k in ("value", "low", "high")) if isinstance(value, Mapping) else value
-    text = _figure(middle, spec)
-    return text if low is None or math.isnan(low) else f"{text} [{low:{spec}}, {high:{spec}}]"
 
 
 def aligned(text: str) -> str:
@@ -166,18 +144,4 @@ class Report:
         Returns:
             The files written.
         """
-        out, text = Path(folder), self.text
-        out.mkdir(parents=True, exist_ok=True)
-        contents = {"report.json": f"{self.json}\n".encode(), "report.md": f"{text}\n".encode()}
-        pictures = {name: _drawn(figure, name) for name, figure in self.figures.items()}
-        contents |= {**pictures, "report.html": page(f"torchpcct: {self.name}", text, pictures).encode()}
-        for name, content in contents.items():
-            with atomic_write(out / name) as part:
-                part.write_bytes(content)
-        return [out / name for name in contents]
-
-
-def _drawn(figure: Any, name: str) -> bytes:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format=Path(name).suffix[1:])
-    return buffer.getvalue()
+        return write_report(folder, f"torchpcct: {self.name}", f"{self.text}\n", self.json, self.figures)

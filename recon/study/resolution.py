@@ -29,20 +29,23 @@ from recon.analytic.inset import InsetFbp
 from recon.evaluate.store import Pieces
 from recon.study.figures import curve_axes, middle_panel, plaque_panel
 from recon.study.paper import facts as paper
-from recon.study.paper.measures import PlaqueImage, Truth, measure_plaque
 from recon.study.paper.plaque_scan import (
     REFERENCE_KERNEL,
     REFERENCE_VOXEL_MM,
     SCANNERS,
+    PlaqueImage,
     PlaqueScan,
+    Truth,
     duty,
     equal_dose,
+    measure_plaque,
     prepare,
 )
 from recon.study.report import Check, around
 from recon.study.study import Clock, Measured, Progress, StudySettings, silent
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.geometry import VolumeGrid
+from torchpcct.metrics.resolution import first_below
 from torchpcct.metrics.roi import PROTOCOL_PIXEL_MM, sample_axial
 from torchpcct.scanner import Scanner
 from torchpcct.scene import Body, EllipticCylinder, Scene
@@ -238,23 +241,15 @@ def point_width(image: NDArray[np.float64], grid: VolumeGrid) -> SystemWidth:
     widths = []
     for direction in (outward, across):
         profile = map_coordinates(point, peak[:, None] + direction[:, None] * reach, order=3)
-        widths.append(_full_width(reach, profile) * grid.spacing[0])
+        top = int(profile.argmax())
+        right, left = (first_below(reach[top::way], profile[top::way], profile[top] / 2, math.nan) for way in (1, -1))
+        widths.append((right - left) * grid.spacing[0])
     fine = map_coordinates(point, np.mgrid[0 : image.shape[0] - 1 : 0.25, 0 : image.shape[1] - 1 : 0.25], order=3)
     area = 2.0 * math.sqrt(float((fine >= 0.5).sum()) * (0.25 * grid.spacing[0]) ** 2 / math.pi)
     # The wire is a disc: its variance along a line is a quarter of its squared radius.
     own = FWHM_PER_SIGMA * _WIRE_RADIUS_MM / 2.0
     area, radial, tangential = (math.sqrt(max(w * w - own * own, 0.0)) for w in (area, *widths))
     return SystemWidth(area, radial, tangential, float(point.min()))
-
-
-def _full_width(x: NDArray[np.float64], profile: NDArray[np.float64]) -> float:
-    top = int(profile.argmax())
-    half = 0.5 * profile[top]
-    right = top + int(np.flatnonzero(profile[top:] < half)[0])
-    left = top - int(np.flatnonzero(profile[top::-1] < half)[0])
-    b = x[right - 1] + (profile[right - 1] - half) / (profile[right - 1] - profile[right]) * (x[right] - x[right - 1])
-    a = x[left + 1] - (profile[left + 1] - half) / (profile[left + 1] - profile[left]) * (x[left + 1] - x[left])
-    return float(b - a)
 
 
 # --- blur -----------------------------------------------------------------------------------------------------------

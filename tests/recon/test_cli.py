@@ -258,11 +258,11 @@ def test_a_lower_dose_of_a_scan_file(tmp_path, capsys):
 
 def test_verify_finds_a_stale_readme_and_renders_it(tmp_path, capsys):
     folder = tmp_path / "notebooks"
-    folder.mkdir()
-    (folder / "r.json").write_text('{"a": 1.26}', encoding="utf-8")
+    (folder / "r").mkdir(parents=True)
+    (folder / "r" / "report.json").write_text('{"a": 1.26}', encoding="utf-8")
     first, last = README_MARKS
     (folder / "results.template.md").write_text(
-        f"{first}\nSo it is {{{{r.json: a | .1f}}}}× now.\n{last}\n", encoding="utf-8"
+        f"{first}\nSo it is {{{{ r.a|f('.1f') }}}}× now.\n{last}\n", encoding="utf-8"
     )
     readme = tmp_path / "README.md"
     readme.write_text(f"# T\n{first}\nSo it is 1.2× now.\n{last}\n", encoding="utf-8")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -13,23 +14,25 @@ import torch
 from torch import Tensor
 
 from torchpcct.acquisition.bodies import Bodies
-from torchpcct.acquisition.detection import detected, signal_spectra
 from torchpcct.acquisition.plan import Plan, make_plan
-from torchpcct.acquisition.transmission import SUB_RAY_COUNTS, Beam, expected_readings
+from torchpcct.acquisition.transmission import SUB_RAY_COUNTS, Beam, compress, expected_readings
 from torchpcct.acquisition.transmission import sub_rays as sub_rays_of
-from torchpcct.acquisition.voxels import acquire_voxels
 from torchpcct.detector_window import DetectorWindow
-from torchpcct.geometry import VolumeGrid
-from torchpcct.scan import Scan, check_exposure
+from torchpcct.geometry import ConeBeam, VolumeGrid
+from torchpcct.projector import Projector
+from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan, check_exposure
 from torchpcct.scanner.scanner import Scanner
 from torchpcct.scene.scene import Scene
 from torchpcct.scene.voxels import VoxelScene
 from torchpcct.validate import checked, whole
 
-__all__ = ["acquire", "plan"]
+__all__ = ["acquire", "acquire_voxels", "detected", "plan", "signal_spectra"]
 
-log = logging.getLogger(__name__)
-
+_TOLERANCE = 1e-5
+"""Error of a line integral over a metre of body by the number of basis maps."""
+_SUB_COLUMNS = 2
+"""Parts of a cell whose transmissions are averaged: a cell records the mean of the photons, not of the path lengths."""
+_LEFT_OUT = "focal spot, gantry turn during a view, scatter; voxels are uniform, and edges as coarse as they are"
 VIEWS_AT_A_TIME = 64
 """Views whose readings are computed, and kept, together."""
 
@@ -153,3 +156,139 @@ def _readings(
         if progress is not None:
             progress(views.stop / g.views)
     return out
+
+
+def acquire_voxels(
+    scene: VoxelScene,
+    scanner: Scanner,
+    *,
+    progress: Callable[[float], None] | None = None,
+    sub_columns: int = _SUB_COLUMNS,
+) -> Scan:
+    """The noise-free scan of a voxel volume, whole detector; called by :func:`torchpcct.acquire`.
+
+    The attenuation of all tissues at all energies is compressed to a few basis maps
+    (:func:`~torchpcct.acquisition.transmission.compress`), which the distance-driven projector integrates over parts of
+    each cell; the polychromatic transmission is exact from there.
+
+    Args:
+        scene: tissues in voxels.
+        scanner: what scans it.
+        progress: called with the finished fraction.
+        sub_columns: parts of each cell.
+
+    Raises:
+        ValueError: a source inside the grid.
+    """
+    start = time.perf_counter()
+    g: ConeBeam = scanner.geometry
+    energies, spectra, air = signal_spectra(scanner)
+    scene = scene.read_by(energies, spectra[: scanner.detector.bins, g.columns // 2].sum(0))
+    coefficients, basis = compress(scene.contrast(energies), tolerance=_TOLERANCE)
+    maps = torch.from_numpy(scene.mixed(coefficients))
+    fine = replace(g, columns=g.columns * sub_columns, pitch=(g.pitch[0], g.pitch[1] / sub_columns))
+    weight = torch.from_numpy((spectra / sub_columns).astype(np.float32))  # (bins, columns, energies)
+    bins = weight.shape[0]
+    rows = torch.from_numpy(np.asarray(scanner.row_factor, dtype=np.float32))
+    spectrum = torch.from_numpy(basis.astype(np.float32))
+    counts = torch.empty((bins, *g.shape), dtype=torch.float32)
+    block = max(1, min(g.views, 2**24 // (max(len(basis), 1) * g.rows * fine.columns)))
+    for v0 in range(0, g.views, block):
+        part = fine.select(slice(v0, min(v0 + block, g.views)))
+        lines = Projector(part, scene.grid)(maps)  # (rank, views, rows, fine columns)
+        for v in range(part.views):
+            counts[:, v0 + v] = _voxel_readings(lines[:, v], spectrum, weight, sub_columns) * rows[:, None]
+        if progress is not None:
+            progress((v0 + part.views) / g.views)
+    info = {
+        "scanner": scanner.name,
+        "scene": list(scene.names),
+        "plan": {
+            "basis_maps": len(basis),
+            "sub_columns": sub_columns,
+            "left_out": _LEFT_OUT,
+            "clipped": scene.clipped,
+            "above_muscle": scene.above_muscle,
+        },
+        "seconds": round(time.perf_counter() - start, 2),
+    }
+    return detected(scanner, counts, air, energies, info)
+
+
+def _voxel_readings(lines: Tensor, spectrum: Tensor, weight: Tensor, sub_columns: int) -> Tensor:
+    """``(bins, rows, columns)`` of one view: ``lines (rank, rows, columns · sub)``, ``spectrum (rank, energies)``."""
+    out = lines.new_empty((weight.shape[0], lines.shape[1], weight.shape[1]))
+    for r in range(lines.shape[1]):
+        transmitted = torch.exp(-(lines[:, r].T @ spectrum))  # (columns · sub, energies)
+        cells = transmitted.view(-1, sub_columns, spectrum.shape[1]).sum(1)
+        out[:, r] = (weight * cells).sum(-1)
+    return out
+
+
+def signal_spectra(scanner: Scanner) -> tuple[Any, Any, Any]:
+    """Energies, ``(bins, columns, energies)`` signal per energy in air, and the air readings ``(bins, rows, columns)``.
+
+    Of an energy-integrating detector the variance follows as one more "bin": the same transmission, weighted by the
+    squared signal.
+    """
+    energies, spectra = scanner.weights()
+    if scanner.detector.energy_integrating:
+        spectra = np.concatenate([spectra, scanner.noise_weights()[1]])
+    spectra = spectra * scanner.mas_per_view(NOISE_FREE_EXPOSURE_S)
+    return energies, spectra, np.einsum("bce,r->brc", spectra, scanner.row_factor)
+
+
+def detected(
+    scanner: Scanner,
+    counts: Tensor,
+    air: Any,
+    energies: Any,
+    info: dict[str, Any],
+    surround: Any = None,
+    window: DetectorWindow | None = None,
+) -> Scan:
+    """The noise-free scan of expected readings, with what the detector makes of them.
+
+    Args:
+        scanner: whose detector it is.
+        counts: ``(bins, views, rows, columns)`` float32, the bins of :func:`signal_spectra`; overwritten, as the
+            readings of a whole detector are large.
+        air, surround: ``(bins, rows, columns)``; surround None: of a scan without window.
+        energies: ``(E,)`` keV.
+        info: of the scan.
+        window: the part of the detector that ``counts`` hold; None: all of it.
+    """
+    g, detector, bins = scanner.geometry, scanner.detector, scanner.detector.bins
+    bare = torch.from_numpy(np.array(air))
+    behind = None if surround is None else torch.from_numpy(np.array(surround))
+    pile_up = scanner.pile_up()
+    if pile_up is not None:
+        kept, cells, columns = window or DetectorWindow.full(g), bare, np.arange(g.columns)
+        part = cells[:, kept.first_row : kept.first_row + kept.rows]
+        for v, seen in enumerate(kept.column_indices):
+            counts[:, v] = pile_up.apply(counts[:, v], part[..., torch.from_numpy(seen)], seen)
+        bare = pile_up.apply(cells, cells, columns)
+        behind = None if behind is None else pile_up.apply(behind, cells, columns)
+    quantum = None
+    if detector.energy_integrating:
+        dark = counts[:bins] <= 0  # behind a perfect absorber any energy will do
+        quantum = counts[bins:].div_(counts[:bins]).masked_fill_(dark, float(energies[-1]))
+
+    def of_bins(values: Tensor) -> Tensor:
+        return (values[0] if bins == 1 else values[:bins]).to(torch.float32)
+
+    return Scan(
+        counts=of_bins(counts),
+        air=of_bins(bare),
+        geometry=g,
+        linearisation=scanner.water_linearisation(),
+        window=window,
+        surround=None if behind is None else of_bins(behind),
+        counting=not detector.energy_integrating,
+        info=info,
+        quantum=None if quantum is None else of_bins(quantum),
+        electronic_noise=detector.electronic_noise if detector.energy_integrating else 0.0,
+    )
+
+
+log = logging.getLogger(__name__)

@@ -177,28 +177,12 @@ def halves(scan: Scan, how: str = "views", seed: int = 0) -> tuple[Scan, Scan]:
         order = np.argsort(angles, kind="stable")
         if order.size < 2:
             raise ValueError("one view cannot be split")
-        return _selected(scan, np.sort(order[::2])), _selected(scan, np.sort(order[1::2]))
+        return scan.select(np.sort(order[::2])), scan.select(np.sort(order[1::2]))
     if not scan.counting or scan.logged or bool((scan.counts != scan.counts.round()).any()):
         raise ValueError('photons can be split only where counts are whole numbers: use how="views"')
     generator = torch.Generator().manual_seed(whole("seed", seed, low=0))
     one = torch.binomial(scan.counts, torch.full_like(scan.counts, 0.5), generator=generator)
     return tuple(replace(scan, counts=c, air=scan.air / 2) for c in (one, scan.counts - one))  # type: ignore[return-value]
-
-
-def _selected(scan: Scan, views: Any) -> Scan:
-    axis, index = -len(scan.geometry.shape), torch.from_numpy(views)
-
-    def part(values: Tensor | None) -> Tensor | None:
-        return None if values is None else values.index_select(axis, index)
-
-    return replace(
-        scan,
-        geometry=scan.geometry.select(views),
-        counts=scan.counts.index_select(axis, index),
-        quantum=part(scan.quantum),
-        dead=part(scan.dead),
-        flux=None if scan.flux is None else scan.flux[index],
-    )
 
 
 @checked

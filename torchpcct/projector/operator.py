@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -18,8 +20,9 @@ from torchpcct.vector_geometry import VectorGeometry
 if TYPE_CHECKING:
     from scipy.sparse.linalg import LinearOperator
 
-__all__ = ["Operator", "Projector"]
+__all__ = ["Operator", "Projector", "apply_linear"]
 
+Linear = Callable[[Tensor], Tensor]
 _DTYPES = (torch.float32, torch.float64)
 _NARROW = (torch.float16, torch.bfloat16)
 
@@ -125,29 +128,34 @@ class Operator(nn.Module):
         return LinearPhysics(A=lambda x, **_: self(x), A_adjoint=lambda y, **_: self.T(y))
 
 
-class _Pass(torch.autograd.Function):
-    """One linear pass; its derivative in either direction is the other pass."""
+class _Linear(torch.autograd.Function):
+    """``forward(x)``; its gradient is ``transpose``, whose gradient is ``forward`` again (any order)."""
 
     @staticmethod
-    def forward(x: Tensor, engine: Engine, transposed: bool) -> Tensor:
-        return engine.apply(x, transposed)
+    def forward(x: Tensor, forward: Linear, transpose: Linear) -> Tensor:
+        return forward(x)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        _, ctx.engine, ctx.transposed = inputs
+        _, ctx.forward_map, ctx.transpose_map = inputs
 
     @staticmethod
-    def backward(ctx: Any, *grads: Any) -> tuple[Tensor, None, None]:
-        return _apply(grads[0], ctx.engine, not ctx.transposed), None, None
+    def backward(ctx: Any, *gradients: Any) -> Any:
+        return _Linear.apply(gradients[0], ctx.transpose_map, ctx.forward_map), None, None
 
     @staticmethod
-    def jvp(ctx: Any, *tangents: Any) -> Tensor:
-        return _apply(tangents[0], ctx.engine, ctx.transposed)
+    def jvp(ctx: Any, *tangents: Any) -> Any:
+        return _Linear.apply(tangents[0], ctx.forward_map, ctx.transpose_map)
 
     @staticmethod
-    def vmap(info: Any, in_dims: tuple[Any, ...], x: Tensor, engine: Engine, transposed: bool) -> tuple[Tensor, int]:
+    def vmap(info: Any, in_dims: tuple[Any, ...], x: Tensor, forward: Linear, transpose: Linear) -> tuple[Tensor, int]:
         # Leading dimensions are batch dimensions already.
-        return _apply(x.movedim(in_dims[0], 0), engine, transposed), 0
+        return _Linear.apply(x.movedim(in_dims[0], 0), forward, transpose), 0
+
+
+def apply_linear(x: Tensor, forward: Linear, transpose: Linear) -> Tensor:
+    """``forward(x)`` with gradients of any order; both maps take and keep leading batch dimensions."""
+    return cast(Tensor, _Linear.apply(x, forward, transpose))
 
 
 # torch.compile and torch.export cannot look into numba kernels; to them a pass is one operation. An exported program
@@ -182,7 +190,7 @@ _traced.register_autograd(_back, setup_context=_note)
 def _apply(x: Tensor, engine: Engine, transposed: bool) -> Tensor:
     if torch.compiler.is_compiling():
         return cast(Tensor, _traced(x, engine.handle, transposed))
-    return cast(Tensor, _Pass.apply(x, engine, transposed))
+    return apply_linear(x, *(partial(engine.apply, transposed=way) for way in (transposed, not transposed)))
 
 
 class Projector(Operator):

@@ -1,4 +1,4 @@
-"""What every method makes of hard scans: ``case`` → ``cases``, ``body`` (what is done to them) → ``measure``."""
+"""What every method makes of hard scans: ``cases`` (what is done to them) → ``measure``."""
 
 from recon.study.hardcases.measure import Settings, figures, measure
 

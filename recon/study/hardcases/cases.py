@@ -3,27 +3,126 @@
 Some change the scan, others what is scanned (metal, a calcification, a large patient). A case that leaves the
 information in the data (some dead cells, a short scan) has a right answer: that of the sound scan, up to noise. One
 that makes the scan's description wrong (centre, gain) has none; it must be noticed.
+
+Two sound scans are made hard: the plaque's; and, for what needs a whole field of view, a slice of the thorax in a fan
+beam, 360 views of 240 columns, exact path lengths at 70 keV, Poisson noise.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy import ndimage
+from torch import Tensor
 
-from recon.study.hardcases.body import BODY_CASES
-from recon.study.hardcases.case import Apply, Case, expected, views
+from torchpcct.acquisition.path_lengths import tissue_path_lengths
+from torchpcct.geometry import ConeBeam, FanBeam, VolumeGrid, full_turn
 from torchpcct.scan import Scan
+from torchpcct.scanner.linearisation import WaterLinearisation
 from torchpcct.scene import Body, EllipticCylinder, Scene
+from torchpcct.scene.materials import material
+from torchpcct.scene.phantoms import thorax
 from torchpcct.scene.plaque import Plaque, plaque_scene
 from torchpcct.scene.plaque.variants import calcification_bodies, stent_bodies
 
-__all__ = ["CASES"]
+__all__ = ["CASES", "GRID", "Apply", "Case", "body_scan", "body_truth", "untouched"]
+
+KEV, PHOTONS, VIEWS = 70.0, 3e3, 360
+GRID = VolumeGrid((116, 158), 2.4, (-34.0, -14.0))
+GEOMETRY = FanBeam(full_turn(VIEWS), 541.0, 949.0, 240, 3.6)
+WATER = float(np.ravel(material("water").attenuation(KEV))[0])
+"""Of the body's scan."""
+
+Apply = Callable[[Scan, Scan, np.random.Generator], Scan]
+"""The noise-free scan, its noisy realisation and a random generator, to the scan that is reconstructed."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One hard case.
+
+    Args:
+        title: what is wrong with the scan, a table's cell.
+        apply: what is done to the scan.
+        noise: the best that any method can do, as noise over that of the sound scan: lost quanta are lost. What a
+            larger body takes comes on top of it.
+        scene: the scene around a plaque, or instead of the body, if it is another one than the sound scan's; ``apply``
+            then gets scans of it. What it adds to the sound scan's own bodies, and the voxels beside that, are left out
+            of the errors.
+        base: ``"plaque"`` or ``"body"``: whose scan is made hard.
+        unseen: why no data can show it; empty: they can.
+        other: the scene's own bodies differ from those of the sound scan: what the case adds to the error against its
+            own truth counts.
+        tissues: reconstructed by MBIR with tissues, too.
+    """
+
+    title: str
+    apply: Apply
+    noise: float = 1.0
+    scene: Callable[[Plaque], Scene] | None = None
+    base: str = "plaque"
+    unseen: str = ""
+    other: bool = False
+    tissues: bool = False
+
+
+def untouched(scene: Scene, sound: Scene, grid: VolumeGrid) -> NDArray[np.bool_]:
+    """Voxels that no body which ``scene`` has beyond those of ``sound`` touches, nor a neighbour of theirs.
+
+    Args:
+        scene: of a case.
+        sound: of the sound scan.
+        grid: ``(z, y, x)``.
+
+    Returns:
+        ``grid.shape``, True where the case shows what the sound scan does.
+    """
+    added = [k for k, name in enumerate(scene.names) if name not in set(sound.names)]
+    if not added:
+        return np.ones(grid.shape, dtype=bool)
+    share = scene.volume_fractions(grid)[added].sum(0)
+    return ~np.asarray(ndimage.binary_dilation(share > 0, np.ones((3, 3, 3))))
+
+
+def _expected(change: Callable[[Tensor, Tensor, np.random.Generator], Tensor]) -> Apply:
+    """Expected readings and those in air to others; noise comes after it, the sound scan's."""
+
+    def apply(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
+        assert scan.exposure_s is not None
+        other = change(clean.counts, clean._at_window(clean.air), rng).float()
+        return replace(clean, counts=other).with_noise(scan.exposure_s, scan.seed or 0)
+
+    return apply
+
+
+def _given(make: Callable[[Any, Scan], Scan]) -> Apply:
+    """What a user makes of an array of readings."""
+    return lambda clean, scan, rng: make(scan.counts.numpy(), scan)
+
+
+def _views(title: str, keep: Callable[[int], NDArray[Any]]) -> Case:
+    """Only some of the views."""
+
+    def apply(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
+        return scan.select(keep(scan.geometry.views))
+
+    return Case(title, apply, (720 / keep(720).size) ** 0.5)
+
+
+def _described(title: str, change: Callable[[Any], Any], unseen: str = "", tissues: bool = False) -> Case:
+    """The geometry is described wrongly."""
+    return Case(
+        title, lambda clean, scan, rng: replace(scan, geometry=change(scan.geometry)), unseen=unseen, tissues=tissues
+    )
+
+
+# --- the plaque's scan ------------------------------------------------------------------------------------------------
 
 
 def _lost(share: float) -> Case:
@@ -49,21 +148,10 @@ def _cells(title: str, rows: slice, columns: int, factor: float) -> Case:
     return Case(title, apply)
 
 
-def _views(title: str, keep: Callable[[int], np.ndarray]) -> Case:
-    return Case(title, views(keep), (720 / keep(720).size) ** 0.5)
-
-
 def _dark_views(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
     counts = scan.counts.clone()
     counts[torch.from_numpy(rng.choice(counts.shape[0], 3, replace=False))] = 0
     return replace(scan, counts=counts)
-
-
-def _described(title: str, change: Callable[[Any], Any], unseen: str = "", tissues: bool = False) -> Case:
-    """The geometry is described wrongly."""
-    return Case(
-        title, lambda clean, scan, rng: replace(scan, geometry=change(scan.geometry)), unseen=unseen, tissues=tissues
-    )
 
 
 def _centre(columns: float) -> Case:
@@ -86,9 +174,9 @@ def _per_view(amplitude: float, drift: bool) -> Apply:
     def change(n: Any, air: Any, rng: np.random.Generator) -> Any:
         views = len(n)
         part = torch.linspace(0, 1, views) if drift else torch.from_numpy(rng.standard_normal(views)).float()
-        return n * (1 + amplitude * part)[:, None, None]
+        return n * (1 + amplitude * part).reshape(-1, *(1,) * (n.ndim - 1))
 
-    return expected(change)
+    return _expected(change)
 
 
 def _cell_gains(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
@@ -241,13 +329,13 @@ _PLAQUE: dict[str, Case] = {
     "sdd-small": _described("sdd 3 % too small", lambda g: replace(g, sdd=0.97 * g.sdd)),
     "pitch": _described("pitch 3 % too large", lambda g: replace(g, pitch=(g.pitch[0], 1.03 * g.pitch[1]))),
     "rolled": Case("a detector rolled by 2°", _rolled),
-    "pile-up": Case("pile-up of 10 %", expected(lambda n, air, rng: n * torch.exp(0.1 - 0.1 * n / air))),
-    "scatter": Case("scatter: 5 % of the mean reading", expected(lambda n, air, rng: n + 0.05 * n.mean())),
-    "dark": Case("a dark signal of 0.1 % of air left in", expected(lambda n, air, rng: n + 0.001 * air)),
+    "pile-up": Case("pile-up of 10 %", _expected(lambda n, air, rng: n * torch.exp(0.1 - 0.1 * n / air))),
+    "scatter": Case("scatter: 5 % of the mean reading", _expected(lambda n, air, rng: n + 0.05 * n.mean())),
+    "dark": Case("a dark signal of 0.1 % of air left in", _expected(lambda n, air, rng: n + 0.001 * air)),
     "saturation": Case(
-        "saturated at the mean reading", expected(lambda n, air, rng: n.clamp(max=float(n.mean()))),
+        "saturated at the mean reading", _expected(lambda n, air, rng: n.clamp(max=float(n.mean()))),
     ),
-    "lag": Case("5 % of a reading in the next view", expected(lambda n, air, rng: 0.95 * n + 0.05 * n.roll(1, 0))),
+    "lag": Case("5 % of a reading in the next view", _expected(lambda n, air, rng: 0.95 * n + 0.05 * n.roll(1, 0))),
     "flicker": Case("the tube flickers by 2 %", _per_view(0.02, drift=False)),
     "rings": Case("gains of the cells off by 1 %", _cell_gains),
     "second-vessel": _scanned("a second enhanced vessel of 3 mm, 1 mm beside", _beside("blood_iodine", 3.0)),
@@ -255,5 +343,225 @@ _PLAQUE: dict[str, Case] = {
     "no-core": _scanned("no core", _coreless, other=True),
 }  # fmt: skip
 
-CASES: dict[str, Case] = _PLAQUE | BODY_CASES
-"""Name → case. A new one needs nothing but its entry there."""
+
+# --- a whole body -----------------------------------------------------------------------------------------------------
+
+
+def body_scan(scene: Scene | None = None) -> Scan:
+    """The noise-free scan of the thorax, or of a scene."""
+    scene = scene or thorax()
+    g = GEOMETRY
+    row = ConeBeam(g.angles, g.sod, g.sdd, g.columns, 1, g.pitch)
+    groups: dict[float, list[str]] = {}
+    for name, tissue in zip(scene.names, scene.materials, strict=True):
+        groups.setdefault(float(np.ravel(tissue.attenuation(KEV))[0]), []).append(name)
+    paths = tissue_path_lengths(scene, list(groups.values()), row)[:, :, 0]
+    lines = torch.tensordot(torch.tensor(list(groups)), paths, dims=1)
+    air = torch.full((g.columns,), PHOTONS)
+    return Scan((air * torch.exp(-lines)).float(), air, g, _water(g.columns, WATER))
+
+
+def body_truth(scene: Scene | None = None) -> Tensor:
+    """``GRID.shape`` HU."""
+    section = VolumeGrid((1, *GRID.shape), (1.0, *GRID.spacing), (0.0, *GRID.center))
+    return torch.from_numpy((scene or thorax()).material_map(section, KEV)[0] / WATER * 1000.0 - 1000.0).float()
+
+
+def _water(columns: int, mu: float) -> WaterLinearisation:
+    return WaterLinearisation.polynomial((1.0,), columns, mu)
+
+
+def _columns(first: float, last: float) -> Apply:
+    def apply(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
+        g = scan.geometry
+        low, high = round(first * g.columns), round(last * g.columns)
+        part = replace(g, columns=high - low, offset=g.offset + g.pitch * ((low + high) - g.columns) / 2)
+        return replace(
+            scan, counts=scan.counts[:, low:high], air=scan.air[low:high], geometry=part,
+            linearisation=_water(high - low, WATER),
+        )  # fmt: skip
+
+    return apply
+
+
+def _implants() -> Scene:
+    """Two screws of titanium of 12 mm in the muscle of the back."""
+    rods = [
+        Body(f"implant_{k}", EllipticCylinder(6.0, position=(-14.0 + x, -34.0 - 85.0, 0.0)), "titanium", "muscle")
+        for k, x in enumerate((-35.0, 35.0))
+    ]
+    base = thorax()
+    return Scene([*base.bodies, *rods])
+
+
+def _zeros(views: slice, columns: slice) -> Apply:
+    def apply(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
+        counts = scan.counts.clone()
+        counts[views, columns] = 0.0
+        return replace(scan, counts=counts)
+
+    return apply
+
+
+def _logged(lines: Any, scan: Scan) -> Scan:
+    return Scan.from_line_integrals(lines, scan.geometry, mu_water=WATER)
+
+
+def _from_counts(readings: Any, scan: Scan, air: Any, **options: Any) -> Scan:
+    return Scan.from_counts(readings, scan.geometry, air=air, mu_water=WATER, **options)
+
+
+def _lines(n: Any) -> Any:
+    return np.log(PHOTONS / (n + 1.0))
+
+
+def _spoilt(value: float) -> Callable[[Any, Scan], Scan]:
+    def make(n: Any, scan: Scan) -> Scan:
+        spoilt = n.copy()
+        spoilt[np.random.default_rng(0).random(n.shape) < 0.01] = value
+        return _from_counts(spoilt, scan, PHOTONS)
+
+    return make
+
+
+def _turned(scan: Scan, angles: Any, counts: Tensor | None = None) -> Scan:
+    return replace(
+        scan, counts=scan.counts if counts is None else counts, geometry=replace(scan.geometry, angles=angles)
+    )
+
+
+_TURNED = "the object turned is another object"
+_SIZED = "an object that is larger by as much and attenuates as much less has the same line integrals"
+_SCALED = "line integrals tell attenuation, not what of it is water's"
+
+_BODY: dict[str, Case] = {
+    "sound": Case("nothing", lambda clean, scan, rng: scan),
+    # How it is described.
+    "step-small": _PLAQUE["step"],
+    "step-large": _described("steps between views 2 % too large", lambda g: replace(g, angles=1.02 * g.angles)),
+    "inclusive": _described(
+        "last view given as the first (inclusive end)",
+        lambda g: replace(g, angles=np.linspace(0, 2 * math.pi, g.views)),
+    ),
+    "direction": _described("turns the other way", lambda g: replace(g, angles=-g.angles)),
+    "start": _described("first view 10° wrong", lambda g: replace(g, angles=g.angles + math.radians(10)), _TURNED),
+    "sdd-large": replace(_PLAQUE["sdd-large"], tissues=False),
+    "sdd-small": _PLAQUE["sdd-small"],
+    "sod": _described("sod 3 % too large", lambda g: replace(g, sod=1.03 * g.sod), _SIZED),
+    "sod-sdd": _described("sod and sdd 3 % too large", lambda g: replace(g, sod=1.03 * g.sod, sdd=1.03 * g.sdd)),
+    "sdd-pitch": _described(
+        "sdd and pitch 3 % too large", lambda g: replace(g, sdd=1.03 * g.sdd, pitch=1.03 * g.pitch)
+    ),
+    "pitch": _described("pitch 3 % too large", lambda g: replace(g, pitch=1.03 * g.pitch)),
+    "curved": _described("flat detector given as curved", lambda g: replace(g, detector="curved")),
+    "centre-0.5": _described("centre wrong by 0.5 columns", lambda g: replace(g, offset=0.5 * g.pitch)),
+    "centre-2": _described("centre wrong by 2 columns", lambda g: replace(g, offset=-2.0 * g.pitch)),
+    "quarter": Case(
+        "quarter offset of the wrong sign", lambda clean, scan, rng: replace(
+            scan, counts=scan.counts.roll(1, -1), geometry=replace(scan.geometry, offset=-0.5 * scan.geometry.pitch)
+        ),
+    ),
+    "reversed": Case("columns reversed", lambda clean, scan, rng: replace(scan, counts=scan.counts.flip(-1))),
+    "swapped": Case(
+        "views and columns swapped", lambda clean, scan, rng: _turned(
+            scan, full_turn(240), scan.counts[:240].T.contiguous()
+        ),
+    ),
+    "not-square": Case(
+        "views and columns swapped, not square", _given(lambda n, s: _from_counts(n.T.copy(), s, PHOTONS))
+    ),
+    "order": Case(
+        "views in random order, angles not",
+        lambda clean, scan, rng: replace(scan, counts=scan.counts[torch.from_numpy(rng.permutation(VIEWS))]),
+    ),
+    "half-as-full": Case(
+        "half a turn given as a whole one",
+        lambda clean, scan, rng: _turned(scan, full_turn(VIEWS // 2), scan.counts[: VIEWS // 2]),
+    ),
+    "full-as-half": _described("a turn given as half a one", lambda g: replace(g, angles=g.angles / 2)),
+    "two-turns": _described("a turn given as two", lambda g: replace(g, angles=2 * g.angles)),
+    "water": Case(
+        "water's attenuation 5 % wrong",
+        lambda clean, scan, rng: replace(scan, linearisation=_water(scan.geometry.columns, 1.05 * WATER)),
+        unseen=_SCALED,
+    ),
+    # Which part of it there is.
+    "twice": Case(
+        "every view stored twice", lambda clean, scan, rng: _turned(
+            scan, scan.geometry.angles.repeat(2), scan.counts.repeat_interleave(2, 0)
+        ),
+    ),
+    "short-scan": _PLAQUE["short-scan"],
+    "short-step": Case(
+        "a short scan, steps 2 % too small", lambda clean, scan, rng: _turned(
+            scan, 0.98 * scan.geometry.angles[:240], scan.counts[:240]
+        ), 1.5**0.5,
+    ),
+    "half-turn": _PLAQUE["too-short"],
+    "gap": _PLAQUE["gap"],
+    "60-views": _views("60 views", lambda n: np.arange(0, n, 6)),
+    "cut-both": Case("cut off on both sides", _columns(0.25, 0.75)),
+    "cut-little": Case("cut off a little on both sides", _columns(0.16, 0.84)),
+    "offset": Case("a detector of three quarters", _columns(0.0, 0.75), 2**0.5),
+    "quarter-detector": Case("less than half a detector", _columns(0.0, 0.45)),
+    # What the readings are.
+    "20-photons": Case(
+        "20 photons in air", lambda clean, scan, rng: clean.with_noise(20.0 / PHOTONS, scan.seed or 0),
+        (PHOTONS / 20.0) ** 0.5,
+    ),
+    "log-as-counts": Case(
+        "line integrals given as counts", _given(lambda n, s: _from_counts(_lines(n) + 1.0, s, 10.0))
+    ),
+    "log-as-transmission": Case(
+        "line integrals given as transmissions", _given(lambda n, s: _from_counts(_lines(n).clip(0), s, 1.0))
+    ),
+    "counts-as-log": Case("counts given as line integrals", _given(lambda n, s: _logged(n, s))),
+    "transmission-as-log": Case(
+        "transmissions given as line integrals", _given(lambda n, s: _logged(n / PHOTONS, s))
+    ),
+    "transmission": Case("transmissions given as counts", _given(lambda n, s: _from_counts(n / PHOTONS, s, 1.0))),
+    "percent": Case(
+        "transmissions in per cent given as counts", _given(lambda n, s: _from_counts(100.0 * n / PHOTONS, s, 100.0))
+    ),
+    "gain": Case(
+        "a signal of 40 a photon given as counts", _given(lambda n, s: _from_counts(40.0 * n, s, 40.0 * PHOTONS))
+    ),
+    "air-twice": Case("air twice too bright", _given(lambda n, s: _from_counts(n, s, 2.0 * PHOTONS))),
+    "air-less": Case("air 10 % too dark", _given(lambda n, s: _from_counts(n, s, 0.9 * PHOTONS))),
+    "negative": Case("readings of the other sign", _given(lambda n, s: _from_counts(-n, s, PHOTONS))),
+    "nan": Case("1 % of the readings NaN", _given(_spoilt(math.nan))),
+    "inf": Case("1 % of the readings infinite", _given(_spoilt(math.inf))),
+    "dark": Case("a dark signal of 1 % left in", _expected(lambda n, air, rng: n + 0.01 * air)),
+    "scatter": _PLAQUE["scatter"],
+    "saturation": Case(
+        "saturated at half of air", _expected(lambda n, air, rng: n.clamp(max=0.5 * float(air.mean())))
+    ),
+    "pile-up": _PLAQUE["pile-up"],
+    "hardening": Case(
+        "beam hardening, not corrected",
+        _expected(lambda n, air, rng: air * torch.exp(-(p := torch.log(air / n)) + 0.015 * p**2)),
+    ),
+    "lag": _PLAQUE["lag"],
+    "rings": Case("gains of the columns off by 1 %", _expected(
+        lambda n, air, rng: n * (1 + 0.01 * torch.from_numpy(rng.standard_normal(n.shape[1])).float())
+    )),
+    "drift": _PLAQUE["gain-drift"],
+    "drift-10": Case("gain drifts by 10 %", _per_view(0.1, drift=True)),
+    "flicker": _PLAQUE["flicker"],
+    "dead-column": Case("a dead column", _zeros(slice(None), slice(112, 113))),
+    "dead-part": Case("eight columns dead for a fifth of the turn", _zeros(slice(90, 162), slice(112, 120))),
+    "dead-views": Case("three views without signal", _zeros(slice(40, 43), slice(None))),
+    "hot-column": Case(
+        "a column that reads 1.6 times too much",
+        _expected(lambda n, air, rng: n * torch.where(torch.arange(n.shape[1]) == 112, 1.6, 1.0)),
+    ),
+    "moved": Case(
+        "moved by two columns after half a turn", lambda clean, scan, rng: replace(
+            scan, counts=torch.cat([scan.counts[:180], scan.counts[180:].roll(2, -1)])
+        ),
+    ),
+    "metal": _scanned("two titanium screws of 12 mm", lambda plaque: _implants(), tissues=False),
+}  # fmt: skip
+
+CASES: dict[str, Case] = _PLAQUE | {f"body-{name}": replace(case, base="body") for name, case in _BODY.items()}
+"""Name → case. A new one needs nothing but its entry in one of the two tables."""

@@ -6,12 +6,10 @@ need be: a prior or weights that the case fools.
 
 from __future__ import annotations
 
-import logging
 import re
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -21,11 +19,10 @@ import numpy as np
 import torch
 
 from recon import reconstruct
+from recon.evaluate.execute import heard
 from recon.evaluate.store import Pieces
-from recon.study.hardcases.body import GRID, body_scan, body_truth
-from recon.study.hardcases.case import Case, untouched
-from recon.study.hardcases.cases import CASES
-from recon.study.paper.rods import rod_values
+from recon.study.hardcases.cases import CASES, GRID, Case, body_scan, body_truth, untouched
+from recon.study.paper.plaque_scan import rod_values
 from recon.study.study import Clock, Measured, Progress, StudySettings, silent
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.geometry import VolumeGrid
@@ -121,17 +118,18 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     FBP from the same scan; either is None if refused).
     """
     clock, pieces = Clock(), Pieces(folder, settings)
-    bases = _bases(settings, pieces, progress)
+    used = {CASES[name].base for name in settings.cases}
+    bases = {name: make(settings, pieces.within(name), progress) for name, make in _BASES.items() if name in used}
     clock.lap("simulate")
-    pieces.ahead(_sound_ahead, *((name, method) for name, base in bases.items() for method in _methods(base, settings)))
-    for base in bases.values():
+    pieces.ahead(_sound, *((name, method) for name, base in bases.items() for method in _methods(base, settings)))
+    for name, base in bases.items():
         for method in _methods(base, settings):
-            base.sound[method] = base.pieces(f"sound_{method}", partial(_sound, base, method))
+            _sound(settings, pieces, name, method, base)
     clock.lap("sound scans")
-    pieces.ahead(_case_ahead, *((name,) for name in settings.cases))
+    pieces.ahead(_case, *((name,) for name in settings.cases))
     rows = []
     for k, name in enumerate(settings.cases):
-        rows += _case(name, bases[CASES[name].base], settings, pieces.within(f"case_{name}"), progress)
+        rows += _case(settings, pieces, name, bases[CASES[name].base], progress)
         progress("cases", (k + 1) / len(settings.cases))
     clock.lap("cases")
     counts = Counter(row["verdict"] for row in rows)
@@ -191,25 +189,8 @@ def _body_base(settings: Settings, pieces: Pieces, progress: Progress) -> _Base:
 _BASES = {"plaque": _plaque_base, "body": _body_base}
 
 
-def _bases(settings: Settings, pieces: Pieces, progress: Progress) -> dict[str, _Base]:
-    used = {CASES[name].base for name in settings.cases}
-    return {name: make(settings, pieces.within(name), progress) for name, make in _BASES.items() if name in used}
-
-
 def _methods(base: _Base, settings: Settings) -> list[str]:
     return [m for m in settings.methods if m != "tissues" or base.plaque is not None]
-
-
-def _sound_ahead(settings: Settings, pieces: Pieces, name: str, method: str) -> None:
-    base = _BASES[name](settings, pieces.within(name), silent)
-    base.pieces(f"sound_{method}", partial(_sound, base, method))
-
-
-def _case_ahead(settings: Settings, pieces: Pieces, name: str) -> None:
-    base = _BASES[CASES[name].base](settings, pieces.within(CASES[name].base), silent)
-    for method in _methods(base, settings):
-        base.sound[method] = base.pieces(f"sound_{method}", partial(_sound, base, method))
-    _case(name, base, settings, pieces.within(f"case_{name}"), silent)
 
 
 def _reconstruct(scan: Scan, grid: VolumeGrid, method: str) -> Volume:
@@ -217,16 +198,29 @@ def _reconstruct(scan: Scan, grid: VolumeGrid, method: str) -> Volume:
     return reconstruct(scan, grid, "mbir" if method == "tissues" else method, **options)
 
 
-def _sound(base: _Base, method: str) -> tuple[torch.Tensor, list[str], float, float]:
-    with _heard() as messages:
-        volume = _reconstruct(base.noisy, base.grid, method)
-        noise = _rms(volume.data - _reconstruct(base.clean, base.grid, method).data)
-    texts = [*volume.report.get("warnings", ()), *messages]
-    return volume.data, texts, noise, _rms(volume.data - base.truth)
+def _sound(settings: Settings, pieces: Pieces, name: str, method: str, base: _Base | None = None) -> None:
+    """What a method makes of the sound scan of this name, for ``base``."""
+    base = base or _BASES[name](settings, pieces.within(name), silent)
+
+    def compute() -> tuple[torch.Tensor, list[str], float, float]:
+        with heard("recon", "torchpcct", alone=True) as messages:
+            volume = _reconstruct(base.noisy, base.grid, method)
+            noise = _rms(volume.data - _reconstruct(base.clean, base.grid, method).data)
+        texts = [*volume.report.get("warnings", ()), *messages]
+        return volume.data, texts, noise, _rms(volume.data - base.truth)
+
+    base.sound[method] = base.pieces(f"sound_{method}", compute)
 
 
-def _case(name: str, base: _Base, settings: Settings, pieces: Pieces, progress: Progress) -> list[dict[str, Any]]:
-    """A row for each method."""
+def _case(
+    settings: Settings, pieces: Pieces, name: str, base: _Base | None = None, progress: Progress = silent
+) -> list[dict[str, Any]]:
+    """A row for each method; without ``base``, its sound scan, this is computed or read first."""
+    if base is None:
+        base = _BASES[CASES[name].base](settings, pieces.within(CASES[name].base), progress)
+        for method in _methods(base, settings):
+            _sound(settings, pieces, CASES[name].base, method, base)
+    pieces = pieces.within(f"case_{name}")
     case, clean, noisy, truth = CASES[name], base.clean, base.noisy, base.truth
     seen, lost = torch.ones(base.grid.shape).bool(), case.noise
     if case.scene is not None:
@@ -267,7 +261,7 @@ def _from_truth(scan: Scan | Exception, grid: VolumeGrid, truth: torch.Tensor, s
     """Error of soft FBP against the truth, rms HU; None if it is refused."""
     if isinstance(scan, Exception):
         return None
-    with _heard():
+    with heard("recon", "torchpcct", alone=True):
         try:
             volume = reconstruct(scan, grid, "fbp", kernel="soft")
         except (ValueError, TypeError):
@@ -282,7 +276,7 @@ def _row(
     """A case by a method; ``seen``: the voxels that count, ``lost``: ``noise`` of :func:`verdict`."""
     sound, usual, noise, _ = base.sound[method]
     start = time.perf_counter()
-    with _heard() as messages:
+    with heard("recon", "torchpcct", alone=True) as messages:
         try:
             if isinstance(scan, Exception):
                 raise scan
@@ -317,29 +311,6 @@ def _kind(text: str) -> str:
 
 def _rms(difference: torch.Tensor) -> float:
     return float(difference.double().square().mean().sqrt())
-
-
-@contextmanager
-def _heard() -> Iterator[list[str]]:
-    """The warnings that are logged meanwhile; they do not reach the terminal."""
-    messages: list[str] = []
-
-    class Listener(logging.Handler):
-        def emit(self, record: logging.LogRecord) -> None:
-            messages.append(record.getMessage())
-
-    listener = Listener(logging.WARNING)
-    loggers = [logging.getLogger("recon"), logging.getLogger("torchpcct")]
-    before = [log.propagate for log in loggers]
-    for log in loggers:
-        log.addHandler(listener)
-        log.propagate = False
-    try:
-        yield messages
-    finally:
-        for log, propagate in zip(loggers, before, strict=True):
-            log.removeHandler(listener)
-            log.propagate = propagate
 
 
 def figures(measured: Measured) -> dict[str, Any]:

@@ -1,1 +1,1 @@
-"""What the paper says (``facts``); how its plaque is scanned (``plaque_scan``, ``rods``) and read (``measures``)."""
+"""What the paper says (``facts``); how its plaque is scanned and read (``plaque_scan``)."""

@@ -1,10 +1,10 @@
-"""What every study of the plaque's noise starts from: grids, ROIs, the noise-free scan and its FBP."""
+"""What the studies of the plaque share: grids, ROIs, the noise-free scan and its FBP, what is read off an image."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,23 +16,30 @@ from recon.evaluate.store import Pieces
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.placement import RoiPair, place_rois
+from torchpcct.metrics.plaque_measures import PlaqueSegmentation, basin_depth, cap_on_line, dice, segment_plaque
 from torchpcct.metrics.roi import axial_grid
 from torchpcct.scan import Scan
 from torchpcct.scanner import Scanner, presets
-from torchpcct.scene import Scene
+from torchpcct.scene import Body, EllipticCylinder, Scene
 from torchpcct.scene.plaque import Plaque
+from torchpcct.validate import number, whole
 
 __all__ = [
     "INSET_MM",
     "REFERENCE_KERNEL",
     "REFERENCE_VOXEL_MM",
     "SCANNERS",
+    "PlaqueImage",
     "PlaqueScan",
+    "RodValues",
+    "Truth",
     "duty",
     "enclosing",
     "equal_dose",
     "inset_grid",
+    "measure_plaque",
     "prepare",
+    "rod_values",
 ]
 
 INSET_MM = (11.3, 9.0, 9.0)
@@ -134,3 +141,182 @@ def enclosing(grids: list[VolumeGrid]) -> VolumeGrid:
     """One voxel as large as the largest of ``grids`` that share a centre."""
     extent = tuple(max(g.extent[a] for g in grids) for a in range(3))
     return VolumeGrid((1, 1, 1), extent, grids[0].center)
+
+
+# --- what each tissue reads ------------------------------------------------------------------------------------------
+
+
+_ROWS = 12
+"""Detector rows about the middle: more do not change what the middle slices read."""
+_LENGTH_MM = 8.0
+_READ_SLICES = 3
+_MARGIN_MM = 1.0
+"""What is read keeps this far from the rod's edge: beyond the reach of every kernel's blur."""
+
+
+@dataclass(frozen=True)
+class RodValues:
+    """True values of tissues: the HU of a rod of each at the plaque's place.
+
+    The true value of a tissue in HU is a matter of definition: it hinges on the spectrum that arrives behind the
+    patient and on the scanner's water correction. A least-squares fit of all tissues to one scan of the plaque has to
+    tell thin layers apart and moves by tens of HU with what it takes the fat for. A rod of the tissue alone, at the
+    same place in the same patient, is large enough for the plateau of its FBP image to be read directly: no fit, no
+    edges, no noise.
+
+    Measured with the paper's scanner, standard kernel: core 41.1, wall 63.5, fibrous 103.2, blood 480.0, fat −92.7 HU.
+    246 views differ from 1968 by 0.01 HU at most, voxels of 0.1 mm from those of 0.25 mm too. Rods of 3, 4 and 6 mm
+    agree within 0.03 HU but for blood with iodine, which hardens its own beam and reads 1.2 HU less per mm of diameter:
+    rods should be about as thick as the vessel. All read 3–6 HU more than ``Material.hu`` of the spectrum behind the
+    patient says: that refers to water behind fat, the scanner's correction to water alone. The soft kernel is 2 % lower
+    in rods of this size.
+
+    Attributes:
+        hu: tissue → HU.
+        flatness_hu: tissue → SD over the voxels that were read: how even the plateau is.
+    """
+
+    hu: dict[str, float]
+    flatness_hu: dict[str, float]
+
+    def contrast(self, tissue: str = "fibrous", core: str = "core") -> float:
+        """HU of ``tissue`` minus HU of ``core``."""
+        return self.hu[tissue] - self.hu[core]
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON values."""
+        return asdict(self)
+
+
+def rod_values(
+    scene: Scene,
+    scanner: Scanner,
+    position: tuple[float, ...],
+    *,
+    tissues: Mapping[str, Any] | None = None,
+    diameter_mm: float = 4.0,
+    views: int = 246,
+    kernel: str = "standard",
+    voxel_mm: float = 0.25,
+    progress: Callable[[float], None] | None = None,
+) -> RodValues:
+    """The HU of every tissue of a plaque's scene, about a second each.
+
+    Args:
+        scene: its first body is the patient, a cylinder about the scanner's axis, which stays as it is; of the others
+            only the materials count.
+        scanner: of the study; its views are thinned out to ``views``.
+        position: ``(x, y, ...)`` mm of the plaque, e.g. ``Plaque.position``.
+        tissues: name → material; None: the bodies of the scene and their materials.
+        diameter_mm: of the rods, more than 2.5 mm.
+        views: per turn, at least 8.
+        kernel, voxel_mm: of FBP.
+        progress: called with the finished fraction.
+
+    Raises:
+        ValueError: a rod that leaves the patient or is too thin to be read, an unknown material.
+    """
+    diameter = number("diameter_mm", diameter_mm, low=2.5, unit="mm")
+    voxel = number("voxel_mm", voxel_mm, positive=True, high=0.5, unit="mm")
+    g = scanner.geometry
+    count = min(whole("views", views, 8), g.views)
+    x, y = (float(v) for v in position[:2])
+    patient = scene.bodies[0]
+    materials = tissues or {body.name: body.material for body in scene.bodies}
+    # The beam is on for as long as in one view of the whole scan.
+    thinned = scanner.with_views(count)
+    device = thinned.replace(geometry=replace(thinned.geometry, rows=min(g.rows, _ROWS)))
+    region = VolumeGrid((1, 1, 1), (_LENGTH_MM + 0.5, diameter + 0.5, diameter + 0.5), (0.0, y, x))
+    across = max(1, 2 * int((diameter - 2 * _MARGIN_MM) / 2 / voxel) + 1)
+    grid = VolumeGrid((_READ_SLICES, across, across), voxel, (0.0, y, x))
+    read = _disc(grid, diameter / 2 - _MARGIN_MM)
+    shape = EllipticCylinder(diameter / 2, _LENGTH_MM / 2, position=(x, y, 0.0))
+    hu, flatness = {}, {}
+    for k, (name, material) in enumerate(materials.items()):
+        rod = Scene([replace(patient, name="patient"), Body("rod", shape, material, "patient")])
+        scan = acquire(rod, device, region=region, duty=count / g.views)
+        values = InsetFbp(scan, [grid], [kernel])(scan)[0][0].double().numpy()[read]
+        hu[str(name)], flatness[str(name)] = float(values.mean()), float(values.std())
+        if progress is not None:
+            progress((k + 1) / len(materials))
+    return RodValues(hu, flatness)
+
+
+def _disc(grid: VolumeGrid, radius: float) -> NDArray[np.bool_]:
+    y, x = (axis - c for axis, c in zip(grid.axes[1:], grid.center[1:], strict=True))
+    inside = np.hypot(y[:, None], x) <= radius + 1e-9
+    return np.broadcast_to(inside, grid.shape)
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """The plaque as it is, on the protocol's axial image through its middle.
+
+    Attributes:
+        image: the axial image, ``(1, y, x)``.
+        masks: ``"lumen"`` and ``"core"`` → ``(y, x)`` bool, where they are.
+        line: ``(y, x)`` mm of the lumen's and of the core's centre: the line on which the cap is measured.
+    """
+
+    image: VolumeGrid
+    masks: dict[str, NDArray[np.bool_]]
+    line: tuple[tuple[float, float], tuple[float, float]]
+
+    @classmethod
+    def of(cls, scene: Scene, plaque: Plaque) -> Truth:
+        """Of a scene at rest and its plaque."""
+        image = axial_grid(plaque.position[::-1])
+        labels = scene.labels(image)[0]
+        x, y, _, _ = (float(v) for v in plaque.section("lumen", 0.0))
+        lumen, core = plaque.to_scanner((x, y, 0.0)), plaque.to_scanner(plaque.core_center)
+        return cls(
+            image,
+            {name: labels == scene.index(name) for name in ("lumen", "core")},
+            ((float(lumen[1]), float(lumen[0])), (float(core[1]), float(core[0]))),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PlaqueImage:
+    """Measures of one axial image.
+
+    Attributes:
+        image: ``(y, x)`` HU.
+        segmentation: of it.
+        cap_line: cap thickness in mm on the line from the lumen's to the core's centre; NaN where there is no lumen.
+        depth: of the core's basin, HU (:func:`torchpcct.metrics.plaque_measures.basin_depth`).
+        lumen_dice, core_dice: overlap of the segmented regions with the true ones.
+    """
+
+    image: Tensor
+    segmentation: PlaqueSegmentation
+    cap_line: float
+    depth: float
+    lumen_dice: float
+    core_dice: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON values."""
+        s = self.segmentation
+        return {
+            "lumen_mm2": s.lumen_area,
+            "core_found": s.core_found,
+            "core_mm2": s.core_area,
+            "cap_line_mm": self.cap_line,
+            "lumen_dice": self.lumen_dice,
+            "core_dice": self.core_dice,
+            "basin_depth_hu": self.depth,
+        }
+
+
+def measure_plaque(image: Tensor, truth: Truth) -> PlaqueImage:
+    """Segment and measure an axial image ``(y, x)`` HU on ``truth.image``."""
+    found = segment_plaque(image, truth.image)
+    return PlaqueImage(
+        image,
+        found,
+        cap_on_line(image, truth.image, *truth.line),
+        basin_depth(image, truth.image, truth.masks["core"]),
+        dice(found.lumen, truth.masks["lumen"]),
+        dice(found.core, truth.masks["core"]),
+    )

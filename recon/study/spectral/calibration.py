@@ -6,13 +6,12 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from recon.analytic.inset import InsetFbp
 from recon.study.paper import facts as paper
-from recon.study.spectral.scan import BODIES, FAT_MM, SpectralScan, Tissues
+from recon.study.spectral.scan import BODIES, SpectralScan, Tissues
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S
 from torchpcct.scanner import Scanner, SiliconDetector, TransportedSilicon
 from torchpcct.spectral import (
@@ -147,17 +146,13 @@ def calibration_costs(s: Any, tissues: Tissues, progress: Callable[[float], None
 
 def _read(scan: SpectralScan, tissues: Tissues, images: Tensor) -> dict[str, Any]:
     """HU of the tissues and of the contrast by energy, and Dice coefficients of the tissue map."""
-    _, y, x = (a - c for a, c in zip(scan.grid.axes, scan.grid.center, strict=True))
-    middle = scan.grid.shape[0] // 2
     lumen = torch.from_numpy(scan.scene.volume_fractions(scan.grid)[scan.scene.index(BODIES["blood_iodine"])] > _PURE)
-    fat = torch.zeros(scan.grid.shape, dtype=torch.bool)
-    fat[middle - 4 : middle + 4] = torch.from_numpy(np.hypot(y[:, None], x) > FAT_MM)
     hu = {}
     for energy in SHOWN_KEV:
         volume = vmi(images, scan.basis, [energy])[0].double()
         core, fibrous = (float(roi(volume)) for roi in scan.rois.on(scan.grid))
         hu[f"{energy:g}"] = {
-            "blood": float(volume[lumen].mean()), "core": core, "fibrous": fibrous, "fat": float(volume[fat].mean()),
-            "contrast": fibrous - core,
+            "blood": float(volume[lumen].mean()), "core": core, "fibrous": fibrous,
+            "fat": float(volume[scan.fat].mean()), "contrast": fibrous - core,
         }  # fmt: skip
     return {"hu": hu, "dice": dict(zip(MMD_TISSUES, tissues.dice(images), strict=True))}

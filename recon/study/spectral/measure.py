@@ -34,7 +34,7 @@ from recon.study.figures import extent
 from recon.study.paper import facts as paper
 from recon.study.report import Check, around
 from recon.study.spectral.calibration import calibration_costs
-from recon.study.spectral.scan import FAT_MM, RULES, SpectralScan, Tissues
+from recon.study.spectral.scan import RULES, SpectralScan, Tissues
 from recon.study.study import Clock, Measured, Progress, StudySettings, silent
 from torchpcct.spectral import (
     MMD_TISSUES,
@@ -158,9 +158,9 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     done("simulate")
     noise_free = scan.fbp.images(scan.exact.line_integrals)[0][0]
     lines, volumes, data["rays"] = [], [], []
-    pieces.ahead(_noisy_ahead, *((k,) for k in range(s.realizations)))
+    pieces.ahead(_noisy, *((k,) for k in range(s.realizations)))
     for k in range(s.realizations):
-        volume, used, statistics = _noisy(scan, pieces, k)
+        volume, used, statistics = _noisy(s, pieces, k, scan)
         data["rays"].append(statistics)
         volumes.append(volume)
         lines += used
@@ -190,19 +190,17 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     return Measured(s, data, clock.seconds, Seen(scan, tissues, images))
 
 
-def _noisy(scan: SpectralScan, pieces: Pieces, k: int) -> tuple[Tensor, list[Tensor], dict[str, Any]]:
+def _noisy(
+    s: Settings, pieces: Pieces, k: int, scan: SpectralScan | None = None
+) -> tuple[Tensor, list[Tensor], dict[str, Any]]:
     """FBP of a realisation, its line integrals if MBIR needs them, and what is told of its rays."""
-    s = scan.settings
+    scan = scan or SpectralScan(s, pieces=pieces)
 
     def draw() -> tuple[Tensor, list[Tensor], dict[str, Any]]:
         noisy, statistics = scan.noisy(s.exposure_s, s.seed + k)
         return scan.fbp.images(noisy)[0][0], [noisy] if k < s.mbir_realizations else [], statistics
 
     return pieces(f"noisy_{k}", draw)
-
-
-def _noisy_ahead(settings: Settings, pieces: Pieces, k: int) -> None:
-    _noisy(SpectralScan(settings, pieces=pieces), pieces, k)
 
 
 def _curve(curve: VmiCurve) -> dict[str, Any]:
@@ -252,12 +250,8 @@ def _scores(level: float, tissues: Tissues, volumes: Sequence[Tensor] | Tensor, 
 def _at_energy(scan: SpectralScan, images: Tensor, energy: float) -> dict[str, float]:
     """ROI means, and the SD of voxels in fat, of one monochromatic image, HU."""
     hu = vmi(images, scan.basis, [energy])[0]
-    _, y, x = (a - c for a, c in zip(scan.grid.axes, scan.grid.center, strict=True))
-    far = torch.from_numpy(np.hypot(y[:, None], x) > FAT_MM)
-    middle = scan.grid.shape[0] // 2
-    fat = hu[middle - 4 : middle + 4][:, far]
     core, fibrous = (float(roi(hu)) for roi in scan.rois.on(scan.grid))
-    return {"core_hu": core, "fibrous_hu": fibrous, "fat_sd_hu": float(fat.double().std())}
+    return {"core_hu": core, "fibrous_hu": fibrous, "fat_sd_hu": float(hu[scan.fat].double().std())}
 
 
 def _mbir(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -120,6 +119,14 @@ class SpectralScan:
         """FBP of the two basis images."""
         return InsetFbp(self.clean, [self.grid], [self.settings.kernel], surround=self.surround)
 
+    @cached_property
+    def fat(self) -> Tensor:
+        """Mask ``grid.shape`` of voxels of fat, in the slices about the middle."""
+        _, y, x = (a - c for a, c in zip(self.grid.axes, self.grid.center, strict=True))
+        middle, mask = self.grid.shape[0] // 2, torch.zeros(self.grid.shape, dtype=torch.bool)
+        mask[middle - 4 : middle + 4] = torch.from_numpy(np.hypot(y[:, None], x) > FAT_MM)
+        return mask
+
     def covariance(self, exposure_s: float) -> Tensor:
         """Cramér–Rao covariance ``(3, views, rows, columns)`` in mm² of every ray."""
         return self.exact.covariance * (NOISE_FREE_EXPOSURE_S / exposure_s)
@@ -142,8 +149,7 @@ class SpectralScan:
         """
         clean, views = self.clean, slice(None, None, step)
         if step > 1:
-            geometry, counts = clean.geometry.select(views), clean.counts[:, views].contiguous()
-            clean = replace(clean, counts=counts, geometry=geometry, window=self.window.select(views))
+            clean = clean.select(views)
         scan, model = clean.with_noise(exposure_s, seed), self.model(exposure_s)
         start, spent = time.perf_counter(), time.process_time()
         found = decompose_scan(scan, model)

@@ -7,8 +7,7 @@ import torch
 from inset_operators import CENTER, HU, matrix, problem, tissue
 from refusals import refused
 
-from recon.gram.gram import Gram
-from recon.gram.positive_definite import make_definite
+from recon.gram.gram import Gram, make_definite
 from torchpcct import FanBeam, Projector, VolumeGrid
 from torchpcct.detector_window import footprint
 from torchpcct.geometry import full_turn

@@ -12,11 +12,9 @@ from small_scan import SPECTRAL_GRID as GRID
 
 from recon.analytic.inset import InsetFbp
 from recon.gram.gram import Gram
-from recon.least_squares.basis_problem import BasisProblem
-from recon.least_squares.joint import joint_pwls, mean_weights, weigh
+from recon.least_squares.basis_problem import BasisProblem, Whitening, joint_pwls, mean_weights, weigh
 from recon.least_squares.pwls import pwls
 from recon.least_squares.qggmrf import QGGMRF, quadratic
-from recon.least_squares.whitening import Whitening
 
 EDGE = QGGMRF(0.15, 100.0)
 

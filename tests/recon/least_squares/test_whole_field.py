@@ -9,9 +9,8 @@ from inset_operators import HU, dense, minimum, problem
 
 from recon.gram.gram import Gram
 from recon.least_squares import field_model
-from recon.least_squares.approach import Approach
 from recon.least_squares.field_model import FieldModel
-from recon.least_squares.pwls import data_model, pwls
+from recon.least_squares.pwls import Approach, data_model, pwls
 from recon.least_squares.qggmrf import QGGMRF, quadratic
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Projector, VolumeGrid, full_turn
 from torchpcct.vector_geometry import VectorGeometry

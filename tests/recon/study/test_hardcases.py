@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from tiny_studies import run_tiny
 
-from recon.study.hardcases.case import untouched
-from recon.study.hardcases.cases import CASES
+from recon.study.hardcases.cases import CASES, untouched
 from recon.study.hardcases.measure import verdict
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scene.plaque import plaque_scene

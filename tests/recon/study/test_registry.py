@@ -9,8 +9,9 @@ import jinja2
 import pytest
 from tiny_studies import TINY
 
+from recon.evaluate.report import templates
 from recon.study import registry
-from recon.study.report import Check, _templates, around
+from recon.study.report import TEMPLATES, Check, around
 
 
 def test_a_check_is_inside_its_closed_range_only():
@@ -47,7 +48,7 @@ def test_effects_say_what_is_modelled():
 
 def rendered(text, **data):
     """A template with what reports share."""
-    return _templates().from_string('{% import "parts.md.j2" as parts %}' + text).render(**data)
+    return templates(TEMPLATES).from_string('{% import "parts.md.j2" as parts %}' + text).render(**data)
 
 
 def test_a_missing_value_is_an_error_and_no_gap():

@@ -10,7 +10,7 @@ import torch
 from plaque_image import tissue_volume
 from tiny_studies import assert_report_is_whole
 
-from recon.study.paper.measures import Truth, measure_plaque
+from recon.study.paper.plaque_scan import Truth, measure_plaque
 from recon.study.resolution import FWHM_PER_SIGMA, blur, blur_series, crossing, limits, point_width
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.resolution import ellipsoid_distance

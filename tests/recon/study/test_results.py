@@ -39,12 +39,10 @@ def rendered(root, text):
 @pytest.mark.parametrize(
     ("text", "expected_text"),
     [
-        ("{{r: rows[m=a]/v | .1f}}× of {{r/report.json: n/k | }}", "1.2× of 200"),
-        ("{{r: plaque, mbir, 2, CNR, small | .1f}}", "1.5"),
-        ("{{r: plaque, mbir, 2, CNR, small | interval .2f}}", "1.53 [1.47, 1.59]"),
-        ("{{r: rows[m=b]/v/0 | .0f}}", "5"),
-        ("it {{r: shift ? gains | loses}} {{r: shift | abs .1f}} %", "it loses 4.6 %"),
-        ("{{r: n/k > 199 ? many | few}}, {{r: plaque, mbir, 2, CNR, small > 1.6 ? more | less}}", "many, less"),
+        ('{{ (r.rows|row(m="a")).v|f(".1f") }}× of {{ r.n.k }}', "1.2× of 200"),
+        ('{{ r|record("plaque", "mbir", 2, "CNR", "small")|f(".1f") }}', "1.5"),
+        ('{{ r|record("plaque", "mbir", 2, "CNR", "small")|interval }}', "1.53 [1.47, 1.59]"),
+        ('it {{ "gains" if r.shift > 0 else "loses" }} {{ r.shift|abs|f(".1f") }} %', "it loses 4.6 %"),
     ],
 )
 def test_fields(root, text, expected_text):
@@ -54,11 +52,11 @@ def test_fields(root, text, expected_text):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("{{x: n/k | .1f}}", "cannot read"),
-        ("{{r: n/x | .1f}}", "no /n/x"),
-        ("{{r: plaque, mbir, 3, CNR, small | .1f}}", "0 rows fit"),
-        ("{{r: rows[m=a]/m | .1f}}", "no figure that"),
-        ("{{r: rows[s=2]/v | .1f}}", "2 rows fit"),
+        ("{{ x.n.k }}", "'x' is undefined"),
+        ('{{ r.n.x|f(".1f") }}', "no attribute 'x'"),
+        ('{{ r|record("plaque", "mbir", 3, "CNR", "small")|f(".1f") }}', "0 rows have"),
+        ("{{ (r.rows|row(s=2)).v }}", "2 rows have"),
+        ('{{ (r.rows|row(m="a")).m|f(".1f") }}', "must be real number"),
         (FIRST, "once"),
     ],
 )

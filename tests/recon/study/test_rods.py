@@ -2,7 +2,7 @@
 
 import pytest
 
-from recon.study.paper.rods import rod_values
+from recon.study.paper.plaque_scan import rod_values
 from torchpcct.scanner import presets
 from torchpcct.scene.materials import MATERIALS
 from torchpcct.scene.plaque import plaque_scene
