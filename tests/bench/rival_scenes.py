@@ -32,7 +32,7 @@ from torchpcct.scene.scene import Scene, voxel_centres
 from torchpcct.volume import to_hu
 
 ROD_HU = {"fat": -92.65, "wall": 63.53, "fibrous": 103.22, "lumen": 479.97, "core": 41.07}
-"""CT numbers of 4 mm rods of each tissue at the plaque's place (:mod:`recon.study.paper.rods`)."""
+"""CT numbers of 4 mm rods of each tissue at the plaque's place (:mod:`recon.study.paper.plaque_scan`)."""
 KERNELS = ("soft", "standard", "detail")
 _X, _Y, _Z = np.eye(3)
 _H = 0.5**0.5
