@@ -175,15 +175,15 @@ def _jobs(
     kernels = tuple(k for m in everyone for k in m.kernels)
     bench = zlib.compress(execute.packed_call(executor, (task, sent, seed, kernels)))
     store, place = Store(folder / task.name), f"{task.name}/"
-    first = f"{task.name}: scan"
-    jobs = []
+    first = f"{task.name}: facts"
+    jobs, scans = [], tuple(f"{task.name}: scan, signal {s}" for s in ("present", "absent"))
     if not store.has("facts", f"1 {task.fingerprint}"):
-        jobs += [Job(f"{first}, signal {s}", _scan, (bench, s)) for s in ("present", "absent")]
-        jobs.append(Job(first, _facts, (bench,), (f"{place}facts.npz",), tuple(job.name for job in jobs)))
+        jobs += [Job(name, _scan, (bench, name.rpartition(" ")[2])) for name in scans]
+        jobs.append(Job(first, _facts, (bench,), (f"{place}facts.npz",), scans))
     for kernel in dict.fromkeys(m.kernels[0] for m in sent if m.is_fbp):
         if not store.has(f"exact_{kernel}", f"1 {task.fingerprint}"):
             name = f"{task.name}: exact noise, {kernel}"
-            jobs.append(Job(name, _exact, (bench, kernel), (f"{place}exact_{kernel}.npz",), (first,)))
+            jobs.append(Job(name, _exact, (bench, kernel), (f"{place}exact_{kernel}.npz",), scans))
     blocks = [range(start, min(start + BLOCK, n)) for start in range(0, n, BLOCK)]
     exposures = exposures or task.exposures_s
     groups = min(len(sent), -(-2 * getattr(executor, "workers", 16) // (len(blocks) * len(exposures)))) or 1
@@ -228,29 +228,34 @@ def _estimate(task: Task, methods: Sequence[Method], n: int) -> tuple[float, flo
 
 
 @lru_cache(maxsize=1)
-def _bench(folder: Path, packed: bytes) -> tuple[Draws, Reader, dict[str, Method]]:
+def _draws(folder: Path, packed: bytes) -> tuple[Draws, dict[str, Method]]:
     """What the jobs of a task share in a process."""
     task, methods, seed, kernels = pickle.loads(zlib.decompress(packed))
-    draws = Draws(task, Store(folder / task.name), seed, kernels)
-    return draws, Reader(task, task.truth(draws.facts)), {m.name: m for m in methods}
+    return Draws(task, Store(folder / task.name), seed, kernels), {m.name: m for m in methods}
 
 
 def _scan(folder: Path, bench: bytes, signal: str) -> None:
-    task = pickle.loads(zlib.decompress(bench))[0]
-    task.scan(Store(folder / task.name), signal)
+    draws = _draws(folder, bench)[0]
+    draws.task.scan(draws.store, signal)
 
 
 def _facts(folder: Path, bench: bytes) -> None:
-    _bench(folder, bench)
+    _ = _draws(folder, bench)[0].facts
 
 
 def _exact(folder: Path, bench: bytes, kernel: str) -> None:
-    _bench(folder, bench)[0].exact_covariance(kernel)
+    _draws(folder, bench)[0].exact_covariance(kernel)
+
+
+@lru_cache(maxsize=1)
+def _reader(draws: Draws) -> Reader:
+    return Reader(draws.task, draws.task.truth(draws.facts))
 
 
 def _block(folder: Path, bench: bytes, exposure: float, names: Sequence[str], k: range) -> None:
     """Pieces of methods at an exposure: of a block of realisations, or of none what is without noise."""
-    draws, reader, methods = _bench(folder, bench)
+    draws, methods = _draws(folder, bench)
+    reader = _reader(draws)
     pairs = cache(partial(_pairs, draws, exposure, k))
     for name in names:
         measurement = Measurement(methods[name], draws, reader, exposure, draws.store)
