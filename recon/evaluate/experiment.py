@@ -9,7 +9,7 @@ import zlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from functools import cache, lru_cache, partial
+from functools import cache, cached_property, lru_cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -176,14 +176,14 @@ def _jobs(
     bench = zlib.compress(execute.packed_call(executor, (task, sent, seed, kernels)))
     store, place = Store(folder / task.name), f"{task.name}/"
     first = f"{task.name}: facts"
-    jobs, scans = [], tuple(f"{task.name}: scan, signal {s}" for s in ("present", "absent"))
+    jobs, scans = [], {f"{task.name}: scan, signal {s}": s for s in ("present", "absent")}
     if not store.has("facts", f"1 {task.fingerprint}"):
-        jobs += [Job(name, _scan, (bench, name.rpartition(" ")[2])) for name in scans]
-        jobs.append(Job(first, _facts, (bench,), (f"{place}facts.npz",), scans))
+        jobs += [Job(name, _scan, (bench, signal)) for name, signal in scans.items()]
+        jobs.append(Job(first, _facts, (bench,), (f"{place}facts.npz",), tuple(scans)))
     for kernel in dict.fromkeys(m.kernels[0] for m in sent if m.is_fbp):
         if not store.has(f"exact_{kernel}", f"1 {task.fingerprint}"):
             name = f"{task.name}: exact noise, {kernel}"
-            jobs.append(Job(name, _exact, (bench, kernel), (f"{place}exact_{kernel}.npz",), scans))
+            jobs.append(Job(name, _exact, (bench, kernel), (f"{place}exact_{kernel}.npz",), tuple(scans)))
     blocks = [range(start, min(start + BLOCK, n)) for start in range(0, n, BLOCK)]
     exposures = exposures or task.exposures_s
     groups = min(len(sent), -(-2 * getattr(executor, "workers", 16) // (len(blocks) * len(exposures)))) or 1
@@ -227,38 +227,43 @@ def _estimate(task: Task, methods: Sequence[Method], n: int) -> tuple[float, flo
     return seconds + n * _DRAW_S, len(methods) * (2.0 * task.grid.voxels + 8e3 * n * (1 + len(task.scene.names)))
 
 
-@lru_cache(maxsize=1)
-def _draws(folder: Path, packed: bytes) -> tuple[Draws, dict[str, Method]]:
+class _Bench:
     """What the jobs of a task share in a process."""
-    task, methods, seed, kernels = pickle.loads(zlib.decompress(packed))
-    return Draws(task, Store(folder / task.name), seed, kernels), {m.name: m for m in methods}
+
+    def __init__(self, folder: Path, packed: bytes) -> None:
+        task, methods, seed, kernels = pickle.loads(zlib.decompress(packed))
+        self.draws = Draws(task, Store(folder / task.name), seed, kernels)
+        self.methods = {m.name: m for m in methods}
+
+    @cached_property
+    def reader(self) -> Reader:
+        """Of the task's volumes; it needs the facts."""
+        return Reader(self.draws.task, self.draws.task.truth(self.draws.facts))
 
 
-def _scan(folder: Path, bench: bytes, signal: str) -> None:
-    draws = _draws(folder, bench)[0]
+_bench = lru_cache(maxsize=1)(_Bench)
+
+
+def _scan(folder: Path, packed: bytes, signal: str) -> None:
+    draws = _bench(folder, packed).draws
     draws.task.scan(draws.store, signal)
 
 
-def _facts(folder: Path, bench: bytes) -> None:
-    _ = _draws(folder, bench)[0].facts
+def _facts(folder: Path, packed: bytes) -> None:
+    _ = _bench(folder, packed).draws.facts
 
 
-def _exact(folder: Path, bench: bytes, kernel: str) -> None:
-    _draws(folder, bench)[0].exact_covariance(kernel)
+def _exact(folder: Path, packed: bytes, kernel: str) -> None:
+    _bench(folder, packed).draws.exact_covariance(kernel)
 
 
-@lru_cache(maxsize=1)
-def _reader(draws: Draws) -> Reader:
-    return Reader(draws.task, draws.task.truth(draws.facts))
-
-
-def _block(folder: Path, bench: bytes, exposure: float, names: Sequence[str], k: range) -> None:
+def _block(folder: Path, packed: bytes, exposure: float, names: Sequence[str], k: range) -> None:
     """Pieces of methods at an exposure: of a block of realisations, or of none what is without noise."""
-    draws, methods = _draws(folder, bench)
-    reader = _reader(draws)
+    bench = _bench(folder, packed)
+    draws = bench.draws
     pairs = cache(partial(_pairs, draws, exposure, k))
     for name in names:
-        measurement = Measurement(methods[name], draws, reader, exposure, draws.store)
+        measurement = Measurement(bench.methods[name], draws, bench.reader, exposure, draws.store)
         if k:
             measurement.block(k, pairs)
 

@@ -86,7 +86,7 @@ class OutlineMbir(Mbir):
         nothing = self.in_hu(problem, torch.zeros_like(b), normal)
         drawn = torch.stack([n if image is None else image for image, n in zip(images, nothing, strict=True)])
         t = self.in_noise_units(problem, drawn, normal)
-        # Without the outlines four turns leave the noise of eight: 0.7 HU root mean square apart on the paper's plaque.
+        # Once the outlines are taken off, four turns do what eight do: 0.7 HU rms apart on the paper's plaque.
         parts = {"prior": partial(self.model.network, mirrored=False), **self.parts}
         u = t + self.model(replace(normal, beta=normal.beta - normal.apply(t)), self.fidelity, **parts)
         refused = []
