@@ -283,7 +283,8 @@ def _one(
     b = gram.ratio * _stacked(problem, projected)
     normal = NormalisedProblem.from_statistic(gram, b[None], torch.ones(1), hu, network.voxel_mm)
     scales = normal.scale_hu * gram.ratio
-    parts = {"prior": model.network, **network.parts}
+    # Its noise is known on average over directions only: along a starved one, noise would pass for structure.
+    parts = {"prior": model.network, "restore": False, **network.parts}
     prior = partial(blockwise, parts.pop("prior"), scales)
     u = model(normal, network.fidelity, prior=prior, solves=SOLVES, **parts)
     left = normal.beta - normal.apply(u)

@@ -59,7 +59,7 @@ class Mbir:
     Args:
         model: with its weights.
         fidelity: 0 (viewing) … 1 (measuring), see :mod:`recon.mbir.unrolled`.
-        parts: for ablations, ``steps``, ``final_data_consistency``, ``prior`` and ``cut_overshoot`` of
+        parts: for ablations, ``steps``, ``final_data_consistency``, ``prior``, ``cut_overshoot`` and ``restore`` of
             :meth:`recon.mbir.unrolled.Unrolled.forward`.
 
     Raises:

@@ -9,6 +9,7 @@ In the normalised problem (:mod:`recon.mbir.problem`), f in line pairs per mm:
    low-pass L of half height at f_c. Below f_c the volume is the data's own linear estimate, unbiased whatever the
    network has learned; above, the network decides.
 4. Beside strong edges overshoot is cut off (:func:`limited`), if the network has a filtered view of the data.
+5. What of the data is still no noise is put back (:mod:`recon.mbir.residual`): patterns that no training has shown.
 
 Both solves are a few conjugate gradients with the circulant H_c for H as preconditioner. (A fixed step with it is not
 safe: at the rim of the inset its eigenvalues reach 2.2.)
@@ -29,6 +30,7 @@ from torch.nn import functional as F
 from recon.conjugate_gradient import conjugate_gradient
 from recon.mbir.network import GUIDE_VOXELS, Network, NetworkConfig, edge_preserved
 from recon.mbir.problem import NormalisedProblem, filtered, squared_frequencies
+from recon.mbir.residual import significant_residual
 from torchpcct.validate import number, whole
 
 __all__ = [
@@ -104,6 +106,7 @@ class Unrolled(nn.Module):
         final_data_consistency: bool = True,
         prior: Prior | None = None,
         cut_overshoot: bool = True,
+        restore: bool = True,
         solves: tuple[int, int] | None = None,
     ) -> Tensor:
         """The reconstruction ``(batch, z, y, x)`` in noise units (times ``problem.scale_hu``: HU above background).
@@ -117,6 +120,8 @@ class Unrolled(nn.Module):
             prior: in the place of the network: block by block (:mod:`recon.mbir.field`), or for comparisons
                 (:func:`recon.mbir.network.bilateral_prior`).
             cut_overshoot: whether :func:`limited` is applied, if the network has a filtered view.
+            restore: whether what the data still hold is put back. A training does not, and a linear reconstruction
+                has no need to.
             solves: conjugate gradients of start and data consistency; None: those of an inset's model.
         """
         scale = problem.scale_hu
@@ -141,7 +146,11 @@ class Unrolled(nn.Module):
             if callback is not None:
                 callback(k + 1, v)
         u = consistent(problem, spectrum, v, fidelities, solves[1]) if final_data_consistency else v
-        return limited(u, smoothed, noise) if smoothed is not None and cut_overshoot else u
+        if smoothed is not None and cut_overshoot:
+            u = limited(u, smoothed, noise)
+        if steps == 0 or self.training or not restore:
+            return u
+        return u + significant_residual(problem, spectrum, u, _TOWARDS)
 
 
 def start(problem: NormalisedProblem, spectrum: Tensor, iterations: int = _SOLVES[0]) -> Tensor:

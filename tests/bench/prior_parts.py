@@ -74,6 +74,7 @@ USES: dict[str, Callable[[Mbir], Mbir]] = {
     "outlines, and the filtered view in place of the network": lambda n: OutlineMbir(
         Mbir(n.model, prior=bilateral_prior)
     ),
+    "outlines, nothing put back": lambda n: OutlineMbir(Mbir(n.model, restore=False)),
     "without outlines": lambda n: n,
     "without outlines, overshoot beside edges not cut off": lambda n: Mbir(n.model, cut_overshoot=False),
     "without outlines, one orientation instead of eight": _one_orientation,
