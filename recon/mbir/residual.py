@@ -99,7 +99,7 @@ def _noise(correlation: Tensor, window: Tensor) -> Tensor:
         window: of a block.
     """
     edges = window.shape
-    both = [2 * e for e in edges]
+    both = tuple(2 * e for e in edges)
     overlap = from_frequencies(torch.fft.rfftn(window, s=both).abs().square(), both)
     lags = [torch.arange(1 - e, e) for e in edges]
     at = [lag % n for lag, n in zip(lags, correlation.shape[-3:], strict=True)]
