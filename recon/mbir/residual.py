@@ -32,7 +32,9 @@ _AXES = (-3, -2, -1)
 
 
 def significant_residual(problem: NormalisedProblem, spectrum: Tensor, u: Tensor, damping: float) -> Tensor:
-    """What ``u`` lacks, ``(batch, z, y, x)``: 0 where nothing but noise is left; linear but for the choice.
+    """What ``u`` lacks, ``(batch, z, y, x)``: 0 where nothing but noise is left, and in slices smaller than a block.
+
+    It is linear but for the choice of coefficients.
 
     Args:
         problem: normalised problem.
@@ -41,6 +43,8 @@ def significant_residual(problem: NormalisedProblem, spectrum: Tensor, u: Tensor
         damping: δ of the step towards the data.
     """
     shape = u.shape[-3:]
+    if min(shape[-2:]) < _BLOCK:
+        return torch.zeros_like(u)
     inverse = 1.0 / (spectrum + damping)
     step = filtered(problem.beta - problem.apply(u), inverse)
     correlation = from_frequencies(spectrum * inverse.square(), shape)

@@ -89,9 +89,9 @@ def statistic(drawn, seen, seed, exposure_s=1.0):
 
 
 def untrained():
-    """MBIR of an untrained network: the linear start, and the data's low frequencies."""
+    """MBIR of an untrained network: the linear start, the data's low frequencies; nothing is put back."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
         model = Unrolled(NetworkConfig((6, 8, 8), 0.3), 2)
     model.seen_scale_hu = torch.tensor([1.0, 5000.0])
-    return Mbir(model)
+    return Mbir(model, restore=False)
