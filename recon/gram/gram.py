@@ -170,7 +170,7 @@ class Gram:
         """The same operator with its kernels on ``device``."""
         other = copy.copy(self)
         other._spectra, other._basis = self._spectra.to(device), self._basis.to(device)
-        other._periodic = self._periodic.to(device)
+        other._periodic, other._of_noise = self._periodic.to(device), self._of_noise.to(device)
         other._factor = None if self._factor is None else self._factor.to(device)
         return other
 

@@ -50,7 +50,8 @@ def significant_residual(problem: NormalisedProblem, spectrum: Tensor, u: Tensor
     correlation = from_frequencies(spectrum * inverse.square(), shape)
     # Slices of a stack that is thinner than a block are looked at one by one.
     edges = [_BLOCK if n >= _BLOCK else 1 for n in shape]
-    window = _outer([torch.sin(math.pi * (torch.arange(e) + 0.5) / e).to(u) for e in edges])
+    along = [torch.sin(math.pi * (torch.arange(e) + 0.5) / e).to(u) for e in edges]
+    window = along[0][:, None, None] * along[1][:, None] * along[2]
     noise = _noise(correlation, window)
     return torch.stack([_significant(v, window, n) for v, n in zip(step, noise, strict=True)])
 
@@ -114,7 +115,3 @@ def _noise(correlation: Tensor, window: Tensor) -> Tensor:
         phase = torch.exp(-2j * math.pi / e * torch.outer(torch.arange(e), lag)).to(product.device)
         product = torch.movedim(torch.tensordot(product.to(phase.dtype), phase, ([axis + 1], [1])), -1, axis + 1)
     return product.real[..., : edges[2] // 2 + 1].clamp_min(torch.finfo(correlation.dtype).tiny)
-
-
-def _outer(windows: list[Tensor]) -> Tensor:
-    return windows[0][:, None, None] * windows[1][:, None] * windows[2]

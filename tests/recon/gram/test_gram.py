@@ -144,6 +144,12 @@ def test_noise_has_the_covariance_of_the_data(inset):
         assert variance == pytest.approx(expected, rel=5 * math.sqrt(2 / n) + 0.03)
 
 
+def test_all_of_it_moves_to_another_device(inset):
+    moved = inset[2].to("meta")
+    held = {name: v.device.type for name, v in vars(moved).items() if isinstance(v, torch.Tensor)}
+    assert set(held.values()) == {"meta"}, held
+
+
 def test_nearly_zero_weights():
     """Weights of 1e-12: the same operator, scaled; single precision does not underflow."""
     A, w = problem(views=60, shape=(4, 9, 9))

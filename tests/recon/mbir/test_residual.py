@@ -78,6 +78,12 @@ def test_a_thin_stack_is_looked_at_slice_by_slice():
     assert float(found(p).abs().max()) > 0.0
 
 
+def test_slices_smaller_than_a_block_hold_no_pattern():
+    A, w = problem(shape=(18, 12, 24), rows=20)
+    p = left(Gram(A, w, nodes=1), bars((18, 12, 24), 5000.0), 0.0)
+    assert not found(p).any()
+
+
 def test_it_is_differentiable(gram):
     p = left(gram, bars(SHAPE, 40.0), 1.0)
     beta = p.beta.clone().requires_grad_(True)
