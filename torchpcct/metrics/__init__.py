@@ -25,13 +25,7 @@ from torchpcct.metrics.observer import (
 )
 from torchpcct.metrics.plaque_measures import lumen_area
 from torchpcct.metrics.residual_test import ResidualTest, residual_test
-from torchpcct.metrics.resolution import (
-    TransferFunction,
-    edge_profile,
-    edge_width,
-    ellipsoid_distance,
-    task_transfer,
-)
+from torchpcct.metrics.resolution import TransferFunction, edge_profile, ellipsoid_distance, task_transfer
 
 __all__ = [
     "Ceiling",
@@ -55,7 +49,6 @@ __all__ = [
     "d_prime",
     "dog_channels",
     "edge_profile",
-    "edge_width",
     "ellipsoid_distance",
     "hotelling_scores",
     "information_matrix",

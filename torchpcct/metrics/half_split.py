@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchpcct.metrics.resolution import first_below
 from torchpcct.scan import Scan
-from torchpcct.validate import checked, choice, whole
+from torchpcct.validate import checked
 from torchpcct.vector_geometry import VectorGeometry
 
 __all__ = ["HalfSplit", "half_split", "halves"]
@@ -153,48 +153,38 @@ def _rings(values: Tensor) -> Tensor:
 
 
 @checked
-def halves(scan: Scan, how: str = "views", seed: int = 0) -> tuple[Scan, Scan]:
-    """Two scans of one.
+def halves(scan: Scan) -> tuple[Scan, Scan]:
+    """Two scans of one: every other view, in the order of their angles.
 
     Args:
         scan: a noisy scan of the whole detector.
-        how: ``"views"``: every other view, in the order of their angles. ``"counts"``: every photon goes to one of the
-            two by the toss of a coin, so that both are Poisson, independent, and see all views (needs whole counts).
-        seed: of the tosses.
 
     Raises:
-        ValueError: a noise-free or windowed scan, fewer than two views, counts that are not whole numbers.
+        ValueError: a noise-free or windowed scan, fewer than two views.
     """
-    choice("how", how, ("views", "counts"))
     if scan.noise_free:
         raise ValueError("a noise-free scan has no noise to measure: draw it with with_noise")
     if scan.window is not None:
         raise ValueError("halves of a windowed scan are not provided: acquire it without region")
-    if how == "views":
-        angles = scan.geometry.angles
-        if isinstance(scan.geometry, VectorGeometry):  # known but for whole turns, and those of a helix differ
-            angles = np.unwrap(angles)
-        order = np.argsort(angles, kind="stable")
-        if order.size < 2:
-            raise ValueError("one view cannot be split")
-        return scan.select(np.sort(order[::2])), scan.select(np.sort(order[1::2]))
-    if not scan.counting or scan.logged or bool((scan.counts != scan.counts.round()).any()):
-        raise ValueError('photons can be split only where counts are whole numbers: use how="views"')
-    generator = torch.Generator().manual_seed(whole("seed", seed, low=0))
-    one = torch.binomial(scan.counts, torch.full_like(scan.counts, 0.5), generator=generator)
-    return tuple(replace(scan, counts=c, air=scan.air / 2) for c in (one, scan.counts - one))  # type: ignore[return-value]
+    angles = scan.geometry.angles
+    if isinstance(scan.geometry, VectorGeometry):  # known but for whole turns, and those of a helix differ
+        angles = np.unwrap(angles)
+    order = np.argsort(angles, kind="stable")
+    if order.size < 2:
+        raise ValueError("one view cannot be split")
+    return scan.select(np.sort(order[::2])), scan.select(np.sort(order[1::2]))
 
 
 @checked
-def half_split(scan: Scan, reconstruct: Callable[[Scan], Tensor], how: str = "views", seed: int = 0) -> HalfSplit:
+def half_split(scan: Scan, reconstruct: Callable[[Scan], Tensor]) -> HalfSplit:
     """Reconstruct both halves of a scan by one method.
 
     Args:
-        scan, how, seed: of :func:`halves`.
+        scan: of :func:`halves`.
         reconstruct: of a scan to its volume, e.g. ``lambda s: recon.reconstruct(s, grid, "fbp").data``.
 
     Raises:
         ValueError: as :func:`halves`.
     """
-    first, second = halves(scan, how, seed)
+    first, second = halves(scan)
     return HalfSplit(reconstruct(first), reconstruct(second))

@@ -114,20 +114,15 @@ def channel_responses(images: ArrayLike, channels: ArrayLike) -> Floats:
 
 
 @checked
-def hotelling_scores(
-    present: ArrayLike, absent: ArrayLike, *, known_means: tuple[Any, Any] | None = None, train: int | None = None
-) -> tuple[Floats, Floats]:
-    """Decision variables of the Hotelling observer on pairs that it was not trained on.
+def hotelling_scores(present: ArrayLike, absent: ArrayLike) -> tuple[Floats, Floats]:
+    """Decision variables of the Hotelling observer, each pair scored by an observer trained on all others.
 
     Args:
         present, absent: ``(n, channels)`` responses; pair k has one noise seed.
-        known_means: expected responses ``(present, absent)``, each ``(channels,)``; for FBP those of the noise-free
-            reconstructions. None: the means of the training pairs.
-        train: train on the first ``train`` pairs and score the others; None: leave each pair out in turn.
 
     Returns:
-        scores of present and absent, ``(n,)`` each (``(n − train,)`` with a split), scaled to the observer's own
-        d′ units: the expected difference of a trained observer is its d′².
+        scores of present and absent, ``(n,)`` each, scaled to the observer's own d′ units: the expected difference of a
+        trained observer is its d′².
 
     Raises:
         ValueError: wrong shapes, too few training pairs for the channels, channels that are linearly dependent.
@@ -136,32 +131,18 @@ def hotelling_scores(
     if a.ndim != 2 or a.shape != b.shape:
         raise ValueError(f"present and absent must be (n, channels) pairs, got {a.shape} and {b.shape}")
     n, c = a.shape
-    used = n - 1 if train is None else int(train)
-    if train is not None and not 0 < used < n - 1:
-        raise ValueError(f"train must leave at least 2 of the {n} pairs for testing, got {train}")
-    if 2 * used - 2 < 2 * c:
+    used = n - 1
+    if used <= c:
         raise ValueError(f"{used} training pairs are too few for {c} channels: use at least {c + 1}, or fewer channels")
-    if known_means is not None:
-        means = [np.asarray(m, dtype=np.float64) for m in known_means]
-        if len(means) != 2 or any(m.shape != (c,) for m in means):
-            raise ValueError(f"known_means must be two arrays ({c},), got {[m.shape for m in means]}")
-    else:
-        means = [x[:train].mean(0) for x in (a, b)]
-    da, db = (x[:train] - m for x, m in zip((a, b), means, strict=True))
-    scatter = da.T @ da + db.T @ db
-    if train is None:
-        own = [d[:, :, None] * d[:, None] for d in (da, db)]
-        # About the mean of the others the scatter is S − n / (n − 1) d dᵀ.
-        scatter = scatter - (own[0] + own[1]) * n / used if known_means is None else scatter - own[0] - own[1]
-        if known_means is None:
-            means = [(x.sum(0) - x) / used for x in (a, b)]
-    difference = np.broadcast_to(means[0] - means[1], scatter.shape[:-1])
-    w = _templates(scatter / (2 * used - (0 if known_means is not None else 2)), difference)
+    da, db = a - a.mean(0), b - b.mean(0)
+    own = [d[:, :, None] * d[:, None] for d in (da, db)]
+    # About the mean of the others the scatter is S − n / (n − 1) d dᵀ.
+    scatter = da.T @ da + db.T @ db - (own[0] + own[1]) * n / used
+    means = [(x.sum(0) - x) / used for x in (a, b)]
+    w = _templates(scatter / (2 * used - 2), means[0] - means[1])
     # Scores from the middle of the two classes: the threshold 0 is that of the trained observer.
-    middle: Any = 0.0 if known_means is not None else (means[0] + means[1]) / 2
-    if train is None:
-        return ((a - middle) * w).sum(1), ((b - middle) * w).sum(1)
-    return (a[used:] - middle) @ w, (b[used:] - middle) @ w
+    middle = (means[0] + means[1]) / 2
+    return ((a - middle) * w).sum(1), ((b - middle) * w).sum(1)
 
 
 def _templates(scatter: Any, difference: Any) -> Floats:
@@ -185,24 +166,23 @@ def _pair(present: Any, absent: Any) -> tuple[Floats, Floats]:
 
 
 @checked
-def auc(present: ArrayLike, absent: ArrayLike, *, paired: bool = True, level: float = 0.95) -> Estimate:
+def auc(present: ArrayLike, absent: ArrayLike, *, level: float = 0.95) -> Estimate:
     """Area under the ROC curve (Wilcoxon) with an interval on the logit scale.
 
-    The variance is DeLong's; with ``paired`` each pair of one noise seed is one sampling unit (Obuchowski 1997), which
-    counts the correlation between its two scores. Scores that are parted perfectly have no measured variance: then the
+    The variance is DeLong's; each pair of one noise seed is one sampling unit (Obuchowski 1997), which counts the
+    correlation between its two scores. Scores that are parted perfectly have no measured variance: then the
     lower bound is that of n successes in n trials, (α / 2)^(1 / n).
 
     Args:
-        present, absent: scores; equally many when paired.
-        paired: pair k of both has the same noise seed.
+        present, absent: ``(n,)`` scores; pair k has one noise seed.
         level: coverage.
 
     Raises:
-        ValueError: fewer than 2 scores, NaN or Inf, unequal numbers when paired, a level outside (0, 1).
+        ValueError: fewer than 2 scores, NaN or Inf, unequal numbers, a level outside (0, 1).
     """
     a, b = _pair(present, absent)
-    if paired and a.size != b.size:
-        raise ValueError(f"paired scores must be equally many, got {a.size} and {b.size}: set paired=False")
+    if a.size != b.size:
+        raise ValueError(f"present and absent must be pairs, got {a.size} and {b.size} scores")
     coverage("level", level)
 
     def beaten(scores: Floats, by: Floats) -> Floats:
@@ -212,12 +192,9 @@ def auc(present: ArrayLike, absent: ArrayLike, *, paired: bool = True, level: fl
     v10, v01 = beaten(b, a), 1.0 - beaten(a, b)
     area = float(v10.mean())
     if area in (0.0, 1.0):
-        bound = ((1 - level) / 2) ** (1.0 / min(a.size, b.size))
+        bound = ((1 - level) / 2) ** (1.0 / a.size)
         return Estimate(area, bound, 1.0) if area == 1.0 else Estimate(area, 0.0, 1.0 - bound)
-    if paired:
-        variance = float((v10 + v01).var(ddof=1)) / a.size
-    else:
-        variance = float(v10.var(ddof=1) / a.size + v01.var(ddof=1) / b.size)
+    variance = float((v10 + v01).var(ddof=1)) / a.size
     half = ndtri(0.5 + level / 2) * math.sqrt(variance) / (area * (1 - area))
     return Estimate(area, float(expit(logit(area) - half)), float(expit(logit(area) + half)))
 
@@ -259,27 +236,12 @@ class ObserverResult(NamedTuple):
 
 
 @checked
-def observe(
-    present: ArrayLike,
-    absent: ArrayLike,
-    channels: ArrayLike,
-    *,
-    known_means: tuple[Any, Any] | None = None,
-    train: int | None = None,
-    level: float = 0.95,
-    seed: int = 0,
-) -> ObserverResult:
+def observe(present: ArrayLike, absent: ArrayLike, channels: ArrayLike) -> ObserverResult:
     """Channelised Hotelling observer on images.
 
     Args:
         present, absent: ``(n, ...)`` images or volumes in HU; pair k has one noise seed.
         channels: ``(c, ...)``, e.g. of :func:`dog_channels`.
-        known_means: expected images ``(present, absent)``; None: estimated.
-        train, level, seed: as in :func:`hotelling_scores`, :func:`auc` and :func:`d_prime`.
     """
-    responses = [channel_responses(x, channels) for x in (present, absent)]
-    means = None
-    if known_means is not None:
-        means = tuple(channel_responses(as_array(m)[None], channels)[0] for m in known_means)
-    s1, s0 = hotelling_scores(*responses, known_means=means, train=train)
-    return ObserverResult(auc(s1, s0, level=level), d_prime(s1, s0, level=level, seed=seed), s1, s0)
+    s1, s0 = hotelling_scores(*(channel_responses(x, channels) for x in (present, absent)))
+    return ObserverResult(auc(s1, s0), d_prime(s1, s0), s1, s0)

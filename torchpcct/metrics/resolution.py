@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,7 +22,6 @@ from torchpcct.validate import checked
 __all__ = [
     "TransferFunction",
     "edge_profile",
-    "edge_width",
     "ellipsoid_distance",
     "first_below",
     "task_transfer",
@@ -33,16 +31,13 @@ Floats = NDArray[np.float64]
 
 
 @checked
-def ellipsoid_distance(
-    grid: VolumeGrid, center: tuple[float, ...], semi_axes: tuple[float, ...], rotation: ArrayLike | None = None
-) -> Floats:
+def ellipsoid_distance(grid: VolumeGrid, center: tuple[float, ...], semi_axes: tuple[float, ...]) -> Floats:
     """Signed distance of every voxel centre from an ellipse or ellipsoid, negative inside.
 
     Args:
         grid: ``(y, x)`` or ``(z, y, x)``.
         center: mm, in the order of the grid's axes.
         semi_axes: mm, in the order of the grid's axes; ``inf`` on at most all but one: a cylinder or a plane pair.
-        rotation: ``(d, d)`` columns: the body's axes in the order of the grid's axes; None: along them.
 
     Returns:
         ``grid.shape`` float64 in mm, exact to 1e-9 of the semi-axes (bisection).
@@ -57,8 +52,6 @@ def ellipsoid_distance(
     if not (axes > 0).all() or not np.isfinite(axes).any():
         raise ValueError(f"semi_axes must be positive and not all infinite, got {semi_axes!r}")
     points = np.stack(np.meshgrid(*grid.axes, indexing="ij"), axis=-1).reshape(-1, d) - np.asarray(center, dtype=float)
-    if rotation is not None:
-        points = points @ np.asarray(rotation, dtype=np.float64)
     bounded = np.isfinite(axes)
     y, e = np.abs(points[:, bounded]), axes[bounded]
     inside = np.square(y / e).sum(-1) < 1
@@ -80,7 +73,7 @@ def ellipsoid_distance(
 
 @checked
 def edge_profile(
-    image: ArrayLike, distance: ArrayLike, reach: tuple[float, float], bin_mm: float, mask: Any = None
+    image: ArrayLike, distance: ArrayLike, reach: tuple[float, float], bin_mm: float
 ) -> tuple[Floats, Floats]:
     """Edge-spread function on equidistant positions.
 
@@ -89,7 +82,6 @@ def edge_profile(
         distance: signed distance of every voxel from the surface in mm, same shape.
         reach: how far inside and outside the surface, mm, both positive: not beyond the next edge.
         bin_mm: width of a bin of distances; a fifth of a voxel or more, so that most bins are filled.
-        mask: bool, voxels to use (a part of the surface); None: all.
 
     Returns:
         positions (bin centres from −reach[0] to reach[1]) in mm and ESF in HU. A bin's mean is moved to its centre by
@@ -99,16 +91,14 @@ def edge_profile(
         ValueError: shapes that differ, a bin or reach that is not positive, more empty than filled bins, NaN or Inf.
     """
     x, r = as_array(image), as_array(distance)
-    if x.shape != r.shape or (mask is not None and np.shape(mask) != x.shape):
-        raise ValueError(f"image, distance and mask must have the same shape, got {x.shape} and {r.shape}")
+    if x.shape != r.shape:
+        raise ValueError(f"image and distance must have the same shape, got {x.shape} and {r.shape}")
     if not (bin_mm > 0 and reach[0] > 0 and reach[1] > 0):
         raise ValueError(f"bin_mm and reach must be greater than 0 mm, got {bin_mm} and {reach}")
     count = round((reach[0] + reach[1]) / bin_mm)
     if count < 8:
         raise ValueError(f"reach {reach} mm holds {count} bins of {bin_mm} mm, at least 8 are needed: use finer bins")
     use = (r >= -reach[0]) & (r < -reach[0] + count * bin_mm)
-    if mask is not None:
-        use &= np.asarray(mask, dtype=bool)
     r, x = r[use].astype(np.float64), x[use].astype(np.float64)
     if not np.isfinite(x).all():
         raise ValueError("image holds NaN or Inf near the edge: check the reconstruction")
@@ -116,7 +106,7 @@ def edge_profile(
     number = np.bincount(index, minlength=count)
     filled = number > 0
     if 2 * filled.sum() < count:
-        raise ValueError(f"{count - filled.sum()} of {count} bins are empty: widen bin_mm ({bin_mm} mm) or the mask")
+        raise ValueError(f"{count - filled.sum()} of {count} bins are empty: widen bin_mm ({bin_mm} mm)")
     mean_r = np.bincount(index, r, count)[filled] / number[filled]
     mean_x = np.bincount(index, x, count)[filled] / number[filled]
     positions = -float(reach[0]) + (np.arange(count, dtype=np.float64) + 0.5) * float(bin_mm)
@@ -132,40 +122,6 @@ def first_below(x: Floats, values: Floats, level: float, never: float) -> float:
     if k == 0:
         return float(x[0])
     return float(x[k - 1] + (values[k - 1] - level) / (values[k - 1] - values[k]) * (x[k] - x[k - 1]))
-
-
-@checked
-def edge_width(
-    positions: ArrayLike, profile: ArrayLike, low: float = 0.1, high: float = 0.9, plateau: int = 3
-) -> float:
-    """Distance in mm over which an edge goes from ``low`` to ``high`` of its step.
-
-    Args:
-        positions, profile: of :func:`edge_profile`.
-        low, high: fractions of the step.
-        plateau: samples at each end whose mean is the plateau.
-
-    Raises:
-        ValueError: an edge without a step, or one that does not cross both levels.
-    """
-    r, x = np.asarray(positions, dtype=np.float64), np.asarray(profile, dtype=np.float64)
-    if r.ndim != 1 or r.shape != x.shape or r.size < 2 * plateau + 2:
-        raise ValueError(f"positions and profile must be two 1-D arrays of at least {2 * plateau + 2} samples")
-    if not 0 < low < high < 1:
-        raise ValueError(f"levels must satisfy 0 < low < high < 1, got {low} and {high}")
-    start, end = x[:plateau].mean(), x[-plateau:].mean()
-    if start == end:
-        raise ValueError("the profile has no step: both plateaus are equal")
-    step = (x - start) / (end - start)
-    # From the middle outwards: noise on the plateaus must not count as a crossing.
-    middle = int(np.flatnonzero(step >= 0.5)[0])
-    under, over = np.flatnonzero(step[:middle] <= low), np.flatnonzero(step[middle:] >= high) + middle
-    if not under.size or not over.size or over[0] == 0:
-        raise ValueError(f"the profile does not cross {low} and {high} of its step: widen the reach")
-    a, b = int(under[-1]), int(over[0])
-    first = r[a] + (low - step[a]) / (step[a + 1] - step[a]) * (r[a + 1] - r[a])
-    last = r[b - 1] + (high - step[b - 1]) / (step[b] - step[b - 1]) * (r[b] - r[b - 1])
-    return float(last - first)
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,38 +150,21 @@ class TransferFunction:
         """Frequency of half the contrast, cycles per mm."""
         return self.frequency(0.5)
 
-    @property
-    def f10(self) -> float:
-        """Frequency of a tenth of the contrast, cycles per mm."""
-        return self.frequency(0.1)
-
-    @property
-    def contrast(self) -> float:
-        """Step from the inner to the outer end of the profile, HU."""
-        return float(self.profile[-1] - self.profile[0])
-
-    @property
-    def edge_width(self) -> float:
-        """10–90 % width in mm."""
-        return edge_width(self.positions, self.profile)
-
 
 @checked
-def task_transfer(
-    image: ArrayLike, distance: ArrayLike, reach: tuple[float, float], bin_mm: float, mask: Any = None
-) -> TransferFunction:
+def task_transfer(image: ArrayLike, distance: ArrayLike, reach: tuple[float, float], bin_mm: float) -> TransferFunction:
     """Task transfer function from the ensemble mean of an edge.
 
     The bins' width and the difference of neighbouring bins each multiply the spectrum by sinc(f · bin); both are
     divided out, and frequencies up to half the bins' Nyquist frequency are returned.
 
     Args:
-        image, distance, reach, bin_mm, mask: as in :func:`edge_profile`.
+        image, distance, reach, bin_mm: as in :func:`edge_profile`.
 
     Raises:
         ValueError: as in :func:`edge_profile`; an edge without contrast.
     """
-    positions, profile = edge_profile(image, distance, reach, bin_mm, mask)
+    positions, profile = edge_profile(image, distance, reach, bin_mm)
     spread = np.diff(profile)
     total = float(spread.sum())
     if total == 0:

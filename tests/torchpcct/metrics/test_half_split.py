@@ -31,20 +31,13 @@ def fbp(scan):
 def test_the_noise_is_that_of_repeated_scans():
     """SD of 576 voxels (about 60 independent) from 5 scans each: standard error 6 %."""
     truth = float(torch.stack([fbp(draw(seed)) for seed in range(8)]).var(0).mean().sqrt())
-    for how in ("views", "counts"):
-        found = [half_split(draw(100 + seed), fbp, how, seed).noise() for seed in range(5)]
-        assert math.sqrt(np.mean(np.square(found))) == pytest.approx(truth, rel=0.15)
+    found = [half_split(draw(100 + seed), fbp).noise() for seed in range(5)]
+    assert math.sqrt(np.mean(np.square(found))) == pytest.approx(truth, rel=0.15)
 
 
-def test_halves_of_counts_add_up_and_are_independent():
+def test_halves_are_every_other_view():
     scan = draw(0)
-    a, b = halves(scan, "counts", 3)
-    assert torch.equal(a.counts + b.counts, scan.counts)
-    assert torch.equal(a.air * 2, scan.air)
-    expected = 1000.0 * torch.from_numpy(np.exp(-LINES)).float()
-    noise = [(h.counts - expected) / expected.sqrt() for h in (a, b)]
-    assert abs(float((noise[0] * noise[1]).mean())) < 5 / math.sqrt(scan.counts.numel())
-    views = halves(scan, "views")
+    views = halves(scan)
     assert [h.geometry.views for h in views] == [120, 120]
     assert torch.equal(views[1].counts, scan.counts[1::2])
 
@@ -94,10 +87,6 @@ def test_the_transfer_is_the_blur_whatever_the_noise():
 
 def test_what_cannot_be_split_is_refused():
     lines = Scan.from_line_integrals(LINES, GEOMETRY, photons=1e4)
-    with pytest.raises(ValueError, match='use how="views"'):
-        halves(lines, "counts")
     assert halves(lines)[0].logged
-    with pytest.raises(ValueError, match="unknown how"):
-        halves(draw(0), "rows")
     with pytest.raises(ValueError, match="two voxels"):
         HalfSplit(torch.zeros(3, 3), torch.zeros(3, 3)).noise(np.eye(3) > 2)

@@ -5,17 +5,10 @@ import math
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.special import erf
 
 from torchpcct import VolumeGrid
-from torchpcct.metrics import (
-    edge_profile,
-    edge_width,
-    ellipsoid_distance,
-    task_transfer,
-)
+from torchpcct.metrics import edge_profile, ellipsoid_distance, task_transfer
 
 GRID = VolumeGrid((120, 120), 0.1, (3.0, -2.0))
 DISK = ellipsoid_distance(GRID, (3.03, -1.98), (4.0, 4.0))
@@ -36,34 +29,13 @@ def test_gaussian_disk(sigma, contrast):
     use = expected > 0.02
     np.testing.assert_allclose(edge.values[use], expected[use], atol=0.01)
     assert edge.values[0] == pytest.approx(1)
-    assert edge.contrast == pytest.approx(contrast, rel=1e-6)
     assert edge.f50 == pytest.approx(math.sqrt(math.log(2) / 2) / (math.pi * sigma), rel=0.01)
-    assert edge.f10 == pytest.approx(math.sqrt(math.log(10) / 2) / (math.pi * sigma), rel=0.02)
-    assert edge.edge_width == pytest.approx(2 * 1.28155 * sigma, rel=0.01)
+    assert edge.frequency(0.1) == pytest.approx(math.sqrt(math.log(10) / 2) / (math.pi * sigma), rel=0.02)
 
 
 def test_bins_do_not_blur():
     f50 = [task_transfer(blurred(DISK, 0.2), DISK, (1.4, 1.4), width).f50 for width in (0.02, 0.1)]
     assert f50[1] == pytest.approx(f50[0], rel=0.01)
-
-
-def test_part_of_a_surface():
-    """A neighbour with another contrast does not count where the mask leaves it out."""
-    image = blurred(DISK, 0.2)
-    y = GRID.axes[0][:, None] + np.zeros(GRID.shape)
-    spoilt = np.where(y > 5.0, 500.0, image)
-    part = task_transfer(spoilt, DISK, (1.5, 1.5), 0.03, mask=y < 5.0)
-    assert part.f50 == pytest.approx(task_transfer(image, DISK, (1.5, 1.5), 0.03).f50, rel=0.01)
-    assert task_transfer(spoilt, DISK, (1.5, 1.5), 0.03).profile[-1] > 110
-
-
-@settings(max_examples=25, deadline=None)
-@given(st.floats(0.1, 0.4), st.floats(-200, 200), st.floats(5, 500))
-def test_edge_width_of_a_profile(sigma, offset, contrast):
-    r = np.linspace(-2, 2, 200)
-    width = edge_width(r, offset + contrast * blurred(r, sigma, 0, 1))
-    assert width == pytest.approx(2.56310 * sigma, rel=0.01)
-    assert edge_width(r, offset - contrast * blurred(r, sigma, 0, 1)) == pytest.approx(width, rel=1e-6)
 
 
 @pytest.mark.parametrize("axes", [(0.6, 0.985, 0.985), (1.0, 0.3, 2.0), (1.0, 1.0, 1.0), (math.inf, 0.5, 1.5)])
@@ -77,14 +49,12 @@ def test_distance_from_an_ellipsoid(axes):
     surface = e * n
     normal = n / e
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    rotation = np.linalg.qr(rng.standard_normal((3, 3)))[0]
     for step in (-0.04, 0.0, 0.3, 2.0):
         for point in surface + step * normal:
             p = np.full(3, 7.0)
             p[bounded] = point
-            place = rotation @ p + [1.0, 2.0, 3.0]
-            one = VolumeGrid((1, 1, 1), 1.0, tuple(place))
-            got = ellipsoid_distance(one, (1.0, 2.0, 3.0), axes, rotation)
+            one = VolumeGrid((1, 1, 1), 1.0, tuple(np.add(p, (1.0, 2.0, 3.0))))
+            got = ellipsoid_distance(one, (1.0, 2.0, 3.0), axes)
             assert got.item() == pytest.approx(step, abs=1e-9)
 
 
@@ -105,11 +75,8 @@ def test_distance_at_the_centre_and_on_symmetry_planes():
         (lambda: edge_profile(DISK, DISK, (1, 1), 0.0), "bin_mm"),
         (lambda: edge_profile(DISK, DISK, (0.1, 0.1), 0.1), "at least 8"),
         (lambda: edge_profile(DISK * np.nan, DISK, (1, 1), 0.1), "NaN"),
-        (lambda: edge_profile(DISK, DISK, (1, 1), 0.1, mask=DISK > 5), "empty"),
+        (lambda: edge_profile(DISK, DISK, (0.1, 0.1), 1e-4), "empty"),
         (lambda: task_transfer(0 * DISK, DISK, (1, 1), 0.1), "no contrast"),
-        (lambda: edge_width(np.arange(20.0), np.ones(20)), "no step"),
-        (lambda: edge_width(np.arange(4.0), np.arange(4.0)), "at least 8"),
-        (lambda: edge_width(np.arange(20.0), np.arange(20.0), 0.9, 0.1), "levels"),
         (lambda: task_transfer(DISK, DISK, (1, 1), 0.1).frequency(1.0), "level"),
         (lambda: ellipsoid_distance(GRID, (0.0, 0.0, 0.0), (1.0, 1.0)), "one per axis"),
         (lambda: ellipsoid_distance(GRID, (0.0, 0.0), (1.0, 0.0)), "positive"),
