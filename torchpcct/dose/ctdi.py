@@ -3,7 +3,7 @@
     CTDI_w = 1/3 · central + 2/3 · mean of the peripheral bores  (IEC 60601-2-44)
 
 Dose is that of the bore's own filling (the plaque study: water) and not the air kerma that a pencil chamber reads; for
-the latter fill the bores with ``"air"``.
+the latter give a ``phantom`` whose bores hold air.
 """
 
 from __future__ import annotations

@@ -27,9 +27,8 @@ _LARGE_CM = (
     1.363, 2.157, 3.013, 3.2756, 3.4318, 3.4967, 3.564, 3.712
 )  # fmt: skip
 
-ROI_THICKNESS_MM = 39.0
-ROI_DIAMETER_MM = 100.0
-ROI_DISTANCE_MM = 263.0
+ROI_THICKNESS_MM, ROI_DIAMETER_MM, ROI_DISTANCE_MM = 39.0, 100.0, 263.0
+"""Published: thickness of the part that blocks, diameter of the region, distance of the filter from the isocentre."""
 ROI_RAMP_MM = 15.0
 """Inferred width of the ramp of the region-of-interest bowtie, measured where the bowtie stands. It is not published; a
 gradual slope is, and 52 % less dose in the peripheral bores of a 32 cm phantom. Widths of 0, 15 and 30 mm give 56, 51
@@ -90,44 +89,25 @@ def large_bowtie() -> Bowtie:
 
 
 @checked
-def roi_bowtie(
-    sod: float,
-    diameter_mm: float = ROI_DIAMETER_MM,
-    thickness_mm: float = ROI_THICKNESS_MM,
-    distance_mm: float = ROI_DISTANCE_MM,
-    ramp_mm: float = ROI_RAMP_MM,
-    material: Material | None = None,
-) -> Bowtie:
-    """A bowtie that spares a centred region of interest and blocks the rest (Li et al., dose study).
+def roi_bowtie(sod: float) -> Bowtie:
+    """A bowtie of aluminium that spares a centred region of interest and blocks the rest (Li et al., dose study).
 
-    Nothing in the way of rays that cross the disc of ``diameter_mm`` about the isocentre, ``thickness_mm`` outside,
-    and a smooth ramp of lateral width ``ramp_mm`` between, where the filter stands.
+    Nothing in the way of rays that cross the region about the isocentre, the full thickness outside, and a smooth ramp
+    between. Its material is not published; graphite and PMMA of this thickness are too weak.
 
     Args:
         sod: distance source–isocentre of the scanner in mm.
-        diameter_mm: diameter of the region of interest.
-        thickness_mm: thickness of the blocking part (published: 39 mm).
-        distance_mm: distance of the filter from the isocentre (published: 263 mm).
-        ramp_mm: width of the ramp. Not published, see ``ROI_RAMP_MM``.
-        material: aluminium unless given (not published; graphite and PMMA of this thickness are too weak).
 
     Raises:
-        ValueError: a length ≤ 0, a region or filter that does not fit between source and isocentre.
+        ValueError: a source that does not lie beyond the filter.
     """
-    lengths = {"sod": sod, "diameter_mm": diameter_mm, "thickness_mm": thickness_mm, "ramp_mm": ramp_mm}
-    for name, value in lengths.items():
-        number(name, value, positive=True, unit="mm")
-    if not (diameter_mm / 2 < sod and 0 <= distance_mm < sod):
-        raise ValueError(
-            f"region ({diameter_mm} mm) and filter ({distance_mm} mm from the isocentre) must lie nearer to the "
-            f"isocentre than the source (sod {sod} mm)"
-        )
-    inner = math.asin(diameter_mm / 2 / sod)
-    to_source = sod - distance_mm
-    outer = math.atan(math.tan(inner) + ramp_mm / to_source)
-    metal: Any = MATERIALS["aluminium"] if material is None else material
+    number("sod", sod, positive=True, unit="mm")
+    if sod <= ROI_DISTANCE_MM:
+        raise ValueError(f"the filter stands {ROI_DISTANCE_MM:g} mm from the isocentre, the source at {sod:g} mm")
+    inner = math.asin(ROI_DIAMETER_MM / 2 / sod)
+    outer = math.atan(math.tan(inner) + ROI_RAMP_MM / (sod - ROI_DISTANCE_MM))
     angles = (0.0, inner, outer, min(outer + 0.1, 1.5))
-    return Bowtie(metal, angles, (0.0, 0.0, thickness_mm, thickness_mm), "roi")
+    return Bowtie(MATERIALS["aluminium"], angles, (0.0, 0.0, ROI_THICKNESS_MM, ROI_THICKNESS_MM), "roi")
 
 
 @checked

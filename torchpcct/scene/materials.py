@@ -248,34 +248,25 @@ def solution(solute: Material | str, mg_per_ml: float, solvent: Material | str =
 
 
 @checked
-def calcification(
-    hu: float = 1500.0,
-    energies_kev: Any = 64.0,
-    weights: Any = 1.0,
-    matrix: Material | None = None,
-    name: str = "calcification",
-) -> Material:
-    """Hydroxyapatite in a soft matrix, mixed by volume so that it reads ``hu`` for the given spectrum.
+def calcification(hu: float = 1500.0) -> Material:
+    """Hydroxyapatite in fibrous tissue, mixed by volume so that it reads ``hu`` at 64 keV, the mean energy of a 100 kVp
+    beam behind 24 cm of adipose tissue.
 
     Args:
-        hu: CT number to reach, between that of the matrix and that of pure hydroxyapatite.
-        energies_kev, weights: the spectrum, as for :meth:`Material.hu`. The default, 64 keV, is the mean energy of a
-            100 kVp beam behind 24 cm of adipose tissue.
-        matrix: what the mineral is embedded in (default: fibrous tissue).
+        hu: CT number to reach, between that of fibrous tissue and that of pure hydroxyapatite.
 
     Raises:
         ValueError: ``hu`` outside what a mixture can reach.
     """
-    matrix = MATERIALS["fibrous_tissue"] if matrix is None else matrix
-    mineral = MATERIALS["hydroxyapatite"]
-    low, high = matrix.hu(energies_kev, weights), mineral.hu(energies_kev, weights)
+    matrix, mineral = MATERIALS["fibrous_tissue"], MATERIALS["hydroxyapatite"]
+    low, high = matrix.hu(_CALCIFIED_KEV), mineral.hu(_CALCIFIED_KEV)
     if not low <= hu <= high:
-        raise ValueError(
-            f"hu must lie between {low:.0f} ({matrix.name}) and {high:.0f} (hydroxyapatite) HU for this "
-            f"spectrum, got {hu}"
-        )
+        raise ValueError(f"hu must lie between {low:.0f} ({matrix.name}) and {high:.0f} (hydroxyapatite) HU, got {hu}")
     share = (hu - low) / (high - low)  # exact: attenuation is linear in the volume share
-    return blend(name, {matrix: 1.0 - share, mineral: share})
+    return blend("calcification", {matrix: 1.0 - share, mineral: share})
+
+
+_CALCIFIED_KEV = 64.0
 
 
 # The plaque tissues carry the *published* element table of Li et al. (rounded to 1e-4); the tests derive the same

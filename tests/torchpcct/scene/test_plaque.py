@@ -131,7 +131,6 @@ def test_contrast_is_exactly_linear():
         (lambda: plaque_variant("none"), ValueError, "unknown variant 'none'"),
         (lambda: stent_bodies(Plaque(), rings=0), ValueError, "at least 1"),
         (lambda: stent_bodies(Plaque(), rings=9), ValueError, "leaves the vessel"),
-        (lambda: stent_bodies(Plaque(), spacing=0.05), ValueError, "spacing"),
         (lambda: textured(plaque_scene()[0], "patient", np.random.default_rng(0)), ValueError, "endless"),
     ],
 )  # fmt: skip

@@ -279,11 +279,11 @@ def test_render():
 
 
 def test_ctdi():
-    scene = ctdi(rotation=0.3)
+    scene = ctdi()
     assert scene.names == ("phantom", *CTDI_HOLES)
     assert [m.name for m in scene.materials[:2]] == ["pmma", "water"]
-    assert scene.shapes[2].position == pytest.approx((150 * math.cos(0.3), 150 * math.sin(0.3), 0.0))
-    lengths = chord_lengths(ctdi(), (-626.0, 0.0, 0.0), (1.0, 0.0, 0.0))[:, 0]
+    assert [s.position for s in scene.shapes[2:4]] == [(150.0, 0.0, 0.0), pytest.approx((0.0, 150.0, 0.0))]
+    lengths = chord_lengths(scene, (-626.0, 0.0, 0.0), (1.0, 0.0, 0.0))[:, 0]
     assert lengths == pytest.approx([320.0, 13.0, 13.0, 0.0, 13.0, 0.0], abs=1e-9)
 
 

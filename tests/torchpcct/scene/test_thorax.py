@@ -1,4 +1,4 @@
-"""The thorax: nesting, tissues, adult dimensions, and a plaque in the heart's wall."""
+"""The thorax: nesting, tissues, adult dimensions."""
 
 from __future__ import annotations
 
@@ -8,11 +8,7 @@ import numpy as np
 import pytest
 
 from torchpcct.geometry import VolumeGrid
-from torchpcct.scene import Scene
 from torchpcct.scene.phantoms.thorax import RIB_ANGLES_DEG, thorax
-from torchpcct.scene.plaque import Plaque
-
-IN_THE_WALL = Plaque(position=(47.0, -4.0, 0.0))
 
 
 def box(scene, name):
@@ -70,27 +66,6 @@ def test_blood_and_muscle_can_be_exchanged():
     assert scene["heart"].material == "soft_tissue"
 
 
-def test_a_plaque_in_the_heart(scene):
-    with_plaque = thorax(plaque=IN_THE_WALL)
-    assert isinstance(with_plaque, Scene)
-    assert with_plaque.inside("coronary_fat") == ("coronary_fat", "wall", "fibrous", "lumen", "core")
-    assert with_plaque["coronary_fat"].parent == "heart"
-    center = np.array([IN_THE_WALL.to_scanner(IN_THE_WALL.core_center)])
-    assert with_plaque.names[int(with_plaque.labels(center)[0])] == "core"
-    far = np.array([[*IN_THE_WALL.position[:2], 50.0]])
-    assert with_plaque.names[int(with_plaque.labels(far)[0])] == "heart"
-
-
-@pytest.mark.parametrize("position", [(20.0, -20.0, 0.0), (90.0, 0.0, 0.0)])
-def test_a_plaque_outside_of_the_wall_is_refused(position):
-    with pytest.raises(ValueError, match=r"overlap|leaves"):
-        thorax(plaque=Plaque(position=position))
-
-
 def test_bad_values():
-    with pytest.raises(TypeError, match="plaque"):
-        thorax(plaque="yes")
     with pytest.raises(ValueError, match="center"):
         thorax(center=(0.0,))
-    with pytest.raises(ValueError, match="pocket_radius"):
-        thorax(plaque=IN_THE_WALL, pocket_radius=0.0)

@@ -32,38 +32,16 @@ def water_cylinder(
 
 
 @checked
-def ctdi(
-    diameter: float = 320.0,
-    insert: Any = "water",
-    *,
-    body: Any = "pmma",
-    hole_diameter: float = 13.0,
-    hole_depth: float = 10.0,
-    length: float = 150.0,
-    rotation: float = 0.0,
-) -> Scene:
-    """The CTDI body phantom (IEC 60601-2-44): an acrylic cylinder with a central and four peripheral bores.
-
-    Args:
-        diameter: of the cylinder in mm: 320 (body) or 160 (head).
-        insert: material of the bores; the paper fills them with water.
-        body: material of the cylinder.
-        hole_diameter: in mm.
-        hole_depth: distance of a peripheral bore's centre from the cylinder's surface in mm.
-        length: of cylinder and bores in mm.
-        rotation: angle in rad by which the peripheral bores are turned counter-clockwise from +x.
+def ctdi() -> Scene:
+    """The CTDI body phantom (IEC 60601-2-44): an acrylic cylinder of 320 mm and five bores, filled with water as the
+    paper's, one in the middle and four at the border.
 
     Returns:
         a scene of the body ``"phantom"`` and, inside it, the bodies named in ``CTDI_HOLES``.
     """
-    half = number("length", length, positive=True, finite=False) / 2.0
-    hole = number("hole_diameter", hole_diameter, positive=True) / 2.0
-    radius = number("diameter", diameter, positive=True) / 2.0
-    ring = radius - number("hole_depth", hole_depth, positive=True)
-    bodies = [Body("phantom", EllipticCylinder(radius, half), body)]
-    places = [(0.0, 0.0)] + [
-        (ring * math.cos(rotation + k * math.pi / 2), ring * math.sin(rotation + k * math.pi / 2)) for k in range(4)
-    ]
+    half, radius, hole, ring = 75.0, 160.0, 6.5, 150.0
+    bodies = [Body("phantom", EllipticCylinder(radius, half), "pmma")]
+    places = [(0.0, 0.0)] + [(ring * math.cos(k * math.pi / 2), ring * math.sin(k * math.pi / 2)) for k in range(4)]
     for name, (x, y) in zip(CTDI_HOLES, places, strict=True):
-        bodies.append(Body(name, EllipticCylinder(hole, half, position=(x, y, 0.0)), insert, "phantom"))
+        bodies.append(Body(name, EllipticCylinder(hole, half, position=(x, y, 0.0)), "water", "phantom"))
     return Scene(bodies)

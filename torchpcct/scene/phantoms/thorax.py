@@ -15,9 +15,8 @@ import math
 from typing import Any
 
 from torchpcct.scene.bodies import EllipticCylinder
-from torchpcct.scene.plaque.plaque import Plaque
 from torchpcct.scene.scene import Body, Scene
-from torchpcct.validate import checked, number, numbers
+from torchpcct.validate import checked, numbers
 
 __all__ = ["HEART_CENTER_MM", "RIB_ANGLES_DEG", "thorax"]
 
@@ -28,7 +27,6 @@ RIB_ANGLES_DEG = (-58.0, -31.0, -2.0, 27.0, 54.0)
 """Where the ribs of the left side cross the slice: polar angle on the chest wall's ellipse, 0 to the side."""
 
 _HEART_TILT = math.radians(-22.0)
-_POCKET_GAP_MM = 1.0
 _WALL = (145.0, 93.5, 2.0)  # ellipse on which the ribs lie: semi-axes, y of its centre
 
 # name, semi-axes, centre (body frame), turn in degrees, material, parent
@@ -68,9 +66,6 @@ def thorax(
     *,
     blood: Any = "blood",
     myocardium: Any = "heart",
-    plaque: Plaque | None = None,
-    plaque_blood: Any = "blood_iodine",
-    pocket_radius: float = 4.0,
 ) -> Scene:
     """The thorax, by default with the heart at the isocentre.
 
@@ -78,20 +73,13 @@ def thorax(
         center: ``(x, y)`` in mm of the body section's middle. +x is the patient's left, +y the front.
         blood: in the chambers and the aorta; ``"blood_iodine"`` for contrast medium.
         myocardium: of the heart's walls.
-        plaque: a coronary plaque to put into the heart wall, at its own ``position`` (scanner's frame), in a pocket of
-            pericoronary fat; None: none. The paper's position, 42.4 mm off the isocentre, lies in the mediastinum
-            behind the heart: give one inside.
-        plaque_blood: blood in the plaque's lumen.
-        pocket_radius: radius in mm of the fat around the vessel.
 
     Returns:
         A scene of endless cylinders: ``"skin"``, ``"fat"``, ``"muscle"``, ``"lungs"``, ``"heart"`` and its chambers,
-        ``"rib_left_0"``… with ``"…_marrow"``, ``"vertebra"``, ``"sternum"`` and others; with a plaque also
-        ``"coronary_fat"`` and the bodies of :func:`~torchpcct.scene.plaque.plaque.plaque_scene`.
+        ``"rib_left_0"``… with ``"…_marrow"``, ``"vertebra"``, ``"sternum"`` and others.
 
     Raises:
-        ValueError: a plaque whose pocket leaves the heart's wall or touches a chamber; unknown materials.
-        TypeError: ``plaque`` is no :class:`~torchpcct.scene.plaque.plaque.Plaque`.
+        ValueError: unknown materials.
     """
     x0, y0 = numbers("center", center, 2)
     bodies = []
@@ -105,8 +93,6 @@ def thorax(
         place = (hx + along * cos - across * sin, hy + along * sin + across * cos)
         bodies.append(Body(name, _cylinder(axes, place, _HEART_TILT), blood, "heart"))
     bodies += _ribs(x0, y0)
-    if plaque is not None:
-        bodies += _plaque(plaque, plaque_blood, number("pocket_radius", pocket_radius, positive=True))
     return Scene(bodies)
 
 
@@ -122,17 +108,3 @@ def _ribs(x0: float, y0: float) -> list[Body]:
             ribs.append(Body(name, _cylinder((13.0, 4.2), place, turn), "cortical_bone", "muscle"))
             ribs.append(Body(f"{name}_marrow", _cylinder((12.0, 3.2), place, turn), "spongiosa", name))
     return ribs
-
-
-def _plaque(plaque: Plaque, blood: Any, radius: float) -> list[Body]:
-    if not isinstance(plaque, Plaque):
-        raise TypeError(f"plaque must be a Plaque, got {type(plaque).__name__}")
-    x, y, z = plaque.position
-    pocket = EllipticCylinder(radius, plaque.vessel_length / 2.0 + _POCKET_GAP_MM, position=(x, y, z))
-    return [
-        Body("coronary_fat", pocket, "pericoronary_fat", "heart"),
-        Body("wall", plaque.outer, "vessel_wall", "coronary_fat"),
-        Body("fibrous", plaque.inner, "fibrous_tissue", "wall"),
-        Body("lumen", plaque.lumen, blood, "fibrous"),
-        Body("core", plaque.core, "necrotic_core", "fibrous"),
-    ]

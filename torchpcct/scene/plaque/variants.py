@@ -16,78 +16,52 @@ from torchpcct.scene.bodies import Ellipsoid, EllipticCylinder
 from torchpcct.scene.materials import calcification
 from torchpcct.scene.plaque.plaque import PAPER_POSITION, Plaque, interpolate_material, plaque_scene
 from torchpcct.scene.scene import Body, Scene
-from torchpcct.validate import checked, choice, number, whole
+from torchpcct.validate import checked, choice, whole
 
 __all__ = ["VARIANTS", "calcification_bodies", "plaque_variant", "stent_bodies", "textured"]
 
-
-@checked
-def calcification_bodies(
-    plaque: Plaque,
-    *,
-    hu: float = 1500.0,
-    center: tuple[float, float, float] = (0.75, 1.1, 0.0),
-    semi_axes: tuple[float, float, float] = (0.25, 0.2, 0.6),
-    material: Any = None,
-) -> tuple[Body, ...]:
-    """A calcified ellipsoid in the fibrous tissue, body ``"calcification"``.
-
-    Args:
-        plaque: geometry that it is placed in.
-        hu: CT number of the default material, hydroxyapatite in fibrous tissue.
-        center, semi_axes: in mm in the plaque's frame; the default lies at the plaque's shoulder, beside the core.
-        material: another material or its name.
-    """
-    if material is None:
-        material = calcification(hu)
-    shape = Ellipsoid(semi_axes, position=tuple(plaque.to_scanner(center)), rotation=plaque.orientation)
-    return (Body("calcification", shape, material, "fibrous"),)
+_STRUT_MM, _RINGS_APART_MM, _CLEARANCE_MM = 0.08, 1.5, 0.01
+"""Radial thickness and height of a stent's ring, common for cobalt chromium; from one ring to the next along the
+vessel; and between ring and lumen wall."""
 
 
 @checked
-def stent_bodies(
-    plaque: Plaque,
-    *,
-    rings: int = 5,
-    spacing: float = 1.5,
-    strut: float = 0.08,
-    clearance: float = 0.01,
-    metal: Any = "cobalt_chromium",
-    blood: Any = "blood_iodine",
-) -> tuple[Body, ...]:
-    """A stent-like row of metal rings along the lumen's wall, with blood inside each ring.
+def calcification_bodies(plaque: Plaque) -> tuple[Body, ...]:
+    """A calcified ellipsoid of 1500 HU at the plaque's shoulder, beside the core: body ``"calcification"``."""
+    place = tuple(plaque.to_scanner((0.75, 1.1, 0.0)))
+    shape = Ellipsoid((0.25, 0.2, 0.6), position=place, rotation=plaque.orientation)
+    return (Body("calcification", shape, calcification(1500.0), "fibrous"),)
+
+
+@checked
+def stent_bodies(plaque: Plaque, *, rings: int = 5, blood: Any = "blood_iodine") -> tuple[Body, ...]:
+    """A stent-like row of rings of cobalt chromium along the lumen's wall, with blood inside each ring.
 
     A ring is a flat metal disc ``"stent_k"`` that fills the lumen, with a disc of blood ``"stent_k_blood"`` in it.
 
     Args:
         plaque: geometry whose lumen holds the rings.
         rings: how many, centred at the middle of the plaque.
-        spacing: distance of neighbouring rings along the vessel, mm.
-        strut: radial thickness and height of a ring, mm; 0.08 mm is common for cobalt chromium.
-        clearance: gap between ring and lumen wall, mm.
-        metal, blood: materials or their names.
+        blood: material or its name.
 
     Raises:
-        ValueError: rings that overlap, are thicker than the lumen, or leave the vessel.
+        ValueError: rings that are thicker than the lumen, or leave the vessel.
     """
-    rings = whole("rings", rings)
-    height = number("strut", strut, positive=True) / 2.0
-    if number("spacing", spacing, positive=True) <= strut:
-        raise ValueError(f"spacing ({spacing:g} mm) must be greater than strut ({strut:g} mm)")
+    rings, height = whole("rings", rings), _STRUT_MM / 2.0
     bodies: list[Body] = []
     for k in range(rings):
-        z = (k - (rings - 1) / 2.0) * spacing
+        z = (k - (rings - 1) / 2.0) * _RINGS_APART_MM
         if abs(z) + height > plaque.vessel_length / 2.0:
-            raise ValueError(f"ring {k} at z = {z:g} mm leaves the vessel: fewer rings or a smaller spacing")
+            raise ValueError(f"ring {k} at z = {z:g} mm leaves the vessel: fewer rings")
         # The ring must fit the lumen over its whole height: all lumen circles touch x = -R, so the smallest decides.
         radii = plaque.section("lumen", np.linspace(z - height, z + height, 9))[2]
-        radius = float(radii.min()) - clearance
+        radius = float(radii.min()) - _CLEARANCE_MM
         centre = float(radii.min()) - plaque.inner_radius
-        if radius <= strut:
-            raise ValueError(f"ring {k}: strut {strut:g} mm does not fit the lumen's radius of {radius:g} mm")
+        if radius <= _STRUT_MM:
+            raise ValueError(f"ring {k}: strut {_STRUT_MM:g} mm does not fit the lumen's radius of {radius:g} mm")
         place = {"position": tuple(plaque.to_scanner((centre, 0.0, z))), "rotation": plaque.orientation}
-        bodies.append(Body(f"stent_{k}", EllipticCylinder(radius, height, **place), metal, "lumen"))
-        inner = EllipticCylinder(radius - strut, height, **place)
+        bodies.append(Body(f"stent_{k}", EllipticCylinder(radius, height, **place), "cobalt_chromium", "lumen"))
+        inner = EllipticCylinder(radius - _STRUT_MM, height, **place)
         bodies.append(Body(f"stent_{k}_blood", inner, blood, f"stent_{k}"))
     return tuple(bodies)
 
