@@ -244,27 +244,16 @@ def slice_scans(scene: Scene, scanners: dict[str, Scanner]) -> dict[str, Scan]:
     }
 
 
-def polynomial_linearisation(
-    scanner: Scanner,
-    order: int = CALIBRATION_ORDER,
-    step_mm: float = CALIBRATION_STEP_MM,
-    max_mm: float = CALIBRATION_MAX_MM,
-) -> WaterLinearisation:
+def polynomial_linearisation(scanner: Scanner) -> WaterLinearisation:
     """The paper's beam-hardening correction: per column a polynomial through 0, fitted to equal steps of water.
 
     The value of water is that of the library's own correction, so that images of both compare.
 
     Args:
         scanner: of one energy bin.
-        order: of the polynomial.
-        step_mm, max_mm: calibration thicknesses.
-
-    Raises:
-        ValueError: fewer thicknesses than coefficients.
     """
-    thickness = np.arange(step_mm, max_mm + 0.5 * step_mm, step_mm)
-    if thickness.size < order:
-        raise ValueError(f"{thickness.size} thicknesses do not determine {order} coefficients: take smaller steps")
+    step = CALIBRATION_STEP_MM
+    thickness = np.arange(step, CALIBRATION_MAX_MM + 0.5 * step, step)
     energies, weights = scanner.weights()
     mu_water = MATERIALS["water"].attenuation(energies)
     transmitted = weights[0] @ np.exp(-np.outer(mu_water, thickness))
@@ -272,7 +261,7 @@ def polynomial_linearisation(
     middle = weights.shape[1] // 2
     mu_ref = WaterLinearisation.calibrate(weights[0, middle : middle + 1], mu_water).mu_ref
     scale = p[:, -1]
-    powers = (p / scale[:, None])[..., None] ** np.arange(1, order + 1)
+    powers = (p / scale[:, None])[..., None] ** np.arange(1, CALIBRATION_ORDER + 1)
     fits = [np.linalg.lstsq(a, mu_ref * thickness / s, rcond=None)[0] for a, s in zip(powers, scale, strict=True)]
     return WaterLinearisation(np.stack(fits), scale, mu_ref)
 

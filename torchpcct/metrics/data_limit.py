@@ -95,38 +95,24 @@ class Ceiling:
         """SD of each functional, ``(m,)`` HU."""
         return np.sqrt(np.diag(self.functional_covariance))
 
-    @property
-    def contrast_sd(self) -> float:
-        """SD of the only functional, HU.
-
-        Raises:
-            ValueError: there are several functionals.
-        """
-        if len(self.functionals) != 1:
-            raise ValueError(f"there are {len(self.functionals)} functionals: read functional_sd")
-        return float(self.functional_sd[0])
-
 
 @checked
-def ceiling(information: ArrayLike, functionals: ArrayLike, dose: float = 1.0) -> Ceiling:
+def ceiling(information: ArrayLike, functionals: ArrayLike) -> Ceiling:
     """Limit for linear functionals of the tissue amplitudes.
 
     Args:
-        information: ``(tissues, tissues)`` of :func:`information_matrix`, at dose 1.
+        information: ``(tissues, tissues)`` of :func:`information_matrix`, which is proportional to the dose.
         functionals: ``(tissues,)`` one functional (a contrast: +1 and −1 at two tissues), or ``(m, tissues)`` several
             (an ROI inside one tissue: the unit vector of this tissue; across tissues: its area fractions).
-        dose: exposure relative to that of ``information``, which is proportional to it.
 
     Raises:
-        ValueError: wrong shapes, an information that is not symmetric or that does not determine all amplitudes, a dose
-            that is not positive.
+        ValueError: wrong shapes, an information that is not symmetric or that does not determine all amplitudes.
     """
     f = np.array(information, dtype=np.float64)
     if f.ndim != 2 or f.shape[0] != f.shape[1] or f.size == 0:
         raise ValueError(f"information must be a square matrix, got the shape {f.shape}")
     if not np.isfinite(f).all() or not np.allclose(f, f.T, rtol=1e-9, atol=1e-12 * np.abs(f).max()):
         raise ValueError("information must be finite and symmetric: compute it with information_matrix")
-    number("dose", dose, positive=True)
     h = np.atleast_2d(np.array(functionals, dtype=np.float64))
     if h.ndim != 2 or h.shape[1] != f.shape[0] or not np.isfinite(h).all():
         raise ValueError(f"functionals must be finite and ({f.shape[0]},) or (m, {f.shape[0]}), got {h.shape}")
@@ -141,7 +127,7 @@ def ceiling(information: ArrayLike, functionals: ArrayLike, dose: float = 1.0) -
         raise ValueError(
             f"the readings cannot tell the tissues apart (least determined: {int(worst.argmax())}): merge or drop maps"
         )
-    half = root[:, None] * vectors / np.sqrt(values * dose)
+    half = root[:, None] * vectors / np.sqrt(values)
     covariance = half @ half.T
     spread = h @ half
     return Ceiling(covariance, h, spread @ spread.T)

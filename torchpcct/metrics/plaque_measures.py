@@ -50,6 +50,9 @@ LUMEN_HU = 250.0
 CORE_HU = (20.0, 60.0)
 """Band of the necrotic core in HU (Li et al.)."""
 
+_STEP_MM = 0.005
+"""Between samples of a line."""
+
 Mask = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 
@@ -181,8 +184,6 @@ def cap_on_line(
     *,
     lumen_hu: float = LUMEN_HU,
     core_hu: float = CORE_HU[1],
-    step_mm: float = 0.005,
-    interpolate: bool = True,
 ) -> float:
     """Cap thickness in mm on the line from the lumen to the core: where the image falls below both thresholds.
 
@@ -193,34 +194,26 @@ def cap_on_line(
         image, grid: as for :func:`segment_plaque`.
         start, end: ``(y, x)`` mm, in the lumen and in the core (their centres).
         lumen_hu, core_hu: the lumen ends where the image first falls below the one, the core begins where it first
-            falls to the other.
-        step_mm: sampling of the line.
-        interpolate: read the crossings between samples; False: at the first sample beyond them, in steps of
-            ``step_mm`` from ``start``.
+            falls to the other; by linear interpolation between samples 5 µm apart.
 
     Returns:
         NaN where the line starts below ``lumen_hu`` or does not reach ``core_hu``.
 
     Raises:
-        ValueError: as :func:`segment_plaque`; a line that leaves the image, a step that is not positive.
+        ValueError: as :func:`segment_plaque`; a line that leaves the image, or has no length.
     """
     x, plane = _slice(image, grid)
     a, b = np.array(start, dtype=np.float64), np.array(end, dtype=np.float64)
     length = float(np.hypot(*(b - a)))
-    if not step_mm > 0 or not length > step_mm:
-        raise ValueError(f"step_mm must be positive and less than the line's {length:g} mm, got {step_mm}")
-    steps = math.ceil(length / step_mm)
-    along: Any = np.linspace(0.0, length, steps + 1) if interpolate else step_mm * np.arange(steps)
+    if not length > _STEP_MM:
+        raise ValueError(f"start and end must lie apart, got a line of {length:g} mm")
+    along = np.linspace(0.0, length, math.ceil(length / _STEP_MM) + 1)
     points = a[:, None] + (b - a)[:, None] * along / length
     index = (points - np.array([v[0] for v in plane.axes])[:, None]) / np.array(plane.spacing)[:, None]
     if index.min() < 0 or (index.max(axis=1) > np.array(plane.shape) - 1).any():
         raise ValueError(f"the line from {tuple(start)} to {tuple(end)} mm leaves the image: give points inside it")
     profile = map_coordinates(x, index, order=1)
-    edges = []
-    for level in (lumen_hu, core_hu):
-        beyond = along[profile <= level]
-        exact = interpolate or not beyond.size
-        edges.append(first_below(along, profile, level, math.nan) if exact else float(beyond[0]))
+    edges = [first_below(along, profile, level, math.nan) for level in (lumen_hu, core_hu)]
     return edges[1] - edges[0] if profile[0] >= lumen_hu else math.nan
 
 

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.threads import run
-from torchpcct.validate import number, numbers, whole
+from torchpcct.validate import number, numbers, reals, whole
 
 __all__ = ["POLYNOMIAL_UP_TO", "WaterLinearisation"]
 
@@ -29,16 +29,6 @@ POLYNOMIAL_UP_TO = 12.0
 """Largest line integral for which a polynomial of :meth:`WaterLinearisation.polynomial` is taken at its word."""
 _ORDER = 7
 _SAMPLES = 400
-
-
-def _table(name: str, values: Any) -> Floats:
-    array = np.asarray(values)
-    if array.dtype.kind not in "fiu":
-        raise TypeError(f"{name} must hold real numbers, got {array.dtype}")
-    array = np.ascontiguousarray(array, dtype=np.float64)
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name} must be finite, {int((~np.isfinite(array)).sum())} entries are NaN or Inf")
-    return array
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +51,12 @@ class WaterLinearisation:
 
     def __post_init__(self) -> None:
         # The kernel reads by index and checks nothing: a table of another shape would be read beyond its end.
-        coefficients, scale = (_table(name, getattr(self, name)) for name in ("coefficients", "scale"))
+        coefficients, scale = (
+            np.ascontiguousarray(reals(name, getattr(self, name))) for name in ("coefficients", "scale")
+        )
+        for name, array in (("coefficients", coefficients), ("scale", scale)):
+            if not np.isfinite(array).all():
+                raise ValueError(f"{name} must be finite, {int((~np.isfinite(array)).sum())} entries are NaN or Inf")
         if coefficients.ndim != 2 or scale.ndim != 1 or coefficients.shape[0] != scale.size or not coefficients.size:
             raise ValueError(
                 "coefficients must have the shape (columns, order) and scale (columns,), got "

@@ -21,7 +21,7 @@ from scipy.special import ndtr
 from torchpcct.scanner.compton import ELECTRON_REST_KEV
 from torchpcct.scanner.detector import SiliconDetector
 from torchpcct.scene.materials import MATERIALS
-from torchpcct.validate import checked, choice, number, whole
+from torchpcct.validate import checked, number, whole
 
 __all__ = ["Deposits", "Stack", "TransportedSilicon", "efficiency", "follow"]
 
@@ -83,34 +83,30 @@ class Deposits:
         """Number of incident photons."""
         return self.incident_kev.size
 
+    def pulses(self) -> tuple[Ints, Floats]:
+        """Incident photon and height in keV of every pulse: of all that one photon left in one segment of a strip."""
+        keys = np.stack([self.photon, self.sheet, self.strip, self.segment], axis=1)
+        places, index = np.unique(keys, axis=0, return_inverse=True)
+        return places[:, 0], np.bincount(index.reshape(-1), self.energy_kev).astype(np.float64)
+
     def counts(
         self,
         threshold_kev: float,
         sigma_kev: float,
         rng: np.random.Generator,
-        pulses: str = "segment",
         charge_sharing: float = 0.0,
     ) -> Ints:
         """Counts of every incident photon, ``(photons,)``, over the whole detector.
+
+        What is left in one depth segment of a strip adds up to one pulse.
 
         Args:
             threshold_kev: a pulse counts above it.
             sigma_kev: standard deviation of a pulse's height.
             rng: of the heights' noise.
-            pulses: what adds up to one pulse: deposits in one depth ``"segment"`` of a strip; ``"strip"``: in one strip
-                (coincident segments are recognised); ``"photon"``: all (every coincidence is recognised).
             charge_sharing: share of the pulses that split, at a uniformly distributed ratio, between two cells.
-
-        Raises:
-            ValueError: an unknown ``pulses``.
         """
-        places = {"segment": (self.sheet, self.strip, self.segment), "strip": (self.sheet, self.strip), "photon": ()}
-        keys = np.stack([self.photon, *places[choice("pulses", pulses, places)]], axis=1)
-        _, index = np.unique(keys, axis=0, return_inverse=True)
-        index = index.reshape(-1)
-        heights: Floats = np.bincount(index, self.energy_kev).astype(np.float64)
-        owner = np.zeros(heights.size, dtype=np.int64)
-        owner[index] = self.photon
+        owner, heights = self.pulses()
         if charge_sharing:
             split = np.flatnonzero(rng.random(heights.size) < charge_sharing)
             part = rng.random(split.size) * heights[split]
@@ -348,9 +344,6 @@ def _further(detector: TransportedSilicon) -> Floats:
     rng = np.random.default_rng(detector.transport_seed)
     d = follow(detector, _NODES_KEV, np.ones(_NODES_KEV.size), detector.photons, rng, detector.stack)
     node = np.searchsorted(_NODES_KEV, d.incident_kev)
-    keys = np.stack([d.photon, d.sheet, d.strip, d.segment], axis=1)
-    pulses, index = np.unique(keys, axis=0, return_inverse=True)
-    heights: Floats = np.bincount(index.reshape(-1), d.energy_kev).astype(np.float64)
     first = d.order == 0
     shape = (_NODES_KEV.size, _HEIGHTS.size)
 
@@ -359,5 +352,5 @@ def _further(detector: TransportedSilicon) -> Floats:
         flat = np.bincount(node[photon] * _HEIGHTS.size + place, minlength=shape[0] * shape[1])
         return flat.reshape(shape).astype(np.float64)
 
-    difference = histogram(pulses[:, 0], heights) - histogram(d.photon[first], d.energy_kev[first])
+    difference = histogram(*d.pulses()) - histogram(d.photon[first], d.energy_kev[first])
     return np.asarray(difference / np.bincount(node, minlength=shape[0])[:, None])

@@ -14,7 +14,7 @@ from torchpcct.spectral.decompose import (
     decompose_surround,
     inverse,
 )
-from torchpcct.spectral.mmd import MMD_TISSUES, clean, dice, label, mmd, nearest
+from torchpcct.spectral.mmd import MMD_TISSUES, clean, label, mmd, nearest
 from torchpcct.spectral.model import SpectralModel
 from torchpcct.spectral.vmi import (
     VMI_ENERGIES_KEV,
@@ -37,7 +37,6 @@ __all__ = [
     "decompose",
     "decompose_scan",
     "decompose_surround",
-    "dice",
     "inverse",
     "label",
     "mmd",

@@ -16,7 +16,7 @@ of the basis plane, in units of its noise: voxels at the edge of the vessel, mix
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -24,12 +24,11 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from torchpcct.metrics import plaque_measures
 from torchpcct.scene.materials import Material
 from torchpcct.spectral.basis import FIT_ENERGIES_KEV, Basis
 from torchpcct.validate import checked
 
-__all__ = ["MMD_TISSUES", "clean", "dice", "label", "mmd", "nearest"]
+__all__ = ["MMD_TISSUES", "clean", "label", "mmd", "nearest"]
 
 MMD_TISSUES = ("blood_iodine", "necrotic_core", "fibrous_tissue", "pericoronary_fat")
 """The tissues of Li et al."""
@@ -219,25 +218,3 @@ def clean(fractions: Tensor, window: int = 3, iterations: int = 50) -> Tensor:
         sums = torch.zeros_like(centres).index_add_(0, labels, x.T)
         centres = torch.where((size > 0)[:, None], sums / size.clamp_min(1)[:, None], centres)
     return labels.reshape(fractions.shape[1:])
-
-
-@checked
-def dice(labels: ArrayLike, truth: ArrayLike, names: Sequence[str] = MMD_TISSUES) -> Mapping[str, float]:
-    """Dice coefficient ``2 |A ∩ B| / (|A| + |B|)`` of each tissue.
-
-    Args:
-        labels, truth: whole numbers of one shape, indices into ``names``. Voxels whose truth is negative are left out
-            (tissues that the decomposition does not know, mixed voxels).
-        names: of the tissues.
-
-    Returns:
-        name → 0…1; NaN for a tissue that neither holds.
-
-    Raises:
-        ValueError: shapes that differ.
-    """
-    a, b = torch.as_tensor(labels).cpu(), torch.as_tensor(truth).cpu()
-    if a.shape != b.shape:
-        raise ValueError(f"labels {tuple(a.shape)} and truth {tuple(b.shape)} must have the same shape")
-    a, b = a[b >= 0], b[b >= 0]
-    return {name: plaque_measures.dice(a == k, b == k) for k, name in enumerate(names)}

@@ -51,18 +51,6 @@ def test_the_polynomial_meets_its_calibration(scanners):
     assert line.mu_ref == pytest.approx(scanner.water_linearisation().mu_ref, rel=1e-12)
 
 
-def test_lower_orders_cup(scanners):
-    scanner = scanners["large"]
-    p = -np.log(scanner.behind({material("water"): 200.0})[0].sum(-1) / scanner.weights()[1][0].sum(-1))
-    errors = []
-    for order in (1, 2, 5):
-        line = polynomial_linearisation(scanner, order=order)
-        errors.append(np.abs(line.apply(torch.from_numpy(p)).numpy() / line.mu_ref - 200.0).max())
-    assert errors[0] > 10 * errors[1] > 10 * errors[2]
-    with pytest.raises(ValueError, match="thicknesses"):
-        polynomial_linearisation(scanner, step_mm=100.0)
-
-
 def test_water_reads_zero_with_both_bowties(water):
     grid = VolumeGrid((150, 150), 1.5)
     for scan in water.values():

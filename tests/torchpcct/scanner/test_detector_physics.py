@@ -144,16 +144,13 @@ def test_first_interactions_are_the_one_interaction_model(followed):
     np.testing.assert_allclose(found, shares / shares.sum(), atol=4.5 * 0.5 / np.sqrt(n))
 
 
-def test_energy_is_conserved_and_coincidences_only_merge(followed):
+def test_energy_is_conserved_and_photons_count_repeatedly(followed):
     deposits = followed[2]
     total = np.bincount(deposits.photon, deposits.energy_kev, deposits.photons)
     assert np.all(total <= deposits.incident_kev * (1 + 1e-9))
-    photon, strip, segment = (
-        deposits.counts(5.0, 1e-6, np.random.default_rng(0), p) for p in ("photon", "strip", "segment")
-    )
-    assert photon.max() == 1
-    assert photon.mean() < strip.mean() <= segment.mean()
-    assert segment.max() > 1
+    counted = deposits.counts(5.0, 1e-6, np.random.default_rng(0))
+    assert (total > 5.0).mean() < counted.mean()
+    assert counted.max() > 1
 
 
 def test_compton_deposits_have_the_mean_of_klein_and_nishina():

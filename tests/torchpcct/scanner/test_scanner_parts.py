@@ -256,5 +256,4 @@ def test_bad_calls_are_refused():
         ("photons must be", lambda: follow(SiliconDetector(), [60.0], [1.0], 0, RNG)),
         ("weights must be", lambda: follow(SiliconDetector(), [60.0], [0.0], 10, RNG)),
         ("foil_mm", lambda: Stack(foil_mm=0.6)),
-        ("unknown pulses", lambda: follow(SiliconDetector(), [60.0], [1.0], 10, RNG).counts(5.0, 1.0, RNG, "pixel")),
     )
