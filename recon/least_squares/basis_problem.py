@@ -16,7 +16,6 @@ iteration this is.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -70,11 +69,9 @@ def joint_pwls(
     information: Tensor,
     prior: QGGMRF | BoundPrior,
     *,
-    mu_per_hu: float = 1.0,
     gram: Gram | None = None,
     tolerance: float = 0.2,
     max_exact: int = 20,
-    callback: Callable[[dict[str, Any]], None] | None = None,
 ) -> PwlsResult:
     """Minimise ½ Σ (y − A x)ᵀ F (y − A x) + R(x) over two channels.
 
@@ -85,12 +82,10 @@ def joint_pwls(
         information: F of the whitened channels, ``(3, *A.range_shape)`` (F₁₁, F₁₂, F₂₂), from smooth expected counts.
             It should be near a multiple of the identity (:class:`recon.least_squares.basis_problem.Whitening`): that is
             for speed alone.
-        prior: in noise-normalised units, or bound already.
-        mu_per_hu: the value of the channels that counts as 1 HU.
+        prior: in noise-normalised units, or bound already; 1 of a channel counts as 1 HU.
         gram: FFT model of Aᵀ diag(½ tr F) A, kept from an earlier call; None: made here.
         tolerance: stop when the images are this close to the minimum: root mean square over both channels, in HU.
         max_exact: largest number of exact projection pairs (each of two channels).
-        callback: see :func:`recon.least_squares.pwls.pwls`.
 
     Returns:
         Images ``(..., 2, *grid.shape)`` in the dtype of y, and the report of :func:`recon.least_squares.pwls.pwls`:
@@ -114,8 +109,7 @@ def joint_pwls(
 
     result = solve_normal(
         A.T(weighted), exact, gram if gram is not None else Gram(A, mean_weights(information)), prior,
-        mu_per_hu=mu_per_hu,
-        spacing=A.grid.spacing, channels=True, tolerance=tolerance, max_exact=max_exact, callback=callback,
+        mu_per_hu=1.0, spacing=A.grid.spacing, channels=True, tolerance=tolerance, max_exact=max_exact,
     )  # fmt: skip
     return PwlsResult(result.x, {**result.report, "method": "joint-pwls", "seconds": time.perf_counter() - started})
 
@@ -205,7 +199,6 @@ class BasisProblem:
         scan: windowed spectral scan; its noise does not matter.
         model: of its scanner and exposure.
         grid: ``(z, y, x)`` grid that holds everything the surround does not.
-        nodes: of the FFT model (:class:`recon.gram.gram.Gram`).
 
     The Fisher information of every ray is that of the expected counts behind the SURROUND: information from the noisy
     counts would bias the result, and a small inset changes it by a few per cent only.
@@ -215,7 +208,7 @@ class BasisProblem:
             outside the field of view or the scan's window.
     """
 
-    def __init__(self, scan: Scan, model: SpectralModel, grid: VolumeGrid, nodes: int = 5) -> None:
+    def __init__(self, scan: Scan, model: SpectralModel, grid: VolumeGrid) -> None:
         background = decompose_surround(scan, model)
         scale = torch.from_numpy(model.row_factor)[:, None]
         information = inverse(cramer_rao(background.double(), model, scale=scale))
@@ -228,7 +221,7 @@ class BasisProblem:
         self.whitening = Whitening.of(on_rays.mean((-1, -2, -3)).numpy(), gain)
         self.information = self.whitening.information(on_rays).to(torch.float32).contiguous()
         self.projector = Projector(scan.geometry, grid, self.window)
-        self.gram = Gram(self.projector, mean_weights(self.information), nodes=nodes)
+        self.gram = Gram(self.projector, mean_weights(self.information), nodes=5)
 
     @property
     def anisotropy(self) -> float:

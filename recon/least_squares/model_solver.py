@@ -13,6 +13,8 @@ __all__ = ["ModelSolver", "line_search", "mean_share"]
 
 # Steps below this many units of rounding of the first one are noise.
 ROUNDING = 30.0
+# Iterations end when the preconditioned gradient norm has fallen by this factor, or after so many.
+REDUCTION, MOST = 3e-3, 60
 
 
 class ModelSolver:
@@ -22,14 +24,10 @@ class ModelSolver:
         gram: G.
         prior: R.
         x: volumes ``(batch, *shape)``; only their shape, dtype and device matter.
-        reduction: stop when the preconditioned gradient norm has fallen by this factor.
-        most: largest number of iterations.
     """
 
-    def __init__(
-        self, gram: NormalOperator, prior: BoundPrior, x: Tensor, reduction: float = 3e-3, most: int = 60
-    ) -> None:
-        self.gram, self.prior, self.reduction, self.most = gram, prior, reduction, most
+    def __init__(self, gram: NormalOperator, prior: BoundPrior, x: Tensor) -> None:
+        self.gram, self.prior = gram, prior
         self._floor: Tensor | None = None
         self._grid = x.shape[-len(prior.spacing) :]
         self._data = gram.periodic_spectrum().to(x)
@@ -51,13 +49,13 @@ class ModelSolver:
         qz = dot(q, z, axes)
         if self._floor is None:  # rounding: the first, largest energy sets what later steps can resolve
             self._floor = qz * (ROUNDING * torch.finfo(x.dtype).eps) ** 2
-        goal = torch.maximum(qz * self.reduction**2, self._floor)
+        goal = torch.maximum(qz * REDUCTION**2, self._floor)
         if bool((qz <= self._floor).all()):
             return d, 0
         s = -z
         at = x
         count = 0
-        while count < self.most:
+        while count < MOST:
             curved = self.gram.apply(s)
             count += 1
             a = per_volume(line_search(prior, at, s, curved, model, start=0.0, most=2), x)

@@ -252,7 +252,7 @@ def _case(
 def _truth(scene: Scene, scanner: Scanner, grid: VolumeGrid) -> torch.Tensor:
     """``grid.shape`` HU of a scene at rest: each tissue reads what a rod of it does at the plaque's place."""
     tissues = {b.name: b.material for b in scene.bodies if b.name in plaque_scene()[0].names}
-    hu = rod_values(scene, scanner, grid.center[::-1], tissues=tissues, views=_ROD_VIEWS).hu
+    hu = rod_values(scene, scanner, grid.center[::-1], tissues=tissues, views=_ROD_VIEWS)
     values = {name: hu.get(name, 0.0) for name in scene.names}  # what a case adds is left out
     return torch.from_numpy(scene.render(grid, values)).float()
 
