@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpcct.metrics.roi import as_array
-from torchpcct.validate import checked, number, per_axis
+from torchpcct.validate import checked, per_axis
 
 __all__ = ["NoisePower", "noise_power_spectrum"]
 
@@ -47,29 +47,21 @@ class NoisePower:
         """Integral of the spectrum: mean variance of a voxel in HU²."""
         return float(self.power.sum() / np.prod([n * s for n, s in zip(self.power.shape, self.spacing, strict=True)]))
 
-    def radial(self, width: float | None = None) -> tuple[Floats, Floats]:
-        """Mean over shells of equal ``|f|``.
-
-        Args:
-            width: of a shell in cycles per mm; None: the coarsest axis' frequency step.
+    def radial(self) -> tuple[Floats, Floats]:
+        """Mean over shells of equal ``|f|``, each as wide as the coarsest axis' frequency step.
 
         Returns:
             mean frequency of each shell (cycles per mm) and mean power; shells without a sample are left out.
             Frequencies beyond the smallest axis' Nyquist frequency (the corners) are left out.
         """
         f = np.sqrt(sum(np.square(a) for a in np.meshgrid(*self.frequencies, indexing="ij"))).ravel()
-        step = max(1 / (n * s) for n, s in zip(self.power.shape, self.spacing, strict=True)) if width is None else width
-        number("width", step, positive=True, unit="cycles per mm")
         inside = f <= 0.5 / max(self.spacing) + 1e-12
-        return _shells(f[inside], self.power.ravel()[inside], step)
-
-
-def _shells(radius: Floats, values: Floats, width: float) -> tuple[Floats, Floats]:
-    shell = np.round(radius / width).astype(np.int64)
-    count = np.bincount(shell)
-    used = count > 0
-    mean_radius = np.bincount(shell, radius)[used] / count[used]
-    return mean_radius, np.bincount(shell, values)[used] / count[used]
+        radius, values = f[inside], self.power.ravel()[inside]
+        width = max(1 / (n * s) for n, s in zip(self.power.shape, self.spacing, strict=True))
+        shell = np.round(radius / width).astype(np.int64)
+        count = np.bincount(shell)
+        used = count > 0
+        return np.bincount(shell, radius)[used] / count[used], np.bincount(shell, values)[used] / count[used]
 
 
 @checked

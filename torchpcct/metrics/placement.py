@@ -66,18 +66,11 @@ class RoiPair:
 
 
 @checked
-def place_rois(
-    scene: Scene,
-    image: VolumeGrid,
-    core: str = "core",
-    tissue: str = "fibrous",
-    lumen: str = "lumen",
-    rule: RoiRule | None = None,
-) -> RoiPair:
+def place_rois(scene: Scene, image: VolumeGrid, rule: RoiRule | None = None) -> RoiPair:
     """Place the paper's ROIs on an axial image of a scene.
 
     Args:
-        scene: the plaque; the bodies ``core``, ``tissue`` and ``lumen`` mark where the ROIs go, whatever fills them.
+        scene: its bodies ``"core"``, ``"fibrous"`` and ``"lumen"`` mark where the ROIs go, whatever fills them.
         image: axial image grid, e.g. :func:`torchpcct.metrics.roi.axial_grid`.
         rule: distances; None: the defaults.
 
@@ -86,14 +79,14 @@ def place_rois(
     """
     rule = rule or RoiRule()
     labels = scene.labels(image)
-    in_core, in_tissue = labels == scene.index(core), labels == scene.index(tissue)
+    in_core, in_tissue = labels == scene.index("core"), labels == scene.index("fibrous")
     if not in_core.any():
-        raise ValueError(f"the body {core!r} does not cross the axial image: move the image")
+        raise ValueError("the body 'core' does not cross the axial image: move the image")
     foreground = _depth(in_core, image) > rule.core_margin
     background = (
         (_depth(in_tissue, image) > rule.background_margin)
         & (_depth(~in_core, image) < rule.background_reach)
-        & (_depth(labels != scene.index(lumen), image) > rule.lumen_margin)
+        & (_depth(labels != scene.index("lumen"), image) > rule.lumen_margin)
     )
     _not_empty(foreground, background, rule)
     regions, count = ndimage.label(background[0])
@@ -103,32 +96,22 @@ def place_rois(
 
 
 @checked
-def whole_rois(
-    scene: Scene,
-    image: VolumeGrid,
-    core: str = "core",
-    tissue: str = "fibrous",
-    lumen: str = "lumen",
-    margin: float = 0.10,
-    lumen_margin: float = 0.30,
-) -> RoiPair:
+def whole_rois(scene: Scene, image: VolumeGrid) -> RoiPair:
     """All of the core and all of the tissue in an image of one or more slices, but for a margin at their edges.
 
     The paper's two ROIs ask for a contrast in one small place; these ask how different the two tissues are.
 
     Args:
-        scene, core, tissue, lumen: as for :func:`place_rois`.
+        scene: as for :func:`place_rois`.
         image: ``(z, y, x)`` grid; with one slice distances are taken in the slice, else in space.
-        margin: both keep this far from every edge of their tissue, mm.
-        lumen_margin: the background keeps this far from the lumen, whose blood would spill into it, mm.
 
     Raises:
         ValueError: an unknown body, or a ROI that comes out empty.
     """
-    labels, rule = scene.labels(image), RoiRule(margin, margin, float("inf"), lumen_margin)
-    foreground = _depth(labels == scene.index(core), image) > margin
-    background = (_depth(labels == scene.index(tissue), image) > margin) & (
-        _depth(labels != scene.index(lumen), image) > lumen_margin
+    labels, rule = scene.labels(image), RoiRule(0.10, 0.10, float("inf"), 0.30)
+    foreground = _depth(labels == scene.index("core"), image) > rule.core_margin
+    background = (_depth(labels == scene.index("fibrous"), image) > rule.background_margin) & (
+        _depth(labels != scene.index("lumen"), image) > rule.lumen_margin
     )
     _not_empty(foreground, background, rule)
     return RoiPair(foreground, background, image, rule)

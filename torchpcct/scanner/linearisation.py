@@ -27,7 +27,8 @@ Floats = NDArray[np.float64]
 
 POLYNOMIAL_UP_TO = 12.0
 """Largest line integral for which a polynomial of :meth:`WaterLinearisation.polynomial` is taken at its word."""
-_ORDER = 7
+THICKEST_MM = 400.0
+"""Of the water in the calibration."""
 _SAMPLES = 400
 
 
@@ -92,34 +93,31 @@ class WaterLinearisation:
         cls,
         weights: ArrayLike,
         mu_water: ArrayLike,
-        max_mm: float = 400.0,
-        order: int = _ORDER,
+        order: int = 7,
         shift: Callable[[Floats], Floats] | None = None,
     ) -> WaterLinearisation:
-        """Fit from the spectra of the columns.
+        """Fit from the spectra of the columns, behind up to :data:`THICKEST_MM` of water.
 
         Args:
             weights: ``(columns, E)`` expected signal per energy without an object.
             mu_water: ``(E,)`` attenuation of water in mm⁻¹.
-            max_mm: thickest water of the calibration.
             order: number of coefficients.
             shift: what else the detector adds to the line integrals ``(columns, samples)`` that it is given (pile-up).
 
         Raises:
-            ValueError: a thickness ≤ 0 or an order < 1.
+            ValueError: an order < 1.
         """
-        number("max_mm", max_mm, positive=True, unit="mm")
         whole("order", order)
         w, mu = np.asarray(weights, np.float64), np.asarray(mu_water, np.float64)
         # Chebyshev nodes: no ringing at the ends.
-        t = max_mm * (0.5 - 0.5 * np.cos(np.pi * (np.arange(_SAMPLES) + 0.5) / _SAMPLES))
+        t = THICKEST_MM * (0.5 - 0.5 * np.cos(np.pi * (np.arange(_SAMPLES) + 0.5) / _SAMPLES))
         transmitted = np.exp(-np.outer(mu, t))
         p = -np.log(w @ transmitted / w.sum(1, keepdims=True))
         if shift is not None:
             p = p + shift(p)
         scale = p[:, -1]
-        centre = w[w.shape[0] // 2] @ np.exp(-mu * max_mm / 2)
-        mu_ref = float((w[w.shape[0] // 2] * np.exp(-mu * max_mm / 2)) @ mu / centre)
+        centre = w[w.shape[0] // 2] @ np.exp(-mu * THICKEST_MM / 2)
+        mu_ref = float((w[w.shape[0] // 2] * np.exp(-mu * THICKEST_MM / 2)) @ mu / centre)
         x = p / scale[:, None]
         powers = x[..., None] ** np.arange(order)
         target = mu_ref * t / p

@@ -132,29 +132,13 @@ class Scanner:
         depth = sum(m.attenuation(energies) * float(t) for m, t in paths.items()) if paths else 0.0
         return np.asarray(weights * np.exp(-depth))
 
-    def water_linearisation(
-        self, max_mm: float = 400.0, bin: int | None = None, order: int | None = None
-    ) -> WaterLinearisation:
+    def water_linearisation(self) -> WaterLinearisation:
         """Beam-hardening correction that makes water linear, one polynomial per column; within 2e-5 of the path.
 
-        Args:
-            max_mm: thickest water of the calibration.
-            bin: calibrate this energy bin alone; None: the sum of all bins.
-            order: coefficients per column; None: 7 for the sum, 11 for a single bin (the low bins hold Compton counts
-                of hard photons beside photoelectric counts of soft ones, which bends their curve more), 15 with
-                pile-up, which bends it most.
-
-        Raises:
-            ValueError: no such bin, ``max_mm`` ≤ 0; a single bin with pile-up.
-
-        It is calibrated on what the detector records: pile-up, if the detector has a dead time, is part of the curve.
+        Of the sum of all energy bins, and calibrated on what the detector records: pile-up, if the detector has a dead
+        time, is part of the curve.
         """
-        if bin is not None and not 0 <= bin < self.detector.bins:
-            raise ValueError(f"bin must lie in 0…{self.detector.bins - 1}, got {bin}")
-        pile_up = self.pile_up()
-        if pile_up is not None and bin is not None:
-            raise ValueError("single energy bins have no water correction with pile-up: calibrate the sum, bin=None")
-        return _linearisation(_Optics.of(self), self.detector, float(max_mm), bin, order, pile_up)
+        return _linearisation(_Optics.of(self), self.detector, self.pile_up())
 
     def describe(self) -> dict[str, Any]:
         """The scanner's numbers as JSON values, for reports and file headers."""
@@ -225,12 +209,8 @@ def _pile_up(optics: _Optics, detector: SiliconDetector) -> PileUpMap:
 
 
 @functools.lru_cache(maxsize=16)
-def _linearisation(
-    optics: _Optics, detector: Detector, max_mm: float, bin: int | None, order: int | None, pile_up: PileUpMap | None
-) -> WaterLinearisation:
+def _linearisation(optics: _Optics, detector: Detector, pile_up: PileUpMap | None) -> WaterLinearisation:
     energies, weights = _weights(optics, detector, False)
-    spectra = weights.sum(0) if bin is None else weights[bin]
-    if order is None:
-        order = 15 if pile_up is not None else 7 if bin is None else 11
+    order = 7 if pile_up is None else 15  # coefficients per column: pile-up bends the curve more
     shift = None if pile_up is None else pile_up.shift
-    return WaterLinearisation.calibrate(spectra, MATERIALS["water"].attenuation(energies), max_mm, order, shift)
+    return WaterLinearisation.calibrate(weights.sum(0), MATERIALS["water"].attenuation(energies), order, shift)

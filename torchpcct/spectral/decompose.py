@@ -78,7 +78,6 @@ def decompose(
     scale: Any = None,
     bias_reduction: bool = True,
     tolerance: float = TOLERANCE,
-    bounds: Any = None,
 ) -> Decomposition:
     """Maximum-likelihood decomposition of every ray.
 
@@ -88,17 +87,16 @@ def decompose(
         columns: detector column of each ray, broadcast to ``counts.shape[1:]``; None: the last axis.
         scale: relative intensity of each ray (row factor), broadcast alike; None: 1.
         bias_reduction: remove the bias of order 1 / counts. False gives plain maximum likelihood: exact for expected
-            counts, unbounded (up to ``bounds``) for rays without counts.
+            counts, unbounded (up to ``model.bounds``, far beyond any body) for rays without counts.
         tolerance: the iteration ends after a step below this many standard deviations.
-        bounds: ``((low, high), (low, high))`` in mm; None: ``model.bounds``, far beyond any body.
 
     Returns:
         :class:`Decomposition`; not differentiable.
 
     Raises:
         TypeError: counts that are no floating-point tensor.
-        ValueError: a wrong number of bins, negative or non-finite counts, indices outside the detector, a tolerance or
-            bounds out of order.
+        ValueError: a wrong number of bins, negative or non-finite counts, indices outside the detector, a tolerance
+            outside (0, 1).
     """
     if not isinstance(counts, Tensor) or counts.dtype not in (torch.float32, torch.float64):
         kind = counts.dtype if isinstance(counts, Tensor) else type(counts).__name__
@@ -111,9 +109,7 @@ def decompose(
             raise ValueError(f"counts must be finite and ≥ 0, got {low}…{high}: give raw counts, not line integrals")
     if not 0 < tolerance < 1:
         raise ValueError(f"tolerance must lie in (0, 1) standard deviations, got {tolerance}")
-    box = np.ascontiguousarray(model.bounds if bounds is None else bounds, np.float64)
-    if box.shape != (2, 2) or not (np.isfinite(box).all() and (box[:, 0] < box[:, 1]).all()):
-        raise ValueError(f"bounds must be ((low, high), (low, high)) in mm with low < high, got {bounds!r}")
+    box = np.ascontiguousarray(model.bounds)
     column, intensity = model.rays(tuple(counts.shape[1:]), columns, scale)
     n, shape = counts.detach().contiguous().reshape(model.bins, -1), counts.shape[1:]
     line_integrals, information = (torch.empty((k, column.size), dtype=counts.dtype) for k in (2, 3))

@@ -32,30 +32,22 @@ VMI_ENERGIES_KEV = tuple(float(e) for e in range(40, 141))
 
 
 @checked
-def vmi_weights(
-    basis: Basis, energies_kev: ArrayLike = VMI_ENERGIES_KEV, water: ArrayLike | None = None
-) -> tuple[Floats, Floats]:
+def vmi_weights(basis: Basis, energies_kev: ArrayLike = VMI_ENERGIES_KEV) -> tuple[Floats, Floats]:
     """The linear map from basis values to HU: ``HU(E) = g(E) · a + offset(E)``.
 
     Args:
         basis: of the images.
         energies_kev: ``(E,)`` keV.
-        water: ``(2,)`` coefficients that read 0 HU, e.g. measured in a water phantom; None: water fitted in the basis.
 
     Returns:
         ``g`` (E, 2) in HU, ``offset`` (E,) in HU, float64.
 
     Raises:
-        ValueError: energies outside 1…500 keV, ``water`` of another shape or not denser than air.
+        ValueError: energies outside 1…500 keV.
     """
     energies = np.atleast_1d(np.asarray(energies_kev, np.float64))
-    w = basis.coefficients("water") if water is None else np.asarray(water, np.float64)
-    if w.shape != (2,) or not np.isfinite(w).all():
-        raise ValueError(f"water must hold 2 finite basis coefficients, got {water!r}")
-    mu_water = basis.mu(w, energies)
+    mu_water = basis.mu(basis.coefficients("water"), energies)
     span = mu_water - material("air").attenuation(energies)
-    if not (span > 0).all():
-        raise ValueError(f"water must attenuate more than air at every energy, its coefficients are {w}")
     return 1000.0 * basis.attenuation(energies).T / span[:, None], -1000.0 * mu_water / span
 
 
@@ -67,14 +59,12 @@ def _pair(name: str, value: Any, entries: int) -> Tensor:
 
 
 @checked
-def vmi(
-    basis_images: Tensor, basis: Basis, energies_kev: ArrayLike = VMI_ENERGIES_KEV, water: ArrayLike | None = None
-) -> Tensor:
+def vmi(basis_images: Tensor, basis: Basis, energies_kev: ArrayLike = VMI_ENERGIES_KEV) -> Tensor:
     """Virtual monochromatic images.
 
     Args:
         basis_images: ``(2, ...)`` basis coefficients (dimensionless: line integrals in mm, reconstructed in mm).
-        basis, energies_kev, water: see :func:`vmi_weights`.
+        basis, energies_kev: see :func:`vmi_weights`.
 
     Returns:
         ``(E, ...)`` in HU, dtype and device of ``basis_images``, differentiable.
@@ -83,19 +73,17 @@ def vmi(
         ValueError: a wrong shape, see also :func:`vmi_weights`.
     """
     images = _pair("basis_images", basis_images, 2)
-    g, offset = (torch.from_numpy(v).to(images) for v in vmi_weights(basis, energies_kev, water))
+    g, offset = (torch.from_numpy(v).to(images) for v in vmi_weights(basis, energies_kev))
     return torch.tensordot(g, images, dims=1) + offset.reshape(-1, *(1,) * (images.ndim - 1))
 
 
 @checked
-def vmi_noise(
-    covariance: ArrayLike, basis: Basis, energies_kev: ArrayLike = VMI_ENERGIES_KEV, water: ArrayLike | None = None
-) -> Tensor:
+def vmi_noise(covariance: ArrayLike, basis: Basis, energies_kev: ArrayLike = VMI_ENERGIES_KEV) -> Tensor:
     """Standard deviation of virtual monochromatic images.
 
     Args:
         covariance: ``(3, ...)`` C₁₁, C₁₂, C₂₂ of the basis images (dimensionless).
-        basis, energies_kev, water: see :func:`vmi_weights`.
+        basis, energies_kev: see :func:`vmi_weights`.
 
     Returns:
         ``(E, ...)`` in HU.
@@ -109,7 +97,7 @@ def vmi_noise(
     # Rounding may leave the determinant of a singular covariance slightly below 0.
     if not bool((c[1] ** 2 <= c[0] * c[2] * (1 + _SINGULAR)).all()):
         raise ValueError("covariance is not that of two images (C12² > C11 · C22, or NaN): pack it as C11, C12, C22")
-    g = torch.from_numpy(vmi_weights(basis, energies_kev, water)[0]).to(c)
+    g = torch.from_numpy(vmi_weights(basis, energies_kev)[0]).to(c)
     terms = torch.stack([g[:, 0] ** 2, 2 * g[:, 0] * g[:, 1], g[:, 1] ** 2], dim=1)
     return torch.tensordot(terms, c, dims=1).clamp_min(0).sqrt()
 
@@ -150,14 +138,13 @@ def vmi_curve(
     covariance: ArrayLike,
     basis: Basis,
     energies_kev: ArrayLike = VMI_ENERGIES_KEV,
-    water: ArrayLike | None = None,
 ) -> VmiCurve:
     """Contrast, noise and CNR of two tissues against the energy of the VMI.
 
     Args:
         first, second: ``(2,)`` mean basis coefficients of the tissues.
         covariance: ``(3,)`` C₁₁, C₁₂, C₂₂ of the noise of the basis images, positive definite.
-        basis, energies_kev, water: see :func:`vmi_weights`.
+        basis, energies_kev: see :func:`vmi_weights`.
 
     Raises:
         ValueError: wrong shapes, a covariance that is not positive definite.
@@ -173,7 +160,7 @@ def vmi_curve(
         raise ValueError(f"covariance must be positive definite, packed as C11, C12, C22, got {c}")
     energies = np.atleast_1d(np.asarray(energies_kev, np.float64))
     d = a - b
-    contrast = vmi_weights(basis, energies, water)[0] @ d
-    noise = vmi_noise(c, basis, energies, water).numpy()
+    contrast = vmi_weights(basis, energies)[0] @ d
+    noise = vmi_noise(c, basis, energies).numpy()
     limit = np.sqrt((c[2] * d[0] ** 2 - 2 * c[1] * d[0] * d[1] + c[0] * d[1] ** 2) / det)
     return VmiCurve(energies, contrast, noise, np.abs(contrast) / noise, float(limit))

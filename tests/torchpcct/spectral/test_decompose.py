@@ -225,7 +225,6 @@ def test_errors(model):
     refused(
         ("float", lambda: decompose(good.int(), model)),
         ("tolerance", lambda: decompose(good, model, tolerance=0.0)),
-        ("bounds", lambda: decompose(good, model, bounds=((1, 0), (0, 1)))),
         (r"0…3", lambda: decompose(good, model, columns=[4])),
         ("whole numbers", lambda: decompose(good, model, columns=[0.5])),
         ("scale", lambda: decompose(good, model, scale=0.0)),

@@ -58,12 +58,6 @@ def test_water_decomposed_from_its_counts_is_zero():
     assert hu.abs().max() < 1.0
 
 
-def test_measured_water_can_take_the_place_of_the_fit():
-    water = np.array([0.97, 0.06])
-    hu = vmi(torch.from_numpy(water), pe_pvc(), ENERGIES, water=water)
-    assert hu.abs().max() < 1e-9
-
-
 def test_noise_follows_from_the_covariance():
     c = np.array([[4e-4, -1.9e-4], [-1.9e-4, 1.2e-4]])
     generator = np.random.default_rng(1)
@@ -126,8 +120,6 @@ def test_errors():
         ("negative", lambda: vmi_noise((-1.0, 0.0, 1.0), basis)),
         ("positive definite", lambda: vmi_curve((1, 0), (0, 1), (1.0, 2.0, 1.0), basis)),
         ("2 coefficients", lambda: vmi_curve((1, 0, 0), (0, 1), (1.0, 0.0, 1.0), basis)),
-        ("water", lambda: vmi_weights(basis, [60.0], water=(1.0,))),
-        ("more than air", lambda: vmi_weights(basis, [60.0], water=(0.0, 0.0))),
         ("keV", lambda: vmi(torch.zeros(2, 4), basis, [52000.0])),
     )
 
