@@ -31,6 +31,7 @@ from torchpcct.detector_window import footprint
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
 from torchpcct.projector import Projector
 from torchpcct.threads import get_num_threads, set_num_threads
+from torchpcct.vector_geometry import to_vectors
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "helpers"))  # where pytest finds them, too
 from analytic import Ellipsoid, Gaussian, line_integrals, rasterize
@@ -155,25 +156,16 @@ def astra_line(case: Case) -> Peer | None:
         return None
     (ny, nx), (cy, cx), (ey, ex) = grid.shape, grid.center, grid.extent
     volume = astra.create_vol_geom(ny, nx, cx - ex / 2, cx + ex / 2, cy - ey / 2, cy + ey / 2)
-    c, s = np.cos(g.angles), np.sin(g.angles)
-    if isinstance(g, ParallelBeam):
-        vectors = np.stack([-c, -s, g.offset * -s, g.offset * c, g.pitch * -s, g.pitch * c], axis=1)
-        projection = astra.create_proj_geom("parallel_vec", g.columns, vectors)
-        projector = astra.create_projector("line", projection, volume)
-    else:
-        back = g.sdd - g.sod
-        vectors = np.stack(
-            [g.sod * c, g.sod * s, -back * c - g.offset * s, -back * s + g.offset * c, -g.pitch * s, g.pitch * c],
-            axis=1,
-        )
-        projection = astra.create_proj_geom("fanflat_vec", g.columns, vectors)
-        projector = astra.create_projector("line_fanflat", projection, volume)
+    vectors = to_vectors(g)
+    kind, line = ("parallel_vec", "line") if isinstance(g, ParallelBeam) else ("fanflat_vec", "line_fanflat")
+    projection = astra.create_proj_geom(kind, g.columns, vectors)
+    projector = astra.create_projector(line, projection, volume)
     image_id, data_id = astra.data2d.create("-vol", volume), astra.data2d.create("-sino", projection)
 
-    def algorithm(kind: str) -> int:
-        config = astra.astra_dict(kind)
+    def algorithm(name: str) -> int:
+        config = astra.astra_dict(name)
         config.update({"ProjectorId": projector, "ProjectionDataId": data_id})
-        config["VolumeDataId" if kind == "FP" else "ReconstructionDataId"] = image_id
+        config["VolumeDataId" if name == "FP" else "ReconstructionDataId"] = image_id
         return astra.algorithm.create(config)
 
     fp, bp = algorithm("FP"), algorithm("BP")

@@ -44,7 +44,7 @@ from torch.nn import functional as F
 
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, view_step
-from torchpcct.validate import checked, coverage
+from torchpcct.validate import checked
 
 __all__ = ["CENTRE_TOLERANCE", "UNKNOWN", "OppositeRays", "ScanTest", "centre_test", "geometry_test"]
 
@@ -102,7 +102,6 @@ def centre_test(
     geometry: Geometry,
     window: DetectorWindow | None = None,
     about: tuple[float, float] = (0.0, 0.0),
-    false_alarms: float = FALSE_ALARMS,
 ) -> ScanTest:
     """Measure the rotation centre by the opposite rays of a scan, of a cone beam by those near the plane of the source.
 
@@ -112,7 +111,6 @@ def centre_test(
         geometry: parallel, fan or cone beam.
         window: of the readings; None: the whole detector.
         about: (y, x) in mm of what the readings show: views are interpolated along its path.
-        false_alarms: share of scans with an error of :data:`CENTRE_TOLERANCE` that raise an alarm.
 
     Returns:
         The test of ``centre``: how many columns too high the described positions of the columns are; and of ``swing``,
@@ -120,11 +118,10 @@ def centre_test(
         measured or nothing is to be seen.
 
     Raises:
-        ValueError: a wrong shape, NaN or Inf, a rate outside (0, 1).
+        ValueError: a wrong shape, NaN or Inf.
     """
-    coverage("false_alarms", false_alarms)
     pairs = _Pairs.of(lines, geometry, window, about)
-    return UNKNOWN if pairs is None else _centre(pairs, false_alarms)[0]
+    return UNKNOWN if pairs is None else _centre(pairs, FALSE_ALARMS)[0]
 
 
 @checked
@@ -133,13 +130,11 @@ def geometry_test(
     geometry: Geometry,
     window: DetectorWindow | None = None,
     about: tuple[float, float] = (0.0, 0.0),
-    false_alarms: float = FALSE_ALARMS,
 ) -> ScanTest:
     """Test the description of a scan by its opposite rays: centre, fan angles, steps between views, roll.
 
     Args:
         lines, geometry, window, about: see :func:`centre_test`.
-        false_alarms: share of scans whose errors are as large as tolerated that raise an alarm.
 
     Returns:
         The test of ``centre`` (see :func:`centre_test`), ``scale`` (fan angles described too small, relative), ``step``
@@ -148,15 +143,14 @@ def geometry_test(
         nothing to do with each other. Of several causes the one that explains most is named.
 
     Raises:
-        ValueError: a wrong shape, NaN or Inf, a rate outside (0, 1).
+        ValueError: a wrong shape, NaN or Inf.
     """
-    coverage("false_alarms", false_alarms)
     pairs = _Pairs.of(lines, geometry, window, about)
     if pairs is None:
         return UNKNOWN
     # What a cone's rays lie apart along z looks like an error of the angles, not like one of the centre.
     plane = pairs if window is not None or pairs.rays.flat else _Pairs.of(lines, geometry, window, about, _PLANE_CELLS)
-    centre, explained = _centre(pairs, false_alarms / 3.0)
+    centre, explained = _centre(pairs, FALSE_ALARMS / 3.0)
     ranked = [(explained / pairs.here.numel(), text) for text in centre.findings]
     sizes, errors = ({k: v for k, v in values.items() if k == "centre"} for values in (centre.sizes, centre.errors))
     causes = [(pairs, "roll"), *((plane, name) for name in ("scale", "step") if plane is not None)]
@@ -170,12 +164,12 @@ def geometry_test(
         if not fits:
             continue
         # The wider slopes reach farther, the narrower ones see smaller errors.
-        level = false_alarms / (3.0 * len(causes) * len(_COLUMNS))
+        level = FALSE_ALARMS / (3.0 * len(causes) * len(_COLUMNS))
         best = next((f for f in reversed(fits) if f.found(level, tolerance, _LARGEST)), fits[0])
         sizes[name], errors[name] = best.size, best.error
         if best.found(level, tolerance, _LARGEST) and best.explained > _INTERPOLATED * of.interpolated:
             ranked.append((best.explained / of.here.numel(), _TEXTS[name](best.size, best.error)))
-    mismatch, differ = (math.nan, 0) if plane is None else plane.mismatch(false_alarms / 3.0)
+    mismatch, differ = (math.nan, 0) if plane is None else plane.mismatch(FALSE_ALARMS / 3.0)
     mirrored = plane is not None and differ > 0 and plane.agrees_mirrored(min(_DIFFER, mismatch / 4.0))
     explained = max((share for share, _ in ranked), default=0.0)
     if plane is not None and differ and (mirrored or explained < _EXPLAINED * plane.disagreement):

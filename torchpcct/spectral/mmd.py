@@ -7,10 +7,10 @@ the one whose triangle in the plane of coefficients holds the voxel or comes nea
 smallest one wins (the most specific explanation); a voxel outside all of them moves to the nearest point of the nearest
 triangle.
 
-Cleaning: Li et al. name "a standard 2D k-means clustering" without its features. :func:`clean` takes the fractions,
-averaged over a small in-plane window, and starts the clusters at the pure tissues, so that each keeps its name and the
-result does not depend on chance. :func:`nearest` keeps the centres there and measures distances in the two dimensions
-of the basis plane, in units of its noise: voxels at the edge of the vessel, mixed with fat, then move no centre.
+Cleaning: Li et al. name "a standard 2D k-means clustering" without its features. :func:`clean` takes the fractions and
+starts the clusters at the pure tissues, so that each keeps its name and the result does not depend on chance.
+:func:`nearest` keeps the centres there and measures distances in the two dimensions of the basis plane, in units of its
+noise: voxels at the edge of the vessel, mixed with fat, then move no centre.
 """
 
 from __future__ import annotations
@@ -34,6 +34,8 @@ MMD_TISSUES = ("blood_iodine", "necrotic_core", "fibrous_tissue", "pericoronary_
 """The tissues of Li et al."""
 
 _SLACK = 1e-9  # round-off: a voxel on an edge is inside
+_ITERATIONS = 50
+"""Most of Lloyd's algorithm, which usually ends after a few."""
 
 
 @checked
@@ -180,35 +182,26 @@ def nearest(
 
 
 @checked
-def clean(fractions: Tensor, window: int = 3, iterations: int = 50) -> Tensor:
+def clean(fractions: Tensor) -> Tensor:
     """Labels from noisy fractions by k-means.
 
     Args:
         fractions: ``(K, y, x)`` or ``(K, z, y, x)`` of :func:`mmd`.
-        window: side of the in-plane square over which fractions are averaged first, odd; 1: no averaging.
-        iterations: at most so many of Lloyd's algorithm; it usually ends after a few.
 
     Returns:
         ``(y, x)`` or ``(z, y, x)`` int64 labels 0…K−1 in the order of the tissues. A cluster that loses its last voxel
         keeps its centre.
 
     Raises:
-        ValueError: a wrong number of axes, an even or negative window.
+        ValueError: a wrong number of axes.
     """
     if fractions.ndim not in (3, 4):
         raise ValueError(f"fractions must be (K, y, x) or (K, z, y, x), got the shape {tuple(fractions.shape)}")
-    if isinstance(window, bool) or not isinstance(window, int) or window < 1 or window % 2 == 0:
-        raise ValueError(f"window must be an odd whole number ≥ 1, got {window!r}")
     count = fractions.shape[0]
-    x = fractions.detach().to(torch.float64)
-    if window > 1:
-        planes = x.reshape(-1, 1, *x.shape[-2:])
-        pad = torch.nn.functional.pad(planes, (window // 2,) * 4, mode="replicate")
-        x = torch.nn.functional.avg_pool2d(pad, window, stride=1).reshape(x.shape)
-    x = x.reshape(count, -1)
+    x = fractions.detach().to(torch.float64).reshape(count, -1)
     centres = torch.eye(count, dtype=torch.float64, device=x.device)  # (clusters, K)
     labels = torch.full((x.shape[1],), -1, device=x.device)
-    for _ in range(iterations):
+    for _ in range(_ITERATIONS):
         distance = centres.square().sum(1)[:, None] - 2 * centres @ x  # less |x|², the same for all clusters
         new = distance.argmin(0)
         if bool((new == labels).all()):

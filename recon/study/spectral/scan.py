@@ -230,7 +230,7 @@ class Tissues:
         if rule == "nearest":
             return nearest(fractions, self.basis, self.corners, self.covariance)
         if rule == "k-means":
-            return torch.stack([clean(fractions[:, k], window=1) for k in range(fractions.shape[1])])
+            return torch.stack([clean(fractions[:, k]) for k in range(fractions.shape[1])])
         return label(fractions)
 
     def dice(self, images: Tensor, rule: str = "nearest") -> list[float]:

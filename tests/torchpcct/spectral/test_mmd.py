@@ -100,7 +100,7 @@ def test_cleaning_loses_the_core_as_noise_grows():
 def test_cleaning_keeps_pure_labels_and_repeats():
     truth = phantom()
     fractions = torch.nn.functional.one_hot(truth, 4).permute(2, 0, 1).double()
-    assert torch.equal(clean(fractions, window=1), truth)
+    assert torch.equal(clean(fractions), truth)
     stacked = torch.stack([fractions] * 3, 1) + 0.1 * torch.rand(
         4, 3, 48, 48, generator=torch.Generator().manual_seed(0)
     )
@@ -140,6 +140,5 @@ def test_errors():
         ("3 or more", lambda: mmd(x, BASIS, ("water", "adipose"))),
         ("one line", lambda: mmd(x, BASIS, np.array([[0.0, 1.0, 2.0], [0.0, 1.0, 2.0]]))),
         ("positive definite", lambda: mmd(x, BASIS, covariance=(1.0, 2.0, 1.0))),
-        ("odd", lambda: clean(torch.rand(4, 5, 5), window=2)),
         (r"\(K, y, x\)", lambda: clean(torch.rand(4, 5))),
     )
