@@ -168,13 +168,13 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     pieces.ahead(_scan, *((name, f) for name in SCANNERS for f in dict.fromkeys(fractions[name])))
     plan: dict[str, Any] = {}
     for name in SCANNERS:
-        with clock.step(f"{name}, residual motion"):
-            still, moving = _residual(s, m, name, reference, pieces, progress)
+        still, moving = _residual(s, m, name, reference, pieces, progress)
+        clock.lap(f"{name}, residual motion")
         if name == "PCCT":
             plan = dict(moving.info["plan"])
-            with clock.step("compensation"):
-                told = partial(progress, "compensation")
-                m.compensated = compensate(s, still, moving, reference, pieces.within("compensation"), told)
+            told = partial(progress, "compensation")
+            m.compensated = compensate(s, still, moving, reference, pieces.within("compensation"), told)
+            clock.lap("compensation")
     data = {
         "range_mm": m.range_mm,
         "step_mm": m.step_mm,

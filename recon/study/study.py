@@ -21,8 +21,7 @@ from __future__ import annotations
 import os
 import platform
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
@@ -120,13 +119,6 @@ class Clock:
         now = time.perf_counter()
         self.seconds[step] = self.seconds.get(step, 0.0) + now - self._last
         self._last = now
-
-    @contextmanager
-    def step(self, step: str) -> Iterator[None]:
-        """Count the time of a block, and only that, to ``step``."""
-        self._last = time.perf_counter()
-        yield
-        self.lap(step)
 
 
 @dataclass

@@ -125,6 +125,16 @@ def _described(title: str, change: Callable[[Any], Any], unseen: str = "", tissu
 # --- the plaque's scan ------------------------------------------------------------------------------------------------
 
 
+def _dosed(title: str, factor: float, noise: float, tissues: bool = False) -> Case:
+    """Another dose, ``factor`` times that of the sound scan."""
+
+    def apply(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
+        assert scan.exposure_s is not None
+        return clean.with_noise(scan.exposure_s * factor, scan.seed or 0)
+
+    return Case(title, apply, noise, tissues=tissues)
+
+
 def _lost(share: float) -> Case:
     def apply(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
         lost = torch.from_numpy(rng.random(tuple(scan.counts.shape), dtype=np.float32) < share)
@@ -198,11 +208,6 @@ def _rolled(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
     return replace(clean, counts=counts).with_noise(scan.exposure_s, scan.seed or 0)
 
 
-def _million(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
-    assert scan.exposure_s is not None
-    return clean.with_noise(scan.exposure_s * 1e6, scan.seed or 0)
-
-
 def _harder(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
     """2 keV more: water attenuates 1.2 % less at 64 keV than at 62 keV."""
     air = scan._at_window(scan.air)
@@ -230,11 +235,6 @@ def _narrow(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
     w = scan.window
     columns = w.columns // 8
     return scan.crop(replace(w, first_column=w.first_column + (w.columns - columns) // 2, columns=columns))
-
-
-def _hundredth(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
-    assert scan.exposure_s is not None
-    return clean.with_noise(scan.exposure_s / 100, scan.seed or 0)
 
 
 def _shuffled(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
@@ -289,8 +289,8 @@ def _large(plaque: Plaque) -> Scene:
 
 _PLAQUE: dict[str, Case] = {
     "sound": Case("nothing", lambda clean, scan, rng: scan, tissues=True),
-    "dose-100th": Case("1/100 of the dose", _hundredth, 10.0, tissues=True),
-    "dose-million": Case("a million times the dose", _million, 2**0.5),
+    "dose-100th": _dosed("1/100 of the dose", 1 / 100, 10.0, tissues=True),
+    "dose-million": _dosed("a million times the dose", 1e6, 2**0.5),
     "lost-0.1": _lost(0.001),
     "lost-1": _lost(0.01),
     "lost-10": _lost(0.1),
@@ -505,10 +505,7 @@ _BODY: dict[str, Case] = {
     "offset": Case("a detector of three quarters", _columns(0.0, 0.75), 2**0.5),
     "quarter-detector": Case("less than half a detector", _columns(0.0, 0.45)),
     # What the readings are.
-    "20-photons": Case(
-        "20 photons in air", lambda clean, scan, rng: clean.with_noise(20.0 / PHOTONS, scan.seed or 0),
-        (PHOTONS / 20.0) ** 0.5,
-    ),
+    "20-photons": _dosed("20 photons in air", 20.0 / PHOTONS, (PHOTONS / 20.0) ** 0.5),
     "log-as-counts": Case(
         "line integrals given as counts", _given(lambda n, s: _from_counts(_lines(n) + 1.0, s, 10.0))
     ),
