@@ -92,7 +92,6 @@ class PlaqueSegmentation:
         lumen: ``(y, x)`` bool, the largest connected region of at least the lumen's threshold.
         band: ``(y, x)`` bool, all that reads between the core's limits, rims and wall included.
         core: ``(y, x)`` bool, the largest enclosed part of the band; empty where there is none.
-        lumen_hu, core_hu: the thresholds, HU.
     """
 
     image: Floats
@@ -100,8 +99,6 @@ class PlaqueSegmentation:
     lumen: Mask
     band: Mask
     core: Mask
-    lumen_hu: float
-    core_hu: tuple[float, float]
 
     @property
     def _pixel_mm2(self) -> float:
@@ -131,8 +128,8 @@ class PlaqueSegmentation:
         """
         if not self.lumen.any() or not self.core.any():
             return math.nan
-        lumen = self._contours(self.lumen, self.lumen_hu)
-        core = self._contours(self.core, self.core_hu[1])
+        lumen = self._contours(self.lumen, LUMEN_HU)
+        core = self._contours(self.core, CORE_HU[1])
         return min(_between(a, b) for a in lumen for b in core)
 
     def _contours(self, region: Mask, level: float) -> list[Floats]:
@@ -148,43 +145,28 @@ class PlaqueSegmentation:
 
 
 @checked
-def segment_plaque(
-    image: ArrayLike, grid: VolumeGrid, *, lumen_hu: float = LUMEN_HU, core_hu: tuple[float, float] = CORE_HU
-) -> PlaqueSegmentation:
-    """Segment lumen and core.
+def segment_plaque(image: ArrayLike, grid: VolumeGrid) -> PlaqueSegmentation:
+    """Segment lumen and core by the paper's thresholds.
 
     Args:
         image: ``(y, x)`` or ``(1, y, x)`` HU, tensor or array; fat must surround the vessel in it.
         grid: of the image.
-        lumen_hu: the lumen reads this or more.
-        core_hu: the core reads between these.
 
     Raises:
-        ValueError: an image that is not one slice of the grid's shape, NaN or Inf, thresholds that do not rise from
-            the core's band to the lumen.
+        ValueError: an image that is not one slice of the grid's shape, NaN or Inf.
     """
-    low, high = (float(v) for v in core_hu)
-    if not low < high < lumen_hu:
-        raise ValueError(f"thresholds must rise from the core's band to the lumen, got {core_hu} and {lumen_hu} HU")
     x, plane = _slice(image, grid)
-    lumen = _largest(label(x >= lumen_hu, connectivity=2))
+    lumen = _largest(label(x >= LUMEN_HU, connectivity=2))
+    low, high = CORE_HU
     band = (x >= low) & (x <= high)
     dark = label(x <= high, connectivity=1)
     border = np.unique(np.concatenate([dark[0], dark[-1], dark[:, 0], dark[:, -1]]))
     core = _largest(np.where(np.isin(dark, border) | ~band, 0, dark))
-    return PlaqueSegmentation(x, plane, lumen, band, core, float(lumen_hu), (low, high))
+    return PlaqueSegmentation(x, plane, lumen, band, core)
 
 
 @checked
-def cap_on_line(
-    image: ArrayLike,
-    grid: VolumeGrid,
-    start: tuple[float, float],
-    end: tuple[float, float],
-    *,
-    lumen_hu: float = LUMEN_HU,
-    core_hu: float = CORE_HU[1],
-) -> float:
+def cap_on_line(image: ArrayLike, grid: VolumeGrid, start: tuple[float, float], end: tuple[float, float]) -> float:
     """Cap thickness in mm on the line from the lumen to the core: where the image falls below both thresholds.
 
     Unlike :attr:`PlaqueSegmentation.cap_thickness` it needs no closed core: it still reads what blur makes of the cap
@@ -192,12 +174,12 @@ def cap_on_line(
 
     Args:
         image, grid: as for :func:`segment_plaque`.
-        start, end: ``(y, x)`` mm, in the lumen and in the core (their centres).
-        lumen_hu, core_hu: the lumen ends where the image first falls below the one, the core begins where it first
-            falls to the other; by linear interpolation between samples 5 µm apart.
+        start, end: ``(y, x)`` mm, in the lumen and in the core (their centres). The lumen ends where the image first
+            falls below its threshold, the core begins where it first falls to its upper one, by linear interpolation
+            between samples 5 µm apart.
 
     Returns:
-        NaN where the line starts below ``lumen_hu`` or does not reach ``core_hu``.
+        NaN where the line does not start in the lumen, or does not reach the core.
 
     Raises:
         ValueError: as :func:`segment_plaque`; a line that leaves the image, or has no length.
@@ -213,8 +195,8 @@ def cap_on_line(
     if index.min() < 0 or (index.max(axis=1) > np.array(plane.shape) - 1).any():
         raise ValueError(f"the line from {tuple(start)} to {tuple(end)} mm leaves the image: give points inside it")
     profile = map_coordinates(x, index, order=1)
-    edges = [first_below(along, profile, level, math.nan) for level in (lumen_hu, core_hu)]
-    return edges[1] - edges[0] if profile[0] >= lumen_hu else math.nan
+    edges = [first_below(along, profile, level, math.nan) for level in (LUMEN_HU, CORE_HU[1])]
+    return edges[1] - edges[0] if profile[0] >= LUMEN_HU else math.nan
 
 
 @checked

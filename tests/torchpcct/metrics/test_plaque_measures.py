@@ -22,8 +22,6 @@ from torchpcct.metrics.plaque_measures import (
 from torchpcct.metrics.resolution import ellipsoid_distance
 
 GRID = VolumeGrid((160, 180), (0.03, 0.025), (-30.0, -29.0))
-HALF = {"lumen_hu": 300.0, "core_hu": (10.0, 70.0)}
-"""Thresholds halfway between blood (500), tissue (100) and core (40)."""
 
 
 def distance(center: tuple[float, float], grid: VolumeGrid = GRID) -> np.ndarray:
@@ -40,12 +38,13 @@ def edge(center: tuple[float, float], radius: float, grid: VolumeGrid = GRID, wi
 def vessel(
     lumen: float = 0.8, core: float = 0.35, cap: float = 0.2, angle: float = 0.0, grid: VolumeGrid = GRID
 ) -> tuple[np.ndarray, tuple[float, float], tuple[float, float]]:
-    """Fat, fibrous tissue, blood and beside it a core; and the centres of the two."""
+    """Fat, fibrous tissue (90 HU), blood (410) and beside it a core (30), with the thresholds halfway between; and the
+    centres of the two."""
     a = (-30.0 - 0.35 * math.sin(angle), -29.0 - 0.35 * math.cos(angle))
     away = lumen + cap + core
     b = (a[0] + away * math.sin(angle), a[1] + away * math.cos(angle))
-    image = -100.0 + 200.0 * edge((-30.0, -29.0), 1.75, grid)
-    return image + 400.0 * edge(a, lumen, grid) - 60.0 * edge(b, core, grid), a, b
+    image = -100.0 + 190.0 * edge((-30.0, -29.0), 1.75, grid)
+    return image + 320.0 * edge(a, lumen, grid) - 60.0 * edge(b, core, grid), a, b
 
 
 @settings(max_examples=10, deadline=None)
@@ -54,14 +53,14 @@ def vessel(
 )
 def test_discs(lumen, core, cap, angle):
     image, a, b = vessel(lumen, core, cap, angle)
-    found = segment_plaque(image, GRID, **HALF)
+    found = segment_plaque(image, GRID)
     # Counting pixels errs by a fraction of those on the rim.
     assert found.lumen_area == pytest.approx(math.pi * lumen**2, abs=0.15 * 2 * math.pi * lumen * 0.03)
     assert found.core_area == pytest.approx(math.pi * core**2, abs=0.2 * 2 * math.pi * core * 0.03)
     assert found.cap_thickness == pytest.approx(cap, abs=0.004)
-    assert cap_on_line(image, GRID, a, b, lumen_hu=300.0, core_hu=70.0) == pytest.approx(cap, abs=0.003)
+    assert cap_on_line(image, GRID, a, b) == pytest.approx(cap, abs=0.003)
     # Contours lie between the pixels.
-    assert math.sqrt(lumen_area(image, GRID, a, 300.0) / math.pi) == pytest.approx(lumen, abs=1e-3)
+    assert math.sqrt(lumen_area(image, GRID, a) / math.pi) == pytest.approx(lumen, abs=1e-3)
 
 
 @pytest.mark.parametrize("radius", [0.4, 1.1])
@@ -99,12 +98,12 @@ def test_an_open_core_is_lost_but_not_its_line():
     image, a, b = vessel()
     rows, columns = (np.abs(GRID.axes[0] - b[0]) < 0.05), GRID.axes[1] > b[1]
     image[np.ix_(rows, columns)] = np.minimum(image[np.ix_(rows, columns)], 50.0)
-    found = segment_plaque(image, GRID, **HALF)
+    found = segment_plaque(image, GRID)
     assert not found.core_found
     assert math.isnan(found.core_area)
     assert math.isnan(found.cap_thickness)
     assert found.lumen_area == pytest.approx(math.pi * 0.8**2, rel=0.02)
-    assert cap_on_line(image, GRID, a, b, lumen_hu=300.0, core_hu=70.0) == pytest.approx(0.2, abs=0.003)
+    assert cap_on_line(image, GRID, a, b) == pytest.approx(0.2, abs=0.003)
 
 
 def test_a_diagonal_line_of_bright_pixels_closes():
@@ -112,7 +111,7 @@ def test_a_diagonal_line_of_bright_pixels_closes():
     image[:2] = -100.0
     image[3, 3] = image[2, 2] = 40.0  # dark pixels that touch at a corner only
     image[5, 3] = 500.0
-    found = segment_plaque(image, VolumeGrid((7, 7), 0.5), **HALF)
+    found = segment_plaque(image, VolumeGrid((7, 7), 0.5))
     assert found.core.sum() == 1
     assert found.core[3, 3]
     assert found.core_area == 0.25
@@ -131,15 +130,15 @@ def test_nothing_there():
 
 def test_tensors_slices_and_any_place():
     image, _, _ = vessel()
-    plain = segment_plaque(image, GRID, **HALF)
+    plain = segment_plaque(image, GRID)
     one = VolumeGrid((1, *GRID.shape), (0.1, *GRID.spacing), (3.0, 5.0, 7.0))
-    moved = segment_plaque(torch.from_numpy(image)[None].float(), one, **HALF)
+    moved = segment_plaque(torch.from_numpy(image)[None].float(), one)
     np.testing.assert_array_equal(moved.core, plain.core)
     assert moved.cap_thickness == pytest.approx(plain.cap_thickness, abs=1e-6)
-    turned = segment_plaque(image.T, VolumeGrid(GRID.shape[::-1], GRID.spacing[::-1]), **HALF)
+    turned = segment_plaque(image.T, VolumeGrid(GRID.shape[::-1], GRID.spacing[::-1]))
     np.testing.assert_array_equal(turned.core, plain.core.T)
     assert turned.cap_thickness == pytest.approx(plain.cap_thickness, rel=1e-9)
-    double = segment_plaque(image, VolumeGrid(GRID.shape, tuple(2 * s for s in GRID.spacing)), **HALF)
+    double = segment_plaque(image, VolumeGrid(GRID.shape, tuple(2 * s for s in GRID.spacing)))
     assert double.cap_thickness == pytest.approx(2 * plain.cap_thickness, rel=1e-9)
     assert double.lumen_area == pytest.approx(4 * plain.lumen_area, rel=1e-12)
 
@@ -176,8 +175,6 @@ def test_dice():
         (lambda: segment_plaque(np.zeros((3, 3)), GRID), "one slice of the grid's shape"),
         (lambda: segment_plaque(np.zeros((2, 3, 3)), VolumeGrid((2, 3, 3), 1.0)), "sample the axial image"),
         (lambda: segment_plaque(np.full(GRID.shape, np.nan), GRID), "NaN"),
-        (lambda: segment_plaque(np.zeros(GRID.shape), GRID, core_hu=(60.0, 20.0)), "thresholds must rise"),
-        (lambda: segment_plaque(np.zeros(GRID.shape), GRID, lumen_hu=50.0), "thresholds must rise"),
         (lambda: cap_on_line(np.zeros(GRID.shape), GRID, (-30, -29), (-30, -9)), "leaves the image"),
         (lambda: cap_on_line(np.zeros(GRID.shape), GRID, (-30, -29), (-30, -29)), "apart"),
         (lambda: basin_depth(np.zeros(GRID.shape), GRID, np.zeros(GRID.shape)), "must mark pixels"),
