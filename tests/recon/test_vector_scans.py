@@ -130,7 +130,7 @@ def test_halves_of_a_helix_take_every_second_view_of_each_turn():
     cone = ConeBeam(np.arange(8) * math.pi / 2 + 0.1, 150.0, 250.0, 4, 3, 1.0)
     geometry = VectorGeometry.of(cone, helical_motion(cone, 8.0))
     scan = Scan.from_counts(np.full(geometry.shape, 50.0), geometry, air=100.0)
-    one, two = halves(scan, "views")
+    one, two = halves(scan)
     assert one.geometry.poses[:, 0, 2].tolist() == pytest.approx([0.0, 4.0, 8.0, 12.0])
     assert two.geometry.poses[:, 0, 2].tolist() == pytest.approx([2.0, 6.0, 10.0, 14.0])
 

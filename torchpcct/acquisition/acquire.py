@@ -158,13 +158,7 @@ def _readings(
     return out
 
 
-def acquire_voxels(
-    scene: VoxelScene,
-    scanner: Scanner,
-    *,
-    progress: Callable[[float], None] | None = None,
-    sub_columns: int = _SUB_COLUMNS,
-) -> Scan:
+def acquire_voxels(scene: VoxelScene, scanner: Scanner, *, progress: Callable[[float], None] | None = None) -> Scan:
     """The noise-free scan of a voxel volume, whole detector; called by :func:`torchpcct.acquire`.
 
     The attenuation of all tissues at all energies is compressed to a few basis maps
@@ -175,7 +169,6 @@ def acquire_voxels(
         scene: tissues in voxels.
         scanner: what scans it.
         progress: called with the finished fraction.
-        sub_columns: parts of each cell.
 
     Raises:
         ValueError: a source inside the grid.
@@ -186,8 +179,8 @@ def acquire_voxels(
     scene = scene.read_by(energies, spectra[: scanner.detector.bins, g.columns // 2].sum(0))
     coefficients, basis = compress(scene.contrast(energies), tolerance=_TOLERANCE)
     maps = torch.from_numpy(scene.mixed(coefficients))
-    fine = replace(g, columns=g.columns * sub_columns, pitch=(g.pitch[0], g.pitch[1] / sub_columns))
-    weight = torch.from_numpy((spectra / sub_columns).astype(np.float32))  # (bins, columns, energies)
+    fine = replace(g, columns=g.columns * _SUB_COLUMNS, pitch=(g.pitch[0], g.pitch[1] / _SUB_COLUMNS))
+    weight = torch.from_numpy((spectra / _SUB_COLUMNS).astype(np.float32))  # (bins, columns, energies)
     bins = weight.shape[0]
     rows = torch.from_numpy(np.asarray(scanner.row_factor, dtype=np.float32))
     spectrum = torch.from_numpy(basis.astype(np.float32))
@@ -197,7 +190,7 @@ def acquire_voxels(
         part = fine.select(slice(v0, min(v0 + block, g.views)))
         lines = Projector(part, scene.grid)(maps)  # (rank, views, rows, fine columns)
         for v in range(part.views):
-            counts[:, v0 + v] = _voxel_readings(lines[:, v], spectrum, weight, sub_columns) * rows[:, None]
+            counts[:, v0 + v] = _voxel_readings(lines[:, v], spectrum, weight) * rows[:, None]
         if progress is not None:
             progress((v0 + part.views) / g.views)
     info = {
@@ -205,7 +198,7 @@ def acquire_voxels(
         "scene": list(scene.names),
         "plan": {
             "basis_maps": len(basis),
-            "sub_columns": sub_columns,
+            "sub_columns": _SUB_COLUMNS,
             "left_out": _LEFT_OUT,
             "clipped": scene.clipped,
             "above_muscle": scene.above_muscle,
@@ -215,12 +208,12 @@ def acquire_voxels(
     return detected(scanner, counts, air, energies, info)
 
 
-def _voxel_readings(lines: Tensor, spectrum: Tensor, weight: Tensor, sub_columns: int) -> Tensor:
+def _voxel_readings(lines: Tensor, spectrum: Tensor, weight: Tensor) -> Tensor:
     """``(bins, rows, columns)`` of one view: ``lines (rank, rows, columns · sub)``, ``spectrum (rank, energies)``."""
     out = lines.new_empty((weight.shape[0], lines.shape[1], weight.shape[1]))
     for r in range(lines.shape[1]):
         transmitted = torch.exp(-(lines[:, r].T @ spectrum))  # (columns · sub, energies)
-        cells = transmitted.view(-1, sub_columns, spectrum.shape[1]).sum(1)
+        cells = transmitted.view(-1, _SUB_COLUMNS, spectrum.shape[1]).sum(1)
         out[:, r] = (weight * cells).sum(-1)
     return out
 

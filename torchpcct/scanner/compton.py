@@ -19,27 +19,26 @@ _NODES = 96
 
 
 @functools.cache
-def _gauss_legendre(count: int) -> tuple[Floats, Floats]:
-    nodes, weights = np.polynomial.legendre.leggauss(count)
+def _gauss_legendre() -> tuple[Floats, Floats]:
+    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
     return nodes, weights
 
 
 @checked
-def recoil(energies_kev: ArrayLike, nodes: int = _NODES) -> tuple[Floats, Floats]:
+def recoil(energies_kev: ArrayLike) -> tuple[Floats, Floats]:
     """Recoil-electron energies and their probabilities (Klein and Nishina 1929; binding is neglected).
 
     Gauss–Legendre quadrature over the cosine of the scattering angle: ``Σ_k p_k f(T_k)`` integrates smooth ``f``.
 
     Args:
         energies_kev: ``(E,)`` photon energies in keV.
-        nodes: number of quadrature nodes.
 
     Returns:
         ``T`` (E, nodes) in keV, from 0 up to the Compton edge 2E²/(mc² + 2E); ``p`` (E, nodes), summing to 1 over
         the nodes.
     """
     energies = np.atleast_1d(np.asarray(energies_kev, dtype=np.float64))[:, None]
-    cosine, weight = _gauss_legendre(nodes)
+    cosine, weight = _gauss_legendre()
     ratio = 1.0 / (1.0 + energies / ELECTRON_REST_KEV * (1.0 - cosine))  # scattered over incident energy
     density = weight * ratio**2 * (ratio + 1.0 / ratio - (1.0 - cosine**2))
     return energies * (1.0 - ratio), density / density.sum(axis=1, keepdims=True)

@@ -39,13 +39,13 @@ _SAMPLES = 2048
 
 
 @checked
-def pulse_heights(detector: SiliconDetector, energies_kev: ArrayLike, size: int, step_kev: float = _STEP_KEV) -> Floats:
+def pulse_heights(detector: SiliconDetector, energies_kev: ArrayLike, size: int) -> Floats:
     """Pulses per incident photon by recorded height, ``(E, size)``.
 
-    Charge sharing and energy resolution included; entry k holds the heights k·step … (k + 1)·step, the first one all
+    Charge sharing and energy resolution included; entry k holds the heights of k … k + 1 keV, the first one all
     below, the last one all above.
     """
-    edges = np.concatenate([[-np.inf], step_kev * np.arange(1, size)])
+    edges = np.concatenate([[-np.inf], _STEP_KEV * np.arange(1, size)])
     cumulative = detector.above(energies_kev, edges)
     return np.asarray(np.maximum(cumulative - np.append(cumulative[1:], 0 * cumulative[:1], axis=0), 0.0).T)
 

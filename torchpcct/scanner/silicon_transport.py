@@ -31,6 +31,9 @@ Ints = NDArray[np.int64]
 _NODES_KEV = np.arange(10.0, 151.0, 2.0)
 """Photon energies that are followed; the difference is smooth between them."""
 
+_MOST_INTERACTIONS = 20
+"""A photon is dropped after so many."""
+
 _HEIGHT_KEV = 0.1
 _HEIGHTS = np.arange(0.5 * _HEIGHT_KEV, _NODES_KEV[-1] + 1.0, _HEIGHT_KEV)
 
@@ -124,7 +127,6 @@ def follow(
     photons: int,
     rng: np.random.Generator,
     stack: Stack | None = None,
-    interactions: int = 20,
 ) -> Deposits:
     """Follow photons that enter the front of the detector along the strips, evenly over one cell.
 
@@ -138,7 +140,6 @@ def follow(
         photons: number of incident photons.
         rng: of all random numbers.
         stack: sheets and foils.
-        interactions: a photon is dropped after so many.
 
     Raises:
         ValueError: no photons, a spectrum without any.
@@ -160,7 +161,7 @@ def follow(
     ends = detector.dead_layer_mm + np.cumsum(detector.segment_mm)
     table = _Attenuation()
     found: list[tuple[Any, ...]] = []
-    for order in range(interactions):
+    for order in range(_MOST_INTERACTIONS):
         index, place, direction, energy = index[alive], place[alive], direction[alive], energy[alive]
         place, alive = _fly(place, direction, energy, stack, float(ends[-1]), table, rng)
         index, place, direction, energy = index[alive], place[alive], direction[alive], energy[alive]
