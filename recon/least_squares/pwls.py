@@ -29,7 +29,7 @@ from recon.gram.gram import Gram, check_weights
 from recon.least_squares.field_model import FieldModel, GradientStep
 from recon.least_squares.memory import gram_bytes, require_memory
 from recon.least_squares.model_solver import ModelSolver, line_search
-from recon.least_squares.qggmrf import FORM, QGGMRF, BoundPrior
+from recon.least_squares.qggmrf import QGGMRF, BoundPrior
 from recon.linear_operator import NormalOperator
 from torchpcct.detector_window import footprint
 from torchpcct.validate import checked, number, renamed, whole
@@ -418,8 +418,8 @@ def solve_normal(
         "strength": prior.strength if isinstance(prior, QGGMRF) else None,
         "lambda": bound.lam,
         "threshold_hu_per_mm": bound.threshold,
-        "p": FORM["p"],
-        "q": FORM["q"],
+        "p": bound.p,
+        "q": bound.q,
         "seconds": time.perf_counter() - started,
     }
     return PwlsResult(x.reshape(*lead, *shape), report)

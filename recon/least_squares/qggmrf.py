@@ -1,12 +1,12 @@
 """The q-generalised Gaussian Markov random field: the edge-preserving prior of model-based reconstruction.
 
 Potential of a gradient t (HU/mm) between two neighbours (Thibault, Sauer, Bouman, Hsieh 2007, Med. Phys. 34:4526,
-eq. 18, with the exponents p = 2 and q = 1, normalised to curvature 1 at t = 0)::
+eq. 18, normalised to curvature 1 at t = 0 for p = 2)::
 
-    ρ(t) = t² / (2 (1 + |t / T|))
+    ρ(t) = |t|ᵖ T²⁻ᵖ / (p (1 + |t / T|ᵖ⁻ᵠ)),        1 ≤ q ≤ p ≤ 2
 
-Below the threshold T it acts like ``t²`` (smooths noise), above like ``|t|`` (lets edges pass); it is convex. With
-T = ∞ it is the quadratic (Gaussian) prior.
+Below the threshold T it acts like ``|t|ᵖ`` (smooths noise), above like ``|t|ᵠ`` (lets edges pass); it is convex.
+p = q = 2 is the quadratic prior (with half the curvature, see :func:`quadratic`).
 
 The energy is a Riemann sum over the volume, so it does not depend on the voxel size, to first order::
 
@@ -38,10 +38,10 @@ from torch import Tensor
 from torchpcct.threads import run
 from torchpcct.validate import number
 
-__all__ = ["DEFAULT_PRIOR", "FORM", "QGGMRF", "BoundPrior"]
+__all__ = ["DEFAULT_PRIOR", "QGGMRF", "BoundPrior", "quadratic"]
 
-FORM = {"p": 2.0, "q": 1.0, "neighbors": 26}
-"""Of the prior, for reports: exponents of small and of large gradients, and how many neighbours a voxel has."""
+# Below p = 2 the curvature at 0 is infinite: gradients are rounded off at this fraction of the threshold.
+ROUNDING = 1e-3
 
 
 @dataclass(frozen=True)
@@ -54,6 +54,8 @@ class QGGMRF:
             hence stays and the noise falls as dose^(−1/2).
         threshold: T in HU/mm, or, with ``relative=True``, in units of ``(λ mm³)^(−1/2)``, a gradient scale that follows
             the noise (∝ dose^(−1/2)). ``inf`` makes the prior quadratic.
+        p, q: exponents of small and large gradients, 1 ≤ q ≤ p ≤ 2.
+        neighbors: 26 (2-D: 8) or 6 (2-D: 4).
         relative: how to read ``threshold``.
 
     Raises:
@@ -62,11 +64,18 @@ class QGGMRF:
 
     strength: float
     threshold: float
+    p: float = 2.0
+    q: float = 1.0
+    neighbors: int = 26
     relative: bool = False
 
     def __post_init__(self) -> None:
         number("strength", self.strength, low=0.0)
         number("threshold", self.threshold, positive=True, finite=False)
+        if not 1.0 <= self.q <= self.p <= 2.0:
+            raise ValueError(f"the exponents need 1 ≤ q ≤ p ≤ 2 for a convex prior, got p = {self.p}, q = {self.q}")
+        if self.neighbors not in (6, 26):
+            raise ValueError(f"neighbors must be 6 or 26 (2-D: 4 or 8), got {self.neighbors}")
 
     def bind(
         self, information: float, spacing: Sequence[float], mu_per_hu: float, channels: bool = False
@@ -85,7 +94,7 @@ class QGGMRF:
         threshold = self.threshold
         if self.relative and lam > 0:
             threshold = self.threshold / math.sqrt(lam)
-        return BoundPrior(lam, threshold, tuple(spacing), mu_per_hu, channels)
+        return BoundPrior(lam, threshold, self.p, self.q, self.neighbors, tuple(spacing), mu_per_hu, channels)
 
 
 DEFAULT_PRIOR = QGGMRF(strength=0.3, threshold=16.0, relative=True)
@@ -96,6 +105,11 @@ prior lowers the noise of ROI means further, but shrinks the contrast of a milli
 and slope, not at CNR alone."""
 
 
+def quadratic(strength: float, neighbors: int = 26) -> QGGMRF:
+    """The quadratic (Gaussian) prior of the same strength: ρ(t) = t² / 2."""
+    return QGGMRF(strength, math.inf, 2.0, 1.0, neighbors)
+
+
 @dataclass(frozen=True)
 class BoundPrior:
     """A q-GGMRF energy of volumes ``(..., [channels,] *grid.shape)`` in mm⁻¹. Made by :meth:`QGGMRF.bind`.
@@ -103,6 +117,7 @@ class BoundPrior:
     Args:
         lam: λ in 1/(HU² mm).
         threshold: T in HU/mm.
+        p, q, neighbors: see :class:`QGGMRF`.
         spacing: voxel size per axis in mm.
         mu_per_hu: 1 HU in mm⁻¹.
         channels: whether the volumes have an axis of channels before those of the grid.
@@ -110,6 +125,9 @@ class BoundPrior:
 
     lam: float
     threshold: float
+    p: float
+    q: float
+    neighbors: int
     spacing: tuple[float, ...]
     mu_per_hu: float
     channels: bool = False
@@ -122,25 +140,48 @@ class BoundPrior:
 
     # -- the potential: the only place where its formula stands ---------------------------------------------------
 
+    def _size(self, t: Tensor) -> Tensor:
+        return t.abs() if self.p == 2.0 else torch.sqrt(t * t + (ROUNDING * self._finite) ** 2)
+
+    @property
+    def _finite(self) -> float:
+        return self.threshold if math.isfinite(self.threshold) else 1.0
+
+    def _bend(self, s: Tensor) -> Tensor:
+        """|t / T|^(p − q)."""
+        if math.isinf(self.threshold):
+            return torch.zeros_like(s)
+        r, power = s / self.threshold, self.p - self.q
+        return r if power == 1.0 else r.pow(power)
+
     def potential(self, t: Tensor) -> Tensor:
         """ρ(t) of gradients t in HU/mm."""
-        return t * t / (2 * (1 + t.abs() / self.threshold))
+
+        def rho(s: Tensor) -> Tensor:
+            u = s * s if self.p == 2.0 else s.pow(self.p) * self._finite ** (2 - self.p)
+            return u / (self.p * (1 + self._bend(s)))
+
+        zero = rho(self._size(torch.zeros(1, dtype=t.dtype, device=t.device)))
+        return rho(self._size(t)) - zero
 
     def curvature(self, t: Tensor) -> Tensor:
         """ρ'(t) / t: the curvature of the parabola through (t, ρ(t)) that lies above ρ everywhere (Huber)."""
-        bend = t.abs() / self.threshold
-        return (1 + 0.5 * bend) / (1 + bend) ** 2
+        s = self._size(t)
+        bend = self._bend(s)
+        head = torch.ones_like(s) if self.p == 2.0 else (s / self._finite).pow(self.p - 2)
+        return head * (1 + (self.q / self.p) * bend) / (1 + bend) ** 2
 
     # -- the energy -----------------------------------------------------------------------------------------------
 
     @property
     def offsets(self) -> tuple[tuple[tuple[int, ...], float, float], ...]:
-        """Half of the 26 neighbours (2-D: 8): (index offset, distance in mm, ω)."""
+        """Half of the neighbours: (index offset, distance in mm, ω)."""
         axes = len(self.spacing)
         found = []
         for step in itertools.product((-1, 0, 1), repeat=axes):
-            if step > (0,) * axes:
-                found.append((step, math.sqrt(sum((i * h) ** 2 for i, h in zip(step, self.spacing, strict=True)))))
+            if step <= (0,) * axes or (self.neighbors == 6 and sum(map(abs, step)) != 1):
+                continue
+            found.append((step, math.sqrt(sum((i * h) ** 2 for i, h in zip(step, self.spacing, strict=True)))))
         total = sum(d for _, d in found)
         return tuple((step, d, axes * d / total) for step, d in found)
 
@@ -243,7 +284,7 @@ class BoundPrior:
         return x.detach().reshape(-1, *shape).contiguous().numpy()
 
     def _tables(self, dtype: Any, both: bool) -> tuple[Any, ...]:
-        """Arguments of the kernels: neighbours, reaches, factors, and ½ in the data's precision."""
+        """Arguments of the kernels: neighbours, scales, factors, kind and form of the potential."""
         steps, scales, factors = [], [], []
         for step, d, omega in self.offsets:
             full = (0,) * (3 - len(step)) + step
@@ -251,20 +292,26 @@ class BoundPrior:
                 steps.append([sign * i for i in full])
                 scales.append(1.0 / (self.mu_per_hu * d))
                 factors.append(self.lam * self._volume * omega / (self.mu_per_hu * d) ** 2)
-        reaches = np.array(scales, dtype) * dtype.type(1.0 / self.threshold)
-        return np.array(steps, dtype=np.int64), reaches, np.array(factors, dtype), dtype.type(0.5)
+        power = self.p - self.q
+        if self.p == 2.0 and math.isinf(self.threshold):
+            kind = 0
+        else:
+            kind = 1 if self.p == 2.0 and power == 1.0 else 2
+        inverse = 1.0 / self._finite
+        form = np.array([inverse, power, self.q / self.p, self.p - 2.0, ROUNDING], dtype=dtype)
+        return np.array(steps, dtype=np.int64), np.array(scales, dtype), np.array(factors, dtype), kind, form
 
-    def spectrum(self, shape: Sequence[int]) -> Tensor:
+    def spectrum(self, shape: Sequence[int], dtype: torch.dtype = torch.float64) -> Tensor:
         """Eigenvalues of the curvature at t = 0 on a periodic grid, ``rfftn`` layout ``(..., shape[-1] // 2 + 1)``."""
         n = len(shape)
-        double = torch.float64
-        grids = [torch.fft.fftfreq(k, dtype=double) for k in shape[:-1]] + [torch.fft.rfftfreq(shape[-1], dtype=double)]
+        grids = [torch.fft.fftfreq(k, dtype=dtype) for k in shape[:-1]] + [torch.fft.rfftfreq(shape[-1], dtype=dtype)]
         mesh = torch.meshgrid(*grids, indexing="ij")
-        total = torch.zeros_like(mesh[0])
+        total = torch.zeros(mesh[0].shape, dtype=dtype)
+        at_zero = 1.0 if self.p == 2.0 else ROUNDING ** (self.p - 2)
         for step, d, omega in self.offsets:
             phase = sum((2 * math.pi * mesh[a] * step[a] for a in range(n)), torch.zeros_like(mesh[0]))
             total = total + (omega / d**2) * (2 - 2 * torch.cos(phase))
-        return total * (self.lam * self._volume / self.mu_per_hu**2)
+        return total * (self.lam * self._volume * at_zero / self.mu_per_hu**2)
 
 
 def _pair(x: Tensor, step: tuple[int, ...]) -> tuple[Tensor, Tensor]:

@@ -2,8 +2,8 @@
 
 The curvature formula is that of ``BoundPrior.curvature``, to which the tests compare these kernels. Rows of voxels are
 independent of each other in every pass, so results do not depend on the number of threads; ``begin … end`` of
-``batch · nz · ny`` are worked on. Inner loops run over slices with unsigned indices and without branches, so that they
-vectorise.
+``batch · nz · ny`` are worked on. Inner loops run over slices with unsigned indices and without branches (one loop for
+each kind of potential), so that they vectorise.
 
 Of several channels the curvature of the length of their difference is written to a buffer first and serves them all; a
 single one, which would take 5 to 14 % longer that way, does without.
@@ -24,51 +24,100 @@ _VIEWS_ONLY: Any = {"nogil": True, "cache": True, "fastmath": _FLAGS, "error_mod
 
 
 @njit(inline="always")
-def _curvature(r, factor, half):
-    """factor · ρ'(t) / t at r = |t| / T."""
-    one = half + half
+def _simple(r, factor, form):
+    """factor · ρ'(t) / t at r = |t| / T for p = 2 and q = 1."""
+    one = form[0] / form[0]
     d = one + r
-    return factor * (one + half * r) / (d * d)
+    return factor * (one + form[2] * r) / (d * d)
 
 
 @njit(inline="always")
-def _add_pull(x0, x1, v0, v1, reach, factor, half, to):
-    """to += factor · ρ'(t)/t · (v0 − v1), t / T = reach · (x0 − x1)."""
-    for j in range(x0.size):
-        i = np.uint64(j)
-        to[i] += _curvature(abs(x0[i] - x1[i]) * reach, factor, half) * (v0[i] - v1[i])
+def _general(r, form):
+    """ρ'(t) / t at r = |t| / T for any 1 ≤ q ≤ p ≤ 2."""
+    one = form[0] / form[0]
+    if form[3] != 0:
+        r = np.sqrt(r * r + form[4] * form[4])
+    bend = r ** form[1]
+    d = one + bend
+    c = (one + form[2] * bend) / (d * d)
+    return c * r ** form[3] if form[3] != 0 else c
 
 
 @njit(inline="always")
-def _two_sums(x0, x1, u0, u1, v0, v1, reach, half):
+def _add_pull(x0, x1, v0, v1, scale, factor, kind, form, to):
+    """to += factor · ρ'(t)/t · (v0 − v1), t = scale · (x0 − x1)."""
+    n = x0.size
+    if kind == 0:
+        for j in range(n):
+            i = np.uint64(j)
+            to[i] += factor * (v0[i] - v1[i])
+    elif kind == 1:
+        reach = scale * form[0]
+        for j in range(n):
+            i = np.uint64(j)
+            to[i] += _simple(abs(x0[i] - x1[i]) * reach, factor, form) * (v0[i] - v1[i])
+    else:
+        for j in range(n):
+            i = np.uint64(j)
+            to[i] += factor * _general(abs((x0[i] - x1[i]) * scale) * form[0], form) * (v0[i] - v1[i])
+
+
+@njit(inline="always")
+def _two_sums(x0, x1, u0, u1, v0, v1, scale, kind, form):
     """Sums of ρ'(t)/t · (x0 − x1)(v0 − v1) and ρ'(t)/t · (u0 − u1)(v0 − v1)."""
-    a = b = half - half
-    for j in range(x0.size):
-        i = np.uint64(j)
-        t = x0[i] - x1[i]
-        c = _curvature(abs(t) * reach, half + half, half) * (v0[i] - v1[i])
-        a += c * t
-        b += c * (u0[i] - u1[i])
+    n = x0.size
+    one = form[0] / form[0]
+    a = b = one - one
+    if kind == 0:
+        for j in range(n):
+            i = np.uint64(j)
+            a += (x0[i] - x1[i]) * (v0[i] - v1[i])
+            b += (u0[i] - u1[i]) * (v0[i] - v1[i])
+    elif kind == 1:
+        reach = scale * form[0]
+        for j in range(n):
+            i = np.uint64(j)
+            t = x0[i] - x1[i]
+            c = _simple(abs(t) * reach, one, form) * (v0[i] - v1[i])
+            a += c * t
+            b += c * (u0[i] - u1[i])
+    else:
+        for j in range(n):
+            i = np.uint64(j)
+            t = x0[i] - x1[i]
+            c = _general(abs(t * scale) * form[0], form) * (v0[i] - v1[i])
+            a += c * t
+            b += c * (u0[i] - u1[i])
     return a, b
 
 
 @njit(inline="always")
-def _curvatures(x0, x1, reach, factor, half, out):
-    """out = factor · ρ'(t)/t for every voxel of a row, t / T = reach · |x0 − x1|; x0, x1 ``(channels, n)``."""
+def _curvatures(x0, x1, scale, factor, kind, form, out):
+    """out = factor · ρ'(t)/t for every voxel of a row, t = scale · |x0 − x1|; x0, x1 ``(channels, n)``."""
+    n = out.size
+    if kind == 0:
+        out[:] = factor
+        return
     out[:] = 0
     for c in range(x0.shape[0]):
         a, b = x0[c], x1[c]
-        for j in range(out.size):
+        for j in range(n):
             i = np.uint64(j)
             d = a[i] - b[i]
             out[i] += d * d
-    for j in range(out.size):
-        i = np.uint64(j)
-        out[i] = _curvature(np.sqrt(out[i]) * reach, factor, half)
+    if kind == 1:
+        reach = scale * form[0]
+        for j in range(n):
+            i = np.uint64(j)
+            out[i] = _simple(np.sqrt(out[i]) * reach, factor, form)
+    else:
+        for j in range(n):
+            i = np.uint64(j)
+            out[i] = factor * _general(np.sqrt(out[i]) * scale * form[0], form)
 
 
 @njit(**_VIEWS_ONLY)
-def _majorize(begin, end, x, v, steps, reaches, factors, half, out, work):
+def _majorize(begin, end, x, v, steps, scales, factors, kind, form, out, work):
     _, channels, nz, ny, nx = x.shape
     for row in range(begin, end):
         n, z, y = row // (nz * ny), (row // ny) % nz, row % ny
@@ -83,11 +132,13 @@ def _majorize(begin, end, x, v, steps, reaches, factors, half, out, work):
                 _add_pull(
                     x[n, 0, z, y, low:high], x[n, 0, z1, y1, low + dx : high + dx],
                     v[n, 0, z, y, low:high], v[n, 0, z1, y1, low + dx : high + dx],
-                    reaches[k], factors[k], half, out[n, 0, z, y, low:high],
+                    scales[k], factors[k], kind, form, out[n, 0, z, y, low:high],
                 )  # fmt: skip
                 continue
             w = work[low:high]
-            _curvatures(x[n, :, z, y, low:high], x[n, :, z1, y1, low + dx : high + dx], reaches[k], factors[k], half, w)
+            _curvatures(
+                x[n, :, z, y, low:high], x[n, :, z1, y1, low + dx : high + dx], scales[k], factors[k], kind, form, w
+            )
             for c in range(channels):
                 v0, v1, to = v[n, c, z, y, low:high], v[n, c, z1, y1, low + dx : high + dx], out[n, c, z, y, low:high]
                 for j in range(high - low):
@@ -96,22 +147,24 @@ def _majorize(begin, end, x, v, steps, reaches, factors, half, out, work):
 
 
 @njit(nogil=True, cache=True, fastmath=_FLAGS, error_model="numpy")
-def majorize(begin, end, x, v, steps, reaches, factors, half, out):
-    """out = Σ_neighbours factor · ρ'(t)/t · (v_j − v_k); t / T = reach · length of x_j − x_k over the channels.
+def majorize(begin, end, x, v, steps, scales, factors, kind, form, out):
+    """out = Σ_neighbours factor · ρ'(t)/t · (v_j − v_k); t = scale · length of x_j − x_k over the channels.
 
     Args:
         x, v: ``(batch, channels, nz, ny, nx)`` contiguous.
         steps: ``(neighbours, 3)`` int64, ALL neighbours (both signs).
-        reaches, factors: ``(neighbours,)`` in the dtype of x: 1 / (T mu_per_hu d) and λ V ω / (mu_per_hu d)².
-        half: ½ in the dtype of x, so that nothing is computed in another one.
+        scales, factors: ``(neighbours,)`` in the dtype of x: 1 / (mu_per_hu d) and λ V ω / (mu_per_hu d)².
+        kind: 0 quadratic, 1 p = 2 and q = 1 (no powers), 2 general.
+        form: ``(5,)`` in the dtype of x: 1 / T, p − q, q / p, p − 2, ε / T.
         out: like x.
     """
-    _majorize(begin, end, x, v, steps, reaches, factors, half, out, np.empty(x.shape[-1], x.dtype))
+    _majorize(begin, end, x, v, steps, scales, factors, kind, form, out, np.empty(x.shape[-1], x.dtype))
 
 
 @njit(**_VIEWS_ONLY)
-def _along(begin, end, x, u, v, steps, reaches, factors, half, out, work):
+def _along(begin, end, x, u, v, steps, scales, factors, kind, form, out, work):
     _, channels, nz, ny, nx = x.shape
+    one = form[0] / form[0]
     for row in range(begin, end):
         n, z, y = row // (nz * ny), (row // ny) % nz, row % ny
         first = second = 0.0
@@ -125,18 +178,20 @@ def _along(begin, end, x, u, v, steps, reaches, factors, half, out, work):
                     x[n, 0, z, y, low:high], x[n, 0, z1, y1, low + dx : high + dx],
                     u[n, 0, z, y, low:high], u[n, 0, z1, y1, low + dx : high + dx],
                     v[n, 0, z, y, low:high], v[n, 0, z1, y1, low + dx : high + dx],
-                    reaches[k], half,
+                    scales[k], kind, form,
                 )  # fmt: skip
                 first += factors[k] * a
                 second += factors[k] * b
                 continue
             w = work[low:high]
-            _curvatures(x[n, :, z, y, low:high], x[n, :, z1, y1, low + dx : high + dx], reaches[k], factors[k], half, w)
+            _curvatures(
+                x[n, :, z, y, low:high], x[n, :, z1, y1, low + dx : high + dx], scales[k], factors[k], kind, form, w
+            )
             for c in range(channels):
                 x0, x1 = x[n, c, z, y, low:high], x[n, c, z1, y1, low + dx : high + dx]
                 u0, u1 = u[n, c, z, y, low:high], u[n, c, z1, y1, low + dx : high + dx]
                 v0, v1 = v[n, c, z, y, low:high], v[n, c, z1, y1, low + dx : high + dx]
-                a = b = half - half
+                a = b = one - one
                 for j in range(high - low):
                     i = np.uint64(j)
                     pull = w[i] * (v0[i] - v1[i])
@@ -149,12 +204,12 @@ def _along(begin, end, x, u, v, steps, reaches, factors, half, out, work):
 
 
 @njit(nogil=True, cache=True, fastmath=_FLAGS, error_model="numpy")
-def along(begin, end, x, u, v, steps, reaches, factors, half, out):
+def along(begin, end, x, u, v, steps, scales, factors, kind, form, out):
     """Row sums of the two inner products ⟨v, M(x) x⟩ and ⟨v, M(x) u⟩, M the matrix of :func:`majorize`.
 
     Args:
-        steps, reaches, factors: HALF of the neighbours.
+        steps, scales, factors: HALF of the neighbours.
         out: ``(batch, nz, ny, 2)`` float64.
-        x, u, v, half: as in :func:`majorize`.
+        x, u, v, kind, form: as in :func:`majorize`.
     """
-    _along(begin, end, x, u, v, steps, reaches, factors, half, out, np.empty(x.shape[-1], x.dtype))
+    _along(begin, end, x, u, v, steps, scales, factors, kind, form, out, np.empty(x.shape[-1], x.dtype))

@@ -29,7 +29,7 @@ from torch import Tensor
 from recon.analytic.exact_noise import functional_covariance
 from recon.evaluate.store import Pieces
 from recon.least_squares.basis_problem import BasisProblem
-from recon.least_squares.qggmrf import DEFAULT_PRIOR, FORM
+from recon.least_squares.qggmrf import DEFAULT_PRIOR
 from recon.study.figures import extent
 from recon.study.paper import facts as paper
 from recon.study.report import Check, around
@@ -282,7 +282,7 @@ def _mbir(
     return {
         "anisotropy": problem.anisotropy,
         "whitening": problem.whitening.forward.tolist(),
-        "prior": {**asdict(DEFAULT_PRIOR), **FORM},
+        "prior": asdict(DEFAULT_PRIOR),
         "solves": reports,
         "at_best_energy": values,
     }, scores

@@ -14,7 +14,7 @@ from recon.analytic.inset import InsetFbp
 from recon.gram.gram import Gram
 from recon.least_squares.basis_problem import BasisProblem, Whitening, joint_pwls, mean_weights, weigh
 from recon.least_squares.pwls import pwls
-from recon.least_squares.qggmrf import QGGMRF
+from recon.least_squares.qggmrf import QGGMRF, quadratic
 
 EDGE = QGGMRF(0.15, 100.0)
 
@@ -81,7 +81,7 @@ def rms(a, b):
     return float((a.double() - b.double()).square().mean().sqrt())
 
 
-@pytest.mark.parametrize("prior", [QGGMRF(0.15, math.inf), EDGE, QGGMRF(0.5, 30.0)])
+@pytest.mark.parametrize("prior", [quadratic(0.15), EDGE, QGGMRF(0.5, 30.0, 2.0, 1.2, 6)])
 def test_exact_minimum(inset, dense, prior):
     A, f, gram, y = inset
     bound = prior.bind(gram.information(1.0), A.grid.spacing, 1.0, channels=True)
@@ -120,7 +120,7 @@ def test_correlation_that_changes_from_ray_to_ray_is_information():
     f = torch.stack([w, 0.9 * sign * w, w])
     truth = tissue(A.grid)
     y = A(truth) + correlated_noise(f, (6,), 3)
-    weak = QGGMRF(0.02, math.inf)
+    weak = quadratic(0.02)
     joint = joint_pwls(A, y, f, weak, tolerance=0.2, max_exact=60).x
     alone = pwls(A, y, w * (1 - 0.81), weak, mu_per_hu=1.0, tolerance=0.2, max_exact=60).x
     clean = A(truth).expand_as(y)

@@ -1,7 +1,5 @@
 """PWLS against dense float64 solutions, and its hard cases."""
 
-import math
-
 import inset_operators
 import pytest
 import torch
@@ -10,7 +8,7 @@ from refusals import refused
 
 from recon.gram.gram import Gram
 from recon.least_squares.pwls import pwls, solve_normal
-from recon.least_squares.qggmrf import QGGMRF
+from recon.least_squares.qggmrf import QGGMRF, quadratic
 
 EDGE = QGGMRF(0.15, 100.0)
 
@@ -44,9 +42,7 @@ def reference(dense, A, w, y, prior, information):
     return minimum(H, b, prior.bind(information, A.grid.spacing, HU), A.domain_shape, 1e-7 * HU)
 
 
-@pytest.mark.parametrize(
-    "prior", [QGGMRF(0.3, 4.0, relative=True), QGGMRF(0.01, math.inf)], ids=["edge-preserving", "weak"]
-)
+@pytest.mark.parametrize("prior", [QGGMRF(0.3, 4.0, relative=True), quadratic(0.01)], ids=["edge-preserving", "weak"])
 def test_distance_is_right_where_the_model_converges_slowly(prior):
     """A shift-invariant model of few views: each step is a fifth or half of the one before."""
     A, w = problem(views=60, shape=(6, 21, 21), rows=8)
@@ -62,7 +58,7 @@ def test_distance_is_right_where_the_model_converges_slowly(prior):
         assert 0.8 * true < found.report["rmsd_hu"][-1] < 1.5 * true
 
 
-@pytest.mark.parametrize("prior", [QGGMRF(0.15, math.inf), EDGE, QGGMRF(0.5, 30.0)])
+@pytest.mark.parametrize("prior", [quadratic(0.15), EDGE, QGGMRF(0.5, 30.0, 2.0, 1.2, 6)])
 def test_exact_minimum_within_three_pairs(inset, dense, prior):
     A, w, gram, y = inset
     x = reference(dense, A, w, y, prior, gram.information(HU))
@@ -119,8 +115,8 @@ def test_lost_readings(inset, dense, case):
 def test_low_dose_is_the_same_problem_scaled(inset):
     """1/100 of the dose with the noise in the same units: strength is noise-normalised, so x is the same."""
     A, w, gram, y = inset
-    full = pwls(A, y, w, QGGMRF(0.15, math.inf), mu_per_hu=HU, gram=gram, tolerance=0.02)
-    low = pwls(A, y, w / 100, QGGMRF(0.15, math.inf), mu_per_hu=HU, gram=gram.scaled(0.01), tolerance=0.02)
+    full = pwls(A, y, w, quadratic(0.15), mu_per_hu=HU, gram=gram, tolerance=0.02)
+    low = pwls(A, y, w / 100, quadratic(0.15), mu_per_hu=HU, gram=gram.scaled(0.01), tolerance=0.02)
     assert hu_rms(full.x, low.x) < 0.1
 
 

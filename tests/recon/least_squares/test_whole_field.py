@@ -11,7 +11,7 @@ from recon.gram.gram import Gram
 from recon.least_squares import field_model
 from recon.least_squares.field_model import FieldModel
 from recon.least_squares.pwls import Approach, data_model, pwls
-from recon.least_squares.qggmrf import QGGMRF
+from recon.least_squares.qggmrf import QGGMRF, quadratic
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Projector, VolumeGrid, full_turn
 from torchpcct.vector_geometry import VectorGeometry
 
@@ -69,7 +69,7 @@ def hu_rms(a, b):
     return float((a.double() - b.double()).square().mean().sqrt()) / HU
 
 
-@pytest.mark.parametrize("prior", [QGGMRF(0.3, math.inf), EDGE], ids=["quadratic", "edge-preserving"])
+@pytest.mark.parametrize("prior", [quadratic(0.3), EDGE], ids=["quadratic", "edge-preserving"])
 def test_finds_the_dense_minimum(scan, prior):
     A, y, w, matrix = scan
     bound = prior.bind(FieldModel(A, w).information(HU), A.grid.spacing, HU)
