@@ -51,13 +51,25 @@ def _parser() -> argparse.ArgumentParser:
         help="start from the weights of another run, of a network as wide or less",
     )
     parser.add_argument("--threads", type=int, metavar="N", help="threads per process (default: torch's choice)")
+    parser.add_argument("--device", default="cpu", metavar="NAME", help="where it trains: cpu (default) or cuda")
+    parser.add_argument(
+        "--painters",
+        type=int,
+        metavar="N",
+        help="processes that paint all scenes beforehand (default: each scene is painted when it is first used; needed "
+        "for the speed of a GPU)",
+    )
     parser.add_argument("--no-progress", action="store_true", help="no progress line")
     parser.add_argument("--no-tensorboard", action="store_true", help="no TensorBoard events")
     return parser
 
 
-def build(config: TrainConfig) -> tuple[Unrolled, Data, Objective]:
-    """Model with its starting weights, data, and objective."""
+def build(config: TrainConfig, device: str = "cpu") -> tuple[Unrolled, Data, Objective]:
+    """Model with its starting weights, data, and objective.
+
+    Raises:
+        ValueError: a device that torch does not have here.
+    """
     import torch
 
     from recon.mbir.network import NetworkConfig
@@ -65,10 +77,15 @@ def build(config: TrainConfig) -> tuple[Unrolled, Data, Objective]:
     from train.data import Data
     from train.objective import Objective
 
+    try:
+        where = torch.zeros((), device=device).device
+    except (RuntimeError, AssertionError) as error:
+        raise ValueError(f"no device {device!r} here: take cpu, or cuda on a machine with a GPU ({error})") from error
     torch.manual_seed(config.seed)
-    model = Unrolled(NetworkConfig(**config.network), steps=config.unroll)
-    model.network.half_precision = config.bfloat16 and torch.ops.mkldnn._is_mkldnn_bf16_supported()
-    return model, Data(config.data), Objective(config.objective, config.single)
+    model = Unrolled(NetworkConfig(**config.network), steps=config.unroll).to(where)
+    fast = where.type == "cuda" or torch.ops.mkldnn._is_mkldnn_bf16_supported()
+    model.network.half_precision = config.bfloat16 and fast
+    return model, Data(config.data, where), Objective(config.objective, config.single)
 
 
 @contextmanager
@@ -109,9 +126,11 @@ def _run(arguments: argparse.Namespace, command: str) -> int:
         changes = {k: v for k, v in (("steps", arguments.steps), ("seed", arguments.seed)) if v is not None}
         config = replace(config, **changes)
         with _processes():
-            model, data, objective = build(config)
+            model, data, objective = build(config, arguments.device)
             if arguments.weights is not None:
                 start_from(model, read_tensors(arguments.weights, WEIGHTS_FORMAT)[0])
+            if arguments.painters is not None:
+                data.paint(config.seed, arguments.painters)
             state, number = train(
                 config,
                 model,
@@ -148,6 +167,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error("--config and --quick exclude each other")
     if arguments.weights is not None and arguments.resume:
         parser.error("--weights starts a new run; --resume continues one")
+    if arguments.painters is not None and arguments.painters < 1:
+        parser.error(f"--painters must be at least 1, got {arguments.painters}")
     # Before torch loads: OpenMP threads that wait should sleep, on machines shared with others by far the faster way.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     if arguments.threads is not None:

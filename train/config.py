@@ -97,6 +97,8 @@ class DataConfig:
         along_z: share of the scenes whose vessels run about z; the others run about y or x.
         core_roi, tissue_roi: ranges of the radii of the random ROIs, mm.
         flat_roi: share of ROIs that are discs of one slice, as in an axial image, instead of balls.
+        reuse: steps that use a scene with its noise, about: what the network sees of it is made once, which takes
+            longer than a step.
 
     Raises:
         TypeError, ValueError: a value is out of its range, or ``scenes`` or a situation has an unknown key.
@@ -113,6 +115,7 @@ class DataConfig:
     core_roi: tuple[float, float] = (0.25, 0.8)
     tissue_roi: tuple[float, float] = (0.15, 0.45)
     flat_roi: float = 0.6
+    reuse: int = 1
 
     def __post_init__(self) -> None:
         if len(self.shape) != 3:
@@ -127,6 +130,7 @@ class DataConfig:
             views=whole("views", self.views),
             situations=tuple(_section(Situation, s, f"situations[{i}]") for i, s in enumerate(self.situations)),
             pool=whole("pool", self.pool),
+            reuse=whole("reuse", self.reuse),
             along_z=number("along_z", self.along_z, low=0.0, high=1.0),
             flat_roi=number("flat_roi", self.flat_roi, low=0.0, high=1.0),
         )

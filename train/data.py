@@ -3,6 +3,8 @@
 For a scene x and an exposure, β = H x + noise of covariance H is distributed as AᵀW y of a scan (up to the model error
 of the Gram operator, see :mod:`recon.gram.gram`), so thousands of scans a minute cost a few FFTs. The Gram operators
 are those of real scanners: several inset positions, patient sizes and pitches, each made when it is first asked for.
+
+Scenes are painted on the CPU. All that follows is done for a whole batch on the device of the training.
 """
 
 from __future__ import annotations
@@ -10,7 +12,11 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field, replace
+from functools import partial
+from multiprocessing import get_context
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -26,7 +32,7 @@ from train.config import DataConfig, Situation
 from train.scenes.rasterise import random_scene
 from train.scenes.scene import SceneConfig
 
-__all__ = ["Batch", "Data", "seed_of", "situation_gram"]
+__all__ = ["Batch", "Data", "painted", "seed_of", "situation_gram"]
 
 
 def seed_of(*key: int | str) -> int:
@@ -37,6 +43,10 @@ def seed_of(*key: int | str) -> int:
 
 ROIS = 3
 """Contrasts of each scene: two of small ROIs, one of a whole core."""
+_DRAWS_OF_ROI, _OWN_DRAWS = 6, 7
+"""Random numbers that a small ROI takes; those of a scene: three mirrors, an exchange, the exposure, two lots."""
+_WINDOW = 64
+"""Draws of each scene of a batch that are at hand where they are used several times."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +60,9 @@ class Batch:
         contrast: ``(size, rois, z, y, x)`` weights of ROI contrasts: mean over a core (or of plain tissue) less mean
             over the tissue around it, random small parts of both, last all of both; 0 where the scene offers none.
         voxels: ``(size, rois)`` voxels of the smaller ROI, 0 if none.
+        lots: ``(size, 2)`` random numbers in 0 … 1 of each scene, for its fidelity and whether it is also seen without
+            noise.
+        kept: what has been made of the batch and does not change, as long as it is used.
     """
 
     problem: NormalisedProblem
@@ -57,6 +70,8 @@ class Batch:
     truth: Tensor
     contrast: Tensor
     voxels: Tensor
+    lots: Tensor
+    kept: dict[str, Any] = field(default_factory=dict)
 
     @property
     def size(self) -> int:
@@ -67,20 +82,53 @@ class Batch:
 class Data:
     """Draws batches; a pure function of seed, step and scene index once the Gram operators are made.
 
-    Scenes come from a pool and are kept once they are drawn.
+    Scenes come from a pool and are kept once they are painted.
+
+    Args:
+        config: what is drawn.
+        device: of the batches.
     """
 
-    def __init__(self, config: DataConfig | None = None) -> None:
+    def __init__(self, config: DataConfig | None = None, device: torch.device | str = "cpu") -> None:
         self.config = config or DataConfig()
-        self.scenes = SceneConfig(**self.config.scenes)
+        self.device = torch.device(device)
         self._grams: dict[int, tuple[Gram, float]] = {}
-        self._pool: dict[tuple[int, int], tuple[Tensor, Tensor, Tensor]] = {}
+        self._pool: dict[tuple[int, int], Tensor] = {}
+        self._kept: dict[tuple[int, int, int], Batch] = {}
 
     def gram(self, situation: int) -> tuple[Gram, float]:
         """Gram operator per second of exposure, and 1 HU in mm⁻¹."""
         if situation not in self._grams:
-            self._grams[situation] = situation_gram(self.config.situations[situation], self.config)
+            gram, hu = situation_gram(self.config.situations[situation], self.config)
+            self._grams[situation] = gram.to(self.device), hu
         return self._grams[situation]
+
+    def paint(self, seed: int, processes: int) -> None:
+        """Paint the whole pool beforehand, by so many processes; else scenes are painted when they are first used."""
+        make = partial(painted, self.config, seed)
+        numbers = range(self.config.pool)
+        make(0)  # compiles the kernels for all
+        with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as workers:
+            for number, maps in zip(numbers, workers.map(make, numbers, chunksize=16), strict=True):
+                self._pool[seed, number] = maps.to(self.device)
+
+    def batches(self, seed: int, step: int, indices: Sequence[int]) -> list[Batch]:
+        """Scenes ``indices`` of a step, all at once; one by one where draws are used several times.
+
+        Then a scene is drawn out of :data:`_WINDOW` that move on by one in ``reuse`` steps.
+        """
+        reuse = self.config.reuse
+        if reuse == 1:
+            return [self.batch(seed, step, indices)]
+        first = step // reuse
+        self._kept = {key: batch for key, batch in self._kept.items() if key[1] >= first}
+        found = []
+        for index in indices:
+            number = first + seed_of("window", seed, step, index) % _WINDOW
+            if (seed, number, index) not in self._kept:
+                self._kept[seed, number, index] = self.batch(seed, number, [index])
+            found.append(self._kept[seed, number, index])
+        return found
 
     def batch(self, seed: int, step: int, indices: Sequence[int]) -> Batch:
         """Scenes ``indices`` of a step.
@@ -92,64 +140,50 @@ class Data:
         """
         c = self.config
         gram, hu = self.gram(seed_of(seed, step) % len(c.situations))
-        drawn = [self._drawn(seed, step, i, gram) for i in indices]
-        truth, exposure, contrast, voxels, first, second = (torch.stack(list(v)) for v in zip(*drawn, strict=True))
-        scaled = (hu * exposure).reshape(-1, 1, 1, 1)
-        signal = gram.apply(truth) * scaled
-        b = torch.cat([signal + first, signal + second, signal])
+        own = [seed_of(seed, step, i) for i in indices]
+        numbers = [o % c.pool for o in own]
+        generators = [torch.Generator().manual_seed(o) for o in own]
+        count = _OWN_DRAWS + (ROIS - 1) * _DRAWS_OF_ROI
+        random = torch.stack([torch.rand(count, generator=g) for g in generators]).to(self.device)
+        if self.device.type != "cpu":
+            generators = [torch.Generator(self.device).manual_seed(o) for o in own]
+        noise = gram.coloured(torch.stack([gram.white((2,), generator=g) for g in generators]))
+        maps = _mirrored(torch.stack([self._scene(seed, n) for n in numbers]).float(), random[:, :4])
+        truth, core, tissue = maps[:, 0], maps[:, 1] > 0, maps[:, 2] > 0
+        low, high = (math.log(v) for v in c.exposure_s)
+        exposure = torch.exp(low + (high - low) * random[:, 4])
+        found = [_random_contrasts(core, tissue, c, part) for part in random[:, _OWN_DRAWS:].split(_DRAWS_OF_ROI, 1)]
+        found.append(_whole_contrasts(core, tissue))
+        contrast, voxels = (torch.stack(v, 1) for v in zip(*found, strict=True))
+        noise = noise * exposure.sqrt().reshape(-1, 1, 1, 1, 1)
+        signal = gram.apply(truth) * (hu * exposure).reshape(-1, 1, 1, 1)
+        b = torch.cat([signal + noise[:, 0], signal + noise[:, 1], signal])
         noisy, all_three = (
             NormalisedProblem.from_statistic(gram, b[: k * len(signal)], exposure.repeat(k), hu, c.voxel_mm)
             for k in (2, 3)
         )
-        return Batch(noisy, all_three, truth, contrast, voxels)
+        return Batch(noisy, all_three, truth, contrast, voxels, random[:, 5:7])
 
-    def _drawn(self, seed: int, step: int, index: int, gram: Gram) -> tuple[Tensor, ...]:
-        c = self.config
-        own = seed_of(seed, step, index)
-        generator = torch.Generator().manual_seed(own)
-        maps = _mirrored(self._scene(seed, own % c.pool), generator)
-        low, high = (math.log(v) for v in c.exposure_s)
-        exposure = torch.exp(low + (high - low) * torch.rand((), generator=generator))
-        noise = gram.noise((2,), generator=generator) * exposure.sqrt()
-        core, tissue = maps[1] > 0, maps[2] > 0
-        found = [_random_contrast(core, tissue, c, generator) for _ in range(ROIS - 1)]
-        found.append(_whole_contrast(core, tissue))
-        contrast, voxels = (torch.stack(v) for v in zip(*found, strict=True))
-        return maps[0], exposure, contrast, voxels, noise[0], noise[1]
-
-    def _scene(self, seed: int, number: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Image in HU above the background; voxels wholly in a core, and wholly in the tissue around."""
+    def _scene(self, seed: int, number: int) -> Tensor:
         if (seed, number) not in self._pool:
-            c = self.config
-            generator = torch.Generator().manual_seed(seed_of("scene", seed, number))
-            draw = float(torch.rand((), generator=generator))
-            axis = 0 if draw < c.along_z else 1 if draw < 0.5 * (1 + c.along_z) else 2
-            across, along = c.shape[axis], c.shape[0]
-            shape = (across, *(along if k == axis else n for k, n in enumerate(c.shape) if k))
-            scene = random_scene(
-                (shape[0], shape[1], shape[2]), (c.voxel_mm,) * 3, generator=generator, config=self.scenes
-            )
-            maps = (scene.image[0] - scene.scenes[0].background, scene.core[0] > 0.97, scene.surround[0] > 0.97)
-            z, y, x = (m.transpose(0, axis).contiguous() for m in maps)
-            self._pool[seed, number] = (z.to(torch.float16), y, x)
+            self._pool[seed, number] = painted(self.config, seed, number).to(self.device)
         return self._pool[seed, number]
 
 
-def _mirrored(maps: tuple[Tensor, Tensor, Tensor], generator: torch.Generator) -> list[Tensor]:
-    """The maps as float32, along every axis mirrored or not, with y and x exchanged or not."""
-    flips = [axis for axis in range(3) if float(torch.rand((), generator=generator)) < 0.5]
-    exchange = float(torch.rand((), generator=generator)) < 0.5 and maps[0].shape[1] == maps[0].shape[2]
-    out = [m.float().flip(flips) for m in maps]
-    return [m.transpose(1, 2).contiguous() for m in out] if exchange else out
+def painted(config: DataConfig, seed: int, number: int) -> Tensor:
+    """A scene of the pool, ``(3, z, y, x)`` float16.
 
-
-def _whole_contrast(core: Tensor, tissue: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean over all of the core less mean over all tissue in its slices."""
-    tissue = tissue & core.any(2).any(1)[:, None, None]
-    n, m = int(core.sum()), int(tissue.sum())
-    if n < 8 or m < 8:
-        return torch.zeros(core.shape), torch.zeros(())
-    return core.float() / n - tissue.float() / m, torch.tensor(float(min(n, m)))
+    Image in HU above the background; voxels wholly in a core, and wholly in the tissue around (0 or 1).
+    """
+    generator = torch.Generator().manual_seed(seed_of("scene", seed, number))
+    draw = float(torch.rand((), generator=generator))
+    axis = 0 if draw < config.along_z else 1 if draw < 0.5 * (1 + config.along_z) else 2
+    across, along = config.shape[axis], config.shape[0]
+    shape = (across, *(along if k == axis else n for k, n in enumerate(config.shape) if k))
+    grid, spacing = (shape[0], shape[1], shape[2]), (config.voxel_mm,) * 3
+    made = random_scene(grid, spacing, generator=generator, config=SceneConfig(**config.scenes))
+    maps = [made.image[0] - made.scenes[0].background, made.core[0] > 0.97, made.surround[0] > 0.97]
+    return torch.stack([m.transpose(0, axis).to(torch.float16) for m in maps])
 
 
 def situation_gram(situation: Situation, config: DataConfig) -> tuple[Gram, float]:
@@ -164,59 +198,89 @@ def situation_gram(situation: Situation, config: DataConfig) -> tuple[Gram, floa
     return problem.gram, problem.mu_ref / 1000.0
 
 
-def _random_contrast(
-    inside: Tensor, around: Tensor, config: DataConfig, generator: torch.Generator
-) -> tuple[Tensor, Tensor]:
-    """Weights of a random ROI contrast between two masks, and the voxels of its smaller ROI."""
-    if not inside.any():
-        inside = around
-    flat = float(torch.rand((), generator=generator)) < config.flat_roi
-    first = _ball(inside, config.core_roi, config.voxel_mm, generator, inside)
+# -- of a whole batch: masks ``(n, z, y, x)``, random numbers in 0 … 1 ``(n, k)`` -------------------------------------
+
+
+def _chosen(which: Tensor, yes: Tensor, no: Tensor) -> Tensor:
+    """``yes`` of the scenes ``(n,)`` that ``which`` names, ``no`` of the others."""
+    return torch.where(which.reshape(-1, *[1] * (yes.dim() - 1)), yes, no)
+
+
+def _mirrored(maps: Tensor, random: Tensor) -> Tensor:
+    """Maps ``(n, k, z, y, x)`` along every axis mirrored or not, with y and x exchanged or not."""
+    for k, axis in enumerate((-3, -2, -1)):
+        maps = _chosen(random[:, k] < 0.5, maps.flip(axis), maps)
+    if maps.shape[-1] == maps.shape[-2]:
+        maps = _chosen(random[:, 3] < 0.5, maps.transpose(-1, -2), maps)
+    return maps
+
+
+def _size(mask: Tensor) -> Tensor:
+    return mask.flatten(1).sum(1)
+
+
+def _contrasts(first: Tensor, second: Tensor, least: int) -> tuple[Tensor, Tensor]:
+    """Mean over one mask less mean over the other, and the voxels of the smaller; 0 where one has too few."""
+    n, m = _size(first), _size(second)
+    enough = (n >= least) & (m >= least)
+    one, other = (mask / size.clamp_min(1).reshape(-1, 1, 1, 1) for mask, size in ((first, n), (second, m)))
+    return _chosen(enough, one - other, torch.zeros_like(one)), torch.minimum(n, m) * enough.float()
+
+
+def _whole_contrasts(core: Tensor, tissue: Tensor) -> tuple[Tensor, Tensor]:
+    """All of the core against all tissue in its slices."""
+    return _contrasts(core, tissue & core.any(3).any(2)[:, :, None, None], 8)
+
+
+def _random_contrasts(inside: Tensor, around: Tensor, config: DataConfig, random: Tensor) -> tuple[Tensor, Tensor]:
+    """A random part of ``inside`` against one of ``around``."""
+    flat, size, place, margin, other_size, other_place = random.unbind(1)
+    inside = _chosen(inside.flatten(1).any(1), inside, around)
+    first = _ball(inside, config.core_roi, config.voxel_mm, size, place) & inside
     # Where there is no core, both lie in the same tissue: voxels of both would cancel.
     around = around & ~first
     # The tissue next to the core is what the study's background ROI lies in, and hardest: half of all draws.
-    margin = 0.7 + 0.5 * float(torch.rand((), generator=generator))
-    near = around & _within(first, margin, config.voxel_mm)
-    second = _ball(near if near.any() else around, config.tissue_roi, config.voxel_mm, generator, around)
-    if flat:
-        first, second = _fullest_slice(first), _fullest_slice(second)
-    n, m = int(first.sum()), int(second.sum())
-    if n < 4 or m < 4:
-        return torch.zeros(inside.shape), torch.zeros(())
-    return first.float() / n - second.float() / m, torch.tensor(float(min(n, m)))
+    near = around & _within(first, 0.7 + 0.5 * margin, config.voxel_mm)
+    near = _chosen(near.flatten(1).any(1), near, around)
+    second = _ball(near, config.tissue_roi, config.voxel_mm, other_size, other_place) & around
+    flat = flat < config.flat_roi
+    first, second = (_chosen(flat, _fullest_slice(m), m) for m in (first, second))
+    return _contrasts(first, second, 4)
 
 
-def _ball(
-    mask: Tensor, radius_mm: tuple[float, float], voxel_mm: float, generator: torch.Generator, within: Tensor
-) -> Tensor:
-    """The voxels of ``within`` in a ball about a random voxel of ``mask``."""
-    places = torch.nonzero(mask)
+def _ball(mask: Tensor, radius_mm: tuple[float, float], voxel_mm: float, size: Tensor, place: Tensor) -> Tensor:
+    """The voxels in a ball about a random voxel of ``mask``."""
     low, high = radius_mm
-    radius = low + (high - low) * float(torch.rand((), generator=generator))
-    draw = torch.rand((), generator=generator)
-    if len(places) == 0:
-        return torch.zeros_like(mask)
-    centre = places[min(int(draw * len(places)), len(places) - 1)]
-    z, y, x = (torch.arange(n) - int(c) for n, c in zip(mask.shape, centre, strict=True))
-    near = z[:, None, None] ** 2 + y[:, None] ** 2 + x**2 <= (radius / voxel_mm) ** 2
-    return near & within
+    reach = (low + (high - low) * size) / voxel_mm
+    counted = mask.flatten(1).int().cumsum(1)
+    wanted = (place * counted[:, -1]).int().clamp_max(counted[:, -1] - 1) + 1
+    at = torch.searchsorted(counted, wanted[:, None].clamp_min(1))[:, 0].clamp_max(counted.shape[1] - 1)
+    nz, ny, nx = mask.shape[1:]
+    z, y, x = (
+        (torch.arange(n, device=mask.device) - c[:, None]).square()
+        for n, c in ((nz, at // (ny * nx)), (ny, at // nx % ny), (nx, at % nx))
+    )
+    apart = z[:, :, None, None] + y[:, None, :, None] + x[:, None, None, :]
+    return apart <= reach.square().reshape(-1, 1, 1, 1)
 
 
 def _fullest_slice(mask: Tensor) -> Tensor:
     """The mask in the slice that holds most of it, empty elsewhere."""
-    out = torch.zeros_like(mask)
-    z = int(mask.sum(dim=(1, 2)).argmax())
-    out[z] = mask[z]
-    return out
+    fullest = mask.sum((2, 3)).argmax(1)
+    here = torch.arange(mask.shape[1], device=mask.device) == fullest[:, None]
+    return mask & here[:, :, None, None]
 
 
-def _within(ball: Tensor, margin_mm: float, voxel_mm: float) -> Tensor:
-    """Voxels within ``margin_mm`` of the box that holds ``ball``."""
-    places = torch.nonzero(ball)
-    if len(places) == 0:
-        return torch.ones_like(ball)
-    out = torch.zeros_like(ball)
-    reach = round(margin_mm / voxel_mm)
-    low, high = places.amin(0) - reach, places.amax(0) + reach + 1
-    out[tuple(slice(max(int(a), 0), int(b)) for a, b in zip(low, high, strict=True))] = True
+def _within(mask: Tensor, margin_mm: Tensor, voxel_mm: float) -> Tensor:
+    """Voxels within a margin ``(n,)`` of the box that holds ``mask``."""
+    reach = (margin_mm / voxel_mm).round()[:, None]
+    out = torch.ones_like(mask)
+    for axis in (1, 2, 3):
+        some = mask.any(tuple(a for a in (1, 2, 3) if a != axis))
+        at = torch.arange(some.shape[1], device=mask.device, dtype=reach.dtype)
+        first = torch.where(some, at, torch.inf).amin(1, keepdim=True) - reach
+        last = torch.where(some, at, -torch.inf).amax(1, keepdim=True) + reach
+        shape = [1] * 4
+        shape[0], shape[axis] = len(mask), -1
+        out &= ((at >= first) & (at <= last)).reshape(shape)
     return out

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,7 +27,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from recon.mbir.problem import NormalisedProblem
-from recon.mbir.unrolled import DEFAULT_FIDELITY, start
+from recon.mbir.unrolled import DEFAULT_FIDELITY, Unrolled, start
 from train.config import ObjectiveConfig
 from train.data import Batch, Data, seed_of
 from train.scenes.held_out import CHECKPOINT_SEED, ValidationScenes, validation_scenes
@@ -38,7 +39,7 @@ _BODY_HU = 15.0
 _TAME_ERROR, _TAME_CONTRAST = 0.02, 2.0
 """A few scenes (calcifications at high dose) would drown all others: losses beyond count less than their size."""
 _NOISE_FREE_SHARE = 0.5
-"""Share of the steps that see their scenes without noise too; there that counts so many times more."""
+"""Share of the scenes that are seen without noise too; there that counts so many times more."""
 _SMALL_VOXELS = 6
 """Of the small ROIs of the validation: a quarter of a square millimetre, as the paper's."""
 _FALSE_HU = {0.35: 6.0, 2.0: 3.0}
@@ -89,25 +90,23 @@ class Objective:
         self.single = single
 
     def __call__(self, model: nn.Module, batch: Batch, progress: float = 0.0) -> Loss:
-        """Loss of a batch; ``progress`` is the finished share of the training. Fidelities are drawn from torch's
-        generator.
+        """Loss of a batch; ``progress`` is the finished share of the training.
 
         Both draws of a scene have the same fidelity.
         """
         c = self.config
-        n = batch.size
-        low, high = c.fidelities
-        fidelity = low + (high - low) * torch.rand(n)
-        steps = 1 if progress < self.single else None
-        free = bool(c.noise_free) and float(torch.rand(())) < _NOISE_FREE_SHARE
-        copies = 3 if free else 2
-        problem = batch.with_noise_free if free else batch.problem
-        truth = batch.truth.repeat(copies, 1, 1, 1)
-        error = model(problem, fidelity.repeat(copies), steps=steps) - truth / problem.scale_hu.reshape(-1, 1, 1, 1)
+        key = f"{c.fidelities} {c.noise_free > 0} {getattr(model, 'bilateral', None)}"
+        if key not in batch.kept:
+            batch.kept[key] = self._seen(model, batch)
+        seen: _Seen = batch.kept[key]
+        n, free = batch.size, len(seen.scene) - 2 * batch.size
+        problem, scene = seen.problem, seen.scene
+        known = {} if seen.views is None else {"views": seen.views}
+        made: Tensor = model(problem, seen.fidelity, steps=1 if progress < self.single else None, **known)
+        error = made - batch.truth[scene] / problem.scale_hu.reshape(-1, 1, 1, 1)
         data = (error * problem.apply(error)).mean(dim=(1, 2, 3))
         places = c.edge * _edges(batch.truth) + c.body * _bodies(batch.truth)
-        weight = 1.0 + places.repeat(copies, 1, 1, 1)
-        white = (error.square() * weight).mean(dim=(1, 2, 3))
+        white = (error.square() * (1.0 + places[scene])).mean(dim=(1, 2, 3))
         image = c.data * (data + c.white * white) / (1.0 + data.detach() / _TAME_ERROR)
         noisy, error = image[: 2 * n], error[: 2 * n]
         # The noise of an ROI mean falls with its size, but less than as 1/√voxels: neighbours are correlated.
@@ -116,6 +115,7 @@ class Objective:
         variance, product = d.square().mean(0), d[0] * d[1]
         total = 0.5 * noisy.sum()
         tame = 1.0 / (1.0 + variance.detach() / _TAME_CONTRAST)
+        fidelity = seen.fidelity[:n]
         kappa = (c.bias[0] + (c.bias[1] - c.bias[0]) * fidelity)[:, None]
         weight = c.contrast * (c.viewing + (1.0 - c.viewing) * fidelity)[:, None]
         total = total + (weight * tame * (variance + kappa * product)).sum()
@@ -123,12 +123,21 @@ class Objective:
             "data": data[: 2 * n].sum() / 2, "white": white[: 2 * n].sum() / 2,
             "contrast": variance.sum(), "bias": product.sum(),
         }  # fmt: skip
-        if c.noise_free:
-            parts["noise_free"] = torch.tensor(math.nan)
         if free:
             total = total + c.noise_free / _NOISE_FREE_SHARE * image[2 * n :].sum()
+        if c.noise_free:
             parts["noise_free"] = image[2 * n :].sum() / c.data
         return Loss(total, {k: float(v.detach()) for k, v in parts.items()})
+
+    @torch.no_grad()
+    def _seen(self, model: nn.Module, batch: Batch) -> _Seen:
+        c, n, whole = self.config, batch.size, batch.with_noise_free
+        low, high = c.fidelities
+        free = torch.nonzero((batch.lots[:, 1] < _NOISE_FREE_SHARE) & bool(c.noise_free))[:, 0]
+        rows = torch.cat([torch.arange(2 * n, device=free.device), 2 * n + free])
+        problem, scene = whole.part(rows), rows % n
+        fidelity = (low + (high - low) * batch.lots[:, 0])[scene]
+        return _Seen(problem, scene, fidelity, model.first_views(problem) if isinstance(model, Unrolled) else None)
 
     @torch.no_grad()
     def validate(
@@ -181,11 +190,11 @@ class Objective:
         """Figures of one held-out plaque, and a picture: truth beside the first volume."""
         c, d = self.config, data.config
         gram, hu = data.gram(0)
-        truth = held.image[i] - held.scenes[i].background
-        rois = torch.stack([_small(held, i), _mean(held.core_roi[i]) - _mean(held.fibrous_roi[i])])
-        generator = torch.Generator().manual_seed(seed_of(seed, i))
+        truth = (held.image[i] - held.scenes[i].background).to(data.device)
+        rois = torch.stack([_small(held, i), _mean(held.core_roi[i]) - _mean(held.fibrous_roi[i])]).to(data.device)
+        generator = torch.Generator(data.device).manual_seed(seed_of(seed, i))
         noise = gram.noise((c.validation_draws,), generator=generator) * math.sqrt(exposure)
-        exposures = torch.full((c.validation_draws,), exposure)
+        exposures = torch.full((c.validation_draws,), exposure, device=data.device)
         volumes, linear = [], []
         for signal in gram.apply(truth) * (hu * exposure):  # the same noise for all contrasts
             problem = NormalisedProblem.from_statistic(gram, signal + noise, exposures, hu, d.voxel_mm)
@@ -206,8 +215,25 @@ class Objective:
             "lesion_linear": plain_variance[1] / plain_slope[1] ** 2,
             "square": error[:, bodies].square().mean(), "fat": error[:, ~bodies].var(0).mean(),
         }  # fmt: skip
-        picture = torch.cat([truth[0, middle], volumes[0][0, middle]], dim=1).numpy()
+        picture = torch.cat([truth[0, middle], volumes[0][0, middle]], dim=1).cpu().numpy()
         return {k: float(v) for k, v in row.items()}, picture
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What the network sees of a batch, and no weight changes.
+
+    Args:
+        problem: of all volumes.
+        scene: ``(m,)`` of each volume: the first draws, the second draws, and what is seen without noise.
+        fidelity: ``(m,)``.
+        views: :meth:`recon.mbir.unrolled.Unrolled.first_views`.
+    """
+
+    problem: NormalisedProblem
+    scene: Tensor
+    fidelity: Tensor
+    views: Any
 
 
 def _bodies(truth: Tensor) -> Tensor:

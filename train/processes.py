@@ -7,6 +7,7 @@ same step, so the weights stay equal without being sent.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
@@ -60,19 +61,21 @@ def gradient(
     """
     torch.manual_seed(seed_of("step", config.seed, step))
     model.zero_grad()
-    batch = data.batch(config.seed, step, range(group.rank, config.batch, group.size))
-    loss = objective(model, batch, step / config.steps)
-    loss.total.backward()
     parameters = list(model.parameters())
+    total, parts = parameters[0].new_zeros(1), Counter[str]()
+    for batch in data.batches(config.seed, step, range(group.rank, config.batch, group.size)):
+        loss = objective(model, batch, step / config.steps)
+        loss.total.backward()
+        total += loss.total.detach()
+        parts.update(loss.parts)
     pieces = [(torch.zeros_like(p) if p.grad is None else p.grad).reshape(-1) for p in parameters]
-    total = loss.total.detach().reshape(1).to(pieces[0])
     # One message: the gradient, the loss (for whether it is finite), and the wish to stop, on which all must agree.
     flat = group.sum(torch.cat([*pieces, total, total.new_tensor([float(stop)])]))
     mean = flat[:-2] / config.batch if torch.isfinite(flat[-2]) else torch.full_like(flat[:-2], math.nan)
     for p, piece in zip(parameters, mean.split([p.numel() for p in parameters]), strict=True):
         p.grad = piece.view_as(p)
     values: dict[str, float] = {}
-    for part in group.gather({"loss": float(total), **loss.parts}):
+    for part in group.gather({"loss": float(total), **parts}):
         for name, value in part.items():
             values[name] = values.get(name, 0.0) + float(value) / config.batch
     return values, bool(flat[-1] > 0)

@@ -260,12 +260,19 @@ class Gram:
         Returns:
             ``(*batch, *grid.shape)`` in the dtype of the weights.
         """
+        return self.coloured(self.white(batch, generator=generator))
+
+    def white(self, batch: tuple[int, ...] = (), *, generator: torch.Generator) -> Tensor:
+        """White noise for :meth:`coloured`, ``(*batch, slices, *padded)``; arguments of :meth:`noise`."""
+        nz = 1 if self._flat else self.grid.shape[0]
+        device = self._of_noise.device
+        return torch.randn((*batch, nz, *self.padded), generator=generator, dtype=self.dtype, device=device)
+
+    def coloured(self, white: Tensor) -> Tensor:
+        """Noise of covariance G (stationary part) from that of :meth:`white`, ``(*batch, *grid.shape)``."""
         if self._factor is None:
             self._factor = cholesky(self._of_noise)[0]
-        nz = 1 if self._flat else self.grid.shape[0]
-        ny, nx = self.grid.shape[-2:]
-        device = self._factor.device
-        white = torch.randn((*batch, nz, *self.padded), generator=generator, dtype=self.dtype, device=device)
+        nz, (ny, nx) = white.shape[-3], self.grid.shape[-2:]
         spectrum = torch.fft.rfft2(white)
         lower = self._factor
         mixed = torch.zeros_like(spectrum)

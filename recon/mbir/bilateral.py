@@ -100,30 +100,45 @@ def _backward(begin, end, u, g, scale, offsets, weights, out, total, grad, grad_
 class _Bilateral(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, u: Tensor, guide: Tensor, threshold: Tensor, reach: float, step: int) -> Tensor:
-        values, g = (v.detach().float().contiguous().numpy() for v in (u, guide))
+        values, g = (v.detach().float().contiguous() for v in (u, guide))
         # Where there is no noise (and so no threshold) every difference is an edge.
-        scale = (1.0 / threshold.detach().float().clamp_min(_LEAST)).numpy()
-        out, total = np.empty_like(values), np.empty_like(values)
-        rows = values.shape[0] * values.shape[1] * values.shape[2]
+        scale = 1.0 / threshold.detach().float().clamp_min(_LEAST)
         offsets, weights = _offsets(reach, step)
-        run(_forward, rows, values, g, scale, offsets, weights, out, total,
+        if u.device.type == "cuda":
+            from recon.mbir import bilateral_triton  # where there is a GPU
+
+            near = torch.from_numpy(offsets).int().to(u.device), torch.from_numpy(weights).to(u.device)
+            out, total = bilateral_triton.forward(values, g, scale, *near)
+            ctx.kept = (values, g, scale, *near, out, total, u.dtype)
+            return out.to(u.dtype)
+        out, total = torch.empty_like(values), torch.empty_like(values)
+        rows = math.prod(values.shape[:3])
+        given = [v.numpy() for v in (values, g, scale)]
+        run(_forward, rows, *given, offsets, weights, out.numpy(), total.numpy(),
             operations=8 * len(weights) * values.shape[3])  # fmt: skip
-        ctx.kept = (values, g, scale, out, total, u.dtype, offsets, weights)
-        return torch.from_numpy(out).to(u.dtype)
+        ctx.kept = (values, g, scale, offsets, weights, out, total, u.dtype)
+        return out.to(u.dtype)
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> Any:
-        values, g, scale, out, total, dtype, offsets, weights = ctx.kept
-        slope = grad.detach().float().contiguous().numpy()
-        found = np.empty_like(values), np.empty_like(values)
-        rows = values.shape[0] * values.shape[1] * values.shape[2]
-        run(_backward, rows, values, g, scale, offsets, weights, out, total, slope, *found,
-            operations=20 * len(weights) * values.shape[3])  # fmt: skip
-        return (*(torch.from_numpy(f).to(dtype) for f in found), None, None, None)
+        values, g, scale, offsets, weights, out, total, dtype = ctx.kept
+        slope = grad.detach().float().contiguous()
+        if grad.device.type == "cuda":
+            from recon.mbir import bilateral_triton
+
+            found = bilateral_triton.backward(values, g, scale, offsets, weights, out, total, slope)
+        else:
+            found = torch.empty_like(values), torch.empty_like(values)
+            rows = math.prod(values.shape[:3])
+            given = [v.numpy() for v in (values, g, scale)]
+            kept = [v.numpy() for v in (out, total, slope, *found)]
+            run(_backward, rows, *given, offsets, weights, *kept,
+                operations=20 * len(weights) * values.shape[3])  # fmt: skip
+        return (*(f.to(dtype) for f in found), None, None, None)
 
 
 def joint_bilateral(u: Tensor, guide: Tensor, threshold: Tensor, reach: float = 2.5, step: int = 1) -> Tensor:
-    """Filtered volumes ``(batch, z, y, x)``, differentiable in volume and guide; on the CPU in float32.
+    """Filtered volumes ``(batch, z, y, x)``, differentiable in volume and guide; in float32, on the device of ``u``.
 
     Args:
         u: volumes.
@@ -132,6 +147,5 @@ def joint_bilateral(u: Tensor, guide: Tensor, threshold: Tensor, reach: float = 
         reach: standard deviation of s in voxels; it ends at twice that.
         step: only every so many voxels along each axis are neighbours: of smooth volumes the others add nothing.
     """
-    device = u.device
-    found: Tensor = _Bilateral.apply(u.cpu(), guide.cpu(), threshold.cpu(), reach, step)
-    return found.to(device)
+    found: Tensor = _Bilateral.apply(u, guide, threshold, reach, step)
+    return found

@@ -10,7 +10,8 @@ So the same tissue at four times the dose looks to the network like twice the co
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -55,6 +56,10 @@ class NormalisedProblem:
         scale = (unit * exposure.to(b) * voxel_mm**3).rsqrt()
         factor = exposure.to(b) * (scale * mu_per_hu) ** 2
         return cls(gram, b * (scale * mu_per_hu).reshape(-1, 1, 1, 1), scale, factor, voxel_mm)
+
+    def part(self, which: Sequence[int] | Tensor) -> NormalisedProblem:
+        """Those of the batch."""
+        return replace(self, beta=self.beta[which], scale_hu=self.scale_hu[which], factor=self.factor[which])
 
     def apply(self, u: Tensor) -> Tensor:
         """H u."""

@@ -46,6 +46,7 @@ __all__ = [
 
 Prior = Callable[..., Tensor]
 """A :class:`recon.mbir.network.Network`, or a function with the arguments of its ``forward``."""
+Views = tuple[Tensor, Tensor, Tensor | None]
 REFERENCE_SCALE_HU = 200.0
 """Noise scale at which its conditioning variable is 0: about 1 s of the paper's scan."""
 DEFAULT_FIDELITY = 0.5
@@ -103,6 +104,7 @@ class Unrolled(nn.Module):
         fidelity: float | Tensor = DEFAULT_FIDELITY,
         callback: Callable[[int, Tensor], None] | None = None,
         steps: int | None = None,
+        views: Views | None = None,
         final_data_consistency: bool = True,
         prior: Prior | None = None,
         cut_overshoot: bool = True,
@@ -116,6 +118,7 @@ class Unrolled(nn.Module):
             fidelity: 0 … 1, one for all or ``(batch,)``.
             callback: called with the number of each step and the volume after it.
             steps: fewer than K; None: K. With 0 the reconstruction is linear, and the solves go on until it is.
+            views: :meth:`first_views` of the problem, where they are known already.
             final_data_consistency: whether that step is taken; without it the network's last volume is the result.
             prior: in the place of the network: block by block (:mod:`recon.mbir.field`), or for comparisons
                 (:func:`recon.mbir.network.bilateral_prior`).
@@ -133,15 +136,14 @@ class Unrolled(nn.Module):
         level = torch.log(scale / REFERENCE_SCALE_HU).clamp(-3.0, 3.0)
         spectrum = problem.spectrum()
         solves = solves or (_LINEAR_SOLVES if steps == 0 else _SOLVES)
-        v = start(problem, spectrum, solves[0])
+        noise = guide_noise(spectrum, problem.beta.shape[-3:], problem.voxel_mm)
+        v = start(problem, spectrum, solves[0]) if views is None else views[0]
         if callback is not None:
             callback(0, v)
-        noise = guide_noise(spectrum, problem.beta.shape[-3:], problem.voxel_mm)
         smoothed = None
         for k in range(self.steps if steps is None else steps):
-            towards = v + filtered(problem.beta - problem.apply(v), 1.0 / (spectrum + _TOWARDS))
+            _, towards, smoothed = views if views and k == 0 else self._views(problem, spectrum, v, noise)
             condition = torch.stack([level, fidelities - 0.5, torch.full_like(level, float(k))], 1)
-            smoothed = edge_preserved(towards, noise) if self.bilateral else None
             v = (prior or self.network)(v, towards, condition, smoothed)
             if callback is not None:
                 callback(k + 1, v)
@@ -151,6 +153,19 @@ class Unrolled(nn.Module):
         if steps == 0 or self.training or not restore:
             return u
         return u + significant_residual(problem, spectrum, u, _TOWARDS)
+
+    def first_views(self, problem: NormalisedProblem) -> Views:
+        """What the network sees in its first step: start, step towards the data, and its filtered view, if it has one.
+
+        No weight takes part in it, so a training may keep it.
+        """
+        spectrum = problem.spectrum()
+        noise = guide_noise(spectrum, problem.beta.shape[-3:], problem.voxel_mm)
+        return self._views(problem, spectrum, start(problem, spectrum), noise)
+
+    def _views(self, problem: NormalisedProblem, spectrum: Tensor, v: Tensor, noise: Tensor) -> Views:
+        towards = v + filtered(problem.beta - problem.apply(v), 1.0 / (spectrum + _TOWARDS))
+        return v, towards, edge_preserved(towards, noise) if self.bilateral else None
 
 
 def start(problem: NormalisedProblem, spectrum: Tensor, iterations: int = _SOLVES[0]) -> Tensor:
@@ -232,14 +247,14 @@ def _largest_nearby(v: Tensor) -> Tensor:
     return v
 
 
-def low_residual(problem: NormalisedProblem, left: Tensor, fidelity: float) -> Tensor:
+def low_residual(problem: NormalisedProblem, left: Tensor, fidelity: float | Tensor) -> Tensor:
     """‖L (β − H u)‖ over ‖L β‖, ``(batch,)``: 0 where the low frequencies are wholly the data's own.
 
     Args:
         problem: normalised problem.
         left: β − H u, ``(batch, z, y, x)``.
-        fidelity: 0 … 1.
+        fidelity: 0 … 1, one for all or ``(batch,)``.
     """
-    low_pass = _low_pass(problem, torch.full_like(problem.scale_hu, fidelity))
+    low_pass = _low_pass(problem, torch.as_tensor(fidelity).to(problem.scale_hu).expand_as(problem.scale_hu))
     sizes = [filtered(v, low_pass).flatten(1).norm(dim=1) for v in (left, problem.beta)]
     return sizes[0] / sizes[1].clamp_min(torch.finfo(sizes[1].dtype).tiny)

@@ -46,6 +46,9 @@ class StubData:
         drawn = [torch.randn(7, generator=torch.Generator().manual_seed(seed + 1000 * step + i)) for i in indices]
         return torch.stack(drawn)
 
+    def batches(self, seed, step, indices):
+        return [self.batch(seed, step, indices)]
+
 
 class StubObjective:
     """Squared error of a fixed function; ``at`` maps a number of the step to something to do in it."""
@@ -170,7 +173,7 @@ def _gradients(out):
 
 
 def _command(out):
-    command_line.build = lambda config: (stub_model(config.seed), StubData(), StubObjective())
+    command_line.build = lambda config, device: (stub_model(config.seed), StubData(), StubObjective())
     assert command_line.main(["--quick", "--out", out, "--threads", "1", "--no-tensorboard"]) == 0
 
 

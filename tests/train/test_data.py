@@ -1,6 +1,8 @@
 """Batches of the training: reproducible, of the right noise and signal, with contrasts that are contrasts."""
 
 import math
+from collections import Counter
+from dataclasses import replace
 
 import pytest
 import torch
@@ -60,7 +62,7 @@ def test_statistic_is_signal_and_two_draws_of_noise(data):
 def test_contrasts_are_differences_of_means(data):
     """Weights of a core add up to 1, of its surround to -1, or all are 0; the number of voxels is the smaller one's."""
     seen = 0
-    for step in range(6):
+    for step in range(12):
         batch = data.batch(1, step, range(4))
         assert batch.contrast.shape == (4, ROIS, *CONFIG.shape)
         for contrast, voxels in zip(batch.contrast.flatten(0, 1), batch.voxels.flatten(), strict=True):
@@ -93,3 +95,28 @@ def test_exposures_lie_in_their_range(data):
     scales = torch.cat([data.batch(5, step, range(4)).problem.scale_hu for step in range(3)])
     ratio = float(scales.max() / scales.min())
     assert 1.1 < ratio < 1.3 * math.sqrt(4.0)  # two situations: their information differs
+
+
+def test_scenes_are_painted_beforehand_as_when_they_are_used():
+    made = Data(CONFIG)
+    ahead = Data(replace(CONFIG, pool=3))
+    ahead.paint(4, 1)
+    for number in range(3):
+        assert torch.equal(ahead._pool[4, number], made._scene(4, number))
+
+
+def test_draws_are_used_several_times():
+    """About as often as asked for, and a resumed run finds the same."""
+    config = replace(CONFIG, reuse=3, situations=CONFIG.situations[:1])
+    made, seen = Data(config), Counter()
+    for step in range(40):
+        for batch in made.batches(1, step, [0, 1]):
+            assert batch.size == 1
+            seen[id(batch)] += 1
+    assert len(made.batches(1, 0, range(3))) == 3
+    assert len(Data(CONFIG).batches(1, 0, range(3))) == 1
+    assert max(seen.values()) > 1
+    later = Data(config).batches(1, 39, [0, 1])
+    for one, other in zip(made.batches(1, 39, [0, 1]), later, strict=True):
+        assert torch.equal(one.truth, other.truth)
+        assert torch.equal(one.problem.beta, other.problem.beta)

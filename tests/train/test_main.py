@@ -17,7 +17,7 @@ from train.checkpoint import start_from
 @pytest.fixture
 def objective(monkeypatch):
     stub = StubObjective()
-    monkeypatch.setattr(command_line, "build", lambda config: (stub_model(config.seed), StubData(), stub))
+    monkeypatch.setattr(command_line, "build", lambda config, device: (stub_model(config.seed), StubData(), stub))
     return stub
 
 

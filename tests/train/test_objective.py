@@ -128,7 +128,7 @@ def test_bias_weighs_more_where_one_measures(data):
 
 
 def test_the_scene_without_noise_counts_with_its_weight(data):
-    """In half of the steps, twice; there the model sees it behind the two draws, in one call."""
+    """Half of the scenes, each for two; there the model sees it behind the two draws, in one call."""
 
     class Constant(nn.Module):
         def __init__(self):
@@ -137,25 +137,30 @@ def test_the_scene_without_noise_counts_with_its_weight(data):
 
         def forward(self, problem, fidelity, steps=None):
             self.calls.append(len(problem.beta))
-            truth = batch.truth.repeat(len(problem.beta) // batch.size, 1, 1, 1)
-            return truth / problem.scale_hu.reshape(-1, 1, 1, 1) + 0.3
+            scene = torch.tensor([0, 1, 0, 1, *free])[: len(problem.beta)]
+            return batch.truth[scene] / problem.scale_hu.reshape(-1, 1, 1, 1) + 0.3
 
     batch = data.batch(0, 0, range(2))
     three = batch.with_noise_free
     assert torch.equal(three.beta[: 2 * batch.size], batch.problem.beta)
     signal = three.apply(batch.truth.repeat(3, 1, 1, 1) / three.scale_hu.reshape(-1, 1, 1, 1))
     torch.testing.assert_close(three.beta[2 * batch.size :], signal[2 * batch.size :])
-    without, model = Objective(ObjectiveConfig(contrast=0.0))(Constant(), batch), Constant()
-    model.calls.clear()
-    totals = []
-    for seed in range(40):
-        torch.manual_seed(seed)
-        totals.append(float(Objective(ObjectiveConfig(contrast=0.0, noise_free=0.5))(model, batch).total))
-    assert set(model.calls) == {2 * batch.size, 3 * batch.size}
-    assert 8 < sum(n == 3 * batch.size for n in model.calls) < 32
+    free, model = [], Constant()
+    without = Objective(ObjectiveConfig(contrast=0.0))(model, batch)
     assert "noise_free" not in without.parts
-    # Two draws and the scene have the same error: once or twice as much as the draws' mean in all.
-    assert {round(t / float(without.total), 4) for t in totals} == {1.0, 2.0}
+    added = {}
+    for lots in ((0.9, 0.9), (0.1, 0.9), (0.9, 0.1), (0.1, 0.1)):
+        free = [k for k, lot in enumerate(lots) if lot < 0.5]
+        drawn = replace(batch, lots=torch.tensor([[0.5, lot] for lot in lots]), kept={})
+        total = Objective(ObjectiveConfig(contrast=0.0, noise_free=0.5))(model, drawn).total
+        added[tuple(free)] = float(total) - float(without.total)
+        assert model.calls[-1] == 4 + len(free)
+    # Two draws and the scene have the same error: with a weight of a half and half of the scenes, once more.
+    assert added[()] == pytest.approx(0.0, abs=1e-4)
+    assert added[0, 1] == pytest.approx(float(without.total), rel=1e-4)
+    assert added[0,] + added[1,] == pytest.approx(added[0, 1], rel=1e-4)
+    lots = torch.cat([data.batch(0, step, range(4)).lots for step in range(20)])
+    assert 0.3 < float((lots[:, 1] < 0.5).float().mean()) < 0.7
 
 
 def test_edges_reach_two_voxels_to_either_side():

@@ -1,5 +1,6 @@
 """The joint bilateral filter as a layer, and as a view of the network."""
 
+import sys
 from dataclasses import replace
 
 import pytest
@@ -7,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recon.mbir.bilateral import joint_bilateral
+from recon.mbir.bilateral import _offsets, joint_bilateral
 from recon.mbir.network import GUIDE_VOXELS, Network, NetworkConfig, edge_preserved, local_mean
 from recon.mbir.unrolled import Unrolled, guide_noise, limited
 
@@ -78,6 +79,29 @@ def test_gradients(which):
         moved[which] = moved[which] + sign * 1e-2 * push
         ends.append(float((joint_bilateral(*moved, T).double() * seen).sum()))
     assert (ends[0] - ends[1]) / 2e-2 == pytest.approx(slope, rel=0.02, abs=0.02)
+
+
+def test_the_gpu_kernels_give_the_same():
+    """By Triton's interpreter, forward and both gradients."""
+    if sys.platform != "linux":  # where the test extra brings Triton along
+        pytest.importorskip("triton")
+    from triton import knobs
+
+    if not knobs.runtime.interpret:
+        pytest.skip("TRITON_INTERPRET=0: kernels need a GPU")
+    from recon.mbir import bilateral_triton
+
+    given = [v.requires_grad_() for v in volumes((2, 4, 5, 6))]
+    push = torch.randn(2, 4, 5, 6, generator=torch.Generator().manual_seed(3))
+    found = joint_bilateral(*given, T, 3.0, 2)
+    found.backward(push)
+    offsets, weights = (torch.from_numpy(v) for v in _offsets(3.0, 2))
+    near, plain = (offsets.int(), weights), [v.detach() for v in given]
+    out, total = bilateral_triton.forward(*plain, 1 / T, *near)
+    torch.testing.assert_close(out, found.detach())
+    gradients = bilateral_triton.backward(*plain, 1 / T, *near, out, total, push)
+    for mine, other in zip(gradients, given, strict=True):
+        torch.testing.assert_close(mine, other.grad, rtol=1e-4, atol=1e-6)
 
 
 CONFIG = NetworkConfig((6, 8, 8), 0.4, local_mm=1.6, turns=True, bilateral=True)

@@ -168,3 +168,8 @@ def test_callback_sees_every_step(scan):
     assert torch.equal(seen[0][1], start(p, p.spectrum()))
     assert torch.equal(seen[2][1], free)
     assert not torch.equal(seen[1][1], free)
+
+
+def test_views_that_are_known_need_not_be_made_again(scan):
+    net, p = model(steps=1, bilateral=True), normal(scan, noise=1.0)
+    torch.testing.assert_close(net(p, 0.5, views=net.first_views(p)), net(p, 0.5))
