@@ -8,7 +8,8 @@ whose fibrous layer the best linear estimate of its contents stands (:mod:`recon
     u = T + MBIR(β − H T),
 
 so whatever the drawing lacks (a branch, muscle, texture) comes from the data as ever, beside an edge that is no longer
-there to bleed into it.
+there to bleed into it. The fidelity belongs to the contents of the layer; the network is told a fifth of it, for low
+frequencies are taken from the data already.
 
 Where no vessel is found, or a drawn one does not explain the data outside of its fibrous layer, the result is the plain
 reconstruction MBIR(β).
@@ -55,6 +56,12 @@ class Drawn:
     unexplained: Callable[[Tensor], float] = lambda volume: 0.0
 
 
+_TOLD = 0.2
+"""Share of the fidelity that the network is told. On four held-out vessels (4 draws, 2 s / 0.35 s) fat then has 3.9 /
+9.5 HU of noise instead of 5.4 / 12.3, the vessel an error of 25.1 / 40.7 instead of 25.3 / 41.3 HU, and the contrast of
+a core at slope 1 is as noisy as before, with a slope of 0.79 / 0.63 instead of 0.80 / 0.66."""
+
+
 def layer_sd_hu(fidelity: float) -> float:
     """Prior standard deviation of what the fibrous layer holds, HU: from 50, quiet, to 200, for measuring contrast."""
     return SD_HU * 4.0 ** (fidelity - DEFAULT_FIDELITY)
@@ -78,27 +85,28 @@ class OutlineMbir(Mbir):
         """See :meth:`recon.mbir.mbir.Mbir.solved`; the notes hold ``outlines``: whether they were drawn, or why not."""
         found = [self.drawn(problem, own, exposure_s) for own in b]
         notes = [one.note for one in found]
-        images = [one.image for one in found]
-        if all(image is None for image in images):
-            return replace(super().solved(problem, b, exposure_s), notes=notes)
         normal = self.problem(problem, b, exposure_s)
-        # Nothing is drawn where the volume is that of the surround.
-        nothing = self.in_hu(problem, torch.zeros_like(b), normal)
-        drawn = torch.stack([n if image is None else image for image, n in zip(images, nothing, strict=True)])
-        t = self.in_noise_units(problem, drawn, normal)
-        # Once the outlines are taken off, four turns do what eight do: 0.7 HU rms apart on the paper's plaque.
-        parts = {"prior": partial(self.model.network, mirrored=False), **self.parts}
-        u = t + self.model(replace(normal, beta=normal.beta - normal.apply(t)), self.fidelity, **parts)
-        refused = []
-        for k, volume in enumerate(self.in_hu(problem, u.detach(), normal)):
-            highest = found[k].unexplained(volume)
-            if highest > STRIKING:
-                refused.append(k)
-                notes[k] |= _unused(f"its outlines leave {highest:.0f} standard deviations of the noise unexplained")
-        if refused:
-            places = torch.tensor(refused)
-            u = u.index_copy(0, places, super().solved(problem, b[places], exposure_s).u)
-        return Solution(normal, u, notes)
+        around = [k for k, one in enumerate(found) if one.image is not None]
+        told, volumes = [self.fidelity] * len(found), dict[int, Tensor]()
+        if around:
+            part, images = normal.part(around), [one.image for one in found if one.image is not None]
+            t = self.in_noise_units(problem, torch.stack(images), part)
+            # Once the outlines are taken off, four turns do what eight do: 0.7 HU rms apart on the paper's plaque.
+            parts = {"prior": partial(self.model.network, mirrored=False), **self.parts}
+            u = t + self.model(replace(part, beta=part.beta - part.apply(t)), _TOLD * self.fidelity, **parts)
+            for k, own, volume in zip(around, u, self.in_hu(problem, u.detach(), part), strict=True):
+                highest = found[k].unexplained(volume)
+                if highest > STRIKING:
+                    notes[k] |= _unused(
+                        f"its outlines leave {highest:.0f} standard deviations of the noise unexplained"
+                    )
+                else:
+                    volumes[k], told[k] = own, _TOLD * self.fidelity
+        plain = [k for k in range(len(found)) if k not in volumes]
+        if plain:
+            without = super().solved(problem, b[plain], exposure_s)
+            volumes |= dict(zip(plain, without.u, strict=True))
+        return Solution(normal, torch.stack([volumes[k] for k in range(len(found))]), notes, told)
 
     def drawn(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> Drawn:
         """What is drawn of one scan.
