@@ -63,10 +63,8 @@ def _poisson_one(mean: float, state: Any) -> float:
             k += 1.0
             p *= mean / k
         return k
-    log_mean = math.log(mean)
     b = 0.931 + 2.53 * math.sqrt(mean)
     a = -0.059 + 0.02483 * b
-    inv_alpha = 1.1239 + 1.1328 / (b - 3.4)
     v_r = 0.9277 - 3.6224 / (b - 2.0)
     while True:
         state, u = draw(state)
@@ -78,8 +76,10 @@ def _poisson_one(mean: float, state: Any) -> float:
             return k
         if k < 0.0 or (us < 0.013 and v > us):
             continue
+        # Nine in ten are done: the logarithms of the rest wait until here.
+        inv_alpha = 1.1239 + 1.1328 / (b - 3.4)
         if math.log(v) + math.log(inv_alpha) - math.log(a / (us * us) + b) <= (
-            k * log_mean - mean - math.lgamma(k + 1.0)
+            k * math.log(mean) - mean - math.lgamma(k + 1.0)
         ):
             return k
 

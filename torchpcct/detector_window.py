@@ -75,7 +75,9 @@ class DetectorWindow:
         """What each reading of the window has at its cell: ``(..., rows, columns)`` of the whole detector to
         ``(..., views, rows, columns)``."""
         kept = cells[..., self.first_row : self.first_row + self.rows, :]
-        return kept[..., torch.from_numpy(self.column_indices)].movedim(-2, -3)
+        # Views first, as they lie in memory, and whole runs of columns at a time.
+        runs = kept.unfold(-1, self.columns, 1).movedim(-2, -3)
+        return runs.index_select(-3, torch.from_numpy(self.first_column.copy()).to(cells.device))
 
     def crop(self, values: Tensor, inner: DetectorWindow) -> Tensor:
         """The readings of a smaller window: ``(..., views, rows, columns)`` on this window to those on ``inner``.

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -60,7 +60,6 @@ class Draws:
     def __init__(self, task: Task, store: Store, seed: int = 0, kernels: Sequence[str] = ()) -> None:
         self.task, self.store, self.seed = task, store, seed
         self.kernels = tuple(dict.fromkeys(kernels))
-        self._sigma: dict[tuple[str, float, float], float] = {}
 
     @cached_property
     def clean(self) -> tuple[Scan, Scan]:
@@ -90,26 +89,31 @@ class Draws:
         return InsetFbp(self.clean[0], [self.task.grid], self.kernels)
 
     @cached_property
-    def signal_fbp(self) -> Tensor:
-        """What the signal changes in FBP without noise, ``(kernels, z, y, x)`` HU."""
-        return self.filtered(self.clean[0])[0] - self.filtered(self.clean[1])[0]
+    def clean_fbp(self) -> tuple[Tensor, Tensor]:
+        """FBP without noise, with and without the signal, ``(kernels, z, y, x)`` HU; the same at every exposure."""
+        return self.filtered(self.clean[0])[0], self.filtered(self.clean[1])[0]
 
     @cached_property
-    def signal_statistic(self) -> Tensor:
-        """The same of AᵀWy at 1 s."""
-        return self.problem.statistic(self.clean[0]).b - self.problem.statistic(self.clean[1]).b
+    def clean_statistic(self) -> tuple[Tensor, Tensor]:
+        """The same of AᵀWy at 1 s, ``(z, y, x)``."""
+        return self.problem.statistic(self.clean[0]).b, self.problem.statistic(self.clean[1]).b
 
-    def exact_covariance(self, kernel: str) -> NDArray[np.float64]:
-        """Of the ROI means of FBP at 1 s, ``(rois, 2, rois, 2)`` HU²; it falls as 1 / exposure."""
-        regions = self.task.regions
+    def exact_covariances(self, kernels: Sequence[str]) -> dict[str, NDArray[np.float64]]:
+        """Of the ROI means of FBP at 1 s, kernel → ``(rois, 2, rois, 2)`` HU²; it falls as 1 / exposure."""
+        regions, key = self.task.regions, f"1 {self.task.fingerprint}"
         functionals: list[Any] = [Functional(w) for pair in regions.values() for w in pair]
 
-        def compute() -> dict[str, Any]:
-            fbp = InsetFbp(self.clean[0], [self.task.grid], [kernel])
-            return {"c": roi_covariance(self.clean[0], fbp, [functionals], NOISE_FREE_EXPOSURE_S)[0][0]}
+        @cache
+        def together() -> dict[str, Any]:
+            # What costs most, the transposed backprojection, is the same for all kernels.
+            fbp = InsetFbp(self.clean[0], [self.task.grid], kernels)
+            found = roi_covariance(self.clean[0], fbp, [functionals], NOISE_FREE_EXPOSURE_S)[0]
+            return {k: {"c": c.reshape(len(regions), 2, len(regions), 2)} for k, c in zip(kernels, found, strict=True)}
 
-        found = self.store.piece(f"exact_{kernel}", f"1 {self.task.fingerprint}", compute)["c"]
-        return np.asarray(found).reshape(len(regions), 2, len(regions), 2)
+        def of(kernel: str) -> NDArray[np.float64]:
+            return np.asarray(self.store.piece(f"exact_{kernel}", key, lambda: together()[kernel])["c"])
+
+        return {k: of(k) for k in kernels}
 
     def response(self, network: Mbir, reader: Any, exposure_s: float) -> dict[str, Any]:
         """``adjoints`` ``(2 · rois, z, y, x)`` of MBIR's ROI means, ``mean`` and ``covariance`` of what they give."""
@@ -124,8 +128,7 @@ class Draws:
 
     def noise_free(self, present: bool, exposure_s: float) -> Simulated:
         """Without noise; ``exposure_s`` is what a method is told."""
-        scan = self.clean[0 if present else 1]
-        return Simulated(self, scan, exposure_s, -1, present)
+        return Simulated(self, self.clean[0 if present else 1], exposure_s, -1, present)
 
     def draw(self, exposure_s: float, k: int) -> tuple[Simulated, Simulated]:
         """Realisation ``k`` with and without the signal."""
@@ -134,9 +137,9 @@ class Draws:
         return present, Simulated(self, None, exposure_s, k, False, present)
 
     def sigma(self, method: Method, exposure_s: float, smooths: float) -> float:
-        """Noise in HU of a linear method in the largest tissue."""
-        key = (method.name, exposure_s, smooths)
-        if key not in self._sigma:
+        """Noise in HU of FBP in the largest tissue; kept, since every job of a filter needs it."""
+
+        def compute() -> dict[str, Any]:
             largest = max(self.task.flat, key=lambda t: len(self.task.flat[t]), default=None)
             if largest is None:
                 raise ValueError(f"task {self.task.name}: no tissue fills a flat part of the inset: enlarge it")
@@ -145,8 +148,10 @@ class Draws:
                 noise_of(method.run(self.draw(exposure_s, k)[0]) - clean, self.task.flat[largest], smooths)
                 for k in _SIGMA_SEEDS
             ]
-            self._sigma[key] = float(np.sqrt(np.mean(np.square(found))))
-        return self._sigma[key]
+            return {"sigma": np.sqrt(np.mean(np.square(found)))}
+
+        name = f"sigma_{method.kernels[0]}_{exposure_s:g}s_{smooths:g}"
+        return float(self.store.piece(name, f"1 {exposure_s} {smooths} {self.task.fingerprint}", compute)["sigma"])
 
 
 class Simulated:
@@ -193,8 +198,11 @@ class Simulated:
 
     @cached_property
     def _fbp(self) -> Tensor:
+        if self.k < 0:
+            return self._draws.clean_fbp[0 if self.present else 1]
         if self._with_signal is not None:
-            return self._with_signal._fbp - self._draws.signal_fbp
+            present, absent = self._draws.clean_fbp
+            return self._with_signal._fbp - (present - absent)
         return self._draws.filtered(self.scan)[0]
 
     def fbp(self, kernel: str) -> Tensor:
@@ -206,10 +214,12 @@ class Simulated:
     @cached_property
     def statistic(self) -> Tensor:
         """AᵀW y ``(z, y, x)`` with the weights of the exposure."""
+        if self.k < 0:
+            return self._draws.clean_statistic[0 if self.present else 1] * self.exposure_s
         if self._with_signal is not None:
-            return self._with_signal.statistic - self.exposure_s * self._draws.signal_statistic
-        b = self.problem.statistic(self.scan).b
-        return b * self.exposure_s if self.scan.noise_free else b
+            present, absent = self._draws.clean_statistic
+            return self._with_signal.statistic - self.exposure_s * (present - absent)
+        return self.problem.statistic(self.scan).b
 
     def pwls(self) -> Tensor:
         """HU ``(z, y, x)``, with the default prior."""

@@ -180,10 +180,11 @@ def _jobs(
     if not store.has("facts", f"1 {task.fingerprint}"):
         jobs += [Job(name, _scan, (bench, signal)) for name, signal in scans.items()]
         jobs.append(Job(first, _facts, (bench,), (f"{place}facts.npz",), tuple(scans)))
-    for kernel in dict.fromkeys(m.kernels[0] for m in sent if m.is_fbp):
-        if not store.has(f"exact_{kernel}", f"1 {task.fingerprint}"):
-            name = f"{task.name}: exact noise, {kernel}"
-            jobs.append(Job(name, _exact, (bench, kernel), (f"{place}exact_{kernel}.npz",), tuple(scans)))
+    wanted = list(dict.fromkeys(m.kernels[0] for m in sent if m.is_fbp))
+    exact = [kernel for kernel in wanted if not store.has(f"exact_{kernel}", f"1 {task.fingerprint}")]
+    if exact:
+        name, made = f"{task.name}: exact noise, {', '.join(exact)}", tuple(f"{place}exact_{k}.npz" for k in exact)
+        jobs.append(Job(name, _exact, (bench, exact), made, tuple(scans)))
     blocks = [range(start, min(start + BLOCK, n)) for start in range(0, n, BLOCK)]
     exposures = exposures or task.exposures_s
     groups = min(len(sent), -(-2 * getattr(executor, "workers", 16) // (len(blocks) * len(exposures)))) or 1
@@ -197,12 +198,12 @@ def _jobs(
                 )]  # fmt: skip
                 if not asked:
                     continue
-                made = tuple(f"{place}{kept[m.name][0]}/{part}.npz" for m in group for part in _parts(m, k))
+                pieces = (f"{place}{kept[m.name][0]}/{part}.npz" for m in group for part in _parts(m, k))
                 name = f"{task.name}: {exposure:g} s, {k.start}-{k.stop}, {', '.join(asked)}" if k else known
                 seconds, kb = _estimate(task, [m for m in group if m.name in asked], max(len(k), 1))
                 jobs.append(
-                    Job(name, _block, (bench, exposure, asked, k), made, (first, known) if k else (first,),
-                        seconds=seconds, mib=_MIB, bytes=kb)
+                    Job(name, _block, (bench, exposure, asked, k), (*pieces, f"{place}sigma_*.npz"),
+                        (first, known) if k else (first,), seconds=seconds, mib=_MIB, bytes=kb)
                 )  # fmt: skip
     return jobs
 
@@ -253,8 +254,8 @@ def _facts(folder: Path, packed: bytes) -> None:
     _ = _bench(folder, packed).draws.facts
 
 
-def _exact(folder: Path, packed: bytes, kernel: str) -> None:
-    _bench(folder, packed).draws.exact_covariance(kernel)
+def _exact(folder: Path, packed: bytes, kernels: Sequence[str]) -> None:
+    _bench(folder, packed).draws.exact_covariances(kernels)
 
 
 def _block(folder: Path, packed: bytes, exposure: float, names: Sequence[str], k: range) -> None:
@@ -286,6 +287,7 @@ def _task(
     true = np.array([float(((truth[0] - truth[1]).double() * (b - a)).sum()) for a, b in task.regions.values()])
     records: list[Record] = []
     volumes = {}
+    at_1_s = draws.exact_covariances(list(dict.fromkeys(m.kernels[0] for m in everyone if m.is_fbp)))
     for exposure in exposures:
         running = [Measurement(method, draws, reader, exposure, store) for method in everyone]
         for start in range(0, n, BLOCK):
@@ -298,10 +300,10 @@ def _task(
                     progress(f"{task.name}: {measurement.method.name}, {exposure:g} s", k.stop / n)
         found = {m.method.name: m.readings() for m in running}
         base = found[reference.name]
-        control = Known(draws.exact_covariance(reference.kernels[0]) / exposure, base.clean_rois, base.rois)
+        control = Known(at_1_s[reference.kernels[0]] / exposure, base.clean_rois, base.rois)
         for method in everyone:
             own = found[method.name]
-            exact = draws.exact_covariance(method.kernels[0]) / exposure if method.is_fbp else None
+            exact = at_1_s[method.kernels[0]] / exposure if method.is_fbp else None
             volumes[method.name, exposure] = (own.first, own.first_clean)
             records += records_of(task.name, method.name, exposure, own, base, control, facts, true, reader.rois, exact)
     true_hu = dict(zip(reader.rois, true.tolist(), strict=True))

@@ -156,14 +156,13 @@ def volume_of(method: Method, draw: Draw) -> Tensor:
     return given.detach().float()
 
 
-def check_method(method: Method, reader: Reader, draws: Draws, exposure_s: float) -> None:
-    """A first look at a method's noise-free volume: its unit and its place.
+def check_volume(volume: Tensor, method: Method, reader: Reader, fbp: Tensor) -> None:
+    """A first look at a noise-free volume with the signal, and FBP of the same scan, HU ``(z, y, x)``: unit and place.
 
     Raises:
         ValueError: not in HU, or shifted.
     """
-    draw = draws.noise_free(True, exposure_s)
-    volume, truth = volume_of(method, draw), reader.truth[0]
+    truth = reader.truth[0]
     a, b = truth - truth.mean(), volume - volume.mean()
     scale = float((a * b).sum() / a.square().sum().clamp_min(1e-9))
     if not 0.2 < scale < 5.0 or float((volume - truth).mean().abs()) > 300.0:
@@ -172,8 +171,7 @@ def check_method(method: Method, reader: Reader, draws: Draws, exposure_s: float
             f"{float(truth.mean()):.4g} HU: does it give HU (water 0, air -1000)?"
         )
     # Its place by FBP: with few views streaks are larger than edges.
-    a = draw.fbp(draws.kernels[0])
-    a = a - a.mean()
+    a = fbp - fbp.mean()
     power = torch.fft.irfftn(torch.fft.rfftn(a).conj() * torch.fft.rfftn(b), s=a.shape)
     at = np.unravel_index(int(power.argmax()), a.shape)
     off = [int(k) if k <= n // 2 else int(k) - n for k, n in zip(at, a.shape, strict=True)]
@@ -206,8 +204,8 @@ class Measurement:
         self._pieces: list[dict[str, Any]] = []
 
         def clean() -> dict[str, Any]:
-            check_method(method, reader, draws, exposure_s)
-            return _of([[draws.noise_free(p, exposure_s) for p in (True, False)]], method, reader, keep=True)
+            pair = [draws.noise_free(p, exposure_s) for p in (True, False)]
+            return _of([pair], method, reader, keep=True, fbp=pair[0].fbp(draws.kernels[0]))
 
         self._clean = store.piece(f"{self._place}/clean", self._key, clean)
         self._known: dict[str, Any] | None = None
@@ -240,8 +238,10 @@ class Measurement:
 
 
 def _of(
-    pairs: Sequence[Sequence[Any]], method: Method, reader: Reader, keep: bool, adjoints: Tensor | None = None
-) -> dict[str, Any]:
+    pairs: Sequence[Sequence[Any]], method: Method, reader: Reader, keep: bool, adjoints: Tensor | None = None,
+    fbp: Tensor | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """A piece of pairs; with ``fbp``, which then is that of the first draw, the first volume is checked against it."""
     rois, square, rim, seconds, control = [], [], [], [], []
     channels: dict[str, list[Any]] = {o: [] for o in OBSERVERS}
     flat: dict[str, list[Any]] = {t: [] for t in reader.task.flat}
@@ -252,6 +252,8 @@ def _of(
             began = time.perf_counter()
             volumes.append(volume_of(method, draw))
             seconds.append(time.perf_counter() - began)
+            if fbp is not None and len(seconds) == 1:
+                check_volume(volumes[0], method, reader, fbp)
         rois.append([reader.pair(v) for v in volumes])
         if adjoints is not None:
             control.append([functionals(adjoints, draw.statistic) for draw in pair])

@@ -364,12 +364,9 @@ def _banded_add(kernel: Tensor, x: Tensor, scale: float, out: Tensor) -> None:
         from recon.gram.kernels import banded_add  # numba loads with its first use
 
         real = kernel.real.numpy().dtype.type
-        shape = (-1, *x.shape[-3:])
+        k, v, to = (torch.view_as_real(a).flatten(-2).numpy() for a in (kernel, x.reshape(-1, *x.shape[-3:]), out))
         row = 4 * x.shape[-1] * kernel.shape[0] * x[..., 0, 0].numel()
-        run(
-            banded_add, x.shape[-2], kernel.numpy(), x.reshape(shape).numpy(), real(scale), out.view(shape).numpy(),
-            operations=row,
-        )  # fmt: skip
+        run(banded_add, x.shape[-2], k, v, real(scale), to.reshape(v.shape), operations=row)
         return
     out += (scale * kernel[0].real) * x
     for b in range(1, kernel.shape[0]):

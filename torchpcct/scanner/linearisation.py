@@ -146,9 +146,8 @@ class WaterLinearisation:
             first = np.repeat(window.first_column, window.rows)
         out = torch.empty_like(flat)
         work = flat.shape[1] * 3 * self.coefficients.shape[1]
-        run(
-            evaluate, len(flat), flat.numpy(), first, self.coefficients, self.scale, slope, out.numpy(), operations=work
-        )
+        terms = np.ascontiguousarray(self.coefficients.T)
+        run(evaluate, len(flat), flat.numpy(), first, terms, self.scale, slope, out.numpy(), operations=work)
         return out.reshape(p.shape).to(p.device)
 
     def apply(self, p: Tensor, window: DetectorWindow | None = None) -> Tensor:

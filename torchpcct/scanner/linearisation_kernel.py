@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from numba import njit
 
 __all__ = ["evaluate"]
@@ -15,23 +16,27 @@ def evaluate(
 ) -> None:
     """Corrected line integrals (or the slope of the correction) of ``(lines, columns)`` readings.
 
-    Line i starts at detector column ``first_column[i % first_column.size]``. Inside 0 … scale a polynomial, beyond
-    both ends straight on.
+    Line i starts at detector column ``first_column[i % first_column.size]``; the ``coefficients`` are
+    ``(order, columns)``. Inside 0 … scale a polynomial, beyond both ends straight on.
     """
-    order = coefficients.shape[1]
+    columns = p.shape[1]
+    x, value, local = np.empty(columns), np.empty(columns), np.empty(columns)
+    # Term by term over a whole line: what stands side by side in memory is computed at once.
     for i in range(begin, end):
         start = first_column[i % first_column.size]
-        for j in range(p.shape[1]):
-            c = start + j
-            value = 0.0
-            derivative = 0.0
+        for j in range(columns):
+            x[j] = min(max(float(p[i, j]) / scale[start + j], 0.0), 1.0)
+            value[j] = local[j] = 0.0
+        for k in range(coefficients.shape[0] - 1, -1, -1):
+            term = coefficients[k, start : start + columns]
+            for j in range(columns):
+                local[j] = local[j] * x[j] + value[j]
+                value[j] = value[j] * x[j] + term[j]
+        for j in range(columns):
             q = float(p[i, j])
-            x = min(max(q / scale[c], 0.0), 1.0)
-            for k in range(order - 1, -1, -1):
-                derivative = derivative * x + value
-                value = value * x + coefficients[c, k]
-            local = value + x * derivative  # d(mu_ref t) / dp at the clamped p
+            bend = value[j] + x[j] * local[j]  # d(mu_ref t) / dp at the clamped p
             if slope:
-                out[i, j] = local + 0.0 * q  # NaN stays NaN
+                out[i, j] = bend + 0.0 * q  # NaN stays NaN
             else:
-                out[i, j] = scale[c] * x * value + (q - scale[c] * x) * local
+                inside = scale[start + j] * x[j]
+                out[i, j] = inside * value[j] + (q - inside) * bend
