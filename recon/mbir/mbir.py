@@ -46,13 +46,11 @@ class Solution:
         normal: the normalised problem.
         u: ``(batch, z, y, x)`` in its units.
         notes: for each volume, what its report shall hold beside; under ``warnings`` a list of texts.
-        told: for each volume, the fidelity of the data consistency at its end.
     """
 
     normal: NormalisedProblem
     u: Tensor
     notes: list[dict[str, Any]]
-    told: list[float]
 
 
 class Mbir:
@@ -133,8 +131,7 @@ class Mbir:
     def solved(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> Solution:
         """The same with what it was made of."""
         normal = self.problem(problem, b, exposure_s)
-        u, n = self.model(normal, self.fidelity, **self.parts), b.shape[0]
-        return Solution(normal, u, [{} for _ in range(n)], [self.fidelity] * n)
+        return Solution(normal, self.model(normal, self.fidelity, **self.parts), [{} for _ in range(b.shape[0])])
 
     @staticmethod
     def in_hu(problem: InsetProblem, u: Tensor, normal: NormalisedProblem) -> Tensor:

@@ -8,8 +8,7 @@ whose fibrous layer the best linear estimate of its contents stands (:mod:`recon
     u = T + MBIR(β − H T),
 
 so whatever the drawing lacks (a branch, muscle, texture) comes from the data as ever, beside an edge that is no longer
-there to bleed into it. The fidelity belongs to the contents of the layer; the network is told a fifth of it, for low
-frequencies are taken from the data already.
+there to bleed into it.
 
 Where no vessel is found, or a drawn one does not explain the data outside of its fibrous layer, the result is the plain
 reconstruction MBIR(β).
@@ -56,12 +55,6 @@ class Drawn:
     unexplained: Callable[[Tensor], float] = lambda volume: 0.0
 
 
-_TOLD = 0.2
-"""Share of the fidelity that the network is told. On four held-out vessels (4 draws, 2 s / 0.35 s) fat then has 3.9 /
-9.5 HU of noise instead of 5.4 / 12.3, the vessel an error of 25.1 / 40.7 instead of 25.3 / 41.3 HU, and the contrast of
-a core at slope 1 is as noisy as before, with a slope of 0.79 / 0.63 instead of 0.80 / 0.66."""
-
-
 def layer_sd_hu(fidelity: float) -> float:
     """Prior standard deviation of what the fibrous layer holds, HU: from 50, quiet, to 200, for measuring contrast."""
     return SD_HU * 4.0 ** (fidelity - DEFAULT_FIDELITY)
@@ -87,13 +80,13 @@ class OutlineMbir(Mbir):
         notes = [one.note for one in found]
         normal = self.problem(problem, b, exposure_s)
         around = [k for k, one in enumerate(found) if one.image is not None]
-        told, volumes = [self.fidelity] * len(found), dict[int, Tensor]()
+        volumes: dict[int, Tensor] = {}
         if around:
             part, images = normal.part(around), [one.image for one in found if one.image is not None]
             t = self.in_noise_units(problem, torch.stack(images), part)
             # Once the outlines are taken off, four turns do what eight do: 0.7 HU rms apart on the paper's plaque.
             parts = {"prior": partial(self.model.network, mirrored=False), **self.parts}
-            u = t + self.model(replace(part, beta=part.beta - part.apply(t)), _TOLD * self.fidelity, **parts)
+            u = t + self.model(replace(part, beta=part.beta - part.apply(t)), self.fidelity, **parts)
             for k, own, volume in zip(around, u, self.in_hu(problem, u.detach(), part), strict=True):
                 highest = found[k].unexplained(volume)
                 if highest > STRIKING:
@@ -101,12 +94,12 @@ class OutlineMbir(Mbir):
                         f"its outlines leave {highest:.0f} standard deviations of the noise unexplained"
                     )
                 else:
-                    volumes[k], told[k] = own, _TOLD * self.fidelity
+                    volumes[k] = own
         plain = [k for k in range(len(found)) if k not in volumes]
         if plain:
             without = super().solved(problem, b[plain], exposure_s)
             volumes |= dict(zip(plain, without.u, strict=True))
-        return Solution(normal, torch.stack([volumes[k] for k in range(len(found))]), notes, told)
+        return Solution(normal, torch.stack([volumes[k] for k in range(len(found))]), notes)
 
     def drawn(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> Drawn:
         """What is drawn of one scan.

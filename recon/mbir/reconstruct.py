@@ -112,7 +112,7 @@ def reconstruct_mbir(
             solution = network.solved(problem, b, exposure)
             normal, u = solution.normal, solution.u
             left = normal.beta - normal.apply(u)
-            residuals = low_residual(normal, left, torch.tensor(solution.told)).tolist()
+            residuals = low_residual(normal, left, network.fidelity).tolist()
             # ‖y − A u‖²_W less ‖y‖²_W = uᵀ H u − 2 βᵀ u
             misfit = -(u * (left + normal.beta)).sum(dim=(1, 2, 3), dtype=torch.float64)
             hu = network.in_hu(problem, u, normal)

@@ -247,14 +247,14 @@ def _largest_nearby(v: Tensor) -> Tensor:
     return v
 
 
-def low_residual(problem: NormalisedProblem, left: Tensor, fidelity: float | Tensor) -> Tensor:
+def low_residual(problem: NormalisedProblem, left: Tensor, fidelity: float) -> Tensor:
     """‖L (β − H u)‖ over ‖L β‖, ``(batch,)``: 0 where the low frequencies are wholly the data's own.
 
     Args:
         problem: normalised problem.
         left: β − H u, ``(batch, z, y, x)``.
-        fidelity: 0 … 1, one for all or ``(batch,)``.
+        fidelity: 0 … 1.
     """
-    low_pass = _low_pass(problem, torch.as_tensor(fidelity).to(problem.scale_hu).expand_as(problem.scale_hu))
+    low_pass = _low_pass(problem, torch.full_like(problem.scale_hu, fidelity))
     sizes = [filtered(v, low_pass).flatten(1).norm(dim=1) for v in (left, problem.beta)]
     return sizes[0] / sizes[1].clamp_min(torch.finfo(sizes[1].dtype).tiny)
