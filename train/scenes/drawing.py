@@ -75,13 +75,9 @@ def _draw(draw: Draw, extent: Triple, config: SceneConfig) -> TrainingScene:
     free: tuple[Solid, ...] = ()
     if draw.chance(config.free_probability):
         contrast = config.wide_contrast if draw.chance(config.wide_probability) else config.free_contrast
-        if draw.chance(config.bars_probability):
-            free = _draw_bars(draw, extent, config, background, draw(contrast))
-        else:
-            free = tuple(
-                _draw_free(draw, extent, config, background, draw(contrast))
-                for _ in range(draw.count(*config.free_count))
-            )
+        free = tuple(
+            _draw_free(draw, extent, config, background, draw(contrast)) for _ in range(draw.count(*config.free_count))
+        )
     else:
         cores = draw.chance(config.core_probability)
         vessels = (_draw_vessel(draw, extent, config, cores),)
@@ -123,23 +119,6 @@ def _draw_free(draw: Draw, extent: Triple, config: SceneConfig, background: floa
         rotation=draw.rotation(),
         contrast=contrast,
     )
-
-
-def _draw_bars(
-    draw: Draw, extent: Triple, config: SceneConfig, background: float, contrast: float
-) -> tuple[Solid, ...]:
-    """Bars side by side, of one contrast."""
-    pitch, rotation, exponent = draw.log(config.bars_pitch), draw.rotation(), config.exponent[1]
-    middle = [draw((-0.25 * e, 0.25 * e)) for e in extent[::-1]]
-    axes = (0.25 * pitch, draw((1.0, 3.0)), draw((1.0, 6.0)))
-    number = draw.count(3, 7)
-    found = []
-    for k in range(number):
-        x, y, z = (m + (k - 0.5 * (number - 1)) * pitch * r for m, r in zip(middle, rotation[:3], strict=True))
-        found.append(
-            Solid("free", "superquadric", background + contrast, (x, y, z), axes, exponent, rotation, contrast=contrast)
-        )
-    return tuple(found)
 
 
 def _bumps(draw: Draw, extent: Triple, amplitude: Range, width: Range, high: int) -> tuple[Bump, ...]:

@@ -40,8 +40,7 @@ class SceneConfig:
         fat, muscle: HU of the background; muscle_probability: of the second one.
         free_probability: of free-standing bodies instead of vessels; free_count, free_contrast, free_size: their
             number, contrast to the background, and semi-axes (log-uniform); wide_probability: of free bodies with
-            wide_contrast instead, like bone, air or contrast agent; bars_probability: of parallel bars instead, like
-            trabeculae, struts or a resolution phantom, bars_pitch apart (log-uniform), half of it thick.
+            wide_contrast instead, like bone, air or contrast agent.
         second_vessel: probability of a second vessel.
         second_tissue: probability of fat beside muscle, or muscle beside fat, behind the vessels or bodies;
             tissue_size: semi-axes (log-uniform) of the ellipsoid in which it lies, so large that the inset sees one
@@ -74,8 +73,6 @@ class SceneConfig:
     free_size: Range = (0.3, 3.0)
     wide_probability: float = 0.3
     wide_contrast: Range = (-900.0, 1500.0)
-    bars_probability: float = 0.0
-    bars_pitch: Range = (0.6, 2.5)
     second_vessel: float = 0.25
     second_tissue: float = 0.3
     tissue_size: Range = (4.0, 30.0)
