@@ -225,7 +225,7 @@ def _estimate(task: Task, methods: Sequence[Method], n: int) -> tuple[float, flo
     """Rough seconds of realisations on one core, and bytes that are kept."""
     volumes = 2 * n * task.grid.voxels / 1e5
     seconds = volumes * sum(_SECONDS.get(m.name.partition(":")[0], _OTHER_S) for m in methods)
-    return seconds + n * _DRAW_S, len(methods) * (2.0 * task.grid.voxels + 8e3 * n * (1 + len(task.scene.names)))
+    return seconds + n * _DRAW_S, len(methods) * (2.0 * task.grid.voxels + 8e3 * n * (1 + len(task.names)))
 
 
 class _Bench:

@@ -40,7 +40,7 @@ from torchpcct.scanner.scanner import Scanner
 from torchpcct.scene.scene import Scene
 from torchpcct.validate import numbers
 
-__all__ = ["ROIS", "Facts", "Task"]
+__all__ = ["ROIS", "Facts", "SomeViews", "Task"]
 
 Floats = NDArray[np.float64]
 Pair = tuple[Tensor, Tensor]
@@ -119,9 +119,8 @@ class Task:
         if not signal:
             raise ValueError(f"task {self.name}: signal names no body of the scene")
         for name in (*signal, *([self.background] if self.background else [])):
-            if name not in self.scene.names:
-                raise ValueError(f"task {self.name}: no body {name!r} in the scene, which has "
-                                 f"{', '.join(self.scene.names)}")  # fmt: skip
+            if name not in self.names:
+                raise ValueError(f"task {self.name}: no body {name!r} in the scene, which has {', '.join(self.names)}")
         background = self.background or self.scene[signal[0]].parent
         if background is None:
             raise ValueError(f"task {self.name}: {signal[0]!r} lies in no other body: name the background")
@@ -132,6 +131,11 @@ class Task:
         exposures = tuple(numbers("exposures_s", self.exposures_s, positive=True, unit="s"))
         for name, value in (("signal", signal), ("background", background), ("exposures_s", exposures)):
             object.__setattr__(self, name, value)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What signal and background can be."""
+        return self.scene.names
 
     @cached_property
     def absent(self) -> Scene:
@@ -185,24 +189,12 @@ class Task:
         return self._facts_of(*self.scans(store))
 
     def _facts_of(self, present: Scan, absent: Scan) -> Facts:
-        g, w = present.geometry, present.window
-        assert w is not None
-        stride = max(1, g.views // _VIEWS)
-        views = list(range(0, g.views, stride))
-        window = DetectorWindow(w.first_column[views], w.columns, w.first_row, w.rows)
-        maps = tissue_path_lengths(
-            self.scene, list(self._groups.values()), g.select(views), window, sub_rays=_SUB_RAYS,
-            focal_spot=self.scanner.source.focal_spot,
-        )  # fmt: skip
-        weight = 1.0 / line_integral_variance(present, NOISE_FREE_EXPOSURE_S)[views]
-        scale, share = present.linearisation.mu_ref / 1000.0, g.views / len(views)
-        information = information_matrix(maps, weight, scale=scale) * share
-        lines = present.line_integrals()[views]
-        right = scale * share * np.array([_inner(m, weight * lines) for m in maps])
-        values = np.linalg.solve(information, right) - 1000.0
+        seen = SomeViews(present)
+        maps = seen.path_lengths(self, list(self._groups.values()))
+        information, values = seen.information(maps), seen.values(maps)
         # The signal by what it changes: whatever else the readings hold drops out.
-        change = lines - absent.line_integrals()[views]
-        differs = _inner(maps[0], weight * change) * scale * share / information[0, 0]
+        change = seen.lines - absent.line_integrals()[seen.views]
+        differs = _inner(maps[0], seen.weight * change) * seen.scale * seen.share / information[0, 0]
         values[0] = values[1] + differs
         limit = ceiling(information, np.eye(len(maps))[1] - np.eye(len(maps))[0])
         return Facts(tuple(self._groups), tuple(float(v) for v in values), float(limit.functional_sd[0]))
@@ -328,6 +320,41 @@ class Task:
         at = ndimage.center_of_mass(self.shares["signal"])
         z, y, x = (float(np.interp(p, np.arange(len(a)), a)) for p, a in zip(at, self.grid.axes, strict=True))
         return z, y, x
+
+
+class SomeViews:
+    """So many views of a noise-free scan as values and limits need.
+
+    Args:
+        scan: within a detector window.
+    """
+
+    def __init__(self, scan: Scan) -> None:
+        g, w = scan.geometry, scan.window
+        assert w is not None
+        self.views = list(range(0, g.views, max(1, g.views // _VIEWS)))
+        self.geometry = g.select(self.views)
+        self.window = DetectorWindow(w.first_column[self.views], w.columns, w.first_row, w.rows)
+        self.weight = 1.0 / line_integral_variance(scan, NOISE_FREE_EXPOSURE_S)[self.views]
+        self.lines = scan.line_integrals()[self.views]
+        self.scale, self.share = scan.linearisation.mu_ref / 1000.0, g.views / len(self.views)
+
+    def path_lengths(self, task: Task, groups: list[list[str]]) -> list[Tensor]:
+        """Of groups of the scene's bodies, mm."""
+        maps = tissue_path_lengths(
+            task.scene, groups, self.geometry, self.window, sub_rays=_SUB_RAYS,
+            focal_spot=task.scanner.source.focal_spot,
+        )  # fmt: skip
+        return list(maps)
+
+    def information(self, maps: list[Tensor]) -> Floats:
+        """Of all views on the values of tissues with these path lengths, HU⁻², at 1 s."""
+        return information_matrix(maps, self.weight, scale=self.scale) * self.share
+
+    def values(self, maps: list[Tensor]) -> Floats:
+        """Least squares for the values of tissues, HU."""
+        right = self.scale * self.share * np.array([_inner(m, self.weight * self.lines) for m in maps])
+        return np.asarray(np.linalg.solve(self.information(maps), right) - 1000.0)
 
 
 def _plain(value: Any) -> Any:

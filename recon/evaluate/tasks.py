@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
@@ -14,20 +14,22 @@ import torch
 from numpy.typing import NDArray
 
 from recon.evaluate.store import Store
-from recon.evaluate.task import Facts, Task
+from recon.evaluate.task import Facts, SomeViews, Task
 from recon.evaluate.vessels import SHAPES, Vessel
 from torchpcct import Projector, VolumeGrid
 from torchpcct.acquisition.config import configured, grid_of
 from torchpcct.formats.damage import read_yaml
+from torchpcct.metrics.data_limit import ceiling
 from torchpcct.metrics.placement import place_rois, whole_rois
 from torchpcct.metrics.roi import axial_grid
 from torchpcct.scan import Scan
 from torchpcct.scene.plaque import plaque_scene
 from torchpcct.scene.plaque.plaque import Plaque
 from torchpcct.scene.scene import Scene
-from torchpcct.validate import choice, number, numbers
+from torchpcct.validate import choice, number, numbers, whole
+from torchpcct.volume import Volume
 
-__all__ = ["TASKS", "VesselTask", "read_task", "task_text"]
+__all__ = ["TASKS", "VesselTask", "VoxelTask", "read_task", "task_text"]
 
 Floats = NDArray[np.float64]
 
@@ -35,7 +37,7 @@ _FOLDER = resources.files("recon") / "evaluate" / "tasks"
 TASKS: tuple[str, ...] = tuple(sorted(Path(str(p)).stem for p in _FOLDER.iterdir() if str(p).endswith(".yaml")))
 """Names of the tasks that come with the package."""
 _KEYS = ("name", "title", "scene", "scanner", "signal", "background", "inset", "exposures_s", "reference", "rois",
-         "tolerance_hu", "vessel")  # fmt: skip
+         "tolerance_hu", "vessel", "voxels")  # fmt: skip
 _VOXEL_MM = 0.2
 """What MBIR's network was trained on."""
 
@@ -88,8 +90,10 @@ def _task(values: Any, name: str, folder: Path) -> Task:
     given: dict[str, Any] = {k: values[k] for k in ("background", "title", "reference") if k in values}
     if "exposures_s" in values:
         given["exposures_s"] = tuple(np.ravel(values["exposures_s"]).tolist())
-    grid = _inset(f"task {name}: inset", values["inset"], scene, signal)
     make: Any = Task
+    if "voxels" in values:
+        make, given = VoxelTask, given | _labels(f"task {name}: voxels", values["voxels"], folder)
+    grid = _inset(f"task {name}: inset", values["inset"], scene, () if make is VoxelTask else signal)
     if "vessel" in values:
         given["direction"], make = choice("vessel", values["vessel"], tuple(SHAPES)), VesselTask
     task: Task = make(
@@ -115,6 +119,11 @@ def _inset(name: str, value: Any, scene: Scene, signal: tuple[str, ...]) -> Volu
 
     size = numbers(f"{name}.size", triple(value["size"]), 3, positive=True, unit="mm")
     voxel = number(f"{name}.voxel_mm", value.get("voxel_mm", _VOXEL_MM), positive=True, unit="mm")
+    shape = tuple(int(np.ceil(s / voxel - 1e-6)) for s in size)
+    if "center" in value:
+        return VolumeGrid(shape, voxel, tuple(numbers(f"{name}.center", triple(value["center"]), 3)))
+    if not signal:
+        raise ValueError(f"{name} needs center {{z, y, x}} in mm: that is where the voxels are put")
     # About what the signal lies in, where that is small: a plaque's vessel, not a patient.
     parent = scene[signal[0]].parent
     boxes = [scene.bounding_box(signal)]
@@ -124,10 +133,20 @@ def _inset(name: str, value: Any, scene: Scene, signal: tuple[str, ...]) -> Volu
             break
         boxes.append(box)
         parent = scene[parent].parent
-    middle = boxes[-1].mean(0)[::-1]
-    center = numbers(f"{name}.center", triple(value["center"]), 3) if "center" in value else middle
-    shape = tuple(int(np.ceil(s / voxel - 1e-6)) for s in size)
-    return VolumeGrid(shape, voxel, tuple(float(c) for c in center))
+    return VolumeGrid(shape, voxel, tuple(float(c) for c in boxes[-1].mean(0)[::-1]))
+
+
+def _labels(name: str, value: Any, folder: Path) -> dict[str, Any]:
+    """``file`` and ``tissues`` of a task's ``voxels``."""
+    if not isinstance(value, Mapping) or set(value) != {"file", "tissues"} or not isinstance(value["tissues"], Mapping):
+        raise ValueError(f"{name} takes file, a volume of whole numbers, and tissues {{name: {{label: 1, hu: 50}}}}")
+    tissues = {}
+    for tissue, of in value["tissues"].items():
+        if not isinstance(of, Mapping) or set(of) != {"label", "hu"}:
+            raise ValueError(f"{name}: tissue {tissue!r} needs label and hu, got {of!r}")
+        tissues[str(tissue)] = (whole(f"{name}: label of {tissue}", of["label"], 1), number(f"{name}: hu", of["hu"]))
+    volume = Volume.load(folder / str(value["file"]))
+    return {"labels": np.asarray(volume.data), "spacing": volume.grid.spacing, "tissues": tissues}
 
 
 def _protocol(plaque: Plaque, grid: VolumeGrid) -> dict[str, Any]:
@@ -197,6 +216,133 @@ class VesselTask(Task):
     @property
     def _beside(self) -> Floats:
         return self.shares[self.background]
+
+
+@dataclass(frozen=True, eq=False)
+class VoxelTask(Task):
+    """A segmented lesion of the user's own: labels of voxels, put into a patient made of bodies.
+
+    The scene is the patient alone, round about the axis. What the labels stand for is painted over it on voxels half as
+    large as the inset's, projected, and changes the patient's counts.
+
+    Args:
+        labels: ``(z, y, x)`` whole numbers; 0 and whatever ``tissues`` does not name is the patient. Their middle lies
+            in the middle of the inset; what is beyond the inset is left out.
+        spacing: ``(z, y, x)`` of their voxels, mm.
+        tissues: name → label and HU on this scanner; signal and background are two of them.
+
+    Raises:
+        ValueError: labels that are not whole numbers or of three axes, a label that no voxel has, a name that is a
+            body's, no background.
+    """
+
+    labels: Any = None
+    spacing: tuple[float, ...] = (1.0, 1.0, 1.0)
+    tissues: Mapping[str, tuple[int, float]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        labels = np.asarray(self.labels)
+        if labels.ndim != 3 or not np.array_equal(labels, np.round(labels)):
+            raise ValueError(f"task {self.name}: labels must be whole numbers (z, y, x), got shape {labels.shape}")
+        for tissue, (label, _) in self.tissues.items():
+            if not (labels == label).any():
+                raise ValueError(f"task {self.name}: no voxel has the label {label} of {tissue!r}")
+        both = set(self.tissues) & set(self.scene.names)
+        if both or not self.background:
+            why = f"{', '.join(sorted(both))} is a tissue and a body" if both else "name the background, one of tissues"
+            raise ValueError(f"task {self.name}: {why}")
+        object.__setattr__(self, "labels", labels.astype(np.int64))
+        super().__post_init__()
+        if len(self.signal) != 1 or not {*self.signal, self.background} <= set(self.tissues):
+            raise ValueError(f"task {self.name}: signal and background must each be one of {', '.join(self.tissues)}")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """See :attr:`Task.names`."""
+        return (*self.tissues, *self.scene.names)
+
+    @property
+    def _patient(self) -> str:
+        """The body in which the middle of the inset lies."""
+        z, y, x = self.grid.center
+        return self.scene.names[int(self.scene.labels(np.array([[x, y, z]]))[0])]
+
+    @cached_property
+    def _groups(self) -> dict[str, list[str]]:
+        others = [t for t in self.tissues if t not in (*self.signal, self.background)]
+        tissues = {"signal": list(self.signal), **{t: [t] for t in (self.background, *others)}}
+        return {**tissues, self._patient: [self._patient]}
+
+    def scan(self, store: Store, signal: str) -> Scan:
+        """See :meth:`Task.scan`."""
+        path = self.scan_file(store, signal)
+        if not path.exists():
+            plain = self._alone(store)
+            fine = VolumeGrid(tuple(2 * n for n in self.grid.shape), self.grid.spacing[0] / 2, self.grid.center)
+            values = dict(self.tissues)
+            if signal == "absent":
+                values[self.signal[0]] = (values[self.signal[0]][0], values[self.background][1])
+            here = self._patient_hu(plain)
+            x = sum((share * (values[t][1] - here) for t, share in self._painted(fine).items()), np.zeros(fine.shape))
+            mu = torch.from_numpy(x * (plain.linearisation.mu_ref / 1000.0)).float()
+            added = Projector(plain.geometry, fine, plain.window)(mu)
+            replace(plain, counts=_behind(plain, added)).save(path)
+        return Scan.load(path)
+
+    def _alone(self, store: Store) -> Scan:
+        """The patient without the labels."""
+        return Task.scan(self, Store(store.folder / "patient"), "present")
+
+    def _patient_hu(self, alone: Scan) -> float:
+        seen, names = SomeViews(alone), list(self.scene.names)
+        return float(seen.values(seen.path_lengths(self, [[n] for n in names]))[names.index(self._patient)])
+
+    def facts(self, store: Store) -> Facts:
+        """The values are given; the limit is that of tissues with these shapes in this patient."""
+        alone = self._alone(store)
+        seen, own = SomeViews(alone), self._painted(self.grid)
+        project = Projector(seen.geometry, self.grid, seen.window)
+        order = [n for names in self._groups.values() for n in names if n in own]
+        maps = [project(torch.from_numpy(own[t]).float()) for t in order]
+        bodies = seen.path_lengths(self, [[n] for n in self.scene.names])
+        around = self.scene.names.index(self._patient)
+        bodies[around] = bodies[around] - torch.stack(maps).sum(0)
+        maps += bodies
+        limit = ceiling(seen.information(maps), np.eye(len(maps))[1] - np.eye(len(maps))[0])
+        values = [*(self.tissues[t][1] for t in order), self._patient_hu(alone)]
+        return Facts(tuple(self._groups), tuple(values), float(limit.functional_sd[0]))
+
+    def _painted(self, grid: VolumeGrid) -> dict[str, Floats]:
+        """Tissue → its share of every voxel of a grid, exactly."""
+        along = [
+            _overlaps(axis - middle, width, step, n)
+            for axis, middle, width, step, n in zip(
+                grid.axes, self.grid.center, grid.spacing, self.spacing, self.labels.shape, strict=True
+            )
+        ]
+        return {
+            tissue: np.einsum("iz,jy,kx,zyx->ijk", *along, (self.labels == label).astype(np.float64), optimize=True)
+            for tissue, (label, _) in self.tissues.items()
+        }
+
+    @cached_property
+    def shares(self) -> dict[str, Floats]:
+        """See :attr:`Task.shares`."""
+        own = self._painted(self.grid)
+        order = {("signal" if n in self.signal else n): own[n] for ns in self._groups.values() for n in ns if n in own}
+        return {**order, self._patient: 1.0 - np.sum(list(own.values()), axis=0)}
+
+    @property
+    def _beside(self) -> Floats:
+        return self.shares[self.background]
+
+
+def _overlaps(at: Floats, width: float, step: float, count: int) -> Floats:
+    """Share of each of ``count`` voxels about 0 in cells of a width at given places, ``(cells, count)``."""
+    middle = (np.arange(count) - 0.5 * (count - 1)) * step
+    high = np.minimum(at[:, None] + 0.5 * width, middle + 0.5 * step)
+    low = np.maximum(at[:, None] - 0.5 * width, middle - 0.5 * step)
+    return np.clip(high - low, 0.0, None) / width
 
 
 def _without_inset(scan: Scan) -> Scan:

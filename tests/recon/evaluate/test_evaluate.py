@@ -316,3 +316,70 @@ def test_volumes_in_two_folders(tmp_path, capsys):
     assert soft["noise"] < 5.0
     with pytest.raises(ValueError, match="shape"):
         evaluate_volumes({"other": [np.zeros((4, 64, 32))] * 2}, reference, 0.5)
+
+
+@pytest.fixture(scope="module")
+def voxel_task(tmp_path_factory):
+    """The insert of :data:`INSERT` again, as a user would have segmented it: on voxels of 0.1 mm."""
+    folder = tmp_path_factory.mktemp("voxels")
+    at = (np.arange(70) - 34.5) * 0.1
+    z, y, x = np.meshgrid(at, at, at, indexing="ij")
+    far = np.sqrt(z**2 + y**2 + x**2)
+    labels = np.where(far < 1.5, 7, np.where(far < 3.2, 2, 0))
+    grid = VolumeGrid(labels.shape, 0.1)
+    Volume(torch.from_numpy(labels).float(), grid).save(folder / "labels.nii.gz")
+    values = yaml.safe_load(INSERT)
+    values["scene"]["bodies"] = values["scene"]["bodies"][:1]
+    tissues = {"insert": {"label": 7, "hu": 52.0}, "rim": {"label": 2, "hu": 0.0}}
+    values |= {"voxels": {"file": "labels.nii.gz", "tissues": tissues}, "background": "rim"}
+    values["inset"] = {**values["inset"], "center": {"z": 0, "y": 10, "x": 30}}
+    path = folder / "mine.yaml"
+    path.write_text(yaml.safe_dump(values), encoding="utf-8")
+    return path
+
+
+def test_a_segmented_lesion_is_a_task(voxel_task, task, folder, tmp_path):
+    """The same figures as the analytic scene, whose insert reads so many HU, within the staircase of the voxels."""
+    mine, store, there = read_task(voxel_task), Store(tmp_path / "pieces"), Store(tmp_path / "analytic")
+    facts, known = mine.facts(store), task.facts(there)
+    assert facts.tissues == ("signal", "rim", "patient")
+    assert facts.values_hu[2] == pytest.approx(0.0, abs=1.0)
+    assert facts.limit_hu == pytest.approx(known.limit_hu, rel=0.4)
+    present, absent = mine.scans(store)
+    other = task.scans(there)
+    scale = known.contrast_hu / facts.contrast_hu
+    change = (present.line_integrals() - absent.line_integrals()) * scale
+    exact = other[0].line_integrals() - other[1].line_integrals()
+    # A column beside it would be 0.23; the staircase of the labels makes the sphere 1.3 % larger.
+    assert float((change - exact).norm() / exact.norm()) < 0.08
+    assert float(change.sum() / exact.sum()) == pytest.approx(1.0, abs=0.04)
+    assert float(mine.shares["signal"].sum()) * 0.4**3 == pytest.approx(float((mine.labels == 7).sum()) * 0.1**3)
+    truth, without = mine.truth(facts)
+    assert float(truth.max()) == pytest.approx(52.0)
+    assert float(without.abs().max()) < 1.0
+    assert float(mine.regions["lesion"][0].sum()) == pytest.approx(1.0)
+    found = evaluate(mine, ["fbp:soft"], n=8, folder=tmp_path / "found")
+    slope = value(found, "slope", "fbp:soft", "lesion")["value"]
+    assert 0.5 < slope < 1.1
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"voxels": {"file": "labels.nii.gz"}}, "takes file"),
+        ({"voxels": {"file": "labels.nii.gz", "tissues": {"insert": {"label": 7}}}}, "needs label and hu"),
+        (
+            {"voxels": {"file": "labels.nii.gz", "tissues": {"insert": {"label": 9, "hu": 1}}}},
+            "no voxel has the label 9",
+        ),
+        ({"background": "patient"}, "each be one of"),
+        ({"background": ""}, "name the background"),
+        ({"inset": {"size": [6, 8, 8]}}, "needs center"),
+    ],
+)
+def test_voxels_that_make_no_task(voxel_task, change, said):
+    values = {**yaml.safe_load(voxel_task.read_text(encoding="utf-8")), **change}
+    path = voxel_task.with_name("other.yaml")
+    path.write_text(yaml.safe_dump(values), encoding="utf-8")
+    with pytest.raises(ValueError, match=said):
+        read_task(path)
