@@ -18,7 +18,9 @@ from functools import partial
 from multiprocessing import get_context
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.gram.gram import Gram
@@ -105,12 +107,12 @@ class Data:
 
     def paint(self, seed: int, processes: int) -> None:
         """Paint the whole pool beforehand, by so many processes; else scenes are painted when they are first used."""
-        make = partial(painted, self.config, seed)
+        make = partial(_as_array, self.config, seed)
         numbers = range(self.config.pool)
         make(0)  # compiles the kernels for all
         with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as workers:
             for number, maps in zip(numbers, workers.map(make, numbers, chunksize=16), strict=True):
-                self._pool[seed, number] = maps.to(self.device)
+                self._pool[seed, number] = torch.from_numpy(maps).to(self.device)
 
     def batches(self, seed: int, step: int, indices: Sequence[int]) -> list[Batch]:
         """Scenes ``indices`` of a step, all at once; one by one where draws are used several times.
@@ -184,6 +186,11 @@ def painted(config: DataConfig, seed: int, number: int) -> Tensor:
     made = random_scene(grid, spacing, generator=generator, config=SceneConfig(**config.scenes))
     maps = [made.image[0] - made.scenes[0].background, made.core[0] > 0.97, made.surround[0] > 0.97]
     return torch.stack([m.transpose(0, axis).to(torch.float16) for m in maps])
+
+
+def _as_array(config: DataConfig, seed: int, number: int) -> NDArray[np.float16]:
+    # Tensors sent from another process would each hold a file open.
+    return np.asarray(painted(config, seed, number).numpy())
 
 
 def situation_gram(situation: Situation, config: DataConfig) -> tuple[Gram, float]:
