@@ -47,6 +47,7 @@ ROIS = 3
 """Contrasts of each scene: two of small ROIs, one of a whole core."""
 _DRAWS_OF_ROI, _OWN_DRAWS = 6, 7
 """Random numbers that a small ROI takes; those of a scene: three mirrors, an exchange, the exposure, two lots."""
+_CORE, _AROUND = 1, 2
 _WINDOW = 64
 """Draws of each scene of a batch that are at hand where they are used several times."""
 
@@ -151,7 +152,7 @@ class Data:
             generators = [torch.Generator(self.device).manual_seed(o) for o in own]
         noise = gram.coloured(torch.stack([gram.white((2,), generator=g) for g in generators]))
         maps = _mirrored(torch.stack([self._scene(seed, n) for n in numbers]).float(), random[:, :4])
-        truth, core, tissue = maps[:, 0], maps[:, 1] > 0, maps[:, 2] > 0
+        truth, core, tissue = maps[:, 0], maps[:, 1] == _CORE, maps[:, 1] == _AROUND
         low, high = (math.log(v) for v in c.exposure_s)
         exposure = torch.exp(low + (high - low) * random[:, 4])
         found = [_random_contrasts(core, tissue, c, part) for part in random[:, _OWN_DRAWS:].split(_DRAWS_OF_ROI, 1)]
@@ -173,9 +174,9 @@ class Data:
 
 
 def painted(config: DataConfig, seed: int, number: int) -> Tensor:
-    """A scene of the pool, ``(3, z, y, x)`` float16.
+    """A scene of the pool, ``(2, z, y, x)`` float16: image in HU above the background, and a label.
 
-    Image in HU above the background; voxels wholly in a core, and wholly in the tissue around (0 or 1).
+    The label is 1 in voxels wholly in a core, 2 in those wholly in the tissue around, else 0.
     """
     generator = torch.Generator().manual_seed(seed_of("scene", seed, number))
     draw = float(torch.rand((), generator=generator))
@@ -184,7 +185,8 @@ def painted(config: DataConfig, seed: int, number: int) -> Tensor:
     shape = (across, *(along if k == axis else n for k, n in enumerate(config.shape) if k))
     grid, spacing = (shape[0], shape[1], shape[2]), (config.voxel_mm,) * 3
     made = random_scene(grid, spacing, generator=generator, config=SceneConfig(**config.scenes))
-    maps = [made.image[0] - made.scenes[0].background, made.core[0] > 0.97, made.surround[0] > 0.97]
+    label = _CORE * (made.core[0] > 0.97) + _AROUND * (made.surround[0] > 0.97)
+    maps = (made.image[0] - made.scenes[0].background, label)
     return torch.stack([m.transpose(0, axis).to(torch.float16) for m in maps])
 
 
