@@ -37,21 +37,23 @@ def bars(shape, hu):
 
 
 def test_noise_is_left_where_it_is(gram):
-    """5 in a million coefficients pass; of the noise's energy less than a thousandth."""
+    """One in 70 million coefficients passes: nothing is put into most volumes of noise."""
     p = left(gram, torch.zeros(SHAPE), 1.0, batch=20)
     step = filtered(p.beta, 1.0 / (p.spectrum() + DAMPING))
-    assert 0.0 < float(found(p).square().mean()) < 4e-4 * float(step.square().mean())
+    found_of_noise = found(p)
+    assert int(found_of_noise.flatten(1).any(1).sum()) <= 4
+    assert float(found_of_noise.square().mean()) < 1e-5 * float(step.square().mean())
 
 
 def test_weak_bars_are_put_back(gram):
-    """At a third of the noise of a voxel no bar is seen, together they are beyond doubt."""
+    """At half of the noise of a voxel no bar is seen, together they are beyond doubt."""
     empty = left(gram, torch.zeros(SHAPE), 1.0)
     scale = float(empty.scale_hu)
-    pattern = bars(SHAPE, scale / 3)
+    pattern = bars(SHAPE, scale / 2)
     v = found(left(gram, pattern, 1.0))[0] * scale
     share = float((v * pattern).sum() / pattern.square().sum())
     assert 0.5 < share < 1.2
-    assert float((v - share * pattern).square().mean().sqrt()) < 0.5 * scale / 3
+    assert float((v - share * pattern).square().mean().sqrt()) < 0.5 * scale / 2
 
 
 def test_without_noise_it_is_the_step_towards_the_data(gram):
@@ -85,7 +87,7 @@ def test_slices_smaller_than_a_block_hold_no_pattern():
 
 
 def test_it_is_differentiable(gram):
-    p = left(gram, bars(SHAPE, 40.0), 1.0)
+    p = left(gram, bars(SHAPE, 80.0), 1.0)
     beta = p.beta.clone().requires_grad_(True)
     v = significant_residual(
         NormalisedProblem(gram, beta, p.scale_hu, p.factor, 0.4), p.spectrum(), torch.zeros_like(beta), DAMPING
