@@ -8,8 +8,8 @@ or more than :data:`_BESIDE` times and its neighbour in frequency is such a one 
 IEEE Trans. Pattern Anal. Mach. Intell. 8:679). Their sum is what the volume lacks; all else stays noise (hard
 thresholds: Donoho, Johnstone 1994, Biometrika 81:425).
 
-Noise alone passes the first threshold in one of 70 million coefficients. A pattern that fills a block is found while it is
-far too weak to be seen in a voxel.
+Noise alone passes the first threshold in one of 70 million coefficients. A pattern that fills a block is found while it
+is far too weak to be seen in a voxel.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ _BLOCK, _STEP = 16, 4
 """Edge of a block and distance of neighbours in voxels: at 0.2 mm 3.2 mm, some periods of the finest lines."""
 _STRIKING, _BESIDE = 4.25, 1.5
 """Thresholds, in root mean squares of a coefficient of noise. Of 24 insets of noise alone at 0.35 s the first one puts
-stripes of 16 HU into one. With 4.0 it is 14 of 24 (up to 27 HU); with 3.5, and real coefficients taken for complex ones,
-all of 12 had stripes of 30 to 83 HU. A higher one costs patterns that are there: line pairs of 1 mm at 0.35 s / 2 s keep
-0.47 / 0.81 of their contrast with 3.5, 0.41 / 0.78 with 4.0, 0.36 / 0.75 with 4.5 (4 draws, before real coefficients
-were told apart), 0.18 / 0.59 if nothing is put back, and 0.52 by soft FBP."""
+stripes of 16 HU into one. With 4.0 it is 14 of 24 (up to 27 HU); with 3.5, and real coefficients taken for complex
+ones, all of 12 had stripes of 30 to 83 HU. A higher one costs patterns that are there: line pairs of 1 mm at 0.35 s /
+2 s keep 0.47 / 0.81 of their contrast with 3.5, 0.41 / 0.78 with 4.0, 0.36 / 0.75 with 4.5 (4 draws, before real
+coefficients were told apart), 0.18 / 0.59 if nothing is put back, and 0.52 by soft FBP."""
 _AXES = (-3, -2, -1)
 
 
