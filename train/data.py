@@ -57,8 +57,7 @@ class Batch:
     """Scenes with two independent noise draws each.
 
     Args:
-        problem: of ``2 · size`` volumes, the first draws of all scenes, then the second ones.
-        with_noise_free: the same with ``size`` volumes without noise after them.
+        with_noise_free: problem of ``3 · size`` volumes: the first draws of all scenes, the second ones, no noise.
         truth: ``(size, z, y, x)`` HU above the background.
         contrast: ``(size, rois, z, y, x)`` weights of ROI contrasts: mean over a core (or of plain tissue) less mean
             over the tissue around it, random small parts of both, last all of both; 0 where the scene offers none.
@@ -68,7 +67,6 @@ class Batch:
         kept: what has been made of the batch and does not change, as long as it is used.
     """
 
-    problem: NormalisedProblem
     with_noise_free: NormalisedProblem
     truth: Tensor
     contrast: Tensor
@@ -80,6 +78,11 @@ class Batch:
     def size(self) -> int:
         """Number of scenes."""
         return self.truth.shape[0]
+
+    @property
+    def problem(self) -> NormalisedProblem:
+        """Of the noisy volumes alone."""
+        return self.with_noise_free.part(torch.arange(2 * self.size))
 
 
 class Data:
@@ -161,11 +164,8 @@ class Data:
         noise = noise * exposure.sqrt().reshape(-1, 1, 1, 1, 1)
         signal = gram.apply(truth) * (hu * exposure).reshape(-1, 1, 1, 1)
         b = torch.cat([signal + noise[:, 0], signal + noise[:, 1], signal])
-        noisy, all_three = (
-            NormalisedProblem.from_statistic(gram, b[: k * len(signal)], exposure.repeat(k), hu, c.voxel_mm)
-            for k in (2, 3)
-        )
-        return Batch(noisy, all_three, truth, contrast, voxels, random[:, 5:7])
+        problem = NormalisedProblem.from_statistic(gram, b, exposure.repeat(3), hu, c.voxel_mm)
+        return Batch(problem, truth, contrast, voxels, random[:, 5:7])
 
     def _scene(self, seed: int, number: int) -> Tensor:
         if (seed, number) not in self._pool:

@@ -40,7 +40,7 @@ from torchpcct.scanner.scanner import Scanner
 from torchpcct.scene.scene import Scene
 from torchpcct.validate import numbers
 
-__all__ = ["ROIS", "Facts", "SomeViews", "Task"]
+__all__ = ["ROIS", "Facts", "SomeViews", "Task", "contrast_limit"]
 
 Floats = NDArray[np.float64]
 Pair = tuple[Tensor, Tensor]
@@ -191,13 +191,13 @@ class Task:
     def _facts_of(self, present: Scan, absent: Scan) -> Facts:
         seen = SomeViews(present)
         maps = seen.path_lengths(self, list(self._groups.values()))
-        information, values = seen.information(maps), seen.values(maps)
+        information = seen.information(maps)
+        values = seen.values(maps, information)
         # The signal by what it changes: whatever else the readings hold drops out.
         change = seen.lines - absent.line_integrals()[seen.views]
         differs = _inner(maps[0], seen.weight * change) * seen.scale * seen.share / information[0, 0]
         values[0] = values[1] + differs
-        limit = ceiling(information, np.eye(len(maps))[1] - np.eye(len(maps))[0])
-        return Facts(tuple(self._groups), tuple(float(v) for v in values), float(limit.functional_sd[0]))
+        return Facts(tuple(self._groups), tuple(float(v) for v in values), contrast_limit(information))
 
     @cached_property
     def _groups(self) -> dict[str, list[str]]:
@@ -351,10 +351,16 @@ class SomeViews:
         """Of all views on the values of tissues with these path lengths, HU⁻², at 1 s."""
         return information_matrix(maps, self.weight, scale=self.scale) * self.share
 
-    def values(self, maps: list[Tensor]) -> Floats:
-        """Least squares for the values of tissues, HU."""
+    def values(self, maps: list[Tensor], information: Floats) -> Floats:
+        """Least squares for the values of tissues with these path lengths and their information, HU."""
         right = self.scale * self.share * np.array([_inner(m, self.weight * self.lines) for m in maps])
-        return np.asarray(np.linalg.solve(self.information(maps), right) - 1000.0)
+        return np.asarray(np.linalg.solve(information, right) - 1000.0)
+
+
+def contrast_limit(information: Floats) -> float:
+    """Smallest SD of an unbiased estimate of the second tissue's value less the first one's, HU."""
+    first, second = np.eye(len(information))[:2]
+    return float(ceiling(information, second - first).functional_sd[0])
 
 
 def _plain(value: Any) -> Any:

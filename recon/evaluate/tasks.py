@@ -14,12 +14,12 @@ import torch
 from numpy.typing import NDArray
 
 from recon.evaluate.store import Store
-from recon.evaluate.task import Facts, SomeViews, Task
+from recon.evaluate.task import Facts, SomeViews, Task, contrast_limit
 from recon.evaluate.vessels import SHAPES, Vessel
+from recon.mbir.mbir import overlap
 from torchpcct import Projector, VolumeGrid
 from torchpcct.acquisition.config import configured, grid_of
 from torchpcct.formats.damage import read_yaml
-from torchpcct.metrics.data_limit import ceiling
 from torchpcct.metrics.placement import place_rois, whole_rois
 from torchpcct.metrics.roi import axial_grid
 from torchpcct.scan import Scan
@@ -295,31 +295,24 @@ class VoxelTask(Task):
 
     def _patient_hu(self, alone: Scan) -> float:
         seen, names = SomeViews(alone), list(self.scene.names)
-        return float(seen.values(seen.path_lengths(self, [[n] for n in names]))[names.index(self._patient)])
+        maps = seen.path_lengths(self, [[n] for n in names])
+        return float(seen.values(maps, seen.information(maps))[names.index(self._patient)])
 
     def facts(self, store: Store) -> Facts:
         """The values are given; the limit is that of tissues with these shapes in this patient."""
         alone = self._alone(store)
-        seen, own = SomeViews(alone), self._painted(self.grid)
+        seen, painted = SomeViews(alone), [names[0] for names in self._groups.values() if names[0] in self.tissues]
         project = Projector(seen.geometry, self.grid, seen.window)
-        order = [n for names in self._groups.values() for n in names if n in own]
-        maps = [project(torch.from_numpy(own[t]).float()) for t in order]
+        maps = [project(torch.from_numpy(share).float()) for t, share in self.shares.items() if t != self._patient]
         bodies = seen.path_lengths(self, [[n] for n in self.scene.names])
         around = self.scene.names.index(self._patient)
+        values = [*(self.tissues[t][1] for t in painted), float(seen.values(bodies, seen.information(bodies))[around])]
         bodies[around] = bodies[around] - torch.stack(maps).sum(0)
-        maps += bodies
-        limit = ceiling(seen.information(maps), np.eye(len(maps))[1] - np.eye(len(maps))[0])
-        values = [*(self.tissues[t][1] for t in order), self._patient_hu(alone)]
-        return Facts(tuple(self._groups), tuple(values), float(limit.functional_sd[0]))
+        return Facts(tuple(self._groups), tuple(values), contrast_limit(seen.information(maps + bodies)))
 
     def _painted(self, grid: VolumeGrid) -> dict[str, Floats]:
         """Tissue → its share of every voxel of a grid, exactly."""
-        along = [
-            _overlaps(axis - middle, width, step, n)
-            for axis, middle, width, step, n in zip(
-                grid.axes, self.grid.center, grid.spacing, self.spacing, self.labels.shape, strict=True
-            )
-        ]
+        along = [overlap(VolumeGrid(self.labels.shape, self.spacing, self.grid.center), grid, a) for a in range(3)]
         return {
             tissue: np.einsum("iz,jy,kx,zyx->ijk", *along, (self.labels == label).astype(np.float64), optimize=True)
             for tissue, (label, _) in self.tissues.items()
@@ -335,14 +328,6 @@ class VoxelTask(Task):
     @property
     def _beside(self) -> Floats:
         return self.shares[self.background]
-
-
-def _overlaps(at: Floats, width: float, step: float, count: int) -> Floats:
-    """Share of each of ``count`` voxels about 0 in cells of a width at given places, ``(cells, count)``."""
-    middle = (np.arange(count) - 0.5 * (count - 1)) * step
-    high = np.minimum(at[:, None] + 0.5 * width, middle + 0.5 * step)
-    low = np.maximum(at[:, None] - 0.5 * width, middle - 0.5 * step)
-    return np.clip(high - low, 0.0, None) / width
 
 
 def _without_inset(scan: Scan) -> Scan:

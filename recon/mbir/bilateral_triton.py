@@ -17,11 +17,19 @@ _BLOCK = 256
 
 
 @triton.jit
+def _neighbour(k, offsets, weights, i, nz, ny, nx, voxels):
+    """How far along the volume neighbour ``k`` of voxels ``i`` lies, whether it is inside, and its weight in space."""
+    dz, dy, dx = tl.load(offsets + 3 * k), tl.load(offsets + 3 * k + 1), tl.load(offsets + 3 * k + 2)
+    x, y, z = i % nx + dx, i // nx % ny + dy, i // (nx * ny) + dz
+    valid = (i < voxels) & (z >= 0) & (z < nz) & (y >= 0) & (y < ny) & (x >= 0) & (x < nx)
+    return (dz * ny + dy) * nx + dx, valid, tl.where(valid, tl.load(weights + k), 0.0)
+
+
+@triton.jit
 def _forward_kernel(u, g, scale, offsets, weights, out, total, nz, ny, nx, voxels, count, BLOCK: tl.constexpr):
     batch = tl.program_id(1)
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = i < voxels
-    x, y, z = i % nx, i // nx % ny, i // (nx * ny)
     base = batch.to(tl.int64) * voxels
     s = tl.load(scale + batch)
     quarter = 0.25 * s * s
@@ -29,12 +37,11 @@ def _forward_kernel(u, g, scale, offsets, weights, out, total, nz, ny, nx, voxel
     sums, counts = tl.zeros((BLOCK,), tl.float32), tl.full((BLOCK,), 1.0, tl.float32)
     k = count * 0  # while loops: the interpreter cannot take a tensor as the end of a range
     while k < count:
-        dz, dy, dx = tl.load(offsets + 3 * k), tl.load(offsets + 3 * k + 1), tl.load(offsets + 3 * k + 2)
-        valid = inside & (z + dz >= 0) & (z + dz < nz) & (y + dy >= 0) & (y + dy < ny) & (x + dx >= 0) & (x + dx < nx)
-        j = base + i + (dz * ny + dy) * nx + dx
+        step, valid, near = _neighbour(k, offsets, weights, i, nz, ny, nx, voxels)
+        j = base + i + step
         d = tl.load(g + j, valid, 0.0) - here
         r = tl.maximum(1.0 - d * d * quarter, 0.0)
-        w = tl.where(valid, tl.load(weights + k) * r * r, 0.0)
+        w = near * r * r
         sums += w * (tl.load(u + j, valid, 0.0) - mine)
         counts += w
         k += 1
@@ -49,7 +56,6 @@ def _backward_kernel(
     batch = tl.program_id(1)
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = i < voxels
-    x, y, z = i % nx, i // nx % ny, i // (nx * ny)
     base = batch.to(tl.int64) * voxels
     s = tl.load(scale + batch)
     quarter = 0.25 * s * s
@@ -59,12 +65,11 @@ def _backward_kernel(
     of_u, of_g = own, tl.zeros((BLOCK,), tl.float32)
     k = count * 0
     while k < count:
-        dz, dy, dx = tl.load(offsets + 3 * k), tl.load(offsets + 3 * k + 1), tl.load(offsets + 3 * k + 2)
-        valid = inside & (z + dz >= 0) & (z + dz < nz) & (y + dy >= 0) & (y + dy < ny) & (x + dx >= 0) & (x + dx < nx)
-        j = base + i + (dz * ny + dy) * nx + dx
+        step, valid, near = _neighbour(k, offsets, weights, i, nz, ny, nx, voxels)
+        j = base + i + step
         d = tl.load(g + j, valid, 0.0) - here
         r = tl.maximum(1.0 - d * d * quarter, 0.0)
-        w = tl.where(valid, tl.load(weights + k) * r, 0.0)
+        w = near * r
         other = tl.load(grad + j, valid, 0.0) / tl.load(total + j, valid, 1.0)
         of_u += w * r * other
         # dw/dd = −s r d scale²: by g here with the other sign, and as a neighbour of j.

@@ -28,7 +28,7 @@ from recon.mbir.weights_io import digest, read_tensors
 from torchpcct.geometry import VolumeGrid
 from torchpcct.volume import from_hu, in_words, to_hu
 
-__all__ = ["Mbir", "Solution", "average_onto", "working_grid"]
+__all__ = ["Mbir", "Solution", "average_onto", "overlap", "working_grid"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -215,16 +215,15 @@ def working_grid(grid: VolumeGrid, voxel_mm: float) -> VolumeGrid:
 def average_onto(volume: Tensor, source: VolumeGrid, target: VolumeGrid) -> Tensor:
     """Averages of a volume over the voxels of another grid that lies inside of it, ``(..., *target.shape)``."""
     for axis in range(3):
-        matrix = torch.from_numpy(
-            _overlap(source.axes[axis], source.spacing[axis], target.axes[axis], target.spacing[axis])
-        )
+        shared = overlap(source, target, axis)
+        matrix = torch.from_numpy(shared / shared.sum(axis=1, keepdims=True))
         volume = torch.movedim(torch.movedim(volume, axis - 3, -1) @ matrix.to(volume).T, -1, axis - 3)
     return volume
 
 
-def _overlap(source: Any, step: float, target: Any, width: float) -> np.ndarray[Any, Any]:
-    """Share of each source voxel in each target voxel, rows add up to 1."""
-    low, high = target[:, None] - width / 2, target[:, None] + width / 2
-    shared = np.minimum(high, source + step / 2) - np.maximum(low, source - step / 2)
-    shared = np.clip(shared, 0.0, None)
-    return shared / shared.sum(axis=1, keepdims=True)
+def overlap(source: VolumeGrid, target: VolumeGrid, axis: int) -> np.ndarray[Any, Any]:
+    """How much of each target voxel lies in each source voxel along an axis, ``(target, source)``, as shares."""
+    at, width = target.axes[axis][:, None], target.spacing[axis]
+    middle, step = source.axes[axis], source.spacing[axis]
+    shared = np.minimum(at + width / 2, middle + step / 2) - np.maximum(at - width / 2, middle - step / 2)
+    return np.clip(shared, 0.0, None) / width
