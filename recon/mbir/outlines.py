@@ -36,7 +36,10 @@ from recon.plaque.start import find_vessel
 from recon.plaque.vessel import Vessel
 from recon.plaque.vessel_prior import VesselPrior
 
-__all__ = ["Drawn", "OutlineMbir"]
+__all__ = ["ARTERY", "Drawn", "OutlineMbir"]
+
+ARTERY = VesselPrior(shift=200.0)
+"""Whatever the tube voltage and the zero of the scanner."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +70,7 @@ class OutlineMbir(Mbir):
 
     Args:
         network: gives weights, fidelity and parts.
-        vessel_prior: what is believed of the vessel before the data; None: a coronary artery.
+        vessel_prior: what is believed of the vessel before the data; None: a coronary artery (:data:`ARTERY`).
     """
 
     def __init__(self, network: Mbir, vessel_prior: VesselPrior | None = None) -> None:
@@ -113,7 +116,7 @@ class OutlineMbir(Mbir):
         try:
             # Many small matrices: BLAS threads would wait for each other.
             with threadpool_limits(limits=1, user_api="blas"):
-                vessel = Vessel(data, find_vessel(data.pilot(), data.grid, None), self.vessel_prior)
+                vessel = Vessel(data, find_vessel(data.pilot(), data.grid, None), self.vessel_prior or ARTERY)
                 estimate = LayerEstimate(vessel.fit(vessel.first_guess(), expected=True), layer_sd_hu(self.fidelity))
         except (ValueError, np.linalg.LinAlgError) as error:
             return Drawn(None, _unused(str(error)))

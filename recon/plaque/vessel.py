@@ -381,11 +381,12 @@ class Vessel:
         """``(p, p)`` precision with ``k`` bodies."""
         precision = np.zeros((self.size + k, self.size + k))
         precision[: self.size, : self.size] = self._prior
+        sd = np.array([self.prior.wall[1], self.prior.fibrous[1]])
         if expected:
-            sd = np.minimum(_EXPECTED_SD, (self.prior.wall[1], self.prior.fibrous[1]))
-            precision[[WALL, FIBROUS], [WALL, FIBROUS]] = sd**-2.0
+            sd = np.minimum(_EXPECTED_SD, sd)
             for part, outline in ((self.lumen_part, self.lumen_outline), (self.outer_part, self.outer_outline)):
                 precision[part, part] += (_EXPECTED_ROUND**2 - 1) * outline.precision(least_order=3)
+        precision[WALL : FIBROUS + 1, WALL : FIBROUS + 1] = np.linalg.inv(np.diag(sd**2) + self.prior.shift**2)
         precision[range(self.size, self.size + k), range(self.size, self.size + k)] = _BODY_SD**-2.0
         return precision
 

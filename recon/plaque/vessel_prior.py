@@ -26,19 +26,24 @@ class VesselPrior:
         fibrous: the same.
         orders: Fourier orders of lumen and outer outline, 2 to 4: the more, the flatter the ellipses they can be, and
             the less the data say of what lies between them.
+        shift: standard deviation of what both differ by from their means together, HU: values move with the tube
+            voltage and with the zero of a scanner. 0: it is calibrated.
 
     Raises:
-        ValueError: a value that is not finite, a standard deviation that is not positive, orders out of range.
+        ValueError: a value that is not finite, a standard deviation that is not positive or a negative shift, orders
+            out of range.
         TypeError: values of the wrong kind.
     """
 
     wall: tuple[float, float] = (50.0, 15.0)
     fibrous: tuple[float, float] = (95.0, 25.0)
     orders: int = 3
+    shift: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("wall", "fibrous"):
             mean, sd = numbers(name, getattr(self, name), 2, unit="HU")
             number(f"standard deviation of {name}", sd, positive=True, unit="HU")
             object.__setattr__(self, name, (mean, sd))
+        object.__setattr__(self, "shift", number("shift", self.shift, low=0.0, unit="HU"))
         number("orders", whole("orders", self.orders, 2), high=MOST_ORDERS)

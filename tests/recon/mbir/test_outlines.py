@@ -116,3 +116,13 @@ def test_what_is_believed_of_the_vessel_reaches_the_fit(drawn, network, vessel, 
     monkeypatch.setattr(outlines, "Vessel", refused)
     OutlineMbir(network, "a prior").solved(drawn, vessel, EXPOSURE_S)
     assert seen == ["a prior"]
+
+
+def test_all_values_moved_move_the_volume(drawn, network, vessel):
+    """The zero of the scanner is 150 HU off: so is the volume, and outlines are drawn as before."""
+    moved = vessel + EXPOSURE_S * drawn.gram.apply(torch.full_like(vessel, 150.0 * drawn.mu_ref / 1000.0))
+    found = [OutlineMbir(network).solved(drawn, b, EXPOSURE_S) for b in (vessel, moved)]
+    assert all(f.notes[0]["outlines"]["used"] for f in found)
+    still, other = (network.in_hu(drawn, f.u, f.normal)[0].detach() for f in found)
+    inside = still > -40
+    assert float((other - still - 150.0)[inside].square().mean().sqrt()) < 3.0

@@ -20,6 +20,8 @@ from recon.plaque.vessel import FIBROUS, WALL, Vessel
         ({"orders": 1}, ValueError, "orders"),
         ({"orders": 5}, ValueError, "orders"),
         ({"orders": 3.0}, TypeError, "orders"),
+        ({"shift": -1.0}, ValueError, "shift"),
+        ({"shift": "wide"}, TypeError, "shift"),
     ],
 )
 def test_what_cannot_be_believed_is_refused(values, error, match):
@@ -45,6 +47,18 @@ def test_a_firm_belief_holds_and_a_loose_one_gives_way(seen):
     assert off[1][1] < 12
     assert off[0][1] > 3 * off[1][1]
     assert off[0][0] > off[1][0]
+
+
+def test_a_belief_in_the_difference_alone_gives_way_together(seen):
+    """Both means 100 HU off: with a shift the fit finds the values, and what the prior says of their difference."""
+    off = []
+    for shift in (0.0, 200.0):
+        means = [drawn_vessel.VALUES[t] + 100.0 for t in ("wall", "fibrous")]
+        vessel = Vessel(*seen, VesselPrior((means[0], 10.0), (means[1], 10.0), shift=shift))
+        found = vessel.fit(vessel.first_guess()).parameters[[WALL, FIBROUS]]
+        off.append(np.abs(found - means + 100.0))
+    assert off[0].max() > 40
+    assert off[1].max() < 15
 
 
 def test_orders_are_those_of_both_outlines(seen):
