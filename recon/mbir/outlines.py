@@ -38,8 +38,10 @@ from recon.plaque.vessel_prior import VesselPrior
 
 __all__ = ["ARTERY", "Drawn", "OutlineMbir"]
 
-ARTERY = VesselPrior(shift=200.0)
-"""Whatever the tube voltage and the zero of the scanner."""
+ARTERY = VesselPrior(shift=200.0, freedom=0.4)
+"""For pictures: whatever the tube voltage and the zero of the scanner, and with outlines of the least error. Drawn on
+four held-out vessels at 0.35 s / 2 s the error is 37.3 / 24.0 HU, with a freedom of 1 (as a reading, which must not be
+surer than it is) 41.0 / 25.0, without noise 19.8 / 16.9 for 17.5 / 16.0; contrast and its noise are the same."""
 
 
 @dataclass(frozen=True, eq=False)

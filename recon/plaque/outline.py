@@ -98,10 +98,16 @@ class Outline:
         shape[:, 0] = (weight @ radius) / weight.sum(1)
         return shape
 
-    def precision(self, least_order: int = 0) -> Floats:
-        """Prior inverse covariance of all coefficients, mm⁻²; 0 for those of a smaller Fourier order."""
+    def precision(self, freedom: float = 1.0, least_order: int = 0) -> Floats:
+        """Prior inverse covariance of all coefficients, mm⁻²; 0 for those of a smaller Fourier order.
+
+        Args:
+            freedom: of all but the radius, factor on their standard deviations.
+            least_order: the smallest that counts.
+        """
         centres = np.arange(self.splines) * _KNOT_MM
         lag = math.sqrt(5.0) * np.abs(centres[:, None] - centres) / _CORRELATION_MM
         k = (1 + lag + lag**2 / 3) * np.exp(-lag)
         order = np.concatenate([[0], np.arange(1, self.orders + 1), np.arange(1, self.orders + 1)])
-        return np.kron(np.linalg.inv(k), np.diag((order >= least_order) / np.array(_SD_MM)[order] ** 2))
+        sd = np.array(_SD_MM)[order] * np.where(order > 0, freedom, 1.0)
+        return np.kron(np.linalg.inv(k), np.diag((order >= least_order) / sd**2))

@@ -278,7 +278,7 @@ class Vessel:
             shape = np.zeros((outline.splines, outline.size // outline.splines))
             shape[:, 0] = np.median(radii)
             mean[part] = shape.ravel()
-            precision[part, part] = outline.precision()
+            precision[part, part] = outline.precision(self.prior.freedom)
         return mean, precision
 
     def first_guess(self) -> Floats:
@@ -385,7 +385,8 @@ class Vessel:
         if expected:
             sd = np.minimum(_EXPECTED_SD, sd)
             for part, outline in ((self.lumen_part, self.lumen_outline), (self.outer_part, self.outer_outline)):
-                precision[part, part] += (_EXPECTED_ROUND**2 - 1) * outline.precision(least_order=3)
+                rounder = outline.precision(self.prior.freedom, least_order=3)
+                precision[part, part] += (_EXPECTED_ROUND**2 - 1) * rounder
         precision[WALL : FIBROUS + 1, WALL : FIBROUS + 1] = np.linalg.inv(np.diag(sd**2) + self.prior.shift**2)
         precision[range(self.size, self.size + k), range(self.size, self.size + k)] = _BODY_SD**-2.0
         return precision

@@ -28,10 +28,12 @@ class VesselPrior:
             the less the data say of what lies between them.
         shift: standard deviation of what both differ by from their means together, HU: values move with the tube
             voltage and with the zero of a scanner. 0: it is calibrated.
+        freedom: how far sections may move and leave a circle, relative to arteries at large. With less of it outlines
+            are less noisy and follow the data less.
 
     Raises:
-        ValueError: a value that is not finite, a standard deviation that is not positive or a negative shift, orders
-            out of range.
+        ValueError: a value that is not finite, a standard deviation or freedom that is not positive, a negative shift,
+            orders out of range.
         TypeError: values of the wrong kind.
     """
 
@@ -39,6 +41,7 @@ class VesselPrior:
     fibrous: tuple[float, float] = (95.0, 25.0)
     orders: int = 3
     shift: float = 0.0
+    freedom: float = 1.0
 
     def __post_init__(self) -> None:
         for name in ("wall", "fibrous"):
@@ -46,4 +49,5 @@ class VesselPrior:
             number(f"standard deviation of {name}", sd, positive=True, unit="HU")
             object.__setattr__(self, name, (mean, sd))
         object.__setattr__(self, "shift", number("shift", self.shift, low=0.0, unit="HU"))
+        object.__setattr__(self, "freedom", number("freedom", self.freedom, positive=True))
         number("orders", whole("orders", self.orders, 2), high=MOST_ORDERS)

@@ -22,6 +22,7 @@ from recon.plaque.vessel import FIBROUS, WALL, Vessel
         ({"orders": 3.0}, TypeError, "orders"),
         ({"shift": -1.0}, ValueError, "shift"),
         ({"shift": "wide"}, TypeError, "shift"),
+        ({"freedom": 0.0}, ValueError, "freedom"),
     ],
 )
 def test_what_cannot_be_believed_is_refused(values, error, match):
