@@ -23,7 +23,7 @@ exposures, found, images = (0.1, 0.3, 1.0), [], {}
 for s in exposures:
     scans = [clean[1].with_noise(s, seed=k) for k in range(16)]
     absent = torch.stack([v.data[0] for v in recon.reconstruct(scans, grid, "fbp")])
-    found.append(observe(absent + signal, absent, dog_channels(grid.slice, (40.0, 0.0), count=4)).d_prime)
+    found.append(observe(absent + signal, absent, dog_channels(grid.slice, (40.0, 0.0), count=4)).estimate())
     images[s] = absent[0] + signal
 fig, axes = plt.subplots(1, 3, figsize=(10, 3.2), layout="constrained")
 for ax, s in zip(axes, (0.1, 1.0), strict=False):

@@ -30,7 +30,7 @@ from recon.evaluate.measure import OBSERVERS, Readings
 from recon.evaluate.task import Facts
 from torchpcct.metrics.control import controlled_log_variance, controlled_mean
 from torchpcct.metrics.intervals import Estimate, Jackknifed, combined, log_of_sum
-from torchpcct.metrics.observer import hotelling_scores
+from torchpcct.metrics.observer import d_prime, hotelling_scores
 
 __all__ = ["Known", "Record", "pivot", "records_of"]
 
@@ -133,11 +133,7 @@ class _Figures:
         present, absent = np.moveaxis(self.r.channels[observer], 1, 0)
         if len(present) < 2 * present.shape[1] + 4:
             return None
-        one, other = hotelling_scores(present, absent)
-        return combined(
-            lambda a, b, v, w: (a - b) / np.sqrt((np.exp(v) + np.exp(w)) / 2.0),
-            _mean(one), _mean(other), controlled_log_variance(one, None), controlled_log_variance(other, None),
-        )  # fmt: skip
+        return d_prime(*hotelling_scores(present, absent))
 
     def rmse(self) -> Jackknifed:
         """HU."""

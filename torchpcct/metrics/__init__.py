@@ -14,8 +14,6 @@ from torchpcct.metrics.data_limit import Ceiling, ceiling, information_matrix
 from torchpcct.metrics.intervals import Estimate, Jackknifed, combined
 from torchpcct.metrics.noise_power import NoisePower, noise_power_spectrum
 from torchpcct.metrics.observer import (
-    ObserverResult,
-    auc,
     channel_responses,
     d_prime,
     dog_channels,
@@ -33,10 +31,8 @@ __all__ = [
     "Interval",
     "Jackknifed",
     "NoisePower",
-    "ObserverResult",
     "ResidualTest",
     "TransferFunction",
-    "auc",
     "ceiling",
     "channel_responses",
     "cnr",

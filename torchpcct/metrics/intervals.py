@@ -25,7 +25,6 @@ __all__ = [
     "Jackknifed",
     "bca_interval",
     "combined",
-    "evaluate",
     "generator",
     "leave_one_out",
     "log_of_sum",
@@ -33,7 +32,6 @@ __all__ = [
 ]
 
 Floats = NDArray[np.float64]
-_ELEMENTS = 1 << 21
 
 
 class Estimate(NamedTuple):
@@ -58,13 +56,6 @@ def leave_one_out(realizations: int) -> NDArray[np.int64]:
     """``(realizations, realizations − 1)`` indices, row i without i."""
     index = np.arange(realizations - 1)
     return index + (index >= np.arange(realizations)[:, None])
-
-
-def evaluate(statistic: Callable[[NDArray[np.int64]], Any], indices: NDArray[np.int64]) -> Floats:
-    """``statistic`` of blocks of rows of ``indices``, so that the resampled data stay small."""
-    block = max(1, _ELEMENTS // indices.shape[1])
-    parts = [np.asarray(statistic(indices[k : k + block])) for k in range(0, len(indices), block)]
-    return np.concatenate(parts).astype(np.float64)
 
 
 def bca_interval(value: float, draws: Any, jackknife: Any, level: float = 0.95) -> tuple[float, float]:

@@ -2,8 +2,8 @@
 
 Each image is reduced to its responses to a few channels centred at the known place of the core; the observer is the
 best linear combination of them, ``w = K⁻¹ (v̄₁ − v̄₀)`` with the mean covariance K of both classes. Present and absent
-images with the same noise seed form a PAIR: they are left out together when the observer is trained, and the interval
-of the area under the ROC curve treats the pair as the sampling unit.
+images with the same noise seed form a PAIR: they are left out together when the observer is trained, and by the
+jackknife that gives the interval of d′.
 
 Channels: dense difference of Gaussians (Abbey and Barrett, J. Opt. Soc. Am. A 18, 473 (2001)), radial in mm, so that
 they serve a plane or a volume of any spacing.
@@ -12,20 +12,18 @@ they serve a plane or a volume of any spacing.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import expit, logit, ndtri
 
 from torchpcct.geometry import VolumeGrid
-from torchpcct.metrics.intervals import Estimate, bca_interval, evaluate, leave_one_out, resampling
+from torchpcct.metrics.control import controlled_log_variance, controlled_mean
+from torchpcct.metrics.intervals import Jackknifed, combined
 from torchpcct.metrics.roi import as_array
-from torchpcct.validate import checked, coverage
+from torchpcct.validate import checked
 
 __all__ = [
-    "ObserverResult",
-    "auc",
     "channel_responses",
     "d_prime",
     "dog_channels",
@@ -156,92 +154,27 @@ def _templates(scatter: Any, difference: Any) -> Floats:
     return np.linalg.solve(scaled, (difference / sd)[..., None])[..., 0] / sd
 
 
-def _pair(present: Any, absent: Any) -> tuple[Floats, Floats]:
-    a, b = np.asarray(present, dtype=np.float64), np.asarray(absent, dtype=np.float64)
-    if a.ndim != 1 or b.ndim != 1 or min(a.size, b.size) < 2:
-        raise ValueError(f"scores must be two 1-D arrays of at least 2, got {a.shape} and {b.shape}")
-    if not (np.isfinite(a).all() and np.isfinite(b).all()):
-        raise ValueError("scores hold NaN or Inf")
-    return a, b
-
-
 @checked
-def auc(present: ArrayLike, absent: ArrayLike, *, level: float = 0.95) -> Estimate:
-    """Area under the ROC curve (Wilcoxon) with an interval on the logit scale.
-
-    The variance is DeLong's; each pair of one noise seed is one sampling unit (Obuchowski 1997), which counts the
-    correlation between its two scores. Scores that are parted perfectly have no measured variance: then the
-    lower bound is that of n successes in n trials, (α / 2)^(1 / n).
+def d_prime(present: ArrayLike, absent: ArrayLike) -> Jackknifed:
+    """Detectability ``(s̄₁ − s̄₀) / sqrt((σ₁² + σ₀²) / 2)``, with a jackknife over pairs.
 
     Args:
-        present, absent: ``(n,)`` scores; pair k has one noise seed.
-        level: coverage.
+        present, absent: ``(n,)`` scores, n ≥ 5; pair k has one noise seed.
 
     Raises:
-        ValueError: fewer than 2 scores, NaN or Inf, unequal numbers, a level outside (0, 1).
+        ValueError: fewer than 5 pairs, unequal numbers, NaN or Inf, scores that do not vary.
     """
-    a, b = _pair(present, absent)
-    if a.size != b.size:
-        raise ValueError(f"present and absent must be pairs, got {a.size} and {b.size} scores")
-    coverage("level", level)
-
-    def beaten(scores: Floats, by: Floats) -> Floats:
-        ordered = np.sort(scores)
-        return (ordered.searchsorted(by) + ordered.searchsorted(by, "right")) / (2.0 * scores.size)
-
-    v10, v01 = beaten(b, a), 1.0 - beaten(a, b)
-    area = float(v10.mean())
-    if area in (0.0, 1.0):
-        bound = ((1 - level) / 2) ** (1.0 / a.size)
-        return Estimate(area, bound, 1.0) if area == 1.0 else Estimate(area, 0.0, 1.0 - bound)
-    variance = float((v10 + v01).var(ddof=1)) / a.size
-    half = ndtri(0.5 + level / 2) * math.sqrt(variance) / (area * (1 - area))
-    return Estimate(area, float(expit(logit(area) - half)), float(expit(logit(area) + half)))
+    means, variances = ([find(s, None, None) for s in (present, absent)] for find in
+                        (controlled_mean, controlled_log_variance))  # fmt: skip
+    return combined(lambda a, b, v, w: (a - b) / np.sqrt((np.exp(v) + np.exp(w)) / 2.0), *means, *variances)
 
 
 @checked
-def d_prime(present: ArrayLike, absent: ArrayLike, level: float = 0.95, draws: int = 2000, seed: int = 0) -> Estimate:
-    """Detectability ``(s̄₁ − s̄₀) / sqrt((σ₁² + σ₀²) / 2)`` with a bootstrap interval over pairs.
-
-    Args:
-        present, absent: ``(n,)`` scores, n ≥ 3; pair k has one noise seed.
-        level, draws, seed: of the bootstrap.
-
-    Raises:
-        ValueError: fewer than 3 pairs, unequal numbers, scores that do not vary.
-    """
-    a, b = _pair(present, absent)
-    if a.size != b.size or a.size < 3:
-        raise ValueError(f"present and absent must be at least 3 pairs, got {a.size} and {b.size}")
-    if a.var() + b.var() == 0:
-        raise ValueError("the scores do not vary: d′ needs noisy realisations")
-
-    def statistic(index: Any) -> Floats:
-        x, y = a[index], b[index]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return (x.mean(-1) - y.mean(-1)) / np.sqrt((x.var(-1, ddof=1) + y.var(-1, ddof=1)) / 2)
-
-    value = float(statistic(np.arange(a.size)[None])[0])
-    resampled = evaluate(statistic, resampling(a.size, draws, seed))
-    return Estimate(value, *bca_interval(value, resampled, statistic(leave_one_out(a.size)), level))
-
-
-class ObserverResult(NamedTuple):
-    """What :func:`observe` found: area, detectability, and the scores ``(n,)`` they come from."""
-
-    auc: Estimate
-    d_prime: Estimate
-    present: Floats
-    absent: Floats
-
-
-@checked
-def observe(present: ArrayLike, absent: ArrayLike, channels: ArrayLike) -> ObserverResult:
-    """Channelised Hotelling observer on images.
+def observe(present: ArrayLike, absent: ArrayLike, channels: ArrayLike) -> Jackknifed:
+    """Detectability that the channelised Hotelling observer finds in images.
 
     Args:
         present, absent: ``(n, ...)`` images or volumes in HU; pair k has one noise seed.
         channels: ``(c, ...)``, e.g. of :func:`dog_channels`.
     """
-    s1, s0 = hotelling_scores(*(channel_responses(x, channels) for x in (present, absent)))
-    return ObserverResult(auc(s1, s0), d_prime(s1, s0), s1, s0)
+    return d_prime(*hotelling_scores(*(channel_responses(x, channels) for x in (present, absent))))
