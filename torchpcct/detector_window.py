@@ -149,10 +149,6 @@ class DetectorWindow:
             and row + inner.rows <= self.rows
         )
 
-    def fraction(self, geometry: Geometry) -> float:
-        """Share of the detector's readings inside the window, 0…1."""
-        return math.prod(self.shape) / math.prod(geometry.shape)
-
 
 @checked
 def footprint(geometry: Geometry, grid: VolumeGrid, margin: int = 0, motion: Any = None) -> DetectorWindow:

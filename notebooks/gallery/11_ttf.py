@@ -5,10 +5,11 @@ Which details survive? The task transfer function (TTF) of the edge of a rod, fo
 """
 
 import matplotlib.pyplot as plt
+import numpy as np
 
 import recon
 from torchpcct import VolumeGrid, acquire
-from torchpcct.metrics import ellipsoid_distance, task_transfer
+from torchpcct.metrics import task_transfer
 from torchpcct.scanner import presets
 from torchpcct.scene import Body, EllipticCylinder, Scene
 
@@ -16,7 +17,8 @@ water = Body("water", EllipticCylinder(100.0), "water")
 rod = Body("rod", EllipticCylinder(4.0, position=(0.0, 40.0, 0.0)), "fibrous_tissue", "water")
 grid = VolumeGrid((1, 80, 80), 0.15, (0.0, 40.0, 0.0))
 scan = acquire(Scene([water, rod]), presets.pcct(views=492, rows=1), region=grid, duty=1 / 4)  # without noise
-distance = ellipsoid_distance(grid.slice, (40.0, 0.0), (4.0, 4.0))  # of every voxel from the rod's edge, mm
+y, x = np.meshgrid(*grid.axes[1:], indexing="ij")
+distance = np.hypot(y - 40.0, x) - 4.0  # of every voxel from the rod's edge, mm
 fig, axes = plt.subplots(1, 2, figsize=(8, 3.2), layout="constrained")
 for kernel in ("soft", "bone"):
     image = recon.reconstruct(scan, grid, "fbp", kernel=kernel).data[0]

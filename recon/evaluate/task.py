@@ -360,7 +360,7 @@ class SomeViews:
 def contrast_limit(information: Floats) -> float:
     """Smallest SD of an unbiased estimate of the second tissue's value less the first one's, HU."""
     first, second = np.eye(len(information))[:2]
-    return float(ceiling(information, second - first).functional_sd[0])
+    return math.sqrt(ceiling(information, second - first).item())
 
 
 def _plain(value: Any) -> Any:

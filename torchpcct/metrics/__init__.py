@@ -8,9 +8,9 @@ whether the core is seen, ``resolution`` and ``noise_power`` how sharp and how n
 its data at all, ``half_split`` what noise and resolution a real scan has, without a truth.
 """
 
-from torchpcct.metrics.cnr import Interval, cnr, cnr_from_moments, cnr_interval, cnr_range, sd_interval
+from torchpcct.metrics.cnr import cnr, cnr_from_moments, cnr_interval, cnr_range, sd_interval
 from torchpcct.metrics.control import controlled_log_variance, controlled_mean
-from torchpcct.metrics.data_limit import Ceiling, ceiling, information_matrix
+from torchpcct.metrics.data_limit import ceiling, information_matrix
 from torchpcct.metrics.intervals import Estimate, Jackknifed, combined
 from torchpcct.metrics.noise_power import NoisePower, noise_power_spectrum
 from torchpcct.metrics.observer import (
@@ -23,12 +23,10 @@ from torchpcct.metrics.observer import (
 )
 from torchpcct.metrics.plaque_measures import lumen_area
 from torchpcct.metrics.residual_test import ResidualTest, residual_test
-from torchpcct.metrics.resolution import TransferFunction, edge_profile, ellipsoid_distance, task_transfer
+from torchpcct.metrics.resolution import TransferFunction, edge_profile, task_transfer
 
 __all__ = [
-    "Ceiling",
     "Estimate",
-    "Interval",
     "Jackknifed",
     "NoisePower",
     "ResidualTest",
@@ -45,7 +43,6 @@ __all__ = [
     "d_prime",
     "dog_channels",
     "edge_profile",
-    "ellipsoid_distance",
     "hotelling_scores",
     "information_matrix",
     "lumen_area",

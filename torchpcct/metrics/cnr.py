@@ -7,7 +7,7 @@ deviation ACROSS realisations. The noise in it is that of an ROI mean, not of a 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,16 +16,9 @@ from scipy import stats
 from torchpcct.metrics.intervals import generator
 from torchpcct.validate import broadcast, checked, coverage, number, whole
 
-__all__ = ["Interval", "cnr", "cnr_from_moments", "cnr_interval", "cnr_range", "sd_interval"]
+__all__ = ["cnr", "cnr_from_moments", "cnr_interval", "cnr_range", "sd_interval"]
 
 Floats = NDArray[np.float64]
-
-
-class Interval(NamedTuple):
-    """A confidence interval."""
-
-    low: float
-    high: float
 
 
 def _means(name: str, values: Any) -> Floats:
@@ -76,7 +69,7 @@ def cnr_from_moments(fg_mean: ArrayLike, fg_sd: ArrayLike, bg_mean: ArrayLike, b
 
 
 @checked
-def sd_interval(sd: float, realizations: int, level: float = 0.95) -> Interval:
+def sd_interval(sd: float, realizations: int, level: float = 0.95) -> tuple[float, float]:
     """χ² interval for a standard deviation estimated from ``realizations`` normal draws: ×[0.69, 1.83] at n = 10.
 
     Raises:
@@ -88,7 +81,7 @@ def sd_interval(sd: float, realizations: int, level: float = 0.95) -> Interval:
     coverage("level", level)
     dof = realizations - 1
     high, low = stats.chi2.ppf([0.5 - level / 2, 0.5 + level / 2], dof)
-    return Interval(float(sd * np.sqrt(dof / low)), float(sd * np.sqrt(dof / high)))
+    return float(sd * np.sqrt(dof / low)), float(sd * np.sqrt(dof / high))
 
 
 @checked
@@ -98,7 +91,7 @@ def cnr_interval(
     level: float = 0.95,
     draws: int = 20_000,
     seed: int = 0,
-) -> Interval:
+) -> tuple[float, float]:
     """Generalised confidence interval for the CNR of correlated, jointly normal ROI means.
 
     A percentile bootstrap is far too narrow at n = 10 (it covers 82 %). Here the unknown covariance is drawn from the
@@ -130,13 +123,13 @@ def cnr_interval(
     variance = np.einsum("dij,dij->di", root, root)
     pivot = (mean[:, 1] - mean[:, 0]) / np.sqrt(variance.sum(1))
     low, high = np.quantile(pivot, [0.5 - level / 2, 0.5 + level / 2])
-    return Interval(float(low), float(high))
+    return float(low), float(high)
 
 
 @checked
 def cnr_range(
     means: ArrayLike, covariance: ArrayLike, realizations: int, level: float = 0.95, draws: int = 20_000, seed: int = 0
-) -> Interval:
+) -> tuple[float, float]:
     """Range of the CNR that an experiment of a few realisations measures when mean and covariance are known exactly.
 
     Args:
@@ -159,7 +152,7 @@ def cnr_range(
     scatter = root @ _bartlett(rng, draws, realizations - 1) / np.sqrt(realizations - 1)
     estimates = (mean[:, 1] - mean[:, 0]) / np.sqrt(np.einsum("dij,dij->d", scatter, scatter))
     low, high = np.quantile(estimates, [0.5 - level / 2, 0.5 + level / 2])
-    return Interval(float(low), float(high))
+    return float(low), float(high)
 
 
 def _bartlett(rng: np.random.Generator, draws: int, dof: int) -> Floats:

@@ -106,12 +106,6 @@ def _known_covariance(value: Any, count: int) -> Floats:
     return c
 
 
-def _count(controls: Any) -> int:
-    if controls is not None and np.ndim(controls) == 0:
-        raise ValueError(f"controls must have the shape (realisations,) or (realisations, controls), got {controls!r}")
-    return 0 if controls is None else 1 if np.ndim(controls) == 1 else np.shape(controls)[-1]
-
-
 @checked
 def controlled_mean(values: ArrayLike, controls: ArrayLike | None, control_mean: ArrayLike | None) -> Jackknifed:
     """Expectation of a method's figure, by regression on controls of known expectation.
@@ -145,8 +139,9 @@ def controlled_log_variance(
     Raises:
         ValueError: as in :func:`controlled_mean`; a matrix that is no covariance; values that do not vary.
     """
-    covariance = _known_covariance(np.zeros((0, 0)) if controls is None else control_covariance, _count(controls))
-    value, left_out = _Regression.of(values, controls, None).variance(covariance)
+    fit = _Regression.of(values, controls, None)
+    known = np.zeros((0, 0)) if controls is None else control_covariance
+    value, left_out = fit.variance(_known_covariance(known, fit.coefficients.size - 1))
     if not (value > 0 and (left_out > 0).all()):
         raise ValueError("the values do not vary over the realisations: they must be noisy")
     return Jackknifed(math.log(value), np.log(left_out))

@@ -13,7 +13,6 @@ fat, pinned by the rest of the scan) is left out of the maps.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,7 @@ from torch import Tensor
 
 from torchpcct.validate import checked, number
 
-__all__ = ["Ceiling", "ceiling", "information_matrix"]
+__all__ = ["ceiling", "information_matrix"]
 
 Floats = NDArray[np.float64]
 
@@ -76,34 +75,17 @@ def information_matrix(maps: Sequence[Any] | Tensor, inverse_variance: ArrayLike
     return (result + result.T) / 2
 
 
-@dataclass(frozen=True, eq=False)
-class Ceiling:
-    """Smallest covariance of any unbiased estimate.
-
-    Attributes:
-        covariance: ``(tissues, tissues)`` of the amplitudes, HU².
-        functionals: ``(m, tissues)`` rows h.
-        functional_covariance: ``(m, m)`` of ``h·c``, HU².
-    """
-
-    covariance: Floats
-    functionals: Floats
-    functional_covariance: Floats
-
-    @property
-    def functional_sd(self) -> Floats:
-        """SD of each functional, ``(m,)`` HU."""
-        return np.sqrt(np.diag(self.functional_covariance))
-
-
 @checked
-def ceiling(information: ArrayLike, functionals: ArrayLike) -> Ceiling:
-    """Limit for linear functionals of the tissue amplitudes.
+def ceiling(information: ArrayLike, functionals: ArrayLike) -> Floats:
+    """Smallest covariance of any unbiased estimate of linear functionals of the tissue amplitudes.
 
     Args:
         information: ``(tissues, tissues)`` of :func:`information_matrix`, which is proportional to the dose.
         functionals: ``(tissues,)`` one functional (a contrast: +1 and −1 at two tissues), or ``(m, tissues)`` several
             (an ROI inside one tissue: the unit vector of this tissue; across tissues: its area fractions).
+
+    Returns:
+        ``(m, m)`` float64, the square of the amplitudes' unit.
 
     Raises:
         ValueError: wrong shapes, an information that is not symmetric or that does not determine all amplitudes.
@@ -127,7 +109,5 @@ def ceiling(information: ArrayLike, functionals: ArrayLike) -> Ceiling:
         raise ValueError(
             f"the readings cannot tell the tissues apart (least determined: {int(worst.argmax())}): merge or drop maps"
         )
-    half = root[:, None] * vectors / np.sqrt(values)
-    covariance = half @ half.T
-    spread = h @ half
-    return Ceiling(covariance, h, spread @ spread.T)
+    spread = h @ (root[:, None] * vectors / np.sqrt(values))
+    return np.asarray(spread @ spread.T)

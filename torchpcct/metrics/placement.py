@@ -8,7 +8,7 @@ connected region: in the paper's table its SD is 1.7 to 2.3 times that of the co
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -77,22 +77,10 @@ def place_rois(scene: Scene, image: VolumeGrid, rule: RoiRule | None = None) -> 
     Raises:
         ValueError: an unknown body, or a ROI that comes out empty.
     """
-    rule = rule or RoiRule()
-    labels = scene.labels(image)
-    in_core, in_tissue = labels == scene.index("core"), labels == scene.index("fibrous")
-    if not in_core.any():
-        raise ValueError("the body 'core' does not cross the axial image: move the image")
-    foreground = _depth(in_core, image) > rule.core_margin
-    background = (
-        (_depth(in_tissue, image) > rule.background_margin)
-        & (_depth(~in_core, image) < rule.background_reach)
-        & (_depth(labels != scene.index("lumen"), image) > rule.lumen_margin)
-    )
-    _not_empty(foreground, background, rule)
-    regions, count = ndimage.label(background[0])
-    sizes = ndimage.sum_labels(background[0], regions, np.arange(1, count + 1))
-    background = (regions == 1 + int(np.argmax(sizes)))[None]
-    return RoiPair(foreground, background, image, rule)
+    found = _placed(scene, image, rule or RoiRule())
+    regions, count = ndimage.label(found.background[0])
+    sizes = ndimage.sum_labels(found.background[0], regions, np.arange(1, count + 1))
+    return replace(found, background=(regions == 1 + int(np.argmax(sizes)))[None])
 
 
 @checked
@@ -108,12 +96,26 @@ def whole_rois(scene: Scene, image: VolumeGrid) -> RoiPair:
     Raises:
         ValueError: an unknown body, or a ROI that comes out empty.
     """
-    labels, rule = scene.labels(image), RoiRule(0.10, 0.10, float("inf"), 0.30)
-    foreground = _depth(labels == scene.index("core"), image) > rule.core_margin
-    background = (_depth(labels == scene.index("fibrous"), image) > rule.background_margin) & (
-        _depth(labels != scene.index("lumen"), image) > rule.lumen_margin
+    return _placed(scene, image, RoiRule(0.10, 0.10, float("inf"), 0.30))
+
+
+def _placed(scene: Scene, image: VolumeGrid, rule: RoiRule) -> RoiPair:
+    labels = scene.labels(image)
+    core, tissue, lumen = (labels == scene.index(name) for name in ("core", "fibrous", "lumen"))
+    if not core.any():
+        raise ValueError("the body 'core' does not cross the image: move the image")
+    foreground = _depth(core, image) > rule.core_margin
+    background = (
+        (_depth(tissue, image) > rule.background_margin)
+        & (_depth(~core, image) < rule.background_reach)
+        & (_depth(~lumen, image) > rule.lumen_margin)
     )
-    _not_empty(foreground, background, rule)
+    for name, mask, margin in (
+        ("foreground", foreground, rule.core_margin),
+        ("background", background, rule.background_margin),
+    ):
+        if not mask.any():
+            raise ValueError(f"the {name} ROI is empty: its margin of {margin} mm is wider than the tissue; reduce it")
     return RoiPair(foreground, background, image, rule)
 
 
@@ -122,12 +124,3 @@ def _depth(mask: Any, image: VolumeGrid) -> Any:
     if image.shape[0] == 1:
         return ndimage.distance_transform_edt(mask[0], sampling=image.spacing[1:])[None]
     return ndimage.distance_transform_edt(mask, sampling=image.spacing)
-
-
-def _not_empty(foreground: Any, background: Any, rule: RoiRule) -> None:
-    for name, mask, margin in (
-        ("foreground", foreground, rule.core_margin),
-        ("background", background, rule.background_margin),
-    ):
-        if not np.any(mask):
-            raise ValueError(f"the {name} ROI is empty: its margin of {margin} mm is wider than the tissue; reduce it")

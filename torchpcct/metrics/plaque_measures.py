@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import binary_dilation, map_coordinates
 from scipy.spatial import cKDTree
-from skimage.measure import find_contours, label
+from skimage.measure import find_contours, label, points_in_poly
 from skimage.morphology import reconstruction
 
 from torchpcct.geometry import VolumeGrid
@@ -79,7 +79,7 @@ def lumen_area(image: ArrayLike, grid: VolumeGrid, seed: tuple[float, float], th
     x, plane = _slice(image, grid)
     origin = np.array([a[0] for a in plane.axes])
     closed = (origin + c * plane.spacing for c in find_contours(x, threshold) if np.array_equal(c[0], c[-1]))
-    return min((_area(c) for c in closed if _surrounds(c, seed)), default=math.nan)
+    return min((_area(c) for c in closed if points_in_poly([seed], c)[0]), default=math.nan)
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,14 +252,6 @@ def _slice(image: Any, grid: VolumeGrid) -> tuple[Floats, VolumeGrid]:
 def _area(points: Floats) -> float:
     p = points - points[0]
     return abs(float((p[:-1, 0] * p[1:, 1] - p[1:, 0] * p[:-1, 1]).sum())) / 2
-
-
-def _surrounds(points: Floats, seed: tuple[float, float]) -> bool:
-    """Even-odd rule for a ray along +x."""
-    y, x = points[:, 0] - seed[0], points[:, 1] - seed[1]
-    cross = (y[:-1] > 0) != (y[1:] > 0)
-    x0, x1, y0, y1 = x[:-1][cross], x[1:][cross], y[:-1][cross], y[1:][cross]
-    return bool(((x0 - y0 * (x1 - x0) / (y1 - y0)) > 0).sum() % 2)
 
 
 def _largest(labels: Any) -> Mask:

@@ -15,60 +15,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.roi import as_array
 from torchpcct.validate import checked
 
 __all__ = [
     "TransferFunction",
     "edge_profile",
-    "ellipsoid_distance",
     "first_below",
     "task_transfer",
 ]
 
 Floats = NDArray[np.float64]
-
-
-@checked
-def ellipsoid_distance(grid: VolumeGrid, center: tuple[float, ...], semi_axes: tuple[float, ...]) -> Floats:
-    """Signed distance of every voxel centre from an ellipse or ellipsoid, negative inside.
-
-    Args:
-        grid: ``(y, x)`` or ``(z, y, x)``.
-        center: mm, in the order of the grid's axes.
-        semi_axes: mm, in the order of the grid's axes; ``inf`` on at most all but one: a cylinder or a plane pair.
-
-    Returns:
-        ``grid.shape`` float64 in mm, exact to 1e-9 of the semi-axes (bisection).
-
-    Raises:
-        ValueError: wrong numbers of axes, a semi-axis that is not positive.
-    """
-    d = grid.ndim
-    axes = np.array(semi_axes, dtype=np.float64)
-    if len(center) != d or axes.shape != (d,):
-        raise ValueError(f"center and semi_axes must have {d} numbers, one per axis of the grid")
-    if not (axes > 0).all() or not np.isfinite(axes).any():
-        raise ValueError(f"semi_axes must be positive and not all infinite, got {semi_axes!r}")
-    points = np.stack(np.meshgrid(*grid.axes, indexing="ij"), axis=-1).reshape(-1, d) - np.asarray(center, dtype=float)
-    bounded = np.isfinite(axes)
-    y, e = np.abs(points[:, bounded]), axes[bounded]
-    inside = np.square(y / e).sum(-1) < 1
-    smallest = float(e.min())
-    # The closest point is e² y / (s + g) with g = e² − min e² and Σ (e y / (s + g))² = 1; the sum falls with s > 0.
-    # For a point on a plane of symmetry a hair beside it the same formula finds a closest point off the plane.
-    y = np.maximum(y, 1e-12 * smallest)
-    gap = e**2 - smallest**2
-    low = smallest * y[:, int(e.argmin())]
-    high = np.sqrt(np.square(e * y).sum(-1))
-    for _ in range(100):
-        middle = 0.5 * (low + high)
-        outside = np.square(e * y / (middle[:, None] + gap)).sum(-1) > 1
-        low, high = np.where(outside, middle, low), np.where(outside, high, middle)
-    closest = e**2 * y / ((0.5 * (low + high))[:, None] + gap)
-    distance = np.sqrt(np.square(y - closest).sum(-1))
-    return np.where(inside, -distance, distance).reshape(grid.shape)
 
 
 @checked
@@ -79,7 +36,8 @@ def edge_profile(
 
     Args:
         image: ensemble mean in HU, any shape.
-        distance: signed distance of every voxel from the surface in mm, same shape.
+        distance: signed distance of every voxel from the surface in mm, negative inside, same shape; of drawn masks
+            :func:`scipy.ndimage.distance_transform_edt` gives it.
         reach: how far inside and outside the surface, mm, both positive: not beyond the next edge.
         bin_mm: width of a bin of distances; a fifth of a voxel or more, so that most bins are filled.
 

@@ -112,11 +112,6 @@ class RoiMean:
         """``grid.shape`` float64 weights that sum to 1."""
         return self._weights  # type: ignore[attr-defined]
 
-    @property
-    def pixels(self) -> int:
-        """Pixels in the ROI."""
-        return int(self.mask.sum())
-
     def __call__(self, volume: Tensor) -> Tensor:
         """ROI mean of ``volume`` ``(..., z, y, x)``, ``(...)`` float64."""
         if tuple(volume.shape[-3:]) != self.grid.shape:

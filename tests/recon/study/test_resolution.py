@@ -13,7 +13,6 @@ from tiny_studies import assert_report_is_whole
 from recon.study.paper.plaque_scan import Truth, measure_plaque
 from recon.study.resolution import FWHM_PER_SIGMA, blur, blur_series, crossing, limits, point_width
 from torchpcct.geometry import VolumeGrid
-from torchpcct.metrics.resolution import ellipsoid_distance
 from torchpcct.metrics.roi import axial_grid
 from torchpcct.scene.plaque import plaque_scene
 
@@ -69,7 +68,8 @@ def test_where_the_plaque_is(plaque):
 
 def test_a_disc_is_found_where_it_is():
     grid = axial_grid((0.0, 0.0, 0.0))
-    disc = ellipsoid_distance(grid.slice, (0.1, 0.2), (1.0, 1.0)) < 0
+    y, x = np.meshgrid(*grid.slice.axes, indexing="ij")
+    disc = np.hypot(y - 0.1, x - 0.2) < 1.0
     image = torch.from_numpy(np.where(disc, 500.0, -100.0))
     found = measure_plaque(image, Truth(grid, {"lumen": disc, "core": disc}, ((0.1, 0.2), (0.1, 2.2))))
     assert found.lumen_dice == 1.0
