@@ -198,6 +198,17 @@ def _first(first: Any, rows: int) -> Any:
     return index
 
 
+def _drawn(kernel: Any, readings: tuple[Tensor, ...], first_index: Any, *parameters: Any) -> Tensor:
+    """What a kernel draws for readings ``(..., n)``, of the shape and dtype of the first."""
+    shape = readings[0].shape
+    rows = [values.detach().cpu().contiguous().reshape(-1, shape[-1]) for values in readings]
+    out = torch.empty_like(rows[0])
+    arrays = [values.numpy() for values in rows]
+    first, work = _first(first_index, len(out)), _OPERATIONS * shape[-1]
+    run(kernel, len(out), *arrays, first, *parameters, out.numpy(), operations=work)
+    return out.reshape(shape)
+
+
 def poisson(mean: Tensor, first_index: Any, seed: int, scale: float = 1.0) -> Tensor:
     """Poisson counts with expectation ``scale * mean``.
 
@@ -213,12 +224,7 @@ def poisson(mean: Tensor, first_index: Any, seed: int, scale: float = 1.0) -> Te
     Raises:
         TypeError, ValueError: a seed that is no whole number ≥ 0, indices that do not match ``mean``.
     """
-    flat = mean.detach().cpu().contiguous().reshape(-1, mean.shape[-1])
-    out = torch.empty_like(flat)
-    first = _first(first_index, flat.shape[0])
-    row = _OPERATIONS * flat.shape[1]
-    run(_poisson_rows, len(first), flat.numpy(), first, float(scale), seed_key(seed), out.numpy(), operations=row)
-    return out.reshape(mean.shape)
+    return _drawn(_poisson_rows, (mean,), first_index, float(scale), seed_key(seed))
 
 
 def compound_poisson(
@@ -249,17 +255,11 @@ def compound_poisson(
         raise ValueError(f"quantum has shape {tuple(quantum.shape)}, mean {tuple(mean.shape)}: they must be equal")
     if not 0 <= electronic < math.inf:
         raise ValueError(f"electronic must be a finite standard deviation ≥ 0, got {electronic}")
-    flat = mean.detach().cpu().contiguous().reshape(-1, mean.shape[-1])
-    weight = quantum.detach().cpu().contiguous().reshape(flat.shape)
-    first = _first(first_index, flat.shape[0])
-    out = torch.empty_like(flat)
-    arrays = flat.numpy(), weight.numpy()
-    row = _OPERATIONS * flat.shape[1]
-    run(_compound_rows, len(first), *arrays, first, float(scale), seed_key(seed), out.numpy(), operations=row)
+    out = _drawn(_compound_rows, (mean, quantum), first_index, float(scale), seed_key(seed))
     if electronic:
-        added = normal(tuple(flat.shape), first, seed, flat.dtype, purpose=_ELECTRONICS)
+        added = normal(tuple(mean.shape), first_index, seed, mean.dtype, purpose=_ELECTRONICS)
         out.add_(added, alpha=float(electronic))
-    return out.reshape(mean.shape)
+    return out
 
 
 def thinned(
@@ -283,20 +283,14 @@ def thinned(
     Returns:
         Shape and dtype of ``counts``.
     """
-    flat = counts.detach().cpu().contiguous().reshape(-1, counts.shape[-1])
-    size = None if quantum is None else quantum.detach().cpu().contiguous().reshape(flat.shape)
-    first = _first(first_index, flat.shape[0])
-    out = torch.empty_like(flat)
-    quanta = flat if size is None else flat / size
-    row = _OPERATIONS * flat.shape[1]
-    key = seed_key(seed, _THINNING)
-    run(_thinned_rows, len(first), quanta.numpy(), first, float(fraction), key, out.numpy(), operations=row)
-    if size is not None:
-        out *= size
+    quanta = counts if quantum is None else counts / quantum
+    out = _drawn(_thinned_rows, (quanta,), first_index, float(fraction), seed_key(seed, _THINNING))
+    if quantum is not None:
+        out *= quantum
     if electronic:
-        added = normal(tuple(flat.shape), first, seed, flat.dtype, purpose=_THINNED_ELECTRONICS)
+        added = normal(tuple(counts.shape), first_index, seed, counts.dtype, purpose=_THINNED_ELECTRONICS)
         out.add_(added, alpha=float(electronic) * math.sqrt(1.0 - fraction**2))
-    return out.reshape(counts.shape)
+    return out
 
 
 def normal(
