@@ -16,7 +16,7 @@ import torch
 
 import recon
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Projector, VolumeGrid
-from torchpcct.vector_geometry import to_vectors
+from torchpcct.vector_geometry import VectorGeometry
 
 ROOT = Path(__file__).parents[1]
 DOCS, GALLERY = ROOT / "notebooks" / "docs", sorted((ROOT / "notebooks" / "gallery").glob("[0-9]*.py"))
@@ -234,7 +234,7 @@ def test_the_angles_of_astra(kind):
     circle = astra.create_proj_geom(kind, *theirs)
     vectors = astra.functions.geom_2vec(circle)["Vectors"]
     parts = slice(2, 6) if kind == "parallel" else slice(0, 6)  # the sign of a parallel ray is free
-    np.testing.assert_allclose(to_vectors(ours)[:, parts], vectors[:, parts], atol=1e-9)
+    np.testing.assert_allclose(VectorGeometry.of(ours).vectors[:, parts], vectors[:, parts], atol=1e-9)
     name = "line" if kind == "parallel" else "line_fanflat"
     projector = astra.create_projector(name, circle, astra.create_vol_geom(32, 32))
     key, sinogram = astra.create_sino(np.ascontiguousarray(image[::-1]), projector)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam
 from torchpcct.validate import checked, number, whole
 
-__all__ = ["VectorGeometry", "check_motion", "helical_motion", "to_vectors"]
+__all__ = ["VectorGeometry", "check_motion", "helical_motion"]
 
 Floats = NDArray[np.float64]
 
@@ -102,21 +102,38 @@ class VectorGeometry(Geometry):
         return (self.views, self.columns) if self.rows is None else (self.views, self.rows, self.columns)
 
     @classmethod
+    @checked
     def of(cls, geometry: Geometry, motion: Any = None) -> VectorGeometry:
-        """A circular scan with a flat detector, view by view.
+        """A circular scan with a flat detector, view by view; its ``vectors`` are what ASTRA takes.
 
         Args:
             geometry: parallel, fan or cone beam.
             motion: displacement of the grid in every view as for ``Projector``, or None: source and detector move the
-                other way.
+                other way, so that the volume may stand still.
 
         Raises:
-            ValueError: a curved detector, a motion of the wrong shape.
-            TypeError: not a geometry.
+            ValueError: a curved detector, which flat ones cannot describe; a motion of the wrong shape.
+            TypeError: another geometry.
         """
-        rows = geometry.rows if isinstance(geometry, ConeBeam) else None
-        parallel = isinstance(geometry, ParallelBeam)
-        return cls(to_vectors(geometry, motion), geometry.columns, rows, parallel)
+        if not isinstance(geometry, ParallelBeam | FanBeam | ConeBeam):
+            raise TypeError(f"geometry must be ParallelBeam, FanBeam or ConeBeam, got {type(geometry).__name__}")
+        rows, parallel = geometry.rows if isinstance(geometry, ConeBeam) else None, isinstance(geometry, ParallelBeam)
+        radial = np.stack([np.cos(geometry.angles), np.sin(geometry.angles)], axis=1)
+        tangent = np.stack([-radial[:, 1], radial[:, 0]], axis=1)
+        if isinstance(geometry, ParallelBeam):
+            parts = [-radial, geometry.offset * tangent, geometry.pitch * tangent]
+        else:
+            if geometry.detector == "curved":
+                raise ValueError("vectors describe flat detectors only, this one is curved: use detector='flat'")
+            source, foot = geometry.sod * radial, (geometry.sod - geometry.sdd) * radial
+            if isinstance(geometry, FanBeam):
+                parts = [source, foot + geometry.offset * tangent, geometry.pitch * tangent]
+            else:
+                zero = np.zeros((geometry.views, 1))
+                parts = [source, zero, foot + geometry.offset[1] * tangent, zero + geometry.offset[0],
+                         geometry.pitch[1] * tangent, zero, zero, zero, zero + geometry.pitch[0]]  # fmt: skip
+        made = cls(np.concatenate(parts, axis=1), geometry.columns, rows, parallel)
+        return made if motion is None else made.moved(motion)
 
     def border_rays(self) -> tuple[Floats, Floats, Floats]:
         """The rays through the outer edge of the detector, each ``(views, rays)``.
@@ -234,9 +251,9 @@ class VectorGeometry(Geometry):
             else:
                 found = ConeBeam(*orbit, self.rows, pitches, (-float(way[:, 2].mean()), offset))
             axes = 2 if self.rows is None else 3
-            motion = to_vectors(found)[:, :axes] - v[:, :axes]
+            motion = self.of(found).vectors[:, :axes] - v[:, :axes]
         motion = np.ascontiguousarray(motion[:, ::-1])
-        again, scale = to_vectors(found, motion), float(np.abs(v).max())
+        again, scale = self.of(found, motion).vectors, float(np.abs(v).max())
         if self.parallel:  # a ray's direction has no length, and its line no sense
             v[:, :2] *= (np.sign((v[:, :2] * again[:, :2]).sum(1)) / np.linalg.norm(v[:, :2], axis=1))[:, None]
         if np.abs(again - v).max() > 1e-9 * scale:
@@ -251,48 +268,6 @@ class VectorGeometry(Geometry):
                 poses[:, place] = value
         flat = poses.reshape(-1, 12) if self.rows is not None else poses[:, :3, :2].reshape(-1, 6)
         return replace(self, vectors=flat)
-
-
-@checked
-def to_vectors(geometry: Geometry, motion: Any = None) -> Floats:
-    """ASTRA's vectors of a scan with a flat detector, ``(views, 6)`` or, for a cone beam, ``(views, 12)`` float64.
-
-    Args:
-        geometry: the scan.
-        motion: displacement of the grid per view as for ``Projector``, or None: source and detector are moved the
-            other way, so that ASTRA's volume may stand still.
-
-    Raises:
-        ValueError: a curved detector, which ASTRA's vectors cannot describe; a motion of the wrong shape.
-        TypeError: not a geometry.
-    """
-    if not isinstance(geometry, ParallelBeam | FanBeam | ConeBeam):
-        raise TypeError(f"geometry must be ParallelBeam, FanBeam or ConeBeam, got {type(geometry).__name__}")
-    if motion is not None:
-        axes = 3 if isinstance(geometry, ConeBeam) else 2
-        back = check_motion(motion, geometry.views, axes)[:, ::-1]
-        vectors = to_vectors(geometry)
-        if not isinstance(geometry, ParallelBeam):
-            vectors[:, :axes] -= back
-        vectors[:, axes : 2 * axes] -= back
-        return vectors
-    radial = np.stack([np.cos(geometry.angles), np.sin(geometry.angles)], axis=1)
-    tangent = np.stack([-radial[:, 1], radial[:, 0]], axis=1)
-    if isinstance(geometry, ParallelBeam):
-        return np.concatenate([-radial, geometry.offset * tangent, geometry.pitch * tangent], axis=1)
-    if geometry.detector == "curved":
-        raise ValueError("ASTRA's vectors describe flat detectors only, this one is curved: use detector='flat'")
-    source, foot = geometry.sod * radial, (geometry.sod - geometry.sdd) * radial
-    if isinstance(geometry, FanBeam):
-        return np.concatenate([source, foot + geometry.offset * tangent, geometry.pitch * tangent], axis=1)
-    zero = np.zeros((geometry.views, 1))
-    return np.concatenate(
-        [
-            source, zero, foot + geometry.offset[1] * tangent, zero + geometry.offset[0],
-            geometry.pitch[1] * tangent, zero, zero, zero, zero + geometry.pitch[0],
-        ],
-        axis=1,
-    )  # fmt: skip
 
 
 @checked

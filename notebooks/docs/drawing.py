@@ -6,13 +6,13 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from torchpcct import ConeBeam, VolumeGrid
-from torchpcct.vector_geometry import to_vectors
+from torchpcct.vector_geometry import VectorGeometry
 
 
 def draw(path: Path) -> None:
     """The plane z = 0 seen from +z, and the side view of the same ray fan; an SVG file."""
     g = ConeBeam([np.deg2rad(35.0)], 60.0, 100.0, 9, 5, (8.0, 8.0), offset=(4.0, 6.0))
-    source, middle, u, _ = to_vectors(g)[0].reshape(4, 3)
+    source, middle, u, _ = VectorGeometry.of(g).vectors[0].reshape(4, 3)
     foot = source * (1 - g.sdd / g.sod)  # where the central ray meets the detector
     columns = middle + (np.arange(9)[:, None] - 4) * u
     figure = Figure(figsize=(10.5, 5.6), layout="constrained")

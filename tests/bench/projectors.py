@@ -31,7 +31,7 @@ from torchpcct.detector_window import footprint
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
 from torchpcct.projector import Projector
 from torchpcct.threads import get_num_threads, set_num_threads
-from torchpcct.vector_geometry import to_vectors
+from torchpcct.vector_geometry import VectorGeometry
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "helpers"))  # where pytest finds them, too
 from analytic import Ellipsoid, Gaussian, line_integrals, rasterize
@@ -156,7 +156,7 @@ def astra_line(case: Case) -> Peer | None:
         return None
     (ny, nx), (cy, cx), (ey, ex) = grid.shape, grid.center, grid.extent
     volume = astra.create_vol_geom(ny, nx, cx - ex / 2, cx + ex / 2, cy - ey / 2, cy + ey / 2)
-    vectors = to_vectors(g)
+    vectors = VectorGeometry.of(g).vectors
     kind, line = ("parallel_vec", "line") if isinstance(g, ParallelBeam) else ("fanflat_vec", "line_fanflat")
     projection = astra.create_proj_geom(kind, g.columns, vectors)
     projector = astra.create_projector(line, projection, volume)

@@ -14,7 +14,7 @@ from recon.analytic.any_orbit import rebin_to_circle
 from recon.analytic.fbp import fbp
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
-from torchpcct.vector_geometry import VectorGeometry, helical_motion, to_vectors
+from torchpcct.vector_geometry import VectorGeometry, helical_motion
 
 MU = 0.02
 BODY = (Ellipsoid((4.0, -6.0), (30.0, 36.0), value=MU), Gaussian((10.0, 12.0), 5.0, value=0.3 * MU))
@@ -43,7 +43,7 @@ def rotated(x, axis, angle):
 
 def wobbling(seed=0):
     """A cone beam whose detector jitters by cells, rolls and tilts by degrees, and whose source leaves the circle."""
-    rng, v = np.random.default_rng(seed), to_vectors(CONE).reshape(-1, 4, 3).copy()
+    rng, v = np.random.default_rng(seed), VectorGeometry.of(CONE).vectors.reshape(-1, 4, 3).copy()
     n = len(v)
     normal = v[:, 0] / np.linalg.norm(v[:, 0], axis=1, keepdims=True)
     for axis, size in ((normal, 3.0), (np.tile([0.0, 0, 1.0], (n, 1)), 4.0)):
@@ -69,7 +69,7 @@ def test_wobbling_cone_beam():
 
 def test_an_ideal_circle_stays_itself():
     for geometry, rows in ((CONE, CONE.rows), (FAN, None)):
-        data = lines(to_vectors(geometry), geometry.columns, rows)
+        data = lines(VectorGeometry.of(geometry).vectors, geometry.columns, rows)
         s = rebin_to_circle(data, VectorGeometry.of(geometry))
         assert s.motion is None
         assert s.geometry.shape == geometry.shape
@@ -77,7 +77,7 @@ def test_an_ideal_circle_stays_itself():
 
 
 def test_mirrored_axes_and_other_pitches_of_a_fan():
-    v = to_vectors(FAN)
+    v = VectorGeometry.of(FAN).vectors.copy()
     v[:, 4:] *= -1.0  # columns counted the other way
     v[::2, 4:] *= 0.98  # two detectors
     v[:, 2:4] += np.random.default_rng(1).uniform(-1, 1, (len(v), 2))
@@ -86,7 +86,7 @@ def test_mirrored_axes_and_other_pitches_of_a_fan():
 
 def test_parallel_vectors_with_roll_and_jitter():
     geometry = ParallelBeam(np.arange(120) * math.pi / 120, 100, 1.0)
-    flat, rng = to_vectors(geometry), np.random.default_rng(2)
+    flat, rng = VectorGeometry.of(geometry).vectors, np.random.default_rng(2)
     n, roll = len(flat), math.radians(1.5)
     zero = np.zeros((n, 1))
     u = np.concatenate([flat[:, 4:] * math.cos(roll), zero + math.sin(roll)], 1)
@@ -100,7 +100,7 @@ def test_parallel_vectors_with_roll_and_jitter():
 
 
 def test_what_fbp_cannot_do_is_refused():
-    v = to_vectors(CONE)
+    v = VectorGeometry.of(CONE).vectors
     data = torch.zeros(CONE.shape)
     helix = v.copy()
     helix[:, [2, 5]] += np.linspace(-10, 10, len(v))[:, None]

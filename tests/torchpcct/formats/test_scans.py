@@ -25,7 +25,7 @@ from torchpcct.formats.geometry_yaml import geometry_of, geometry_values
 from torchpcct.formats.preprocess import centred, cleaned, find_axis
 from torchpcct.formats.rtk import read_rtk
 from torchpcct.formats.scans import open_scan
-from torchpcct.vector_geometry import to_vectors
+from torchpcct.vector_geometry import VectorGeometry
 from torchpcct.volume import Volume
 
 MU = 0.02
@@ -286,7 +286,7 @@ def test_helical_and_flying_spots_are_refused(tmp_path):
 
 def test_rtk_matrices(tmp_path):
     """Matrices made from the rays that our own vectors describe, at random homogeneous scales."""
-    vectors = to_vectors(CONE).reshape(-1, 4, 3)[..., [1, 2, 0]]  # to RTK's axes
+    vectors = VectorGeometry.of(CONE).vectors.reshape(-1, 4, 3)[..., [1, 2, 0]]  # to RTK's axes
     parts = []
     for k, (source, centre, u, v) in enumerate(vectors):
         # A point x meets the detector at centre + s û + t v̂: three homogeneous rows.
@@ -298,7 +298,7 @@ def test_rtk_matrices(tmp_path):
     distance = "<SourceToDetectorDistance>500</SourceToDetectorDistance>"
     path.write_text(f"<RTKThreeDCircularGeometry>{distance}{''.join(parts)}</RTKThreeDCircularGeometry>")
     geometry = read_rtk(path, CONE.columns, CONE.rows, CONE.pitch)
-    np.testing.assert_allclose(geometry.vectors, to_vectors(CONE), atol=1e-8)
+    np.testing.assert_allclose(geometry.vectors, VectorGeometry.of(CONE).vectors, atol=1e-8)
     circular = geometry.as_circular()
     assert circular is not None
     np.testing.assert_allclose(circular[0].angles % (2 * math.pi), CONE.angles, atol=1e-9)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from torchpcct.detector_window import footprint
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
 from torchpcct.projector import Projector
-from torchpcct.vector_geometry import to_vectors
+from torchpcct.vector_geometry import VectorGeometry
 
 
 def _error(geometry, grid, bodies, window=None, sub=1, dtype=torch.float64):
@@ -170,7 +170,7 @@ def test_shadow_follows_the_motion(name):
 def test_vectors_move_against_the_object(name):
     geometry, grid = SCANS[name]
     motion = _walk(grid.ndim)
-    still, moved = to_vectors(geometry), to_vectors(geometry, motion)
+    still, moved = VectorGeometry.of(geometry).vectors, VectorGeometry.of(geometry, motion).vectors
     n = grid.ndim
     np.testing.assert_allclose(still[:, n : 2 * n] - moved[:, n : 2 * n], motion[:, ::-1], atol=1e-12)
     source = 0.0 if name == "parallel" else motion[:, ::-1]

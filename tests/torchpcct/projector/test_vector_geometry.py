@@ -13,7 +13,7 @@ from torchpcct import ConeBeam, FanBeam, ParallelBeam, Projector, VectorGeometry
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.formats.geometry_yaml import geometry_of
 from torchpcct.projector.tables import Tables, VectorTables
-from torchpcct.vector_geometry import helical_motion, to_vectors
+from torchpcct.vector_geometry import helical_motion
 
 CONE = ConeBeam(full_turn(7, 0.2), 60.0, 110.0, 18, 11, (1.8, 2.1), (0.3, 0.5))
 FAN = FanBeam(full_turn(7, 0.2), 60.0, 110.0, 21, 2.1, 0.5)
@@ -230,7 +230,7 @@ def test_refusals():
     ],
 )
 def test_vectors_of_the_first_view(geometry, expected):
-    assert to_vectors(geometry)[0] == pytest.approx(expected, abs=1e-12)
+    assert VectorGeometry.of(geometry).vectors[0] == pytest.approx(expected, abs=1e-12)
 
 
 @pytest.mark.parametrize("moving", [False, True])
@@ -241,7 +241,7 @@ def test_a_circle_is_found_in_its_vectors(geometry, moving):
     vectors = VectorGeometry.of(geometry, motion)
     found, moved = vectors.as_circular()
     assert (moved is not None) == moving
-    np.testing.assert_allclose(to_vectors(found, moved), vectors.vectors, atol=1e-11)
+    np.testing.assert_allclose(VectorGeometry.of(found, moved).vectors, vectors.vectors, atol=1e-11)
     if moving:
         assert np.linalg.norm(moved) < np.linalg.norm(motion)
     else:
