@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
 from torchpcct.validate import checked, whole
-from torchpcct.vector_geometry import VectorGeometry
+from torchpcct.vector_geometry import VectorGeometry, check_motion
 
 __all__ = ["DetectorWindow", "footprint"]
 
@@ -92,6 +92,14 @@ class DetectorWindow:
         values = values[..., row : row + inner.rows, :]
         index = columns[:, None].to(values.device).expand(*values.shape[:-1], -1)
         return values.gather(-1, index)
+
+    def check(self, geometry: Geometry, name: str = "the window") -> None:
+        """Raise ``ValueError`` unless this is a part of the detector of ``geometry`` in each of its views."""
+        if self.views != geometry.views:
+            raise ValueError(f"{name} has {self.views} views, but the geometry has {geometry.views}")
+        whole = DetectorWindow.full(geometry)
+        if not whole.holds(self):
+            raise ValueError(f"{name} reaches beyond the detector of {whole.rows} rows × {whole.columns} columns")
 
     @staticmethod
     def full(geometry: Geometry) -> DetectorWindow:
@@ -171,9 +179,7 @@ def footprint(geometry: Geometry, grid: VolumeGrid, margin: int = 0, motion: Any
     hy, hx = grid.extent[-2] / 2, grid.extent[-1] / 2
     corners = np.array([(cx + sx * hx, cy + sy * hy) for sx in (-1, 1) for sy in (-1, 1)])
     beta = geometry.angles[:, None]
-    shift = np.zeros((geometry.views, grid.ndim)) if motion is None else np.asarray(motion, dtype=np.float64)
-    if shift.shape != (geometry.views, grid.ndim):
-        raise ValueError(f"motion needs the shape ({geometry.views}, {grid.ndim}), got {shift.shape}")
+    shift = np.zeros((geometry.views, grid.ndim)) if motion is None else check_motion(motion, geometry.views, grid.ndim)
     x, y = corners[:, 0] + shift[:, -1:], corners[:, 1] + shift[:, -2:-1]  # (views, 4)
     along = x * np.cos(beta) + y * np.sin(beta)  # (views, 4), towards the source
     across = -x * np.sin(beta) + y * np.cos(beta)

@@ -460,10 +460,8 @@ def _check(scan: Scan) -> None:
         raise ValueError(f"air has shape {tuple(scan.air.shape)}, expected {expected_air}")
     if (w is None) != (scan.surround is None):
         raise ValueError("a windowed scan needs the readings of its surround, a full scan has none")
-    if w is not None and w.views != g.views:
-        raise ValueError(f"the window has {w.views} views, the geometry {g.views}")
-    if w is not None and not DetectorWindow.full(g).holds(w):
-        raise ValueError(f"the window reaches beyond the detector of {g.rows} rows × {g.columns} columns")
+    if w is not None:
+        w.check(g)
     if scan.linearisation.scale.size != g.columns:
         raise ValueError(
             f"the water correction is that of {scan.linearisation.scale.size} columns, the detector has {g.columns}"

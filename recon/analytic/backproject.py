@@ -78,8 +78,7 @@ class BackprojectionPlan:
         axes = 3 if self.cone else 2
         if grid.ndim != axes:
             raise ValueError(f"a {type(geometry).__name__} needs a {axes}-D grid, got {grid.ndim} axes")
-        if window.views != geometry.views:
-            raise ValueError(f"the window has {window.views} views, but the geometry has {geometry.views}")
+        window.check(geometry)
         self.cosines, self.sines = np.cos(geometry.angles), np.sin(geometry.angles)
         self.shifts = _shifts(motion, self.cosines, self.sines, grid.ndim)
         self.travel = float(np.hypot(self.shifts[:, 0], self.shifts[:, 1]).max())

@@ -52,12 +52,8 @@ class FilterPlan:
 
     def __post_init__(self) -> None:
         g, a, b = self.geometry, self.window_in, self.window_out
-        rows = g.rows if isinstance(g, ConeBeam) else 1
         for name, w in (("window_in", a), ("window_out", b)):
-            if w.views != g.views:
-                raise ValueError(f"{name} has {w.views} views, but the geometry has {g.views}")
-            if int(w.first_column.max()) + w.columns > g.columns or w.first_row + w.rows > rows:
-                raise ValueError(f"{name} reaches beyond the detector of {rows} rows × {g.columns} columns")
+            w.check(g, name)
         if b.first_row < a.first_row or b.first_row + b.rows > a.first_row + a.rows:
             raise ValueError(
                 f"the window to fill has rows {b.first_row}…{b.first_row + b.rows - 1}, but the data only rows "

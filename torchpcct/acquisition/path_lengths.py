@@ -63,8 +63,7 @@ def tissue_path_lengths(
         raise ValueError("the scene moves: path lengths are those of one place, give scene.with_motion(None)")
     if window is None:
         window = DetectorWindow.full(geometry)
-    if window.views != geometry.views:
-        raise ValueError(f"window has {window.views} views, the geometry {geometry.views}: they must be equal")
+    window.check(geometry)
     used, mixing = _mixing(scene, names)
     shapes = [scene.shapes[b] for b in used]
     active = (focal_spot[0] > 0, focal_spot[1] > 0, True, True, view_step > 0)

@@ -99,19 +99,7 @@ def check_pair(geometry: Any, grid: Any, window: Any) -> None:
         return
     if not isinstance(window, DetectorWindow):
         raise TypeError(f"window must be a DetectorWindow or None, got {type(window).__name__}")
-    if window.views != geometry.views:
-        raise ValueError(f"window has {window.views} views, the geometry {geometry.views}: they must be equal")
-    if int(window.first_column.max()) + window.columns > geometry.columns:
-        raise ValueError(
-            f"window reaches column {int(window.first_column.max()) + window.columns - 1}, the detector has columns "
-            f"0…{geometry.columns - 1}: make it narrower"
-        )
-    rows = geometry.rows if isinstance(geometry, ConeBeam) else 1
-    if window.first_row + window.rows > rows:
-        raise ValueError(
-            f"window reaches row {window.first_row + window.rows - 1}, the detector has rows 0…{rows - 1}: "
-            "reduce first_row or rows"
-        )
+    window.check(geometry)
 
 
 def rays_of(geometry: Geometry, window: DetectorWindow | None = None) -> Rays:
