@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -269,26 +269,24 @@ class Scan:
         """
         if self.window is None:
             raise ValueError("only a windowed scan can be cropped: acquire it with region=")
-        return replace(
-            self,
-            counts=self.window.crop(self.counts, window),
-            quantum=None if self.quantum is None else self.window.crop(self.quantum, window),
-            dead=None if self.dead is None else self.window.crop(self.dead.expand(self.counts.shape), window),
-            window=window,
-        )
+        outer = self.window
+        return replace(self, window=window, **self.each(lambda readings: outer.crop(readings, window)))
+
+    def each(self, change: Callable[[Tensor], Tensor]) -> dict[str, Any]:
+        """What has a value for each reading (``counts``, ``quantum``, ``dead``), changed alike; None stays."""
+        held = {name: getattr(self, name) for name in ("counts", "quantum", "dead")}
+        return {name: None if values is None else change(values) for name, values in held.items()}
 
     def select(self, views: Any) -> Scan:
         """The same scan with a subset (or reordering) of the views: an index array, mask or slice."""
         at = views if isinstance(views, slice) else torch.as_tensor(views)
         axes = (..., at, *(slice(None),) * (len(self.geometry.shape) - 1))
-        held = {name: getattr(self, name) for name in ("counts", "quantum", "dead")}
-        kept: dict[str, Any] = {name: None if v is None else v[axes].contiguous() for name, v in held.items()}
         return replace(
             self,
             geometry=self.geometry.select(views),
             window=None if self.window is None else self.window.select(views),
             flux=None if self.flux is None else self.flux[at],
-            **kept,
+            **self.each(lambda readings: readings[axes].contiguous()),
         )
 
     def _require_noise_model(self) -> None:

@@ -192,14 +192,26 @@ def broadcast(**arrays: Any) -> list[Any]:
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-_SAID = {
-    "int": "a whole number", "float": "a number", "str": "a text", "bool": "True or False", "None": "None",
-    "ArrayLike": "real numbers", "Floats": "real numbers",
-    "Tensor": "a torch.Tensor",
-    "Callable": "a function", "Sequence": "a sequence",
-    "Geometry": "a ParallelBeam, FanBeam or ConeBeam (or a VectorGeometry)",
-    "Mapping": "a mapping", "tuple": "a sequence",
+_KINDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    "int": ("a whole number", lambda v: isinstance(v, int | np.integer) and not _is_truth(v)),
+    "float": ("a number", lambda v: not _is_truth(v) and (
+        isinstance(v, int | np.integer | float | np.floating) or (getattr(v, "shape", None) == () and _is_real(v)))),
+    "str": ("a text", lambda v: isinstance(v, str)),
+    "bool": ("True or False", lambda v: _is_truth(v)),
+    "None": ("None", lambda v: v is None),
+    "Any": ("anything", lambda v: True),
+    "ArrayLike": ("real numbers", lambda v: _is_real(v)),
+    "Floats": ("real numbers", lambda v: _is_real(v)),
+    "Callable": ("a function", callable),
+    "Mapping": ("a mapping", lambda v: isinstance(v, Mapping)),
+    "Sequence": ("a sequence", lambda v: isinstance(v, Iterable) and not isinstance(v, str | bytes | Mapping)),
 }  # fmt: skip
+"""Name of an annotation, in words, and whether a value is one."""
+_SAID = {
+    "Tensor": "a torch.Tensor",
+    "Geometry": "a ParallelBeam, FanBeam or ConeBeam (or a VectorGeometry)",
+    "tuple": "a sequence",
+}
 
 
 def checked(function: F) -> F:
@@ -252,32 +264,15 @@ def _in_words(kind: str) -> str:
     head, _, inner = kind.partition("[")
     if head == "tuple" and "..." not in inner:
         return f"{inner.count(',') + 1} numbers"
+    if head in _KINDS:
+        return _KINDS[head][0]
     return _SAID.get(head, f"a {head.rpartition('.')[2]}")
 
 
 def _is(value: Any, kind: str, names: Mapping[str, Any]) -> bool:
     head, _, inner = kind.partition("[")
-    if head == "Any":
-        return True
-    if head == "None":
-        return value is None
-    if head in ("int", "float"):
-        exact = isinstance(value, int | np.integer) or (
-            head == "float" and (isinstance(value, float | np.floating) or _is_scalar(value))
-        )
-        return exact and not isinstance(value, bool | np.bool_)
-    if head == "bool":
-        return isinstance(value, bool | np.bool_)
-    if head == "str":
-        return isinstance(value, str)
-    if head in ("ArrayLike", "Floats"):
-        return _is_real(value)
-    if head == "Callable":
-        return callable(value)
-    if head == "Mapping":
-        return isinstance(value, Mapping)
-    if head == "Sequence":
-        return isinstance(value, Iterable) and not isinstance(value, str | bytes | Mapping)
+    if head in _KINDS:
+        return _KINDS[head][1](value)
     if head == "tuple":
         if not isinstance(value, Sequence | np.ndarray) or isinstance(value, str | bytes):
             return False
@@ -295,9 +290,8 @@ def _is(value: Any, kind: str, names: Mapping[str, Any]) -> bool:
     return not by_name or any(base.__name__ == head for base in type(value).__mro__)
 
 
-def _is_scalar(value: Any) -> bool:
-    """An array or a tensor without axes, of a real number."""
-    return getattr(value, "shape", None) == () and _is_real(value)
+def _is_truth(value: Any) -> bool:
+    return isinstance(value, bool | np.bool_)
 
 
 def _is_real(value: Any) -> bool:

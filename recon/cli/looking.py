@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 # What loads torch or numba is imported by the commands: help and refusals come at once.
 from recon.cli.parsing import (
+    FORCE,
     SCAN_ENDINGS,
     Commands,
-    add_force,
     add_options,
     as_json,
     check_ending,
@@ -196,8 +196,8 @@ def add_view(commands: Commands) -> None:
         ("--out", Path, "PATH", "picture: .png, .pdf or .svg (default VOLUME.png)"),
         ("--level", float, None, "centre of the grey scale (default 40 HU; in mm⁻¹ by the values)"),
         ("--window", float, None, "its width (default 400 HU; in mm⁻¹ by the values)", {"limits": {"positive": True}}),
+        FORCE,
     )
-    add_force(parser)
     add_options(
         parser,
         ("--plane", str, None, "axis across the slice (default z)", {"choices": ("z", "y", "x"), "default": "z"}),

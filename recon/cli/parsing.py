@@ -19,11 +19,11 @@ from torchpcct.files import WriteError, atomic_write, require_folder, require_wr
 from torchpcct.validate import meant, number, numbers, whole
 
 __all__ = [
+    "FORCE",
     "SCAN_ENDINGS",
     "Commands",
     "Parser",
     "add_execution",
-    "add_force",
     "add_options",
     "as_json",
     "as_options",
@@ -50,7 +50,7 @@ Commands = Any
 
 
 _COMMON, _SEED = "common options", {"low": 0}
-_FORCE = "replace a file that another command or software has made"
+FORCE = ("--force", bool, None, "replace a file that another command or software has made")
 
 
 class _Help(argparse.HelpFormatter):
@@ -174,7 +174,7 @@ def command(
         parser,
         ("--seed", int, None, f"first seed of the noise, ≥ 0 (default {default})", {"default": seed, "limits": _SEED}),
         ("--device", str, None, "where volumes are kept (default cpu)", {"choices": ("cpu", "cuda"), "default": "cpu"}),
-        ("--force", bool, None, _FORCE),
+        FORCE,
         ("--no-progress", bool, None, "no progress bars"),
         ("-v --verbose", bool, None, "log what the library does"),
         group=_COMMON,
@@ -315,11 +315,6 @@ def executing(arguments: argparse.Namespace, out: Path) -> Iterator[Any]:
     finally:
         if executor is not None:
             executor.shutdown(cancel_futures=True)
-
-
-def add_force(parser: argparse._ActionsContainer) -> None:
-    """The option ``--force`` of a command that writes."""
-    parser.add_argument("--force", action="store_true", help=_FORCE)
 
 
 def check_output(

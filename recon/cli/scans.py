@@ -425,10 +425,9 @@ def _reconstruct_scan(arguments: argparse.Namespace, progress: ProgressBars) -> 
     import yaml
 
     from recon.api import METHODS, reconstruct
-    from torchpcct.formats.scans import check_scan_name, open_scan
+    from torchpcct.formats.scans import open_scan
 
     choice("method", arguments.method, METHODS)
-    check_scan_name(arguments.scan)
     if slabs:
         _reconstruct_slabs(arguments, options, progress)
         return

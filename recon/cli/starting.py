@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 # What loads torch or numba is imported by the commands: help and refusals come at once.
-from recon.cli.parsing import Commands, add_force, examples
+from recon.cli.parsing import FORCE, Commands, add_options, examples
 from torchpcct.files import require_writable
 
 __all__ = ["add_demo", "add_doctor", "add_train", "demo_steps", "train"]
@@ -70,10 +70,8 @@ def add_demo(commands: Commands) -> None:
         "and print the commands that do this. Half a minute on two cores; the first time kernels are compiled, too.",
     )  # fmt: skip
     examples(parser, "torchpcct demo --out first_look")
-    parser.add_argument(
-        "--out", type=Path, default=Path("out/demo"), metavar="FOLDER", help="for the files (default out/demo)"
-    )
-    add_force(parser)
+    folder = {"default": Path("out/demo")}
+    add_options(parser, ("--out", Path, "FOLDER", "for the files (default out/demo)", folder), FORCE)
 
 
 # --- train --------------------------------------------------------------------------------------------------------

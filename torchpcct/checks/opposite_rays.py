@@ -254,21 +254,24 @@ def _blocks(values: Floats, used: NDArray[np.int64]) -> Floats:
     return np.array([values[b].sum() for b in np.array_split(used, _BLOCKS)])
 
 
-def _fitted(score: Floats, power: Floats, tolerance: float) -> _Fit:
-    """Regression of the blocks' scores on their powers, and Student's test of a size beyond ``tolerance``."""
+def _spread(blocks: Floats) -> float:
+    """Standard error of the sum of blocks, from their scatter."""
+    return max(float(blocks.std(ddof=1)) * math.sqrt(blocks.size), float(np.finfo(np.float64).tiny))
+
+
+def _above(blocks: Floats) -> float:
+    """Student's p-value of blocks whose sum should be 0 or less."""
     from scipy import stats
 
-    size = float(score.sum() / power.sum())
+    return float(stats.t.sf(float(blocks.sum()) / _spread(blocks), blocks.size - 1))
 
-    def deviation(of: float) -> tuple[float, float]:
-        left = score - of * power
-        spread = float(left.std(ddof=1)) * math.sqrt(left.size)
-        return float(left.sum()), max(spread, float(np.finfo(np.float64).tiny))
 
-    total, spread = deviation(math.copysign(tolerance, size))
-    beyond = max(math.copysign(1.0, size) * total / spread, 0.0)
-    p = float(min(1.0, 2.0 * stats.t.sf(beyond, score.size - 1)))
-    return _Fit(size, deviation(size)[1] / float(power.sum()), p, size**2 * float(power.sum()))
+def _fitted(score: Floats, power: Floats, tolerance: float) -> _Fit:
+    """Regression of the blocks' scores on their powers, and Student's test of a size beyond ``tolerance``."""
+    total = float(power.sum())
+    size = float(score.sum()) / total
+    beyond = math.copysign(1.0, size) * (score - math.copysign(tolerance, size) * power)
+    return _Fit(size, _spread(score - size * power) / total, min(1.0, 2.0 * _above(beyond)), size**2 * total)
 
 
 Pattern = tuple[Tensor, str]
@@ -429,8 +432,6 @@ class _Pairs:
 
     def mismatch(self, false_alarms: float) -> tuple[float, int]:
         """Share of the difference in what changes from view to view, and whether it is 1: too large, 2: nearly all."""
-        from scipy import stats
-
         used = np.flatnonzero(self.known.flatten(1).any(1).numpy())
         if used.size < _BLOCKS:
             return math.nan, 0
@@ -452,9 +453,7 @@ class _Pairs:
         sampled = float(stray.sum() / signal.sum())
 
         def beyond(value: Floats, limit: float) -> bool:
-            left = value - limit * signal
-            spread = max(float(left.std(ddof=1)) * math.sqrt(left.size), float(np.finfo(np.float64).tiny))
-            return float(stats.t.sf(float(left.sum()) / spread, left.size - 1)) < false_alarms / 3
+            return _above(value - limit * signal) < false_alarms / 3
 
         grade = sum(beyond(different, max(limit, 2.0 * sampled)) for limit in (_DIFFER, _STRANGERS))
         # Views that their neighbours do not foretell, in steps that they should: out of order.

@@ -48,7 +48,7 @@ def centred(scan: Scan, axis: float | RotationAxis | None = None) -> Scan:
 
 
 @checked
-def cleaned(scan: Scan, *, snr: float = 3.0, threshold: float = 0.08) -> Scan:
+def cleaned(scan: Scan) -> Scan:
     """The same parallel or fan-beam scan without outliers and stripes (:func:`without_outliers`,
     :func:`without_stripes`).
 
@@ -64,7 +64,7 @@ def cleaned(scan: Scan, *, snr: float = 3.0, threshold: float = 0.08) -> Scan:
     lines = scan._logarithm()  # before the water correction, which belongs to the true readings
     if scan.dead is not None:
         lines = bridge(lines, scan.dead, rows=False)
-    corrected = without_stripes(without_outliers(lines, threshold=threshold), snr=snr)
+    corrected = without_stripes(without_outliers(lines))
     return replace(scan, counts=scan.counts * torch.exp(lines - corrected))
 
 

@@ -174,9 +174,7 @@ def _sliced(scan: Scan, slices: slice) -> Scan:
     axis = slice_axis(scan.geometry, tuple(scan.counts.shape), scan.window)
     geometry, kept = sliced(scan.geometry, slices, scan.counts.shape[axis])
     at = (slice(None),) * axis + (slice(*kept[:2]),)
-    changed: dict[str, Any] = {
-        n: None if getattr(scan, n) is None else getattr(scan, n)[at] for n in ("counts", "quantum", "dead")
-    }
+    changed = scan.each(lambda readings: readings[at])
     return replace(scan, geometry=geometry, air=scan.air[at[-1:]], info={**scan.info, "slices": kept}, **changed)
 
 
@@ -184,12 +182,9 @@ def _placed(scan: Scan, geometry: VectorGeometry) -> Scan:
     """The same readings, of a geometry that was measured view by view."""
     if scan.window is not None:
         raise ValueError("this scan holds a part of the detector: a VectorGeometry needs all of it")
-    changed: dict[str, Any] = {"geometry": geometry}
-    if geometry.has_rows and not scan.geometry.has_rows and scan.counts.ndim == 3:
-        for name in ("counts", "quantum", "dead"):
-            values = getattr(scan, name)
-            changed[name] = None if values is None else values.movedim(0, 1).contiguous()
-    return replace(scan, **changed)
+    turned = geometry.has_rows and not scan.geometry.has_rows and scan.counts.ndim == 3
+    changed = scan.each(lambda readings: readings.movedim(0, 1).contiguous()) if turned else {}
+    return replace(scan, geometry=geometry, **changed)
 
 
 def _is_own(path: Path) -> bool:
