@@ -278,8 +278,7 @@ def write_dicom(folder: str | os.PathLike[str], data: Any, grid: VolumeGrid, uni
         ValueError: a volume in mm⁻¹, values that are not finite, a folder that holds files.
     """
     pydicom = needed("pydicom")
-    from pydicom.dataset import FileMetaDataset
-    from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, generate_uid
+    from pydicom.uid import CTImageStorage, generate_uid
 
     _check_series(Path(folder), unit)
     values = np.asarray(data, dtype=np.float64)
@@ -293,12 +292,8 @@ def write_dicom(folder: str | os.PathLike[str], data: Any, grid: VolumeGrid, uni
     dz, dy, dx = grid.spacing
     images = []
     for k, image in enumerate(stored):
-        meta = FileMetaDataset()
-        meta.TransferSyntaxUID, meta.MediaStorageSOPClassUID = ExplicitVRLittleEndian, CTImageStorage
-        meta.MediaStorageSOPInstanceUID = generate_uid()
         d = pydicom.Dataset()
-        d.file_meta = meta
-        d.SOPClassUID, d.SOPInstanceUID = CTImageStorage, meta.MediaStorageSOPInstanceUID
+        d.SOPClassUID = CTImageStorage
         d.StudyInstanceUID, d.SeriesInstanceUID, d.FrameOfReferenceUID = study, series, frame
         d.Modality, d.Manufacturer, d.SeriesDescription = "CT", "torchpcct", "simulated or reconstructed by torchpcct"
         d.ImageType = ["DERIVED", "PRIMARY", "AXIAL"]
@@ -308,13 +303,10 @@ def write_dicom(folder: str | os.PathLike[str], data: Any, grid: VolumeGrid, uni
         d.ImageOrientationPatient = [-1, 0, 0, 0, -1, 0]
         d.ImagePositionPatient = [_ds(-x), _ds(-y), _ds(z + k * dz)]
         d.PixelSpacing, d.SliceThickness = [_ds(dy), _ds(dx)], _ds(dz)
-        d.Rows, d.Columns = image.shape
-        d.SamplesPerPixel, d.PhotometricInterpretation = 1, "MONOCHROME2"
-        d.BitsAllocated, d.BitsStored, d.HighBit, d.PixelRepresentation = 16, 16, 15, 1
         d.RescaleSlope, d.RescaleIntercept, d.RescaleType = _ds(slope), "0", "HU"
         d.ImagesInAcquisition = len(stored)
         d.WindowCenter, d.WindowWidth, d.KVP, d.AcquisitionNumber = "40", "400", "", ""
-        d.PixelData = image.tobytes()
+        d.set_pixel_data(image, "MONOCHROME2", 16)
         images.append(d)
     with atomic_write(os.path.realpath(folder)) as part:
         part.mkdir()

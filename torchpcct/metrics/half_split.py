@@ -20,6 +20,7 @@ from torchpcct.vector_geometry import VectorGeometry
 __all__ = ["HalfSplit", "half_split", "halves"]
 
 Floats = NDArray[np.float64]
+_AGREE = 0.143
 
 
 @dataclass(frozen=True)
@@ -56,20 +57,19 @@ class HalfSplit:
             raise ValueError("a standard deviation needs a region of two voxels or more")
         return float(values.std())
 
-    def resolution(self, grid_spacing: float, threshold: float = 0.143) -> float:
+    def resolution(self, grid_spacing: float) -> float:
         """Highest spatial frequency, line pairs per mm, that both halves agree on: Fourier ring correlation.
 
-        The correlation of the halves in rings of one frequency of every slice; it falls below ``threshold`` where noise
-        takes over (0.143: Rosenthal and Henderson, J. Mol. Biol. 333, 721, 2003). An image without structure gives 0.
+        The correlation of the halves in rings of one frequency of every slice; it falls below 0.143 where noise takes
+        over (Rosenthal and Henderson, J. Mol. Biol. 333, 721, 2003). An image without structure gives 0.
 
         Args:
             grid_spacing: voxel size in the plane in mm.
-            threshold: correlation that counts as agreement.
         """
         a, b = _spectra(self)
         cross, one, two = (_rings(part) for part in ((a * b.conj()).real, a.abs() ** 2, b.abs() ** 2))
         correlation = cross / (one * two).sqrt().clamp(min=1e-300)
-        below = torch.nonzero(correlation < threshold)
+        below = torch.nonzero(correlation < _AGREE)
         rings = int(below[0]) if below.numel() else correlation.numel()
         return rings / (min(a.shape[-2:]) * grid_spacing)
 

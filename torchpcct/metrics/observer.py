@@ -33,37 +33,31 @@ __all__ = [
 ]
 
 Floats = NDArray[np.float64]
+_RATIO, _WIDTH = 1.4, 1.67
 
 
 @checked
-def dog_channels(
-    grid: VolumeGrid,
-    center: tuple[float, ...],
-    count: int = 10,
-    lowest: float | None = None,
-    ratio: float = 1.4,
-    width: float = 1.67,
-) -> Floats:
-    """Dense difference-of-Gaussians channels: ``exp(−f² / 2 (Q s_j)²) − exp(−f² / 2 s_j²)``, ``s_j = s₀ αʲ``.
+def dog_channels(grid: VolumeGrid, center: tuple[float, ...], count: int = 10, lowest: float | None = None) -> Floats:
+    """Dense difference-of-Gaussians channels: ``exp(−f² / 2 (Q s_j)²) − exp(−f² / 2 s_j²)``, ``s_j = s₀ αʲ``, with the
+    source's α = 1.4 and Q = 1.67.
 
     Args:
         grid: ``(y, x)`` axial plane or ``(z, y, x)`` volume.
         center: of the channels in mm, in the order of the grid's axes (the core's known place).
         count: channels.
         lowest: s₀ in cycles per mm; None: 0.005 cycles per voxel of the finest axis, as in the source.
-        ratio, width: α and Q of the source.
 
     Returns:
         ``(count, *grid.shape)`` float64, each of unit norm.
 
     Raises:
-        ValueError: a centre of other axes than the grid, a count < 1, parameters that do not give channels.
+        ValueError: a centre of other axes than the grid, a count < 1, a frequency that is not positive.
     """
     if len(center) != grid.ndim:
         raise ValueError(f"center must have {grid.ndim} numbers in mm, one per axis of the grid, got {center!r}")
     s0 = 0.005 / min(grid.spacing) if lowest is None else float(lowest)
-    if count < 1 or not s0 > 0 or not ratio > 1 or not width > 1:
-        raise ValueError(f"need count ≥ 1, lowest > 0, ratio > 1 and width > 1, got {count}, {s0}, {ratio}, {width}")
+    if count < 1 or not s0 > 0:
+        raise ValueError(f"need count ≥ 1 and lowest > 0, got {count} and {s0}")
     squares = np.zeros(grid.shape)
     for axis, (positions, c) in enumerate(zip(grid.axes, center, strict=True)):
         shape = [1] * grid.ndim
@@ -73,7 +67,7 @@ def dog_channels(
     def gaussian(s: float) -> Floats:
         return s**grid.ndim * np.exp(-2.0 * (math.pi * s) ** 2 * squares)
 
-    channels = np.stack([gaussian(width * s) - gaussian(s) for s in s0 * ratio ** np.arange(count)])
+    channels = np.stack([gaussian(_WIDTH * s) - gaussian(s) for s in s0 * _RATIO ** np.arange(count)])
     return channels / np.sqrt(np.square(channels).sum(tuple(range(1, channels.ndim)), keepdims=True))
 
 
