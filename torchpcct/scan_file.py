@@ -18,8 +18,7 @@ __all__ = ["read_geometry", "scan_fields", "slice_axis", "sliced", "write_geomet
 
 _VERSION = 5
 """2: energy-integrating scans with their noise model. 3: with a checksum (:func:`torchpcct.files.write_hdf5`). 4:
-parallel and fan beams, flux, dead readings, units. 5: geometries given view by view. Each scan is written as the lowest
-version that holds it."""
+parallel and fan beams, flux, dead readings, units. 5: geometries given view by view."""
 # Compress in blocks of one view: fast to write, and a window of views, or of rows, can be read without the rest.
 _CHUNK_ROWS = 64
 _HDF5_COMPRESSION = {"compression": "lzf", "shuffle": True}
@@ -28,12 +27,8 @@ _HDF5_COMPRESSION = {"compression": "lzf", "shuffle": True}
 def write_scan(scan: Any, path: str | os.PathLike[str]) -> None:
     """Write a scan; the file appears under its name only when it is complete."""
     with write_hdf5(path, "scan") as file:
-        foreign = scan.unit != "HU" or scan.logged or not isinstance(scan.geometry, ConeBeam)
-        foreign = foreign or scan.flux is not None or scan.dead is not None
-        version = 5 if isinstance(scan.geometry, VectorGeometry) else 4 if foreign else 3
-        file.attrs.update(version=version, software=f"torchpcct {VERSION}")
-        file.attrs["counting"] = scan.counting
-        file.attrs.update(unit=scan.unit, logged=scan.logged)
+        file.attrs.update(version=_VERSION, software=f"torchpcct {VERSION}")
+        file.attrs.update(counting=scan.counting, unit=scan.unit, logged=scan.logged)
         file.attrs["info"] = json.dumps(dict(scan.info), default=str)
         if scan.exposure_s is not None:
             file.attrs["exposure_s"] = scan.exposure_s
@@ -42,9 +37,9 @@ def write_scan(scan: Any, path: str | os.PathLike[str]) -> None:
         rows, columns = scan.counts.shape[-2:]
         rows = min(rows, _CHUNK_ROWS) if scan.geometry.has_rows else rows
         chunk = (*(1,) * (scan.counts.ndim - 2), rows, columns)
-        # Counts are whole numbers: as integers they compress, and they stay exact.
+        # Counts that are whole numbers compress as integers, and stay exact.
         whole = scan.counting and not (scan.noise_free or scan.logged) and float(scan.counts.max()) < 2**31
-        whole = whole and (not foreign or bool((scan.counts == scan.counts.round()).all()))
+        whole = whole and bool((scan.counts == scan.counts.round()).all())
         data = scan.counts.to(torch.int32) if whole else scan.counts
         file.create_dataset("counts", data=data.numpy(), chunks=chunk, **_HDF5_COMPRESSION)
         file.create_dataset("air", data=scan.air.numpy())
