@@ -9,15 +9,13 @@ itself throws away what one says about the other. F is the information matrix of
 The channels are mixed first so that the mean of F over the rays is a multiple of the identity (:class:`Whitening`). In
 these coordinates noise is isotropic, which is what R needs, and AᵀFA is nearly the same scalar operator in each
 channel: one FFT model (:class:`recon.gram.gram.Gram`) with the weights ½ tr F serves as the preconditioner of all. What
-it leaves out (F's change from ray to ray) the exact projections repair, as in :mod:`recon.least_squares.pwls`, whose
-iteration this is.
+it leaves out (F's change from ray to ray) the exact projections of :func:`recon.least_squares.pwls.pwls` repair.
 """
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 import torch
@@ -26,8 +24,8 @@ from torch import Tensor
 
 from recon.analytic.inset import static_fbp
 from recon.gram.gram import Gram
-from recon.least_squares.pwls import PwlsResult, solve_normal, weighted_data
-from recon.least_squares.qggmrf import DEFAULT_PRIOR, QGGMRF, BoundPrior
+from recon.least_squares.pwls import PwlsOptions, mean_weights, pwls
+from recon.least_squares.qggmrf import DEFAULT_PRIOR, QGGMRF
 from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import VolumeGrid
 from torchpcct.projector import Projector
@@ -35,88 +33,7 @@ from torchpcct.scan import Scan
 from torchpcct.spectral import SpectralModel, cramer_rao, decompose_surround, inverse, vmi_weights
 from torchpcct.validate import number
 
-__all__ = ["REFERENCE_KEV", "BasisProblem", "Whitening", "joint_pwls", "mean_weights"]
-
-
-def weigh(information: Tensor, y: Tensor, axes: int) -> Tensor:
-    """F y of every ray: ``(3, *range)`` times ``(..., 2, *range)``, ``axes`` axes of rays."""
-    first, second = y.unbind(-axes - 1)
-    f11, f12, f22 = information
-    return torch.stack([f11 * first + f12 * second, f12 * first + f22 * second], dim=-axes - 1)
-
-
-def check_information(information: Any, shape: tuple[int, ...]) -> None:
-    """Refuse information matrices that are not finite and positive semi-definite, of a wrong shape, or all 0."""
-    if not isinstance(information, Tensor) or information.dtype not in (torch.float32, torch.float64):
-        kind = getattr(information, "dtype", type(information).__name__)
-        raise TypeError(f"information must be a float32 or float64 tensor, got {kind}")
-    if tuple(information.shape) != (3, *shape):
-        raise ValueError(f"information must have the shape {(3, *shape)} (F11, F12, F22), got "
-                         f"{tuple(information.shape)}")  # fmt: skip
-    if not torch.isfinite(information).all():
-        raise ValueError("information must be finite: give rays that hold none the matrix 0")
-    f11, f12, f22 = information
-    slack = 1e-5 * (f11 * f22).clamp_min(0)
-    if bool((f11 < 0).any()) or bool((f22 < 0).any()) or bool((f12 * f12 > f11 * f22 + slack).any()):
-        raise ValueError("information must be positive semi-definite on every ray, packed as F11, F12, F22")
-    if not bool((f11 + f22 > 0).any()):
-        raise ValueError("all information is 0: no ray says anything about the inset")
-
-
-def joint_pwls(
-    A: Any,
-    y: Tensor,
-    information: Tensor,
-    prior: QGGMRF | BoundPrior,
-    *,
-    gram: Gram | None = None,
-    tolerance: float = 0.2,
-    max_exact: int = 20,
-) -> PwlsResult:
-    """Minimise ½ Σ (y − A x)ᵀ F (y − A x) + R(x) over two channels.
-
-    Args:
-        A: the exact operator (:class:`torchpcct.projector.Projector`).
-        y: whitened line integrals with the background taken off, ``(..., 2, *A.range_shape)`` float32 or float64; rays
-            of information 0 may hold anything. Leading dimensions are independent realisations.
-        information: F of the whitened channels, ``(3, *A.range_shape)`` (F₁₁, F₁₂, F₂₂), from smooth expected counts.
-            It should be near a multiple of the identity (:class:`recon.least_squares.basis_problem.Whitening`): that is
-            for speed alone.
-        prior: in noise-normalised units, or bound already; 1 of a channel counts as 1 HU.
-        gram: FFT model of Aᵀ diag(½ tr F) A, kept from an earlier call; None: made here.
-        tolerance: stop when the images are this close to the minimum: root mean square over both channels, in HU.
-        max_exact: largest number of exact projection pairs (each of two channels).
-
-    Returns:
-        Images ``(..., 2, *grid.shape)`` in the dtype of y, and the report of :func:`recon.least_squares.pwls.pwls`:
-        ``gradient`` is the norm of the exact gradient of Φ over that of the zero images.
-
-    Raises:
-        ValueError: shapes that do not fit, data that are not finite, F not positive semi-definite or all 0, a
-            tolerance ≤ 0.
-        TypeError: data or information that are not float tensors.
-    """
-    started = time.perf_counter()
-    n = len(A.range_shape)
-    check_information(information, tuple(A.range_shape))
-    known = information[0] + information[2] > 0
-    weighted = weighted_data(y, (2, *A.range_shape), known, lambda v: weigh(information.to(v.dtype), v, n))
-    f = information.to(weighted.dtype)
-
-    def exact(x: Tensor) -> Tensor:
-        out: Tensor = A.T(weigh(f, A(x), n))
-        return out
-
-    result = solve_normal(
-        A.T(weighted), exact, gram if gram is not None else Gram(A, mean_weights(information)), prior,
-        mu_per_hu=1.0, spacing=A.grid.spacing, channels=True, tolerance=tolerance, max_exact=max_exact,
-    )  # fmt: skip
-    return PwlsResult(result.x, {**result.report, "method": "joint-pwls", "seconds": time.perf_counter() - started})
-
-
-def mean_weights(information: Tensor) -> Tensor:
-    """½ tr F of every ray: the weights of the FFT model."""
-    return (0.5 * (information[0] + information[2])).contiguous()
+__all__ = ["REFERENCE_KEV", "BasisProblem", "Whitening"]
 
 
 Floats = NDArray[np.float64]
@@ -247,8 +164,7 @@ class BasisProblem:
         prior: QGGMRF | None = None,
         *,
         dose: float = 1.0,
-        tolerance: float = 0.2,
-        max_exact: int = 20,
+        **options: Unpack[PwlsOptions],
     ) -> tuple[Tensor, dict[str, Any]]:
         """Basis images.
 
@@ -256,7 +172,7 @@ class BasisProblem:
             lines, window: decomposed line integrals, see :meth:`data`.
             prior: None: :data:`recon.least_squares.qggmrf.DEFAULT_PRIOR`.
             dose: of the data relative to the model's exposure; it scales the information.
-            tolerance, max_exact: of :func:`joint_pwls`.
+            options: of :func:`recon.least_squares.pwls.pwls`.
 
         Returns:
             ``(..., 2, z, y, x)`` basis coefficients (dimensionless), and the solver's report.
@@ -265,9 +181,9 @@ class BasisProblem:
             ValueError: shapes that do not fit, ``dose`` ≤ 0.
         """
         number("dose", dose, positive=True, unit="of the model's exposure")
-        result = joint_pwls(
-            self.projector, self.data(lines, window), self.information * dose, prior or DEFAULT_PRIOR,
-            gram=self.gram.scaled(dose), tolerance=tolerance, max_exact=max_exact,
+        result = pwls(
+            self.projector, self.data(lines, window), self.information * dose, prior or DEFAULT_PRIOR, mu_per_hu=1.0,
+            gram=self.gram.scaled(dose), **options,
         )  # fmt: skip
         images = self.whitening.undo(result.x) + self.level.to(lines.dtype).reshape(2, 1, 1, 1)
-        return images, dict(result.report)
+        return images, {**result.report, "method": "joint-pwls"}

@@ -11,6 +11,9 @@ result is the minimum of Φ itself, not of a model. Two proposers:
   is measured with the first exact pair; a model that does not fit loses its place to
 * the preconditioned gradient (:class:`recon.least_squares.field_model.GradientStep`), for whole fields from the start:
   there a projection pair costs no more than the model would, and the weights change too much over the field.
+
+Two channels whose noise is correlated (:mod:`recon.least_squares.basis_problem`) are the same problem with a 2 × 2
+matrix of every ray for its weight.
 """
 
 from __future__ import annotations
@@ -24,6 +27,7 @@ from typing import Any, TypedDict
 import torch
 from torch import Tensor
 
+from recon.analytic.backproject import check_data
 from recon.conjugate_gradient import dot, per_volume
 from recon.gram.gram import Gram, check_weights
 from recon.least_squares.field_model import FieldModel, GradientStep
@@ -34,7 +38,7 @@ from recon.linear_operator import NormalOperator
 from torchpcct.detector_window import footprint
 from torchpcct.validate import checked, number, renamed, whole
 
-__all__ = ["Approach", "PwlsOptions", "PwlsResult", "data_model", "pwls", "solve_normal", "weighted_data"]
+__all__ = ["Approach", "PwlsOptions", "PwlsResult", "data_model", "mean_weights", "pwls", "solve_normal", "weigh"]
 
 
 class Approach:
@@ -176,12 +180,13 @@ def pwls(
             ``range_shape`` and ``grid``).
         y: line integrals ``(..., *A.range_shape)`` float32 or float64, of all that lies in the beam: whatever the grid
             does not hold must have been taken off. Readings of weight 0 may hold anything. Leading dimensions are
-            independent noise realisations.
+            independent noise realisations. Of two channels ``(..., 2, *A.range_shape)``.
         weights: W, ``A.range_shape``: expected inverse variances of y (from smooth expected counts: weights taken
-            from the noisy counts themselves bias the result).
+            from the noisy counts themselves bias the result). Of two channels the information of every ray,
+            ``(3, *A.range_shape)`` F₁₁, F₁₂, F₂₂, in place of W; near a multiple of the identity for the sake of speed.
         prior: a prior in noise-normalised units, or one that is bound already.
-        mu_per_hu: 1 HU in mm⁻¹ (μ of water / 1000); default: water at about 64 keV.
-        gram: model of AᵀWA with these weights (:class:`recon.gram.gram.Gram` or
+        mu_per_hu: 1 HU in mm⁻¹ (μ of water / 1000), or of channels what counts as 1 HU; default: water at about 64 keV.
+        gram: model of AᵀWA with these weights (of channels with :func:`mean_weights`) (:class:`recon.gram.gram.Gram` or
             :class:`recon.least_squares.field_model.FieldModel`, kept from an earlier call); default:
             :func:`data_model`.
         start: first volume ``(..., *grid.shape)`` mm⁻¹, default 0. It costs one exact pair and does not change the
@@ -218,25 +223,63 @@ def pwls(
     if hu is not None:
         mu_per_hu = renamed("hu", "mu_per_hu", hu)
     started = time.perf_counter()
-    check_weights(weights, A.range_shape)
-    known = weights > 0
-    check_data(y, tuple(A.range_shape))
+    rays = tuple(A.range_shape)
+    channels = weights.dim() > len(rays)
+    if channels:
+        check_information(weights, rays)
+    else:
+        check_weights(weights, rays)
+    mean = mean_weights(weights) if channels else weights
+    known, shape = mean > 0, (2, *rays) if channels else rays
+    check_data("y", y, shape)
     require_memory(A, y, memory)
-    weighted = weighted_data(y, tuple(A.range_shape), known, lambda v: weights.to(v.dtype) * v)
-    w = weights.to(weighted.dtype)
-    model = data_model(A, weights) if gram is None else gram
+    y = torch.where(known, y, torch.zeros((), dtype=y.dtype, device=y.device))
+    w = weights.to(y.dtype)
+
+    def weighed(v: Tensor) -> Tensor:
+        return weigh(w, v, len(rays)) if channels else w * v
+
+    weighted = weighed(y)
+    if not torch.isfinite(weighted).all():
+        raise ValueError("y holds NaN or Inf in readings of positive weight: give these readings the weight 0")
+    model = data_model(A, mean) if gram is None else gram
 
     def exact(x: Tensor) -> Tensor:
-        out: Tensor = A.T(w * A(x))
+        out: Tensor = A.T(weighed(A(x)))
         return out
 
-    axes = len(A.range_shape)
-    energy = dot(weighted, torch.where(known, y, torch.zeros_like(y)), axes)
+    energy, readings = dot(weighted, y, len(shape)), int(known.sum()) * (1 + channels)
+    del y
     result = solve_normal(
-        A.T(weighted), exact, model, prior, mu_per_hu=mu_per_hu, spacing=A.grid.spacing, start=start,
-        tolerance=tolerance, max_exact=max_exact, callback=callback, data=(energy.reshape(-1), int(known.sum())),
+        A.T(weighted), exact, model, prior, mu_per_hu=mu_per_hu, spacing=A.grid.spacing, channels=channels, start=start,
+        tolerance=tolerance, max_exact=max_exact, callback=callback, data=(energy.reshape(-1), readings),
     )  # fmt: skip
     return PwlsResult(result.x, {**result.report, "seconds": time.perf_counter() - started})
+
+
+def weigh(information: Tensor, y: Tensor, axes: int) -> Tensor:
+    """F y of every ray: ``(3, *range)`` times ``(..., 2, *range)``, ``axes`` axes of rays."""
+    first, second = y.unbind(-axes - 1)
+    f11, f12, f22 = information
+    return torch.stack([f11 * first + f12 * second, f12 * first + f22 * second], dim=-axes - 1)
+
+
+def mean_weights(information: Tensor) -> Tensor:
+    """½ tr F of every ray: the weights of the model of two channels."""
+    return (0.5 * (information[0] + information[2])).contiguous()
+
+
+def check_information(information: Any, shape: tuple[int, ...]) -> None:
+    """Refuse information matrices that are not finite and positive semi-definite, of a wrong shape, or all 0."""
+    check_data("information", information, (3, *shape))
+    if not torch.isfinite(information).all():
+        raise ValueError("information must be finite: give rays that hold none the matrix 0")
+    f11, f12, f22 = information
+    slack = 1e-5 * (f11 * f22).clamp_min(0)
+    if bool((f11 < 0).any()) or bool((f22 < 0).any()) or bool((f12 * f12 > f11 * f22 + slack).any()):
+        raise ValueError("information must be positive semi-definite on every ray, packed as F11, F12, F22")
+    if not bool((f11 + f22 > 0).any()):
+        raise ValueError("all information is 0: no ray says anything about the inset")
 
 
 @checked
@@ -259,29 +302,6 @@ def data_model(A: Any, weights: Tensor, nodes: int = 9) -> Gram | FieldModel:
         except ValueError:  # the grid reaches beyond the field of view
             inset = False
     return Gram(A, weights, nodes) if inset else FieldModel(A, weights)
-
-
-def check_data(y: Any, shape: tuple[int, ...]) -> None:
-    """Refuse data that are no float tensor (TypeError) or not ``(..., *shape)`` (ValueError)."""
-    if not isinstance(y, Tensor) or y.dtype not in (torch.float32, torch.float64):
-        raise TypeError(f"y must be a float32 or float64 tensor, got {getattr(y, 'dtype', type(y).__name__)}")
-    if tuple(y.shape[-len(shape) :]) != shape:
-        raise ValueError(f"y must have shape (..., {', '.join(map(str, shape))}), got {tuple(y.shape)}")
-
-
-@checked
-def weighted_data(y: Any, shape: tuple[int, ...], known: Tensor, weigh: Callable[[Tensor], Tensor]) -> Tensor:
-    """W y of data ``(..., *shape)``, where readings that are not ``known`` count as 0 and may hold anything.
-
-    Raises:
-        TypeError: no float tensor.
-        ValueError: another shape, or readings of positive weight that are not finite.
-    """
-    check_data(y, shape)
-    weighted = weigh(torch.where(known, y, torch.zeros((), dtype=y.dtype, device=y.device)))
-    if not torch.isfinite(weighted).all():
-        raise ValueError("y holds NaN or Inf in readings of positive weight: give these readings the weight 0")
-    return weighted
 
 
 @checked

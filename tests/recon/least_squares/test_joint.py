@@ -12,8 +12,8 @@ from small_scan import SPECTRAL_GRID as GRID
 
 from recon.analytic.inset import InsetFbp
 from recon.gram.gram import Gram
-from recon.least_squares.basis_problem import BasisProblem, Whitening, joint_pwls, mean_weights, weigh
-from recon.least_squares.pwls import pwls
+from recon.least_squares.basis_problem import BasisProblem, Whitening
+from recon.least_squares.pwls import mean_weights, pwls, weigh
 from recon.least_squares.qggmrf import QGGMRF, quadratic
 
 EDGE = QGGMRF(0.15, 100.0)
@@ -85,9 +85,9 @@ def rms(a, b):
 def test_exact_minimum(inset, dense, prior):
     A, f, gram, y = inset
     bound = prior.bind(gram.information(1.0), A.grid.spacing, 1.0, channels=True)
-    fine = joint_pwls(A, y.double(), f.double(), prior, gram=gram, tolerance=1e-6, max_exact=80)
+    fine = pwls(A, y.double(), f.double(), prior, mu_per_hu=1.0, gram=gram, tolerance=1e-6, max_exact=80)
     x = reference(dense, f, y, bound, A.domain_shape, fine.x)
-    result = joint_pwls(A, y, f, prior, gram=gram, tolerance=0.02)
+    result = pwls(A, y, f, prior, mu_per_hu=1.0, gram=gram, tolerance=0.02)
     assert result.report["converged"]
     assert result.x.shape == (2, *A.domain_shape)
     assert rms(result.x, x) < 0.06
@@ -107,7 +107,7 @@ def test_certificate_is_the_gradient_of_the_objective(inset):
         value = 0.5 * (r * weigh(f.double(), r, 3)).sum() + bound.value(x)
         return torch.autograd.grad(value, x)[0].norm()
 
-    result = joint_pwls(A, y, f, EDGE, gram=gram, tolerance=0.5)
+    result = pwls(A, y, f, EDGE, mu_per_hu=1.0, gram=gram, tolerance=0.5)
     measured = float(gradient(result.x) / gradient(torch.zeros(2, *A.domain_shape)))
     assert measured == pytest.approx(result.report["gradient"][-1], rel=0.02)
 
@@ -121,10 +121,10 @@ def test_correlation_that_changes_from_ray_to_ray_is_information():
     truth = tissue(A.grid)
     y = A(truth) + correlated_noise(f, (6,), 3)
     weak = quadratic(0.02)
-    joint = joint_pwls(A, y, f, weak, tolerance=0.2, max_exact=60).x
+    joint = pwls(A, y, f, weak, mu_per_hu=1.0, tolerance=0.2, max_exact=60).x
     alone = pwls(A, y, w * (1 - 0.81), weak, mu_per_hu=1.0, tolerance=0.2, max_exact=60).x
     clean = A(truth).expand_as(y)
-    scatter = rms(joint, joint_pwls(A, clean[0], f, weak, tolerance=0.2, max_exact=60).x.expand_as(joint))
+    scatter = rms(joint, pwls(A, clean[0], f, weak, mu_per_hu=1.0, tolerance=0.2, max_exact=60).x.expand_as(joint))
     apart = rms(
         alone, pwls(A, clean[0], w * (1 - 0.81), weak, mu_per_hu=1.0, tolerance=0.2, max_exact=60).x.expand_as(alone)
     )
@@ -135,24 +135,24 @@ def test_lost_rays_may_hold_anything(inset):
     A, f, _, y = inset
     lost = torch.rand(A.range_shape, generator=torch.Generator().manual_seed(4)) < 0.1
     f = torch.where(lost, torch.zeros(()), f)
-    result = joint_pwls(A, torch.where(lost, torch.nan, y), f, EDGE, tolerance=0.1, max_exact=40)
+    result = pwls(A, torch.where(lost, torch.nan, y), f, EDGE, mu_per_hu=1.0, tolerance=0.1, max_exact=40)
     assert result.report["converged"]
     bound = EDGE.bind(Gram(A, mean_weights(f)).information(1.0), A.grid.spacing, 1.0, channels=True)
-    full = joint_pwls(A, torch.where(lost, torch.zeros(()), y), f, bound, tolerance=0.1, max_exact=40)
+    full = pwls(A, torch.where(lost, torch.zeros(()), y), f, bound, mu_per_hu=1.0, tolerance=0.1, max_exact=40)
     assert rms(result.x, full.x) < 0.3
 
 
 def test_refusals(inset):
     A, f, gram, y = inset
     refused(
-        ("information", lambda: joint_pwls(A, y, f.int(), EDGE)),
-        ("shape", lambda: joint_pwls(A, y, f[:2], EDGE)),
-        ("semi-definite", lambda: joint_pwls(A, y, torch.stack([f[0], 2 * f[2], f[2]]), EDGE)),
-        ("finite", lambda: joint_pwls(A, y, f * torch.nan, EDGE)),
-        ("all information is 0", lambda: joint_pwls(A, y, 0 * f, EDGE)),
-        ("y must", lambda: joint_pwls(A, y.int(), f, EDGE, gram=gram)),
-        ("y must have shape", lambda: joint_pwls(A, y[:1], f, EDGE, gram=gram)),
-        ("NaN or Inf", lambda: joint_pwls(A, y * torch.inf, f, EDGE, gram=gram)),
+        ("information", lambda: pwls(A, y, f.int(), EDGE, mu_per_hu=1.0)),
+        ("shape", lambda: pwls(A, y, f[:2], EDGE, mu_per_hu=1.0)),
+        ("semi-definite", lambda: pwls(A, y, torch.stack([f[0], 2 * f[2], f[2]]), EDGE, mu_per_hu=1.0)),
+        ("finite", lambda: pwls(A, y, f * torch.nan, EDGE, mu_per_hu=1.0)),
+        ("all information is 0", lambda: pwls(A, y, 0 * f, EDGE, mu_per_hu=1.0)),
+        ("y must", lambda: pwls(A, y.int(), f, EDGE, mu_per_hu=1.0, gram=gram)),
+        ("y must have the shape", lambda: pwls(A, y[:1], f, EDGE, mu_per_hu=1.0, gram=gram)),
+        ("NaN or Inf", lambda: pwls(A, y * torch.inf, f, EDGE, mu_per_hu=1.0, gram=gram)),
     )
 
 
