@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, Unpack, overload
 
 import torch
+from torch import Tensor
 
 from recon.analytic.coverage import consistency_warnings, sampling_warnings, view_notes
 from recon.analytic.inset import InsetFbp
@@ -16,6 +16,7 @@ from recon.least_squares.pwls import PwlsOptions
 from recon.least_squares.reconstruct import reconstruct_pwls
 from recon.mbir.reconstruct import reconstruct_mbir
 from recon.metal import metal_warnings
+from recon.solution import Solution
 from torchpcct.checks.defects import dead_readings, repair_defects
 from torchpcct.checks.readings import reading_warnings
 from torchpcct.geometry import VolumeGrid
@@ -145,52 +146,46 @@ def reconstruct(
     for text in {text for _, texts in whole for text in texts}:
         _LOG.warning("%s", text)
     methods: dict[str, Any] = {"fbp": _fbp, "pwls": reconstruct_pwls, "mbir": reconstruct_mbir}
-    volumes: list[Volume] = methods[method](scans, grid, progress=progress, **options)
-    # MBIR says itself what lies beyond its training.
-    metal = [
-        [] if method == "mbir" or s.unit != "HU" else metal_warnings(v.data)
-        for s, v in zip(scans, volumes, strict=True)
-    ]
-    contradictions = [consistency_warnings(s, grid) for s in scans]
-    for text in dict.fromkeys(text for texts in (*contradictions, *metal) for text in texts):
-        _LOG.warning("%s", text)
-    if scans[0].unit != "HU":
-        mu = scans[0].linearisation.mu_ref
-        volumes = [replace(v, data=from_hu(v.data, mu), unit=scans[0].unit) for v in volumes]
-    volumes = [
-        replace(
-            v,
-            data=v.data.to(device),
-            report={
-                **v.report,
-                "dead_readings": dead_readings(s),
-                "warnings": [*before, *wrong, *v.report.get("warnings", []), *found],
-            },
-        )
-        for v, (s, before), wrong, found in zip(volumes, whole, contradictions, metal, strict=True)
-    ]
+    volumes: list[Volume] = []
+    told: set[str] = set()
+    began = time.perf_counter()
+    for batch in methods[method](scans, grid, progress or (lambda _: None), **options):
+        seconds = round((time.perf_counter() - began) / len(batch), 3)
+        for solution in batch:
+            s, before = whole[len(volumes)]
+            volume, report, found = _finished(s, grid, solution)
+            report |= {"seconds": seconds, "dead_readings": dead_readings(s), "warnings": [*before, *found]}
+            for text in found:
+                if text not in told:
+                    _LOG.warning("%s", text)
+            told.update(found)
+            volumes.append(Volume(volume.to(device), grid, report, unit=s.unit))
+        began = time.perf_counter()
     return volumes[0] if isinstance(scan, Scan) else volumes
 
 
+def _finished(scan: Scan, grid: VolumeGrid, solution: Solution) -> tuple[Tensor, dict[str, Any], list[str]]:
+    """The volume in the scan's unit, the report with what the tests of the data say, and all warnings."""
+    values, report, tests = solution.volume.to(torch.float32), dict(solution.report), solution.tests
+    if tests:
+        report.setdefault("chi2", sum(t.chi2 for t in tests) / len(tests))
+        report["residual_p"] = {n: min(t.p_values.get(n, 1.0) for t in tests) for n in tests[0].p_values}
+    found = [*consistency_warnings(scan, grid), *solution.warnings, *(text for t in tests for text in t.findings)]
+    # MBIR says itself what lies beyond its training.
+    if report["method"] != "mbir" and scan.unit == "HU":
+        found += metal_warnings(values)
+    data = values if scan.unit == "HU" else from_hu(values, scan.linearisation.mu_ref)
+    return data, report, list(dict.fromkeys(found))
+
+
 def _fbp(
-    scans: Sequence[Scan], grid: VolumeGrid, *, progress: Callable[[float], None] | None, kernel: str = "standard"
-) -> list[Volume]:
+    scans: Sequence[Scan], grid: VolumeGrid, progress: Callable[[float], None], *, kernel: str = "standard"
+) -> Iterator[list[Solution]]:
     if not isinstance(kernel, str):
         raise TypeError(f"kernel must be one name, got {kernel!r}; recon.analytic.inset.InsetFbp takes several at once")
-    start = time.perf_counter()
     run = InsetFbp(scans[0], [grid], [kernel])
-    warnings = [*run.warnings, *sampling_warnings(run.circle)]
-    for text in warnings:
-        _LOG.warning("%s", text)
-    volumes, notes = [], view_notes(run.circle)
+    warnings, notes = [*run.warnings, *sampling_warnings(run.circle)], view_notes(run.circle)
+    report = {"method": "fbp", "kernel": kernel, **({"notes": notes} if notes else {})}
     for i, s in enumerate(scans):
-        data = run(s)[0][0].to(torch.float32)
-        seconds = time.perf_counter() - start
-        report = {"method": "fbp", "kernel": kernel, "seconds": round(seconds, 3), "warnings": list(warnings)}
-        if notes:
-            report["notes"] = notes
-        volumes.append(Volume(data, grid, report))
-        start = time.perf_counter()
-        if progress is not None:
-            progress((i + 1) / len(scans))
-    return volumes
+        yield [Solution(run(s)[0][0], report, warnings)]
+        progress((i + 1) / len(scans))

@@ -10,7 +10,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from recon.analytic.coverage import check_rows
 from recon.analytic.fbp import fbp
 from recon.least_squares.pwls import PwlsOptions, pwls
 from recon.least_squares.qggmrf import DEFAULT_PRIOR, QGGMRF
+from recon.solution import Solution
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid
 from torchpcct.projector import Projector
 from torchpcct.scan import Scan
@@ -30,7 +31,7 @@ from torchpcct.volume import in_words, to_hu
 if TYPE_CHECKING:
     from torchpcct.metrics.residual_test import ResidualTest
 
-__all__ = ["FieldProblem", "Problem", "Solution", "field_prior", "is_whole_field"]
+__all__ = ["FieldProblem", "field_prior", "is_whole_field"]
 
 REFERENCE_VOXEL_MM = 0.25
 # Distance from the minimum, beyond the field of view, from which it is named.
@@ -70,47 +71,6 @@ def is_whole_field(scan: Scan, grid: VolumeGrid) -> bool:
         return True  # an inset of a scan given view by view is solved on all that its rays cross
     edges = zip(grid.extent[1:], grid.center[1:], strict=True)
     return all(extent / 2 - abs(center) >= geometry.fov_radius / math.sqrt(2) for extent, center in edges)
-
-
-class Solution(NamedTuple):
-    """What PWLS makes of a scan.
-
-    Attributes:
-        volume: ``grid.shape`` float32 HU.
-        report: of :func:`recon.least_squares.pwls.pwls`; of several slices the sum of ``exact_pairs``, the worst of the
-            rest.
-        findings: what is to be said of it.
-        tests: what is left of the data, slice by slice; none of a noise-free scan.
-    """
-
-    volume: Tensor
-    report: dict[str, Any]
-    findings: list[str]
-    tests: Sequence[ResidualTest]
-
-
-class Problem(Protocol):
-    """What all scans of a kind share on one grid, as :func:`recon.least_squares.reconstruct.reconstruct_pwls` takes it:
-    :class:`FieldProblem`, :class:`recon.least_squares.inset_problem.InsetProblem`.
-
-    Attributes:
-        warnings: what is to be said of all volumes.
-        unit, mu_ref: of the scans.
-        prior: the one that suits.
-    """
-
-    warnings: list[str]
-    unit: str
-    mu_ref: float
-
-    @property
-    def prior(self) -> QGGMRF: ...
-
-    def solutions(
-        self, scans: Sequence[Scan], prior: QGGMRF, options: PwlsOptions, advance: Callable[[float], None]
-    ) -> Iterator[Solution]:
-        """The volumes of ``scans`` in their order; ``advance`` is told the finished share of them, 0…1."""
-        ...
 
 
 class FieldProblem:
@@ -209,7 +169,7 @@ class FieldProblem:
     def solutions(
         self, scans: Sequence[Scan], prior: QGGMRF, options: PwlsOptions, advance: Callable[[float], None]
     ) -> Iterator[Solution]:
-        """PWLS of every scan, slice by slice, from FBP as the first volume; see :class:`Problem`."""
+        """PWLS of every scan, slice by slice, from FBP as the first volume; ``advance`` is told the finished share."""
         hu = self.mu_ref / 1000.0
         for i, scan in enumerate(scans):
             slices = self.slices(scan)
@@ -227,8 +187,7 @@ class FieldProblem:
                     "field of view, outer slices): there the volume is "
                     f"{in_words(report['undetermined_rmsd_hu'], self.unit, self.mu_ref)} from the minimum"
                 )
-            found += sorted({text for test in tests for text in test.findings})
-            yield Solution(self.hu([r.x for r in results]).to(torch.float32), report, found, tests)
+            yield Solution(self.hu([r.x for r in results]), report, found, tests)
 
     def residual_test(self, y: Tensor, w: Tensor, x: Tensor) -> ResidualTest:
         """Whether a volume ``work.shape`` in mm⁻¹ explains the readings of one slice."""

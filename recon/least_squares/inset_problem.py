@@ -15,10 +15,11 @@ from recon.analytic.coverage import check_rows
 from recon.analytic.inset import require_inside, require_same_surround, static_fbp
 from recon.gram.gram import Gram
 from recon.least_squares.field_model import FieldModel
-from recon.least_squares.field_problem import Solution, is_whole_field
+from recon.least_squares.field_problem import is_whole_field
 from recon.least_squares.pwls import PwlsOptions, data_model, pwls
 from recon.least_squares.qggmrf import DEFAULT_PRIOR, QGGMRF
 from recon.least_squares.surround import UnknownSurround
+from recon.solution import Solution
 from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import VolumeGrid
 from torchpcct.projector import Projector
@@ -244,10 +245,9 @@ class InsetProblem:
     def solutions(
         self, scans: Sequence[Scan], prior: QGGMRF, options: PwlsOptions, advance: Callable[[float], None]
     ) -> Iterator[Solution]:
-        """PWLS of all scans together; see :class:`recon.least_squares.field_problem.Problem`."""
+        """PWLS of all scans together; ``advance`` is told the finished share of them."""
         data = [self.data(s) for s in scans]
         found, report = self.solve(scans, prior, data, **options)
         for scan, lines, values in zip(scans, data, found.to(torch.float32), strict=True):
-            tests = [] if scan.noise_free else [self.residual_test(scan, values, lines)]
-            yield Solution(values, report, [text for test in tests for text in test.findings], tests)
+            yield Solution(values, report, (), [] if scan.noise_free else [self.residual_test(scan, values, lines)])
         advance(1.0)

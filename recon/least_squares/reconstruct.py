@@ -2,35 +2,32 @@
 
 from __future__ import annotations
 
-import logging
-import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Unpack
 
-from recon.least_squares.field_problem import FieldProblem, Problem, is_whole_field
+from recon.least_squares.field_problem import FieldProblem, is_whole_field
 from recon.least_squares.inset_problem import InsetProblem
 from recon.least_squares.pwls import PwlsOptions
 from recon.least_squares.qggmrf import QGGMRF
+from recon.solution import Solution
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
-from torchpcct.volume import Volume, in_words
+from torchpcct.volume import in_words
 
 __all__ = ["reconstruct_pwls"]
-
-_LOG = logging.getLogger(__name__)
 
 
 def reconstruct_pwls(
     scans: Sequence[Scan],
     grid: VolumeGrid,
+    progress: Callable[[float], None],
     *,
-    progress: Callable[[float], None] | None = None,
     prior: QGGMRF | None = None,
-    problem: Problem | None = None,
+    problem: InsetProblem | FieldProblem | None = None,
     batch: int = 1,
     **options: Unpack[PwlsOptions],
-) -> list[Volume]:
+) -> Iterator[list[Solution]]:
     """PWLS with a q-GGMRF prior, to convergence: of an inset, or of a whole field of view (every scan of a parallel or
     fan beam, slice by slice, from FBP as the first volume).
 
@@ -44,48 +41,37 @@ def reconstruct_pwls(
         batch: volumes of an inset solved at a time; they iterate until the slowest has converged.
         options: of :func:`recon.least_squares.pwls.pwls`; ``tolerance`` is 1 HU unless given.
 
-    Returns:
-        Volumes in HU with the solver's report (:class:`recon.least_squares.field_problem.Solution`); of noisy scans
-        also ``chi2`` (weighted squared residual per reading), ``residual_p`` and ``warnings`` of
-        :func:`torchpcct.metrics.residual_test.residual_test`: a volume that does not explain its data (wrong centre,
-        drifting gain, metal or a body beyond the grid) carries a warning. A volume whose iteration did
+    Yields:
+        Volumes in HU, batch by batch, with the solver's report; of several slices with the sum of ``exact_pairs`` and
+        the worst of the rest. Of noisy scans also ``chi2`` (weighted squared residual per reading), ``residual_p`` and
+        ``warnings`` of :func:`torchpcct.metrics.residual_test.residual_test`: a volume that does not explain its data
+        (wrong centre, drifting gain, metal or a body beyond the grid) carries a warning. A volume whose iteration did
         not reach ``tolerance`` says so in ``warnings``, too, and a :class:`RuntimeWarning` is given.
 
     Raises:
         ValueError, TypeError: see :class:`recon.least_squares.inset_problem.InsetProblem`,
             :class:`recon.least_squares.field_problem.FieldProblem` and :func:`recon.least_squares.pwls.pwls`.
     """
-    began = time.perf_counter()
     wanted: PwlsOptions = {"tolerance": 1.0, **options}
     if problem is None:
         problem = FieldProblem(scans[0], grid) if is_whole_field(scans[0], grid) else InsetProblem(scans[0], grid)
-    volumes: list[Volume] = []
     for i in range(0, len(scans), batch):
         part = scans[i : i + batch]
 
         def advance(share: float, done: int = i, count: int = len(part)) -> None:
-            if progress is not None:
-                progress((done + share * count) / len(scans))
+            progress((done + share * count) / len(scans))
 
-        solutions = list(problem.solutions(part, prior or problem.prior, wanted, advance))
-        seconds = round((time.perf_counter() - began) / len(part), 3)
-        for solution in solutions:
-            report, found = {**solution.report, "seconds": seconds}, list(problem.warnings)
+        found = []
+        for solution in problem.solutions(part, prior or problem.prior, wanted, advance):
+            said, report = list(problem.warnings), solution.report
             if not report["converged"]:
                 left, asked = (
                     in_words(v, problem.unit, problem.mu_ref) for v in (report["rmsd_hu"][-1], report["tolerance_hu"])
                 )
-                found.append(
+                said.append(
                     f"PWLS stopped {left} from the minimum after {report['exact_pairs']} projection pairs (tolerance "
                     f"{asked}): raise max_exact, or strengthen the prior"
                 )
-                warnings.warn(found[-1], RuntimeWarning, stacklevel=2)
-            found += solution.findings
-            for text in found:
-                _LOG.warning("%s", text)
-            if tests := solution.tests:
-                report["chi2"] = sum(t.chi2 for t in tests) / len(tests)
-                report["residual_p"] = {n: min(t.p_values.get(n, 1.0) for t in tests) for n in tests[0].p_values}
-            volumes.append(Volume(solution.volume, grid, {**report, "warnings": found}))
-        began = time.perf_counter()
-    return volumes
+                warnings.warn(said[-1], RuntimeWarning, stacklevel=2)
+            found.append(solution._replace(warnings=[*said, *solution.warnings]))
+        yield found

@@ -21,9 +21,7 @@ of a stack are one volume.
 
 from __future__ import annotations
 
-import logging
 import math
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -40,13 +38,12 @@ from recon.least_squares.qggmrf import QGGMRF
 from recon.mbir.mbir import Mbir, average_onto
 from recon.mbir.problem import NormalisedProblem
 from recon.mbir.unrolled import REFERENCE_SCALE_HU, Prior, low_residual
+from recon.solution import Solution
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
-from torchpcct.volume import Volume, to_hu
+from torchpcct.volume import to_hu
 
-__all__ = ["FieldGram", "blockwise", "reconstruct_field_mbir", "trained_grid"]
-
-_LOG = logging.getLogger(__name__)
+__all__ = ["FieldGram", "blockwise", "field_solutions", "trained_grid"]
 
 VOXELS_PER_CELL = (0.7, 1.5)
 """Voxel over detector cell at the axis: the training has 0.2 mm voxels on cells of 0.2 mm × 0.29 mm."""
@@ -197,32 +194,25 @@ def _fade(part: slice, n: int, halo: int) -> Tensor:
     return torch.minimum(low, high).clamp(1e-6, 1.0)
 
 
-def reconstruct_field_mbir(
-    scans: Sequence[Scan],
-    grid: VolumeGrid,
-    *,
-    network: Mbir,
-    progress: Callable[[float], None] | None = None,
-    memory: int | None = None,
-) -> list[Volume]:
-    """Unrolled MBIR of whole fields.
+def field_solutions(
+    scans: Sequence[Scan], grid: VolumeGrid, network: Mbir, progress: Callable[[float], None]
+) -> Iterator[list[Solution]]:
+    """Unrolled MBIR of whole fields, see :func:`recon.mbir.reconstruct.reconstruct_mbir`.
 
     Args:
         scans: without a known surround, of one geometry.
         grid: ``(z, y, x)``; of a parallel or fan beam ``(y, x)`` or ``(slices, y, x)``.
         network: with its weights and fidelity.
         progress: called with the finished fraction.
-        memory: bytes that may be used; None: what the machine has left.
 
-    Returns:
-        Volumes in HU with the report of :func:`recon.mbir.reconstruct.reconstruct_mbir`, and ``noise_scale_hu`` (10 and
-        90 % of the voxels), ``voxel_mm`` (of the grid that was worked on).
+    Yields:
+        Volumes in HU; the report also holds ``noise_scale_hu`` (10 and 90 % of the voxels), ``voxel_mm`` (of the grid
+        that was worked on).
 
     Raises:
         ValueError: see :class:`recon.least_squares.field_problem.FieldProblem`; too little memory; voxels finer than
             what the detector resolves.
     """
-    began = time.perf_counter()
     flat = len(scans[0].geometry.shape) == 2
     asked = grid.slice if flat and grid.ndim == 3 else grid
     work = trained_grid(asked, scans[0].geometry)
@@ -239,28 +229,18 @@ def reconstruct_field_mbir(
             (grid.shape[0], *work.shape), (grid.spacing[0], *work.spacing), (grid.center[0], *work.center)
         )
     problem = FieldProblem(scans[0], full)
-    volumes = []
     for i, scan in enumerate(scans):
         slices = problem.slices(scan)
-        require_memory(problem.projector, slices[0][0], memory)
-        found, info = _one(problem, slices, network)
+        require_memory(problem.projector, slices[0][0], None)
+        found, report, warnings = _one(problem, slices, network)
+        tests = []
         if not scan.noise_free:
             tests = [problem.residual_test(y, w, x) for (y, w), x in zip(slices, found, strict=True)]
-            names = tests[0].p_values
-            info["residual_p"] = {name: min(t.p_values.get(name, 1.0) for t in tests) for name in names}
-            info["warnings"] += sorted({text for t in tests for text in t.findings})
-        info["warnings"] = [*problem.warnings, *info["warnings"]]
-        for text in info["warnings"]:
-            _LOG.warning("%s", text)
         hu = problem.hu(found)
         if work is not asked:
             hu = _onto(hu, work, asked)
-        info["voxel_mm"], info["seconds"] = cell, round(time.perf_counter() - began, 3)
-        volumes.append(Volume(hu.to(torch.float32), grid, info))
-        began = time.perf_counter()
-        if progress is not None:
-            progress((i + 1) / len(scans))
-    return volumes
+        yield [Solution(hu, {**report, "voxel_mm": cell}, [*problem.warnings, *warnings], tests)]
+        progress((i + 1) / len(scans))
 
 
 def _onto(hu: Tensor, source: VolumeGrid, target: VolumeGrid) -> Tensor:
@@ -274,8 +254,8 @@ def _onto(hu: Tensor, source: VolumeGrid, target: VolumeGrid) -> Tensor:
 @torch.no_grad()
 def _one(
     problem: FieldProblem, slices: Sequence[tuple[Tensor, Tensor]], network: Mbir
-) -> tuple[list[Tensor], dict[str, Any]]:
-    """The volume of each slice in mm⁻¹ (of a cone beam one), and the report."""
+) -> tuple[list[Tensor], dict[str, Any], list[str]]:
+    """The volume of each slice in mm⁻¹ (of a cone beam one), the report, and warnings."""
     A, model, hu = problem.projector, network.model, problem.mu_ref / 1000.0
     gram = FieldGram(problem, [w for _, w in slices], network.voxel_mm)
     around = _surround(problem, slices)
@@ -307,13 +287,13 @@ def _one(
         strange.append("another noise than that of its scans")
     if strange:
         warnings.insert(0, f'the network was not trained for this ({"; ".join(strange)}): use method="pwls"')
-    info = {
+    report = {
         "method": "mbir", "iterations": model.steps, "fidelity": network.fidelity,
         "residual": float(low_residual(replace(normal, beta=whole), left, network.fidelity)),
         "chi2": float(torch.stack(squares).sum()) / max(readings, 1), "noise_scale_hu": (low, high),
-        "weights_sha256": network.weights_sha256, "warnings": list(dict.fromkeys(warnings)),
+        "weights_sha256": network.weights_sha256,
     }  # fmt: skip
-    return found, info
+    return found, report, warnings
 
 
 def _stacked(problem: FieldProblem, volumes: Sequence[Tensor]) -> Tensor:

@@ -2,36 +2,32 @@
 
 from __future__ import annotations
 
-import logging
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import torch
 
 from recon.least_squares.field_problem import is_whole_field
 from recon.least_squares.inset_problem import InsetProblem
-from recon.mbir.field import reconstruct_field_mbir
+from recon.mbir.field import field_solutions
 from recon.mbir.mbir import Mbir, average_onto, working_grid
 from recon.mbir.outlines import OutlineMbir
 from recon.mbir.tissues import TissueMbir
 from recon.mbir.unrolled import low_residual
 from recon.plaque.vessel_prior import VesselPrior
+from recon.solution import Solution
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
 from torchpcct.validate import renamed
-from torchpcct.volume import Volume
 
 __all__ = ["reconstruct_mbir"]
-
-_LOG = logging.getLogger(__name__)
 
 
 def reconstruct_mbir(
     scans: Sequence[Scan],
     grid: VolumeGrid,
+    progress: Callable[[float], None],
     *,
-    progress: Callable[[float], None] | None = None,
     network: Mbir | None = None,
     problem: InsetProblem | None = None,
     batch: int = 4,
@@ -42,7 +38,7 @@ def reconstruct_mbir(
     point: Any = None,
     vessel_prior: VesselPrior | None = None,
     look: float | None = None,
-) -> list[Volume]:
+) -> Iterator[list[Solution]]:
     """Unrolled MBIR with the learned prior, of an inset or of a whole field (:mod:`recon.mbir.field`).
 
     Args:
@@ -65,20 +61,18 @@ def reconstruct_mbir(
         vessel_prior: what is believed of the vessel's tissues before the data; None: a coronary artery.
         look: the former name of ``fidelity``.
 
-    Returns:
-        Volumes in HU. Report: ``iterations``, ``fidelity``, ``residual`` (what is left of the data at the low
-        frequencies that are the data's own, over what there was, :func:`recon.mbir.unrolled.low_residual`), ``chi2``
-        (weighted squared residual per reading), ``weights_sha256``, of noisy scans ``residual_p``
-        (:mod:`torchpcct.metrics.residual_test`: does the volume explain its data?), ``warnings``, ``seconds``; of
-        insets ``outlines``: whether a vessel was drawn, or why not; with ``tissues`` what was read of them, under that
-        name.
+    Yields:
+        Volumes in HU, batch by batch. Report: ``iterations``, ``fidelity``, ``residual`` (what is left of the data at
+        the low frequencies that are the data's own, over what there was, :func:`recon.mbir.unrolled.low_residual`),
+        ``chi2`` (weighted squared residual per reading), ``weights_sha256``, of noisy scans ``residual_p``
+        (:mod:`torchpcct.metrics.residual_test`: does the volume explain its data?), ``warnings``; of insets
+        ``outlines``: whether a vessel was drawn, or why not; with ``tissues`` what was read of them, under that name.
 
     Raises:
         ValueError, TypeError: see :class:`recon.least_squares.inset_problem.InsetProblem`; a problem that was made for
-            another grid; a fidelity outside of 0 … 1.
+            another grid; a fidelity outside of 0 … 1; for a whole field see :func:`recon.mbir.field.field_solutions`.
         FileNotFoundError: the package has no weights.
     """
-    start = time.perf_counter()
     network = network or Mbir.load()
     if look is not None:
         fidelity = renamed("look", "fidelity", look)
@@ -92,7 +86,8 @@ def reconstruct_mbir(
         for name, asked in (("noise_map", noise_map), ("tissues", tissues)):
             if asked:
                 raise ValueError(f"{name} needs the FFT model of a small inset: ask for a smaller grid")
-        return reconstruct_field_mbir(scans, grid, network=network, progress=progress)
+        yield from field_solutions(scans, grid, network, progress)
+        return
     if tissues:
         network = TissueMbir(network, point, vessel_prior=vessel_prior)
     elif outlines:
@@ -101,7 +96,6 @@ def reconstruct_mbir(
     problem = problem or InsetProblem(scans[0], work)
     if problem.grid != work:
         raise ValueError(f"the problem was made for another grid: make it on {work} (recon.mbir.working_grid)")
-    volumes: list[Volume] = []
     for i in range(0, len(scans), batch):
         part = scans[i : i + batch]
         exposure = problem.exposure(part)
@@ -116,29 +110,21 @@ def reconstruct_mbir(
             # ‖y − A u‖²_W less ‖y‖²_W = uᵀ H u − 2 βᵀ u
             misfit = -(u * (left + normal.beta)).sum(dim=(1, 2, 3), dtype=torch.float64)
             hu = network.in_hu(problem, u, normal)
-        seconds = (time.perf_counter() - start) / len(part)
-        for k, (volume, statistic) in enumerate(zip(hu, statistics, strict=True)):
-            chi2 = (statistic.energy + float(misfit[k])) / statistic.readings
-            info: dict[str, Any] = {
+        found = []
+        for k, (scan, volume, statistic) in enumerate(zip(part, hu, statistics, strict=True)):
+            report: dict[str, Any] = {
                 "method": "mbir", "iterations": network.model.steps, "fidelity": network.fidelity,
-                "residual": residuals[k],
-                "chi2": chi2, "seconds": round(seconds, 3), "weights_sha256": network.weights_sha256,
+                "residual": residuals[k], "chi2": (statistic.energy + float(misfit[k])) / statistic.readings,
+                "weights_sha256": network.weights_sha256, **solution.notes[k],
             }  # fmt: skip
-            info |= solution.notes[k]
-            seen = network.check([float(normal.scale_hu[k])], float(volume.max()), part[k].unit, problem.mu_ref)
-            info["warnings"] = [*info.get("warnings", []), *seen]
-            if not part[k].noise_free:
-                tested = problem.residual_test(part[k], volume, data[k])
-                info["residual_p"] = dict(tested.p_values)
-                info["warnings"] += tested.findings
-            for text in info["warnings"]:
-                _LOG.warning("%s", text)
+            seen = network.check([float(normal.scale_hu[k])], float(volume.max()), scan.unit, problem.mu_ref)
+            warnings = [*report.pop("warnings", []), *seen]
+            tests = [] if scan.noise_free else [problem.residual_test(scan, volume, data[k])]
             if noise_map:
                 sd = network.noise_map(problem, statistic.b, exposure)
-                info["noise_sd_hu"] = sd if work is grid else average_onto(sd, work, grid)
-            averaged = volume if work is grid else average_onto(volume, work, grid)
-            volumes.append(Volume(averaged.to(torch.float32), grid, info))
-        start = time.perf_counter()
-        if progress is not None:
-            progress(min(i + batch, len(scans)) / len(scans))
-    return volumes
+                report["noise_sd_hu"] = sd if work is grid else average_onto(sd, work, grid)
+            found.append(
+                Solution(volume if work is grid else average_onto(volume, work, grid), report, warnings, tests)
+            )
+        yield found
+        progress(min(i + batch, len(scans)) / len(scans))

@@ -23,7 +23,7 @@ from torch import Tensor
 from recon.analytic.inset import InsetFbp, view_motion
 from recon.evaluate.store import Pieces
 from recon.least_squares.inset_problem import InsetProblem
-from recon.least_squares.reconstruct import reconstruct_pwls
+from recon.least_squares.qggmrf import DEFAULT_PRIOR
 from recon.mbir.mbir import Mbir
 from recon.study.figures import curve_axes, middle_panel, plaque_panel
 from recon.study.paper import facts as paper
@@ -320,7 +320,8 @@ def compensate(
         if method == "fbp":
             return reconstruct_fbp(scan, grid, estimates[error])
         if network is None or method == "pwls":
-            return reconstruct_pwls([scan], grid, problem=problems[error], tolerance=_PWLS_TOLERANCE_HU)[0].data
+            found, _ = problems[error].solve([scan], DEFAULT_PRIOR, tolerance=_PWLS_TOLERANCE_HU)
+            return found[0].float()
         # Noise free: as a scan of the study's exposure whose readings happen to be their expectations.
         b = problems[error].statistic(scan).b * (s.exposure_s / NOISE_FREE_EXPOSURE_S if scan.noise_free else 1.0)
         return network(problems[error], b[None], s.exposure_s)[0]
