@@ -7,24 +7,22 @@ import io
 import logging
 import math
 import os
-import re
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+from matplotlib.image import imsave
 from numpy.typing import NDArray
-from PIL import Image
 from tqdm import tqdm
 
 from torchpcct.files import atomic_write
 
-__all__ = ["Logs", "Table", "save_picture"]
+__all__ = ["Logs", "Table"]
 
 logger = logging.getLogger(__name__)
 
-CENTRE_HU, WIDTH_HU = 150.0, 600.0
+DARKEST_HU, BRIGHTEST_HU = -150.0, 450.0
 SMALLEST_PICTURE = 256
 """Pictures are enlarged by a whole factor until their shorter side has this many pixels."""
 
@@ -96,28 +94,6 @@ def _number(value: float) -> str:
     return str(int(value)) if value.is_integer() and abs(value) < 2**53 else repr(value)
 
 
-def save_picture(path: Path, image: NDArray[Any]) -> None:
-    """A section in the window C150/W600 (−150 HU black, 450 HU white) as PNG; not-a-number shows black.
-
-    Args:
-        path: file, in an existing folder.
-        image: 2-D, HU.
-
-    Raises:
-        ValueError: not a 2-D array with pixels.
-    """
-    image = np.asarray(image)
-    if image.ndim != 2 or image.size == 0:
-        raise ValueError(f"a picture must be a 2-D array, got shape {image.shape}")
-    with np.errstate(invalid="ignore"):
-        shade = (image.astype(np.float64) - (CENTRE_HU - 0.5 * WIDTH_HU)) / WIDTH_HU
-    grey = np.rint(255 * np.nan_to_num(shade.clip(0, 1))).astype(np.uint8)
-    factor = max(1, math.ceil(SMALLEST_PICTURE / min(grey.shape)))
-    grey = grey.repeat(factor, 0).repeat(factor, 1)
-    with atomic_write(path) as part:
-        Image.fromarray(grey).save(part, format="PNG")
-
-
 class Logs:
     """Everything a run writes beside its checkpoints.
 
@@ -178,8 +154,10 @@ class Logs:
         self.validation.append(step, values)
         self._events("validation", step, values)
         for name, image in pictures.items():
-            name = re.sub(r"[^\w.-]+", "_", name).strip("._") or "picture"
-            save_picture(self.pictures / f"{name}_{step:06d}.png", image)
+            factor = max(1, math.ceil(SMALLEST_PICTURE / min(image.shape)))
+            with atomic_write(self.pictures / f"{name}_{step:06d}.png") as part:
+                large = image.repeat(factor, 0).repeat(factor, 1)
+                imsave(part, large, vmin=DARKEST_HU, vmax=BRIGHTEST_HU, cmap="gray", format="png")
         self.message(f"step {step}: validation score {score:.5g}")
 
     def message(self, text: str) -> None:

@@ -30,7 +30,7 @@ from recon.mbir.problem import NormalisedProblem
 from recon.mbir.unrolled import DEFAULT_FIDELITY, Unrolled, start
 from train.config import ObjectiveConfig
 from train.data import Batch, Data, seed_of
-from train.scenes.held_out import CHECKPOINT_SEED, ValidationScenes, validation_scenes
+from train.scenes.held_out import ValidationScenes, validation_scenes
 
 __all__ = ["Loss", "Objective", "Validation"]
 
@@ -140,16 +140,14 @@ class Objective:
         return _Seen(problem, scene, fidelity, model.first_views(problem) if isinstance(model, Unrolled) else None)
 
     @torch.no_grad()
-    def validate(
-        self, model: nn.Module, data: Data, seed: int = CHECKPOINT_SEED, fidelity: float = DEFAULT_FIDELITY
-    ) -> Validation:
-        """Figures on held-out plaques; small contrasts and lesions count, and that no contrast is invented.
+    def validate(self, model: nn.Module, data: Data, seed: int) -> Validation:
+        """Figures on held-out plaques at the usual fidelity; what counts are small contrasts and lesions, and that none
+        is invented.
 
         Args:
             model: in evaluation mode.
             data: whose first situation is used.
             seed: of the scenes and their noise.
-            fidelity: of the reconstruction.
         """
         c, d = self.config, data.config
         held = validation_scenes(d.shape, (d.voxel_mm,) * 3, seed=seed, contrasts=(-60.0, 0.0))
@@ -159,7 +157,7 @@ class Objective:
         for exposure in c.validation_exposures_s:
             rows = []
             for i in range(held.image.shape[0]):
-                row, picture = self._of_scene(model, data, held, i, exposure, seed, fidelity)
+                row, picture = self._of_scene(model, data, held, i, exposure, seed)
                 rows.append(row)
                 if i < 2:
                     pictures[f"{exposure:g}s_{i}"] = picture
@@ -185,7 +183,7 @@ class Objective:
         return Validation(float(np.mean(scores)), figures, pictures)
 
     def _of_scene(
-        self, model: nn.Module, data: Data, held: ValidationScenes, i: int, exposure: float, seed: int, fidelity: float
+        self, model: nn.Module, data: Data, held: ValidationScenes, i: int, exposure: float, seed: int
     ) -> tuple[dict[str, float], NDArray[np.float32]]:
         """Figures of one held-out plaque, and a picture: truth beside the first volume."""
         c, d = self.config, data.config
@@ -199,7 +197,7 @@ class Objective:
         for signal in gram.apply(truth) * (hu * exposure):  # the same noise for all contrasts
             problem = NormalisedProblem.from_statistic(gram, signal + noise, exposures, hu, d.voxel_mm)
             scale = problem.scale_hu.reshape(-1, 1, 1, 1)
-            volumes.append(model(problem, fidelity) * scale)
+            volumes.append(model(problem, DEFAULT_FIDELITY) * scale)
             linear.append(start(problem, problem.spectrum()) * scale)
         found, plain = (torch.einsum("cnzyx,rzyx->rcn", torch.stack(v), rois).double() for v in (volumes, linear))
         true = torch.einsum("czyx,rzyx->rc", truth, rois).double()

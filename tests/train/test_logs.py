@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from PIL import Image
+from matplotlib.image import imread
 from tiny_training import STEPS, StubObjective, rows, run, send, stub_config
 
-from train.logs import Table, save_picture
+from train.logs import Logs, Table
 
 
 def test_table_is_cut_back_to_the_checkpoint(tmp_path):
@@ -39,12 +39,13 @@ def test_table_is_cut_back_to_the_checkpoint(tmp_path):
 
 
 def test_picture_window(tmp_path):
-    save_picture(tmp_path / "p.png", np.array([[-200.0, -150.0, 150.0], [450.0, 900.0, np.nan]]))
-    image = np.asarray(Image.open(tmp_path / "p.png"))
-    assert image.shape == (256, 384)
-    assert image[::128, ::128].tolist() == [[0, 0, 128], [255, 255, 0]]
-    with pytest.raises(ValueError, match="2-D"):
-        save_picture(tmp_path / "q.png", np.zeros((2, 2, 2)))
+    logs = Logs(tmp_path, 0, 10, progress=False, tensorboard=False)
+    image = np.array([[-200.0, -150.0, 150.0], [450.0, 900.0, np.nan]])
+    logs.validated(3, 0.5, {}, {"0.35s_1": image})
+    logs.close()
+    picture = imread(tmp_path / "pictures" / "0.35s_1_000003.png")
+    assert picture.shape == (256, 384, 4)
+    assert (255 * picture[::128, ::128, 0]).round().tolist() == [[0, 0, 128], [255, 255, 0]]
 
 
 def test_fewer_rows_and_a_progress_line(tmp_path, capfd):

@@ -4,14 +4,12 @@ from dataclasses import replace
 
 import pytest
 import torch
-from safetensors.torch import save_file
 from torch import nn
 
 from recon.mbir.unrolled import start
-from train.config import DataConfig, ObjectiveConfig, Situation, packaged_config
+from train.config import DataConfig, ObjectiveConfig, Situation
 from train.data import Data
-from train.fidelity import fidelity_table, main
-from train.objective import Objective, Validation, _edges
+from train.objective import Objective, _edges
 
 CONFIG = DataConfig(shape=(24, 20, 20), voxel_mm=0.4, views=120, pool=10, situations=(Situation(42.0, 0.0),))
 
@@ -170,27 +168,3 @@ def test_edges_reach_two_voxels_to_either_side():
     found = _edges(truth)
     assert found[0, 4, 4].tolist() == [0.0] * 4 + [1.0] * 4 + [0.0] * 4
     assert torch.equal(_edges(truth + 50.0), found)
-
-
-def test_a_row_for_every_fidelity():
-    names = ("fat_hu", "rmse_hu", "slope", "sd_hu", "lesion_slope", "lesion", "false_hu", "false_lesion_hu")
-    figures = {f"{name}_{e:g}s": k + e for k, name in enumerate(names) for e in (0.35, 2.0)}
-    table = fidelity_table([(0.0, Validation(-5.0, figures)), (0.5, Validation(-4.0, figures))], (0.35, 2.0))
-    lines = table.splitlines()
-    assert len(lines) == 4
-    assert lines[0].count("|") == lines[2].count("|") == 11
-    assert lines[3].startswith("| 0.5 | 0.35 / 2 | 1.35 / 3 |")
-    assert lines[3].endswith("| -4.000 |")
-
-
-def test_what_cannot_be_measured_says_why(tmp_path, capsys):
-    assert packaged_config("default").objective.validation_exposures_s == (0.35, 2.0)
-    assert main([str(tmp_path / "missing.safetensors")]) == 1
-    assert "missing.safetensors" in capsys.readouterr().err
-    import torch
-
-    save_file({"a": torch.zeros(1)}, tmp_path / "other.safetensors")
-    assert main([str(tmp_path / "other.safetensors")]) == 1
-    assert "other.safetensors" in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        main([])

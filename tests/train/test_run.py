@@ -120,7 +120,7 @@ def test_crash_at_any_write(tmp_path, uninterrupted, crash_before):
         ("checkpoint.next.safetensors", 3),
         ("checkpoint.previous.safetensors", 2),
         ("checkpoint.safetensors", 2),
-        ("a_b_000005.png", 1),
+        ("a b_000005.png", 1),
         ("validation.csv", 1),
         ("weights.safetensors", 1),
         ("log.csv", 1),
