@@ -21,7 +21,7 @@ from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, Volume
 from torchpcct.validate import checked, whole
 from torchpcct.vector_geometry import VectorGeometry
 
-__all__ = ["IdealCircle", "Rebinned", "at_slices", "ideal_circle", "rebin_to_circle"]
+__all__ = ["IdealCircle", "at_slices", "ideal_circle", "rebin_to_circle"]
 
 Floats = NDArray[np.float64]
 
@@ -49,20 +49,6 @@ class IdealCircle(NamedTuple):
     maps: Floats
 
 
-class Rebinned(NamedTuple):
-    """A scan on an ideal circle.
-
-    Attributes:
-        sinogram: ``(..., views, [rows,] columns)``, of parallel rays with rows ``(..., slices, views, columns)``.
-        geometry, motion, slices: of :class:`IdealCircle`.
-    """
-
-    sinogram: Tensor
-    geometry: Geometry
-    motion: Floats | None
-    slices: Floats | None = None
-
-
 @checked
 def ideal_circle(geometry: VectorGeometry) -> IdealCircle:
     """The ideal circle about z that a scan of any flat detectors can be resampled onto.
@@ -78,47 +64,49 @@ def ideal_circle(geometry: VectorGeometry) -> IdealCircle:
 
 
 @checked
-def rebin_to_circle(sinogram: Tensor, geometry: VectorGeometry) -> Rebinned:
+def rebin_to_circle(sinogram: Tensor, geometry: VectorGeometry) -> tuple[Tensor, IdealCircle]:
     """Resample a scan of any flat detectors onto an ideal circle about z.
 
     Args:
         sinogram: line integrals ``(..., *geometry.shape)``, float32 or float64.
         geometry: of the scan.
 
+    Returns:
+        ``(..., views, [rows,] columns)``, of parallel rays with rows ``(..., slices, views, columns)``; and the circle.
+
     Raises:
         ValueError: a shape that does not fit; see :func:`ideal_circle`.
         TypeError: data that are not float32 or float64 tensors.
     """
     check_data("sinogram", sinogram, geometry.shape)
-    circle: Any = ideal_circle(geometry)
+    circle = ideal_circle(geometry)
     flat = geometry.rows is None
     out = _resampled(sinogram.unsqueeze(-2) if flat else sinogram, circle)
     if flat:
         out = out.squeeze(-2)
     elif geometry.parallel:
         out = out.transpose(-3, -2)
-    return Rebinned(out, circle.geometry, circle.motion, circle.slices)
+    return out, circle
 
 
 @checked
-def at_slices(s: Rebinned, grid: VolumeGrid) -> Tensor:
-    """Sinograms ``(..., z, views, columns)`` of a grid's slices, interpolated between the rows of parallel rays.
+def at_slices(sinogram: Tensor, slices: Floats, grid: VolumeGrid) -> Tensor:
+    """Sinograms ``(..., z, views, columns)`` of a grid's slices, interpolated between those at the heights ``slices``.
 
     Raises:
         ValueError: a grid without z axis, or beyond the rows.
     """
-    assert s.slices is not None
     if grid.ndim != 3:
         raise ValueError(f"parallel rays with rows need a 3-D grid, got shape {grid.shape}")
-    place = np.interp(grid.axes[0], s.slices, np.arange(s.slices.size))
+    place = np.interp(grid.axes[0], slices, np.arange(slices.size))
     # The outermost rows reach half a row beyond their centres.
-    half = 0.5 * float(s.slices[1] - s.slices[0]) if s.slices.size > 1 else 0.0
-    if grid.axes[0][0] < s.slices[0] - half - 1e-6 or grid.axes[0][-1] > s.slices[-1] + half + 1e-6:
-        raise ValueError(f"the grid's slices must lie in the rows' {s.slices[0]:g} … {s.slices[-1]:g} mm")
-    below = np.minimum(place.astype(int), max(s.slices.size - 2, 0))
-    share = torch.from_numpy(place - below).to(s.sinogram)[:, None, None]
-    above = torch.from_numpy(np.minimum(below + 1, s.slices.size - 1))
-    return torch.lerp(s.sinogram[..., torch.from_numpy(below), :, :], s.sinogram[..., above, :, :], share)
+    half = 0.5 * float(slices[1] - slices[0]) if slices.size > 1 else 0.0
+    if grid.axes[0][0] < slices[0] - half - 1e-6 or grid.axes[0][-1] > slices[-1] + half + 1e-6:
+        raise ValueError(f"the grid's slices must lie in the rows' {slices[0]:g} … {slices[-1]:g} mm")
+    below = np.minimum(place.astype(int), max(slices.size - 2, 0))
+    share = torch.from_numpy(place - below).to(sinogram)[:, None, None]
+    above = torch.from_numpy(np.minimum(below + 1, slices.size - 1))
+    return torch.lerp(sinogram[..., torch.from_numpy(below), :, :], sinogram[..., above, :, :], share)
 
 
 def _axis_of(low: float, high: float, pitch: float) -> tuple[int, float]:

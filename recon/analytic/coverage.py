@@ -178,12 +178,12 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
     lines, geometry = scan.line_integrals(), scan.geometry
     if isinstance(geometry, VectorGeometry):
         try:
-            circle = rebin_to_circle(lines, geometry)
+            lines, circle = rebin_to_circle(lines, geometry)
         except ValueError:  # nearly no circle: only an iterative method takes it
             return []
         if circle.motion is not None:  # of sources beside the circle opposite rays need not meet
             return []
-        lines, geometry = circle.sinogram, circle.geometry
+        geometry = circle.geometry
     if lines.ndim > len(geometry.shape):
         lines = lines[lines.shape[0] // 2]
     if window is not None:

@@ -40,13 +40,11 @@ class Rows(NamedTuple):
         lines: ``(..., views, [rows,] columns)``.
         geometry: of the wider detector.
         weights: ``(views, 1)`` or ``(views, columns)`` angular weights.
-        added: columns added before the first one.
     """
 
     lines: Tensor
     geometry: Any
     weights: Floats
-    added: int
 
 
 @checked
@@ -145,7 +143,7 @@ def mirrored(rows: Rows, grid: VolumeGrid, travel: float = 0.0) -> Rows:
     before, behind = (missing, 0) if t[-1] > -t[0] else (0, missing)
     lines = torch.nn.functional.pad(rows.lines, (before, behind))
     weights = np.pad(rows.weights, ((0, 0), (before, behind)))
-    return Rows(lines, _wider(g, before, behind), weights, rows.added + before)
+    return Rows(lines, _wider(g, before, behind), weights)
 
 
 @checked
@@ -183,7 +181,7 @@ def continued(rows: Rows, sides: tuple[bool, bool], outside: float) -> Rows:
     weights = rows.weights
     if weights.shape[1] > 1:
         weights = np.pad(weights, ((0, 0), tuple(room)), mode="edge")
-    return Rows(torch.cat(parts, -1), wide, weights, rows.added + room[0])
+    return Rows(torch.cat(parts, -1), wide, weights)
 
 
 def _cylinder(last: Tensor, near: Floats, far: Floats, mu: Any) -> Tensor:

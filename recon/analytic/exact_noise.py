@@ -20,7 +20,7 @@ from torch import Tensor
 
 from recon.analytic.angular_weights import angular_weights
 from recon.analytic.backproject import BackprojectionPlan, backproject
-from recon.analytic.fbp import filter_windowed
+from recon.analytic.fbp import filter_sinogram
 from recon.analytic.filter_plan import FilterPlan
 from recon.analytic.inset import InsetFbp
 from torchpcct.detector_window import DetectorWindow
@@ -206,7 +206,7 @@ def voxel_covariance(clean: Scan, fbp: InsetFbp, exposure_s: float, voxel: Seque
     hu = 1000.0 / fbp.linearisation.mu_ref
 
     def reconstruct(lines: Tensor) -> Tensor:
-        filtered = filter_windowed(lines, fbp.geometry, window, fbp.kernels, fbp.footprint)
+        filtered = filter_sinogram(lines, fbp.geometry, fbp.kernels, fbp.footprint, held=window)
         return backproject(filtered, fbp.geometry, grid, fbp.footprint)[0] * hu
 
     leaf = torch.zeros_like(variance, requires_grad=True)

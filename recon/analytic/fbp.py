@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from recon.analytic.angular_weights import angular_weights, view_steps
-from recon.analytic.any_orbit import Rebinned, at_slices, rebin_to_circle
-from recon.analytic.backproject import BackprojectionPlan, backproject, check_data, data_shape
+from recon.analytic.any_orbit import at_slices, rebin_to_circle
+from recon.analytic.backproject import backproject, check_data, data_shape
 from recon.analytic.coverage import check_rows, refuse_helix
 from recon.analytic.detector_edges import Rows, continued, cut_off, mirrored
 from recon.analytic.filter_plan import FilterPlan, kernel_names
@@ -27,7 +27,7 @@ from torchpcct.readings import bridge
 from torchpcct.validate import checked, number, reals
 from torchpcct.vector_geometry import VectorGeometry
 
-__all__ = ["Fbp", "backproject", "fbp", "filter_sinogram", "filter_windowed", "interleave", "rebinned_fbp"]
+__all__ = ["Fbp", "backproject", "fbp", "filter_sinogram", "interleave"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -47,19 +47,6 @@ def _check_weights(weights: Any, geometry: Geometry, grid: VolumeGrid | None = N
     return w
 
 
-def _filter(
-    data: Tensor, geometry: Geometry, kernel: Any, weights: Any, a: DetectorWindow, b: DetectorWindow
-) -> Tensor:
-    names, several = kernel_names(kernel)
-    plan = FilterPlan(geometry, names, _check_weights(weights, geometry), a, b)
-    flat = not isinstance(geometry, ConeBeam)
-    given = (data.unsqueeze(-2) if flat else data).cpu()  # the kernels are CPU code
-    out = apply_linear(given, plan.forward, plan.transpose).to(data.device)
-    out = out.squeeze(-2) if flat else out
-    kernel_axis = -3 if flat else -4
-    return out.movedim(kernel_axis, 0) if several else out.squeeze(kernel_axis)
-
-
 @checked
 def filter_sinogram(
     sinogram: Tensor,
@@ -67,18 +54,22 @@ def filter_sinogram(
     kernel: str | Sequence[str] = "standard",
     window: DetectorWindow | None = None,
     *,
+    held: DetectorWindow | None = None,
     weights: Any = None,
 ) -> Tensor:
     """Weight and ramp-filter the rows of a scan: the first half of filtered backprojection.
 
-    The result carries the cosine, angular and redundancy weights, ready for :func:`backproject`.
+    The result carries the cosine, angular and redundancy weights, ready for :func:`backproject`. Filtering is linear:
+    after the scan of a background has been filtered once, the scan of a small inset or of other noise in its footprint
+    is filtered from that footprint alone (``held``). The result equals that of the whole rows to rounding.
 
     Args:
         sinogram: line integrals ``(..., views, [rows,] columns)``, float32 or float64. Data of another device are
             filtered on the CPU and sent back.
         geometry: parallel, fan or cone beam.
         kernel: reconstruction kernel (:data:`recon.analytic.ramp.KERNELS`) or a sequence of them.
-        window: return only these readings of every view (rows and columns); default: all.
+        window: return only these readings of every view (rows and columns); default: all. Its rows must be held.
+        held: the readings that ``sinogram`` holds, default: all; what is not held is zero.
         weights: angular weights ``(views,)`` or ``(views, columns)`` in rad that replace
             :func:`recon.analytic.angular_weights.angular_weights`.
 
@@ -92,41 +83,16 @@ def filter_sinogram(
         TypeError: data that are not float32 or float64 tensors.
     """
     whole = DetectorWindow.full(geometry)
-    check_data("sinogram", sinogram, data_shape(geometry, whole))
-    return _filter(sinogram, geometry, kernel, weights, whole, whole if window is None else window)
-
-
-@checked
-def filter_windowed(
-    difference: Tensor,
-    geometry: Geometry,
-    window_in: DetectorWindow,
-    kernel: str | Sequence[str],
-    window_out: DetectorWindow,
-    *,
-    weights: Any = None,
-) -> Tensor:
-    """Like :func:`filter_sinogram`, for data that are zero outside a window.
-
-    Filtering is linear: after the scan of a background has been filtered once, the scan of a small inset or of other
-    noise in its footprint is filtered from that footprint alone. The result equals that of the whole rows to rounding.
-
-    Args:
-        difference: ``(..., views, [rows,] columns)`` on ``window_in``.
-        geometry: parallel, fan or cone beam.
-        window_in: where the data are; zero elsewhere.
-        kernel: reconstruction kernel or a sequence of them.
-        window_out: the readings to return; its rows must lie within those of ``window_in``.
-        weights: see :func:`filter_sinogram`.
-
-    Returns:
-        ``(..., views, [rows,] columns)`` on ``window_out``; with a sequence of kernels a leading axis of kernels.
-
-    Raises:
-        ValueError, TypeError: as :func:`filter_sinogram`.
-    """
-    check_data("difference", difference, data_shape(geometry, window_in))
-    return _filter(difference, geometry, kernel, weights, window_in, window_out)
+    held = whole if held is None else held
+    check_data("sinogram", sinogram, data_shape(geometry, held))
+    names, several = kernel_names(kernel)
+    plan = FilterPlan(geometry, names, _check_weights(weights, geometry), held, whole if window is None else window)
+    flat = not isinstance(geometry, ConeBeam)
+    given = (sinogram.unsqueeze(-2) if flat else sinogram).cpu()  # the kernels are CPU code
+    out = apply_linear(given, plan.forward, plan.transpose).to(sinogram.device)
+    out = out.squeeze(-2) if flat else out
+    kernel_axis = -3 if flat else -4
+    return out.movedim(kernel_axis, 0) if several else out.squeeze(kernel_axis)
 
 
 @checked
@@ -202,7 +168,6 @@ def fbp(
     geometry: Geometry,
     grid: VolumeGrid,
     kernel: str | Sequence[str] = "standard",
-    window: DetectorWindow | None = None,
     *,
     weights: Any = None,
     motion: Any = None,
@@ -225,7 +190,6 @@ def fbp(
             nearly so (:mod:`recon.analytic.any_orbit`).
         grid: voxels to reconstruct, 2-D for parallel and fan beams, 3-D for cone beams.
         kernel: reconstruction kernel ``"soft"``, ``"standard"``, ``"detail"``, ``"bone"``, ``"ram-lak"``, or several.
-        window: readings to filter and backproject; default: the grid's footprint.
         weights: angular weights that replace the automatic ones, see :func:`filter_sinogram`.
         motion: displacement of everything in the scan in every view, see :func:`backproject`.
         outside: attenuation in mm⁻¹ (unit of ``sinogram`` per mm) of the object beyond the detector's edges, e.g. that
@@ -250,31 +214,19 @@ def fbp(
         0.02
     """
     if isinstance(geometry, VectorGeometry):
-        if window is not None:
-            raise ValueError("a window belongs to a circular scan: leave it out for a VectorGeometry")
-        rebinned = rebin_to_circle(sinogram, geometry if motion is None else geometry.moved(motion))
-        return rebinned_fbp(rebinned, grid, kernel, weights=weights, outside=outside)
+        lines, circle = rebin_to_circle(sinogram, geometry if motion is None else geometry.moved(motion))
+        if circle.slices is not None:
+            lines, grid = at_slices(lines, circle.slices, grid), grid.slice
+        return fbp(lines, circle.geometry, grid, kernel, weights=weights, motion=circle.motion, outside=outside)
     check_data("sinogram", sinogram, data_shape(geometry, DetectorWindow.full(geometry)))
     refuse_helix(geometry, motion)
     for text in check_rows(geometry, grid, motion):
         _LOG.warning("%s", text)
     repaired = _without_dead(sinogram, geometry)
-    rows = _completed(Rows(repaired, geometry, _check_weights(weights, geometry, grid), 0), grid, motion, outside)
-    window = _read_window(rows, grid, window, motion)
+    rows = _completed(Rows(repaired, geometry, _check_weights(weights, geometry, grid)), grid, motion, outside)
+    window = read_window(rows.geometry, grid, motion)
     filtered = filter_sinogram(rows.lines, rows.geometry, kernel, window, weights=rows.weights)
-    plan = BackprojectionPlan(rows.geometry, grid, window, motion)
-    return apply_linear(filtered.cpu(), plan.forward, plan.transpose).to(filtered.device)
-
-
-@checked
-def rebinned_fbp(
-    rebinned: Rebinned, grid: VolumeGrid, kernel: str | Sequence[str], *, weights: Any = None, outside: float | None
-) -> Tensor:
-    """:func:`fbp` of a scan that was resampled onto an ideal circle."""
-    lines, plane = rebinned.sinogram, grid
-    if rebinned.slices is not None:
-        lines, plane = at_slices(rebinned, grid), grid.slice
-    return fbp(lines, rebinned.geometry, plane, kernel, weights=weights, motion=rebinned.motion, outside=outside)
+    return backproject(filtered, rows.geometry, grid, window, motion=motion)
 
 
 class Fbp(nn.Module):
@@ -341,11 +293,9 @@ def _completed(rows: Rows, grid: VolumeGrid, motion: Any, outside: float | None)
     return mirrored(rows, grid, shift)
 
 
-def _read_window(rows: Rows, grid: VolumeGrid, window: DetectorWindow | None, motion: Any) -> DetectorWindow:
-    """``window`` on the completed rows; None: the footprint of the grid."""
-    if window is not None:
-        return DetectorWindow(window.first_column + rows.added, window.columns, window.first_row, window.rows)
+def read_window(geometry: Geometry, grid: VolumeGrid, motion: Any = None) -> DetectorWindow:
+    """The readings that are filtered for a grid: its footprint."""
     try:
-        return footprint(rows.geometry, grid, margin=1, motion=motion)
+        return footprint(geometry, grid, margin=1, motion=motion)
     except ValueError:
-        return DetectorWindow.full(rows.geometry)  # a grid larger than the field of view: the backprojection decides
+        return DetectorWindow.full(geometry)  # a grid larger than the field of view: the backprojection decides

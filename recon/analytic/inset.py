@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.analytic.angular_weights import angular_weights
-from recon.analytic.any_orbit import Rebinned, ideal_circle, rebin_to_circle
+from recon.analytic.any_orbit import ideal_circle
 from recon.analytic.backproject import backproject
 from recon.analytic.coverage import check_rows
-from recon.analytic.fbp import filter_sinogram, filter_windowed, rebinned_fbp
+from recon.analytic.fbp import fbp, filter_sinogram
 from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import ConeBeam, Geometry, VolumeGrid
 from torchpcct.scan import Scan
@@ -58,14 +58,13 @@ def view_motion(motion: SinusoidalMotion, geometry: Geometry, rotation_s: float)
 
 
 @checked
-def static_fbp(lines: Tensor, geometry: ConeBeam, grid: VolumeGrid, kernel: str = "standard") -> Tensor:
-    """FBP of readings that are the same in every view (rotationally symmetric objects).
+def static_fbp(lines: Tensor, geometry: ConeBeam, grid: VolumeGrid) -> Tensor:
+    """FBP (standard kernel) of readings that are the same in every view (rotationally symmetric objects).
 
     Args:
         lines: ``(..., rows, columns)`` line integrals of one view.
         geometry: of the whole scan.
         grid: ``(z, y, x)`` grid in the field of view.
-        kernel: reconstruction kernel.
 
     Returns:
         ``(..., *grid.shape)``, unit of ``lines`` per mm.
@@ -74,7 +73,7 @@ def static_fbp(lines: Tensor, geometry: ConeBeam, grid: VolumeGrid, kernel: str 
         ValueError: a wrong shape, a grid outside the field of view.
     """
     part = footprint(geometry, grid, margin=1)
-    return backproject(_static(lines, geometry, kernel, part), geometry, grid, part)
+    return backproject(_static(lines, geometry, "standard", part), geometry, grid, part)
 
 
 def _static(lines: Tensor, geometry: ConeBeam, kernel: str | Sequence[str], part: DetectorWindow) -> Tensor:
@@ -214,26 +213,18 @@ class InsetFbp:
         """
         g, part = self.geometry, self.footprint
         if self.window is None or self._lines is None:
-            return self._whole(self._rebinned(lines), outside)
+            grids = self.grids if g.has_rows else [grid.slice for grid in self.grids]
+            return [fbp(lines, g, grid, self.kernels, outside=outside) for grid in grids]
         channels = tuple(self._lines.shape[:-2])
         if lines.ndim < 3 or tuple(lines.shape[lines.ndim - 3 - len(channels) : -3]) != channels:
             raise ValueError(f"lines must have the channels {channels} before the views, got {tuple(lines.shape)}")
         difference = lines - self.window.take(self._lines.to(lines.dtype))
-        filtered = filter_windowed(difference, g, self.window, self.kernels, part)
+        filtered = filter_sinogram(difference, g, self.kernels, part, held=self.window)
         if self.motion is None:
             filtered = filtered + self._over_batch(self._surround.to(lines.dtype), filtered)
             return [backproject(filtered, g, grid, part) for grid in self.grids]
         moving = [backproject(filtered, g, grid, part, motion=self.motion) for grid in self.grids]
         return [self._over_batch(rest, m) + m for rest, m in zip(self._rest, moving, strict=True)]
-
-    def _rebinned(self, lines: Tensor) -> Rebinned:
-        if isinstance(self.geometry, VectorGeometry):
-            return rebin_to_circle(lines, self.geometry)
-        return Rebinned(lines, self.geometry, None)
-
-    def _whole(self, rebinned: Rebinned, outside: float | None) -> list[Tensor]:
-        grids = self.grids if self.geometry.has_rows else [grid.slice for grid in self.grids]
-        return [rebinned_fbp(rebinned, grid, self.kernels, outside=outside) for grid in grids]
 
     @staticmethod
     def _over_batch(surround: Tensor, like: Tensor) -> Tensor:
@@ -248,8 +239,5 @@ class InsetFbp:
             raise ValueError("this scan has another window than the one that InsetFbp was made for")
         if self._lines is not None and self._of_scan:
             require_same_surround(scan, self._lines)
-        lines, water = scan.line_integrals(), self.linearisation.mu_ref
-        if self.window is not None:
-            return [to_hu(v, water) for v in self.images(lines)]
-        rebinned = self._rebinned(lines)
-        return [to_hu(v, water) for v in self._whole(rebinned, water)]
+        water = self.linearisation.mu_ref
+        return [to_hu(v, water) for v in self.images(scan.line_integrals(), water)]

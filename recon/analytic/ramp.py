@@ -41,18 +41,14 @@ def _points(kernel: Any) -> tuple[float, ...]:
 
 
 @cache
-def _pieces(kernel: str) -> tuple[Floats, Floats]:
-    """Break points ``(P + 1,)`` and local polynomial coefficients ``(3, P)``, highest power first, of a window."""
+def _window(kernel: str) -> Any:
+    """The window as ``scipy.interpolate.PPoly``."""
     from scipy.interpolate import PPoly, make_interp_spline
 
     points = _points(kernel)
     spline = PPoly.from_spline(make_interp_spline(np.linspace(0.0, 1.0, len(points)), points, k=2))
     keep = np.diff(spline.x) > 0.0
-    breaks = np.append(spline.x[:-1][keep], spline.x[-1])
-    coefficients = spline.c[:, keep]
-    for array in (breaks, coefficients):
-        array.setflags(write=False)
-    return breaks, coefficients
+    return PPoly(spline.c[:, keep], np.append(spline.x[:-1][keep], spline.x[-1]))
 
 
 @checked
@@ -71,21 +67,17 @@ def apodization(kernel: str, fraction: ArrayLike) -> Floats:
         TypeError: a kernel that is not a string.
     """
     _points(kernel)
-    breaks, c = _pieces(kernel)
     x = np.abs(np.asarray(fraction, dtype=np.float64))
-    piece = np.clip(np.searchsorted(breaks, x, side="right") - 1, 0, breaks.size - 2)
-    t = x - breaks[piece]
-    value = (c[0, piece] * t + c[1, piece]) * t + c[2, piece]
-    return np.asarray(np.where(x > 1.0, 0.0, value))
+    return np.asarray(np.where(x > 1.0, 0.0, _window(kernel)(x)))
 
 
 @lru_cache(maxsize=64)
 def _unit_kernel(n: int, kernel: str) -> Floats:
     """``½ ∫₀¹ x W(x) cos(π m x) dx`` for m = 0 … n−1: the apodised ramp at unit pitch, in closed form."""
-    breaks, c = _pieces(kernel)
+    window = _window(kernel)
     omega = np.pi * np.arange(1, n, dtype=np.float64)
     out = np.zeros(n)
-    for left, right, piece in zip(breaks[:-1], breaks[1:], c.T, strict=True):
+    for left, right, piece in zip(window.x[:-1], window.x[1:], window.c.T, strict=True):
         p = np.poly1d(piece) * np.poly1d([1.0, left])  # x·W(x) in the local variable x − left
         out[0] += p.integ()(right - left)
         derivatives = [p, p.deriv(), p.deriv(2), p.deriv(3)]

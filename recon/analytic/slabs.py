@@ -18,7 +18,7 @@ import pickle
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple, TypedDict, Unpack
@@ -32,7 +32,7 @@ from recon.analytic.angular_weights import angular_weights
 from recon.analytic.backproject import BackprojectionPlan
 from recon.analytic.coverage import check_rows, consistency_warnings, sampling_warnings, view_notes
 from recon.analytic.detector_edges import Rows, continued, ends_cut_off, mirrored, row_ends
-from recon.analytic.fbp import filter_windowed
+from recon.analytic.fbp import filter_sinogram, read_window
 from recon.api import reconstruct, require_light
 from recon.evaluate import execute
 from recon.evaluate.sources import source_digest
@@ -50,7 +50,7 @@ from torchpcct.checks.defects import (
     wrong_cells,
 )
 from torchpcct.checks.readings import reading_warnings
-from torchpcct.detector_window import DetectorWindow, footprint
+from torchpcct.detector_window import DetectorWindow
 from torchpcct.files import clear_folder
 from torchpcct.formats.scans import adapted, open_scan, own_options
 from torchpcct.formats.volume_slabs import CHUNK, SlabFile, check_slab_name
@@ -273,21 +273,12 @@ class _Fbp:
         self.cone = isinstance(geometry, ConeBeam)
         self.plane = grid if self.cone else grid.slice
         self.weights = angular_weights(geometry, self.plane)
-        wide = self.complete(torch.zeros(geometry.select([0]).shape)[..., :1, :].expand(*geometry.shape[:-2], 1, -1)
-                             if self.cone else torch.zeros(geometry.shape), self._rows(0, 1)).geometry  # fmt: skip
-        self.wide: Any = replace(wide, rows=geometry.rows, offset=(geometry.offset[0], wide.offset[1])) if isinstance(
-            geometry, ConeBeam) else wide  # fmt: skip
-        try:
-            self.window = footprint(self.wide, self.plane, margin=1)
-        except ValueError:
-            self.window = DetectorWindow.full(self.wide)
+        self.wide: Any = self.complete(torch.empty(geometry.shape, device="meta"), geometry).geometry
+        self.window = read_window(self.wide, self.plane)
         self.plan = BackprojectionPlan(self.wide, self.plane, self.window)
 
-    def _rows(self, first: int, stop: int) -> Any:
-        return self.geometry.with_rows(first, stop - first) if isinstance(self.geometry, ConeBeam) else self.geometry
-
     def complete(self, lines: Tensor, geometry: Any) -> Rows:
-        rows = Rows(lines, geometry, self.weights, 0)
+        rows = Rows(lines, geometry, self.weights)
         return mirrored(continued(rows, self.sides, self.water) if any(self.sides) else rows, self.plane)
 
     def band(self, first: int, stop: int) -> tuple[int, int]:
@@ -316,19 +307,14 @@ class _Fbp:
         rows = self.complete(lines, geometry)
         del lines
         _give_back()
-        whole = DetectorWindow.full(self.wide)
+        held, wanted = DetectorWindow.full(self.wide), self.window
         if self.cone:
-            held, wanted = (
-                whole.with_rows(low - own.start, rows.lines.shape[-2]),
-                self.window.with_rows(low, high - low),
-            )
-            filtered = filter_windowed(rows.lines, self.wide, held, self.kernel, wanted, weights=rows.weights)
-            del rows
-            mu = self.plan.forward(filtered, (first, stop), low - self.window.first_row)
-        else:
-            filtered = filter_windowed(rows.lines, self.wide, whole, self.kernel, self.window, weights=rows.weights)
-            del rows
-            mu = self.plan.forward(filtered)
+            held = held.with_rows(low - own.start, rows.lines.shape[-2])
+            wanted = wanted.with_rows(low, high - low)
+        filtered = filter_sinogram(rows.lines, self.wide, self.kernel, wanted, held=held, weights=rows.weights)
+        del rows
+        place = ((first, stop), low - self.window.first_row) if self.cone else ()
+        mu = self.plan.forward(filtered, *place)
         del filtered
         _give_back()
         return to_hu(mu, self.water).to(torch.float32)

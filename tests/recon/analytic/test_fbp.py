@@ -15,7 +15,7 @@ from fresh_python import run_python
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recon.analytic.fbp import Fbp, backproject, fbp, filter_sinogram, filter_windowed, interleave
+from recon.analytic.fbp import Fbp, backproject, fbp, filter_sinogram, interleave
 from recon.analytic.ramp import KERNELS
 from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid, full_turn
@@ -250,7 +250,7 @@ def test_windows_that_do_not_fit_are_named():
     cone = ConeBeam(full_turn(9), 50, 90, 19, 8, 1.3)
     low, high = (DetectorWindow(np.zeros(9, int), 19, r, 4) for r in (0, 4))
     with pytest.raises(ValueError, match=r"rows 4…7, but the data only rows 0…3"):
-        filter_windowed(torch.zeros(9, 4, 19), cone, low, "soft", high)
+        filter_sinogram(torch.zeros(9, 4, 19), cone, "soft", high, held=low)
     with pytest.raises(ValueError, match=r"rows 4…7 do not cover the grid"):
         backproject(torch.zeros(9, 4, 19), cone, VolumeGrid((3, 3, 3), 1.0), high)
 

@@ -159,7 +159,7 @@ def test_compensated_pwls_shows_the_inset_at_rest(scans, path):
     assert report["converged"]
     assert report["exact_pairs"] <= 6
     assert float((found - rest).square().mean().sqrt()) < 12.0
-    same = InsetProblem(scans[2.0], GRID, nodes=1, motion=path)
+    same = InsetProblem(scans[2.0], GRID, nodes=1).with_motion(path)
     assert torch.equal(same.data(scans[2.0]), moved.data(scans[2.0]))
     assert moved.with_motion(None).window == problem.window != moved.window
     # The Gram holds for the moving operator about as well as for the one at rest; its weights move along.

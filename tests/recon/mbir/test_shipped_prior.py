@@ -13,7 +13,7 @@ from scipy import ndimage
 from torch import nn
 
 from recon.analytic.backproject import backproject
-from recon.analytic.fbp import filter_windowed
+from recon.analytic.fbp import filter_sinogram
 from recon.gram.gram import Gram
 from recon.mbir.mbir import Mbir
 from recon.mbir.network import NetworkConfig
@@ -51,7 +51,7 @@ def found(drawn, request):
     noise = torch.randn((2, *drawn.readings.shape), generator=generator)
     y = drawn.readings + noise / (drawn.w * exposure).sqrt()
     b, network = drawn.A.T(drawn.w * exposure * y), Mbir.load()
-    kernels = filter_windowed(y, drawn.A.geometry, drawn.A.window, ["soft", "standard"], drawn.A.window)
+    kernels = filter_sinogram(y, drawn.A.geometry, ["soft", "standard"], drawn.A.window, held=drawn.A.window)
     soft, standard = backproject(kernels, drawn.A.geometry, drawn.A.grid, drawn.A.window) / HU - 1000.0 * (1.0 - LEVEL)
     with torch.no_grad():
         volumes = {"soft": soft, "standard": standard, "mbir": network(drawn.scan, b, exposure),
