@@ -14,6 +14,7 @@ frequencies, but 36 mm off it, 400 mm from the source, frequencies (f_r, f_z) wi
 
 from __future__ import annotations
 
+import copy
 import itertools
 import math
 from collections.abc import Sequence
@@ -125,9 +126,8 @@ class FieldModel:
 
     def scaled(self, factor: float) -> FieldModel:
         """The model of ``factor`` · W."""
-        other = object.__new__(FieldModel)
-        other.grid, other.at, other.spectrum = self.grid, self.at, self.spectrum
-        other.determined, other.nodes = self.determined, self.nodes
+        other = copy.copy(self)
+        other.nodes = self.nodes
         other.seen, other.scale = self.seen * factor, self.scale * factor
         other._column = self._column * factor
         return other
@@ -160,11 +160,6 @@ class GradientStep:
             self._scale, inverse = scale.to(x).rsqrt(), scale.to(x).reciprocal()
         # In units of D² the prior weighs more where fewer rays pass: η_c is its mean over the slices of c.
         self._nodes = [(k.to(x), s.to(x), _mean(inverse, s.to(x))) for k, s in nodes]
-
-    @classmethod
-    def of(cls, model: FieldModel, prior: BoundPrior, x: Tensor) -> GradientStep:
-        """For a whole field."""
-        return cls(model.nodes, prior, x, model.scale)
 
     def step(self, x: Tensor, data_gradient: Tensor) -> tuple[Tensor, int]:
         """The direction of descent, ``(batch, *shape)``, and 0: no iteration of a model."""
@@ -208,12 +203,8 @@ def _central(seen: Tensor) -> tuple[int, ...]:
     for axis, n in enumerate(seen.shape):
         along = (torch.arange(n, device=seen.device) - (n - 1) / 2).square()
         distance = distance + along.reshape(-1, *[1] * (seen.dim() - 1 - axis))
-    flat = int(torch.where(enough, distance, torch.full_like(distance, math.inf)).argmin())
-    place = []
-    for n in reversed(seen.shape):
-        flat, k = divmod(flat, n)
-        place.append(k)
-    return tuple(reversed(place))
+    nearest = torch.where(enough, distance, torch.full_like(distance, math.inf)).argmin()
+    return tuple(int(k) for k in torch.unravel_index(nearest, seen.shape))
 
 
 def _periodic(response: Tensor, at: tuple[int, ...]) -> Tensor:

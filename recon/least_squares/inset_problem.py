@@ -58,10 +58,6 @@ class InsetProblem:
         grid: ``(z, y, x)`` grid that holds everything the background does not.
         nodes: of the Gram operator. Linear in position (5) is enough for solvers: what the model lacks, the exact
             pairs repair, and each step costs half of that with 9.
-        motion: displacement of the inset in every view, ``(views, 3)`` z, y, x mm
-            (:func:`recon.analytic.inset.view_motion`); None: at rest. The background stands still; it is taken off
-            before, so that only what moves is projected. The Gram is that of a grid at rest with the weights that the
-            moving one meets; exact pairs use the moving projector.
 
     The weights are the inverse variances of the line integrals expected from the BACKGROUND: weights from the noisy
     readings themselves would bias the result, and a small inset changes the counts behind it by a few per cent only.
@@ -76,14 +72,14 @@ class InsetProblem:
 
     prior = DEFAULT_PRIOR
 
-    def __init__(self, scan: Scan, grid: VolumeGrid, nodes: int = 5, *, motion: Any = None) -> None:
+    def __init__(self, scan: Scan, grid: VolumeGrid, nodes: int = 5) -> None:
         if scan.counts.ndim != 3:
             raise ValueError("PWLS in HU needs a counting-mode scan; decompose or sum the energy bins before")
         if not scan.counting:
             raise ValueError("PWLS and MBIR weigh readings as photon counts; use fbp for an energy-integrating scan")
         self.grid, self.geometry = grid, scan.geometry
         self.outer = scan.window or DetectorWindow.full(scan.geometry)
-        check_rows(scan.geometry, grid, motion)
+        check_rows(scan.geometry, grid)
         self.mu_ref, self.unit = scan.linearisation.mu_ref, scan.unit
         self.warnings: list[str] = []
         self._nodes = nodes
@@ -92,7 +88,7 @@ class InsetProblem:
         self.model: Gram | FieldModel
         exposure = scan.exposure_s or NOISE_FREE_EXPOSURE_S
         if scan.surround is None:
-            self._start_unknown(scan, exposure, motion)
+            self._start_unknown(scan, exposure)
             return
         require_inside(footprint(scan.geometry, grid, margin=1), self.outer)
         self._background = scan.surround_line_integrals()
@@ -102,16 +98,14 @@ class InsetProblem:
         slope = scan.linearisation.slope(polychromatic)
         # Per second of exposure: the Gram of one exposure serves all by a factor.
         self._cell_weights = scan.surround / slope.square() / exposure
-        self._place(motion)
+        self._place(None)
 
-    def _start_unknown(self, scan: Scan, exposure: float, motion: Any) -> None:
+    def _start_unknown(self, scan: Scan, exposure: float) -> None:
         """Weights from the smoothed readings themselves; what surrounds the inset is found scan by scan."""
         if is_whole_field(scan, self.grid):
             raise ValueError(
                 "the grid holds the whole field of view: use recon.least_squares.field_problem.FieldProblem"
             )
-        if motion is not None:
-            raise ValueError("motion compensation needs the surround at rest: acquire the scan with region=")
         geometry, grid = self.geometry, self.grid
         self.window = footprint(geometry, grid, margin=1)
         self.weights = self.outer.crop(scan.weights(), self.window) / exposure
@@ -137,17 +131,6 @@ class InsetProblem:
         self.model = Gram(Projector(geometry, grid, still), weights, nodes=self._nodes)
 
     @property
-    def background(self) -> Tensor:
-        """Line integrals of the known surround, ``(rows, columns)``.
-
-        Raises:
-            ValueError: nobody knows it.
-        """
-        if self._background is None:
-            raise ValueError("the surround of this scan is not known: acquire it with region=")
-        return self._background
-
-    @property
     def gram(self) -> Gram:
         """The FFT model of AᵀWA at 1 s.
 
@@ -162,11 +145,21 @@ class InsetProblem:
         return self.model
 
     def with_motion(self, motion: Any) -> InsetProblem:
-        """The same problem for another displacement of the inset (None: at rest); the background is kept.
+        """The same problem for an inset that moves.
+
+        The background stands still; it is taken off before, so that only what moves is projected. The Gram is that of a
+        grid at rest with the weights that the moving one meets; exact pairs use the moving projector.
 
         Args:
-            motion: as for :class:`InsetProblem`.
+            motion: displacement of the inset in every view, ``(views, 3)`` z, y, x mm
+                (:func:`recon.analytic.inset.view_motion`); None: at rest.
+
+        Raises:
+            ValueError: the surround is not known.
         """
+        if self._background is None:
+            raise ValueError("motion compensation needs the surround at rest: acquire the scan with region=")
+        check_rows(self.geometry, self.grid, motion)
         other = copy.copy(self)
         other._place(motion)
         return other

@@ -345,7 +345,10 @@ def solve_normal(
     lead = b.shape[:-axes]
     b = b.reshape(-1, *shape)
     proposer: ModelSolver | GradientStep
-    proposer = GradientStep.of(gram, bound, b) if isinstance(gram, FieldModel) else ModelSolver(gram, bound, b)
+    if isinstance(gram, FieldModel):
+        proposer = GradientStep(gram.nodes, bound, b, gram.scale)
+    else:
+        proposer = ModelSolver(gram, bound, b)
     reference = dot(b, b, axes).sqrt().clamp_min(torch.finfo(b.dtype).tiny)
 
     pairs = 0

@@ -105,9 +105,9 @@ prior lowers the noise of ROI means further, but shrinks the contrast of a milli
 and slope, not at CNR alone."""
 
 
-def quadratic(strength: float, neighbors: int = 26) -> QGGMRF:
+def quadratic(strength: float) -> QGGMRF:
     """The quadratic (Gaussian) prior of the same strength: ρ(t) = t² / 2."""
-    return QGGMRF(strength, math.inf, 2.0, 1.0, neighbors)
+    return QGGMRF(strength, math.inf)
 
 
 @dataclass(frozen=True)
@@ -301,9 +301,9 @@ class BoundPrior:
         form = np.array([inverse, power, self.q / self.p, self.p - 2.0, ROUNDING], dtype=dtype)
         return np.array(steps, dtype=np.int64), np.array(scales, dtype), np.array(factors, dtype), kind, form
 
-    def spectrum(self, shape: Sequence[int], dtype: torch.dtype = torch.float64) -> Tensor:
+    def spectrum(self, shape: Sequence[int]) -> Tensor:
         """Eigenvalues of the curvature at t = 0 on a periodic grid, ``rfftn`` layout ``(..., shape[-1] // 2 + 1)``."""
-        n = len(shape)
+        n, dtype = len(shape), torch.float64
         grids = [torch.fft.fftfreq(k, dtype=dtype) for k in shape[:-1]] + [torch.fft.rfftfreq(shape[-1], dtype=dtype)]
         mesh = torch.meshgrid(*grids, indexing="ij")
         total = torch.zeros(mesh[0].shape, dtype=dtype)

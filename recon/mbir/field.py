@@ -21,6 +21,7 @@ of a stack are one volume.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -179,11 +180,9 @@ def blockwise(
 
 
 def _parts(shape: Sequence[int], block: int, halo: int) -> Iterator[tuple[slice, ...]]:
-    along = [[slice(max(k - halo, 0), min(k + block + halo, n)) for k in range(0, n, block)] for n in shape]
-    for z in along[0]:
-        for y in along[1]:
-            for x in along[2]:
-                yield z, y, x
+    return itertools.product(
+        *([slice(max(k - halo, 0), min(k + block + halo, n)) for k in range(0, n, block)] for n in shape)
+    )
 
 
 def _fade(part: slice, n: int, halo: int) -> Tensor:

@@ -43,25 +43,21 @@ class TissueMbir(OutlineMbir):
     Args:
         network: gives weights, fidelity and parts.
         point: ``(z, y, x)`` mm where a reader sees the plaque; None: in the largest vessel.
-        seed: of the reading's Monte Carlo.
         vessel_prior: what is believed of the vessel before the data; None: what a reading believes, a coronary artery.
 
     Raises:
         ValueError, TypeError: a point that is not three finite numbers.
     """
 
-    def __init__(
-        self, network: Mbir, point: Any = None, seed: int = 0, vessel_prior: VesselPrior | None = None
-    ) -> None:
+    def __init__(self, network: Mbir, point: Any = None, vessel_prior: VesselPrior | None = None) -> None:
         super().__init__(network, vessel_prior)
         self.point = None if point is None else numbers("point", point, 3, unit="mm")
-        self.seed = seed
 
     def drawn(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> Drawn:
         """See :meth:`recon.mbir.outlines.OutlineMbir.drawn`; the note holds ``tissues``: what was read, or why not."""
         try:
             data = TissueData.of_statistic(b.detach(), problem, exposure_s)
-            reading = read_plaque(data, self.point, vessel_prior=self.vessel_prior, seed=self.seed)
+            reading = read_plaque(data, self.point, vessel_prior=self.vessel_prior)
         except ValueError as error:
             return self._without(problem, b, exposure_s, f"no tissues were fitted: {error}")
         if reading.warnings:

@@ -16,8 +16,8 @@ from torchpcct.scan import Scan
 __all__ = ["fbp_deviations"]
 
 
-def fbp_deviations(scan: Scan, grid: VolumeGrid, regions: Mapping[str, Any], kernel: str = "soft") -> dict[str, float]:
-    """Standard deviation in HU of FBP's mean over each region, and of the contrast, of the noise alone.
+def fbp_deviations(scan: Scan, grid: VolumeGrid, regions: Mapping[str, Any]) -> dict[str, float]:
+    """Standard deviation in HU of soft FBP's mean over each region, and of the contrast, of the noise alone.
 
     One adjoint pass a region (:mod:`recon.analytic.exact_noise`), with the variance of the readings that is expected
     behind the known surround: what the inset adds to the attenuation, a few per cent of the counts, is left out, and so
@@ -27,7 +27,6 @@ def fbp_deviations(scan: Scan, grid: VolumeGrid, regions: Mapping[str, Any], ker
         scan: windowed, its surround known, noisy or noise free (then of the exposure its readings stand for).
         grid: of the regions.
         regions: name → shares of the voxels, as :attr:`recon.plaque.reading.PlaqueReading.regions`.
-        kernel: of FBP.
 
     Raises:
         ValueError: a scan of the whole detector, or of an unknown surround.
@@ -35,7 +34,7 @@ def fbp_deviations(scan: Scan, grid: VolumeGrid, regions: Mapping[str, Any], ker
     if scan.window is None or scan.surround is None:
         raise ValueError("the noise of regions needs a scan whose surround is known: acquire it with region=")
     masks = core_regions(regions)
-    fbp = InsetFbp(scan, [grid], [kernel])
+    fbp = InsetFbp(scan, [grid], ["soft"])
     slope = scan.linearisation.slope(scan.air.log() - scan.surround.log())
     variance = slope.square() / scan.surround
     pair = [n for n in masks if n in ("fibrous", "core")]

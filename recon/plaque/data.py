@@ -24,7 +24,8 @@ Floats = NDArray[np.float64]
 
 _PILOT_SD_MM = 0.25
 _PILOT_STEPS = 4
-_PILOT_FLOOR = 0.02
+_FLOOR = 0.02
+"""Of the spectrum that preconditions, as a share of its largest value."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,15 +93,29 @@ class TissueData:
         Args:
             b: of another statistic, ``grid.shape`` HU⁻¹; None: of the data.
         """
+        x = self.least_squares(self.b if b is None else b, _PILOT_STEPS)
+        sd = [_PILOT_SD_MM / step for step in self.grid.spacing]
+        return np.asarray(ndimage.gaussian_filter(x.double().numpy(), sd, mode="nearest"))
+
+    def least_squares(self, b: Tensor, steps: int, free: Tensor | float = 1.0, precision: float = 0.0) -> Tensor:
+        """Some conjugate gradients towards least squares, ``grid.shape`` HU.
+
+        Args:
+            b: ``grid.shape`` HU⁻¹.
+            steps: number of them.
+            free: 1 in the voxels that may differ from 0, else 0.
+            precision: of the prior of every voxel, HU⁻².
+        """
         spectrum = self.gram.periodic_spectrum() * self.scale
-        floor = _PILOT_FLOOR * float(spectrum.max())
+        floor = _FLOOR * float(spectrum.max())
 
         def precondition(v: Tensor) -> Tensor:
-            return torch.fft.irfftn(torch.fft.rfftn(v, dim=(1, 2, 3)) / (spectrum + floor), s=v.shape[1:])
+            return free * torch.fft.irfftn(torch.fft.rfftn(free * v, dim=(1, 2, 3)) / (spectrum + floor), s=v.shape[1:])
 
-        x = conjugate_gradient(self.apply, (self.b if b is None else b)[None], precondition, iterations=_PILOT_STEPS)
-        sd = [_PILOT_SD_MM / step for step in self.grid.spacing]
-        return np.asarray(ndimage.gaussian_filter(x[0].double().numpy(), sd, mode="nearest"))
+        def curved(v: Tensor) -> Tensor:
+            return free * self.apply(free * v) + v * precision
+
+        return free * conjugate_gradient(curved, (free * b)[None], precondition, iterations=steps)[0]
 
     def scores(self, left: Tensor, sd_mm: tuple[float, float]) -> Floats:
         """How far each place of a residual stands out of the noise, ``grid.shape`` standard deviations.

@@ -21,6 +21,8 @@ Target = Callable[[Floats], tuple[Floats, Floats]]
 
 _KEEP = 0.5
 """Effective share of the cloud that a step in temperature leaves."""
+_MOST_STEPS = 40
+"""Largest number of temperatures."""
 _SCALES = (1.0, 0.5, 0.2)
 """Widths of the Metropolis moves of every point at every temperature, as shares of the cloud's."""
 
@@ -37,9 +39,7 @@ class Cloud(NamedTuple):
     log_evidence: float
 
 
-def lead(
-    start: Floats, base: Target, target: Target, rng: np.random.Generator, *, log_evidence: float = 0.0, most: int = 40
-) -> Cloud:
+def lead(start: Floats, base: Target, target: Target, rng: np.random.Generator, *, log_evidence: float = 0.0) -> Cloud:
     """Lead a cloud from one distribution to another.
 
     Args:
@@ -48,13 +48,12 @@ def lead(
         target: log prior and log likelihood of the last distribution; the prior is the same.
         rng: of all randomness.
         log_evidence: of the first distribution.
-        most: largest number of temperatures.
     """
     points = start
     log_prior, first = base(points)
     _, last = target(points)
     done, steps = 0.0, 0
-    while done < 1.0 and steps < most:
+    while done < 1.0 and steps < _MOST_STEPS:
         gain = last - first
         step = _step(gain, 1.0 - done)
         weight = np.exp(step * gain - (step * gain).max())

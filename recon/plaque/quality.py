@@ -14,7 +14,6 @@ from scipy import ndimage
 from scipy.stats import norm
 from torch import Tensor
 
-from recon.conjugate_gradient import conjugate_gradient
 from recon.plaque.data import TissueData
 from recon.plaque.vessel import FAT, FIBROUS, Fit, Vessel
 
@@ -127,19 +126,7 @@ def beside(data: TissueData, vessel: Vessel, fit: Fit) -> Tensor | None:
     if not there.any():
         return None
     mask = torch.from_numpy(free & (ndimage.distance_transform_edt(~there, sampling=step) <= _EDGE_MM)).to(left)
-    spectrum = data.gram.periodic_spectrum() * data.scale
-    floor = 0.02 * float(spectrum.max())
-
-    def inverse(v: Tensor) -> Tensor:
-        return mask * torch.fft.irfftn(torch.fft.rfftn(mask * v, dim=(1, 2, 3)) / (spectrum + floor), s=v.shape[1:])
-
-    found = conjugate_gradient(
-        lambda v: mask * data.apply(mask * v) + v / _BESIDE_HU**2,
-        (mask * left)[None],
-        inverse,
-        iterations=_BESIDE_STEPS,
-    )
-    return mask * found[0]
+    return data.least_squares(left, _BESIDE_STEPS, mask, _BESIDE_HU**-2)
 
 
 def scores_of(vessel: Vessel, fit: Fit, explained: Tensor | float = 0.0) -> Floats:
