@@ -109,7 +109,7 @@ def test_tissues_that_do_not_explain_the_data_are_not_used(drawn, network, fine,
 def test_what_is_believed_of_the_vessel_reaches_the_reading(drawn, network, fine, monkeypatch):
     seen = []
 
-    def reading(*arguments, vessel_prior, seed):
+    def reading(*arguments, vessel_prior):
         seen.append(vessel_prior)
         raise ValueError("seen")
 
