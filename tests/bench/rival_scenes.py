@@ -113,7 +113,7 @@ class Bench:
         fine = VolumeGrid(tuple(2 * n for n in g.shape), g.spacing[0] / 2, g.center)
         x = vessel.painted(fine, {k: h - values["patient"] for k, h in values.items()})
         lines = Projector(p.geometry, fine, window)(torch.from_numpy(x * (p.mu_ref / 1000.0)).float())
-        images = self.fbp.images(lines + window.take(p.background))[0]
+        images = self.fbp.images(lines + window.take(self.clean.surround_line_integrals()))[0]
         b = p.projector.T(p.weights * p.outer.crop(lines, p.window))
         return to_hu(images, p.mu_ref), b
 
