@@ -28,7 +28,7 @@ from recon.mbir.weights_io import digest, read_tensors
 from torchpcct.geometry import VolumeGrid
 from torchpcct.volume import from_hu, in_words, to_hu
 
-__all__ = ["Mbir", "Batch", "average_onto", "overlap", "working_grid"]
+__all__ = ["Mbir", "Reconstructed", "average_onto", "overlap", "working_grid"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -39,7 +39,7 @@ LARGEST_HU = 2000.0
 
 
 @dataclass(frozen=True)
-class Batch:
+class Reconstructed:
     """Reconstructions of a batch.
 
     Attributes:
@@ -128,10 +128,10 @@ class Mbir:
         found = self.solved(problem, b, exposure_s)
         return self.in_hu(problem, found.u, found.normal)
 
-    def solved(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> Batch:
+    def solved(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> Reconstructed:
         """The same with what it was made of."""
         normal = self.problem(problem, b, exposure_s)
-        return Batch(normal, self.model(normal, self.fidelity, **self.parts), [{} for _ in range(b.shape[0])])
+        return Reconstructed(normal, self.model(normal, self.fidelity, **self.parts), [{} for _ in range(b.shape[0])])
 
     @staticmethod
     def in_hu(problem: InsetProblem, u: Tensor, normal: NormalisedProblem) -> Tensor:

@@ -27,7 +27,7 @@ from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from recon.least_squares.inset_problem import InsetProblem
-from recon.mbir.mbir import Mbir, Batch
+from recon.mbir.mbir import Mbir, Reconstructed
 from recon.mbir.unrolled import DEFAULT_FIDELITY
 from recon.plaque.data import TissueData
 from recon.plaque.layer import SD_HU, LayerEstimate
@@ -79,7 +79,7 @@ class OutlineMbir(Mbir):
         super().__init__(network.model, network.fidelity, **network.parts)
         self.vessel_prior = vessel_prior
 
-    def solved(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> Batch:
+    def solved(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> Reconstructed:
         """See :meth:`recon.mbir.mbir.Mbir.solved`; the notes hold ``outlines``: whether they were drawn, or why not."""
         found = [self.drawn(problem, own, exposure_s) for own in b]
         notes = [one.note for one in found]
@@ -104,7 +104,7 @@ class OutlineMbir(Mbir):
         if plain:
             without = super().solved(problem, b[plain], exposure_s)
             volumes |= dict(zip(plain, without.u, strict=True))
-        return Batch(normal, torch.stack([volumes[k] for k in range(len(found))]), notes)
+        return Reconstructed(normal, torch.stack([volumes[k] for k in range(len(found))]), notes)
 
     def drawn(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> Drawn:
         """What is drawn of one scan.
