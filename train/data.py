@@ -31,7 +31,8 @@ from torchpcct.geometry import VolumeGrid
 from torchpcct.scanner import presets
 from torchpcct.scene import Body, EllipticCylinder, Scene
 from train.config import DataConfig, Situation
-from train.scenes.rasterise import random_scene
+from train.scenes.drawing import draw_scene
+from train.scenes.rasterise import rasterise
 from train.scenes.scene import SceneConfig
 
 __all__ = ["Batch", "Data", "painted", "seed_of", "situation_gram"]
@@ -183,10 +184,13 @@ def painted(config: DataConfig, seed: int, number: int) -> Tensor:
     axis = 0 if draw < config.along_z else 1 if draw < 0.5 * (1 + config.along_z) else 2
     across, along = config.shape[axis], config.shape[0]
     shape = (across, *(along if k == axis else n for k, n in enumerate(config.shape) if k))
-    grid, spacing = (shape[0], shape[1], shape[2]), (config.voxel_mm,) * 3
-    made = random_scene(grid, spacing, generator=generator, config=SceneConfig(**config.scenes))
-    label = _CORE * (made.core[0] > 0.97) + _AROUND * (made.surround[0] > 0.97)
-    maps = (made.image[0] - made.scenes[0].background, label)
+    # The extents of equal insets differ by rounding; without this so would positions drawn in them, in the last digit.
+    z, y, x = (round(n * config.voxel_mm, 6) for n in shape)
+    drawn = int(torch.randint(2**62, (), generator=generator))
+    scene = draw_scene(drawn, (z, y, x), SceneConfig(**config.scenes))
+    found = rasterise(scene, (shape[0], shape[1], shape[2]), (config.voxel_mm,) * 3)
+    image, core, around = torch.from_numpy(found)
+    maps = (image - scene.background, _CORE * (core > 0.97) + _AROUND * (around > 0.97))
     return torch.stack([m.transpose(0, axis).to(torch.float16) for m in maps])
 
 

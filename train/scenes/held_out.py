@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
 from scipy import ndimage
 
 from train.scenes.drawing import Draw
-from train.scenes.rasterise import check_grid, rasterise
+from train.scenes.rasterise import rasterise
 from train.scenes.scene import Solid, TrainingScene, Triple, Vessel
 
 __all__ = ["CHECKPOINT_SEED", "CHECKPOINT_SIZE", "ValidationScenes", "validation_scenes"]
@@ -25,7 +26,6 @@ class ValidationScenes:
 
     Args:
         image: ``(scenes, contrasts, nz, ny, nx)`` float32, HU.
-        contrasts: ``(contrasts,)`` HU of the core to its fibrous layer.
         core: ``(scenes, nz, ny, nx)`` float32, volume fraction of the core.
         core_roi: likewise, 0 or 1: voxels wholly inside the core.
         fibrous_roi: likewise, 0 or 1: voxels at most 1.5 mm from the core that lie, with all their 26 neighbours,
@@ -34,7 +34,6 @@ class ValidationScenes:
     """
 
     image: torch.Tensor
-    contrasts: torch.Tensor
     core: torch.Tensor
     core_roi: torch.Tensor
     fibrous_roi: torch.Tensor
@@ -57,7 +56,7 @@ def validation_scenes(
     Raises:
         ValueError: an invalid grid, or one in which a ROI is empty (too coarse or too small for the plaques).
     """
-    shape, spacing = check_grid(grid_shape, spacing_mm)
+    shape, spacing = _checked(grid_shape, spacing_mm)
     extent = (shape[0] * spacing[0], shape[1] * spacing[1], shape[2] * spacing[2])
     rng = np.random.default_rng(seed)
     found, scenes = [], []
@@ -79,7 +78,16 @@ def validation_scenes(
         found.append((each, weight, core_roi.astype(np.float32), fibrous_roi.astype(np.float32)))
         scenes.append(_with_contrast(scene, contrasts[0]))
     image, core, inside, around = (torch.from_numpy(np.stack(maps)) for maps in zip(*found, strict=True))
-    return ValidationScenes(image, torch.tensor(contrasts, dtype=torch.float32), core, inside, around, tuple(scenes))
+    return ValidationScenes(image, core, inside, around, tuple(scenes))
+
+
+def _checked(shape: Any, spacing: Any) -> tuple[tuple[int, int, int], Triple]:
+    """Shape and spacing as tuples; ``ValueError`` unless they are three positive numbers each."""
+    if len(shape) != 3 or any(int(n) != n or n < 1 for n in shape):
+        raise ValueError(f"grid_shape must be three positive whole numbers (nz, ny, nx), got {shape!r}")
+    if len(spacing) != 3 or not all(math.isfinite(s) and s > 0 for s in spacing):
+        raise ValueError(f"spacing_mm must be three positive numbers (dz, dy, dx), got {spacing!r}")
+    return (int(shape[0]), int(shape[1]), int(shape[2])), (float(spacing[0]), float(spacing[1]), float(spacing[2]))
 
 
 def _with_contrast(scene: TrainingScene, contrast: float) -> TrainingScene:

@@ -1,51 +1,27 @@
-"""Scenes on grids: area-averaged voxel values, and batches of random scenes."""
+"""Scenes on grids: area-averaged voxel values."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from train.scenes.drawing import draw_scene
 from train.scenes.paint_kernels import KINDS, QUADRIC_COLUMNS, TABLE_ROWS, TUBE_COLUMNS, paint
-from train.scenes.scene import SceneConfig, Solid, TrainingScene, Triple
+from train.scenes.scene import Solid, TrainingScene, Triple
 
-__all__ = ["SceneBatch", "check_grid", "random_scene", "rasterise"]
+__all__ = ["rasterise"]
 
 # Spacing in mm of the tables over z, well below the shortest bump.
 TABLE_STEP = 0.1
-# A core with less than this inside the grid does not count as one, mm³: half of the smallest ellipsoid drawn.
-SMALLEST_CORE = 0.05
-
-
-@dataclass(frozen=True)
-class SceneBatch:
-    """Rasterised scenes.
-
-    Args:
-        image: ``(batch, nz, ny, nx)`` float32, HU: averages over the voxels.
-        core: likewise, volume fraction of all cores, of the virtual ones too (then ``has_core`` is false, contrast 0).
-        surround: likewise, volume fraction of the fibrous layer of the vessels that hold these cores.
-        has_core: ``(batch,)`` bool: a core of a contrast other than 0, at least 0.05 mm³ of it inside the grid.
-        contrast: ``(batch,)`` float32, HU: of the first core to its fibrous layer, 0 without one; also where the core
-            lies outside the grid.
-        scenes: parameters, one object per scene; HU of every body are in there.
-    """
-
-    image: torch.Tensor
-    core: torch.Tensor
-    surround: torch.Tensor
-    has_core: torch.Tensor
-    contrast: torch.Tensor
-    scenes: tuple[TrainingScene, ...]
 
 
 def rasterise(scene: TrainingScene, shape: tuple[int, int, int], spacing_mm: Triple) -> NDArray[np.float32]:
-    """Image in HU, volume fraction of the cores and of their fibrous layers: ``(3, nz, ny, nx)`` float32."""
+    """Averages over the voxels of a grid about the origin, ``(3, nz, ny, nx)`` float32.
+
+    Image in HU; volume fraction of all cores, of the virtual ones too; volume fraction of the fibrous layers of the
+    vessels that hold them.
+    """
     diagonal = math.sqrt(sum(s * s for s in spacing_mm))
     half = 0.5 * shape[0] * spacing_mm[0]
     # A foot lies at most reach · sin(tilt) above or below its point
@@ -99,52 +75,3 @@ def rasterise(scene: TrainingScene, shape: tuple[int, int, int], spacing_mm: Tri
     for texture, weight in zip(scene.textures, maps[3:], strict=True):
         maps[0] += weight * texture.field(shape, spacing_mm)
     return maps[:3]
-
-
-def random_scene(
-    grid_shape: tuple[int, int, int],
-    spacing_mm: Triple,
-    *,
-    generator: torch.Generator,
-    config: SceneConfig | None = None,
-    size: int = 1,
-) -> SceneBatch:
-    """A batch of random scenes on a grid.
-
-    One number per scene is taken from ``generator``: a batch of two gives what two batches of one give, and equal
-    extents in mm give the same scenes at every voxel size.
-
-    Args:
-        grid_shape: ``(nz, ny, nx)``.
-        spacing_mm: ``(dz, dy, dx)``.
-        generator: of PyTorch, on the CPU.
-        config: default :class:`SceneConfig`.
-        size: scenes in the batch.
-
-    Raises:
-        ValueError: a shape or spacing that is not three positive numbers, or a size below 1.
-    """
-    shape, spacing = check_grid(grid_shape, spacing_mm)
-    if size < 1:
-        raise ValueError(f"size must be 1 or more, got {size}")
-    extent = (shape[0] * spacing[0], shape[1] * spacing[1], shape[2] * spacing[2])
-    # The extents of equal insets differ by rounding; without this so would positions drawn in them, in the last digit.
-    extent = (round(extent[0], 6), round(extent[1], 6), round(extent[2], 6))
-    seeds = torch.randint(2**62, (size,), generator=generator, dtype=torch.int64).tolist()
-    scenes = tuple(draw_scene(seed, extent, config) for seed in seeds)
-    stacks = torch.empty((3, size, *shape), dtype=torch.float32)
-    for index, scene in enumerate(scenes):
-        stacks[:, index] = torch.from_numpy(rasterise(scene, shape, spacing))
-    voxel = math.prod(spacing)
-    inside = stacks[1].sum(dim=(1, 2, 3)) * voxel >= SMALLEST_CORE
-    contrast = torch.tensor([scene.contrast for scene in scenes], dtype=torch.float32)
-    return SceneBatch(stacks[0], stacks[1], stacks[2], inside & (contrast != 0), contrast, scenes)
-
-
-def check_grid(shape: Any, spacing: Any) -> tuple[tuple[int, int, int], Triple]:
-    """Shape and spacing as tuples; ``ValueError`` unless they are three positive numbers each."""
-    if len(shape) != 3 or any(int(n) != n or n < 1 for n in shape):
-        raise ValueError(f"grid_shape must be three positive whole numbers (nz, ny, nx), got {shape!r}")
-    if len(spacing) != 3 or not all(math.isfinite(s) and s > 0 for s in spacing):
-        raise ValueError(f"spacing_mm must be three positive numbers (dz, dy, dx), got {spacing!r}")
-    return (int(shape[0]), int(shape[1]), int(shape[2])), (float(spacing[0]), float(spacing[1]), float(spacing[2]))

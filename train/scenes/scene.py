@@ -260,11 +260,6 @@ class TrainingScene:
         """Cores of all vessels, virtual ones included."""
         return tuple(core for vessel in self.vessels for core in vessel.cores)
 
-    @property
-    def contrast(self) -> float:
-        """Contrast in HU of the first core to its fibrous layer; 0 without a core."""
-        return self.cores[0].contrast if self.cores else 0.0
-
 
 def is_paper_family(scene: TrainingScene) -> bool:
     """Whether a scene is close to the paper's plaque in everything that describes it.
