@@ -79,11 +79,14 @@ class Engine:
             self._devices[device] = cuda.GpuPasses(self.tables, device, NEAREST, MAX_LAYERS_PER_SLAB)
         return self._devices[device]
 
+    def shapes(self, transposed: bool) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """Of one input and of one output."""
+        shapes = self.tables.domain_shape, self.tables.range_shape
+        return shapes[::-1] if transposed else shapes
+
     def apply(self, x: Tensor, transposed: bool) -> Tensor:
         """One pass, ``(..., *domain_shape)`` to ``(..., *range_shape)`` or, ``transposed``, back; no autograd."""
-        inner, outer = self.tables.domain_shape, self.tables.range_shape
-        if transposed:
-            inner, outer = outer, inner
+        inner, outer = self.shapes(transposed)
         lead = x.shape[: x.dim() - len(inner)]
         batch = math.prod(lead)
         if batch == 0:
@@ -111,8 +114,8 @@ class Engine:
         """True if the device's kernels reproduce the CPU's on random data of this scan, both ways; warns if not."""
         generator = torch.Generator().manual_seed(0)
         passes = self.on(device)
-        for transposed, shape in ((False, self.tables.domain_shape), (True, self.tables.range_shape)):
-            given = torch.randn((1, *shape), generator=generator, dtype=dtype)
+        for transposed in (False, True):
+            given = torch.randn((1, *self.shapes(transposed)[0]), generator=generator, dtype=dtype)
             expect = self._on_cpu(given, transposed)
             there = given.to(device)
             found = (passes.adjoint(there) if transposed else passes.forward(there)).cpu()

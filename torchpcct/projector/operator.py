@@ -28,22 +28,31 @@ _NARROW = (torch.float16, torch.bfloat16)
 
 
 class Operator(nn.Module):
-    """A linear operator with a matched adjoint ``T``, between ``domain_shape`` and ``range_shape``."""
+    """Passes of an engine from ``domain_shape`` to ``range_shape``, and their matched adjoint ``T``."""
+
+    def __init__(self, engine: Engine, transposed: bool = False) -> None:
+        super().__init__()
+        self._engine, self._transposed = engine, transposed
+        self._other: list[Operator] = []  # in a list: a submodule that holds its parent would recurse
 
     @property
     def domain_shape(self) -> tuple[int, ...]:
-        """Shape of one input."""
-        raise NotImplementedError
+        """Shape of one input: of a :class:`Projector` that of a volume, ``(y, x)`` or ``(z, y, x)``."""
+        return self._engine.shapes(self._transposed)[0]
 
     @property
     def range_shape(self) -> tuple[int, ...]:
-        """Shape of one output."""
-        raise NotImplementedError
+        """Shape of one output: of a :class:`Projector` ``(views, columns)`` or ``(views, rows, columns)``."""
+        return self._engine.shapes(self._transposed)[1]
 
     @property
     def T(self) -> Operator:
-        """The adjoint operator."""
-        raise NotImplementedError
+        """The adjoint operator; ``A.T.T is A``."""
+        if not self._other:
+            other = Operator(self._engine, not self._transposed)
+            other._other.append(self)
+            self._other.append(other)
+        return self._other[0]
 
     @property
     def H(self) -> Operator:
@@ -52,6 +61,13 @@ class Operator(nn.Module):
 
     def __matmul__(self, x: Tensor) -> Tensor:
         return cast(Tensor, self(x))
+
+    def forward(self, x: Tensor) -> Tensor:
+        name, operator = ("y", "A.T") if self._transposed else ("x", "A")
+        return _apply(_checked(x, self.domain_shape, name, operator), self._engine, self._transposed)
+
+    def extra_repr(self) -> str:
+        return f"{type(self._engine.tables.geometry).__name__}, {self.domain_shape} -> {self.range_shape}"
 
     def norm(self, tolerance: float = 1e-4, most: int = 200) -> float:
         """Largest singular value, by power iteration on AᵀA in float32; kept after the first call.
@@ -169,10 +185,7 @@ def _traced(x: Tensor, engine: int, transposed: bool) -> Tensor:
 
 @_traced.register_fake
 def _shape(x: Tensor, engine: int, transposed: bool) -> Tensor:
-    tables = ENGINES[engine].tables
-    inner, outer = tables.domain_shape, tables.range_shape
-    if transposed:
-        inner, outer = outer, inner
+    inner, outer = ENGINES[engine].shapes(transposed)
     return x.new_empty((*x.shape[: x.dim() - len(inner)], *outer))
 
 
@@ -236,33 +249,10 @@ class Projector(Operator):
         window: DetectorWindow | None = None,
         motion: Any = None,
     ) -> None:
-        super().__init__()
+        super().__init__(Engine(_tables(geometry, grid, window, motion)))
         self.geometry = geometry
         self.grid = grid
         self.window = window
-        self._engine = Engine(_tables(geometry, grid, window, motion))
-        self._adjoint: list[_Adjoint] = []  # in a list: a submodule that holds its parent would recurse
-
-    @property
-    def domain_shape(self) -> tuple[int, ...]:
-        """Shape of one volume, ``(y, x)`` or ``(z, y, x)``."""
-        return self._engine.tables.domain_shape
-
-    @property
-    def range_shape(self) -> tuple[int, ...]:
-        """Shape of one set of line integrals, ``(views, columns)`` or ``(views, rows, columns)``."""
-        return self._engine.tables.range_shape
-
-    @property
-    def T(self) -> _Adjoint:
-        """The adjoint operator; ``A.T.T is A``."""
-        if not self._adjoint:
-            self._adjoint.append(_Adjoint(self))
-        return self._adjoint[0]
-
-    def forward(self, x: Tensor) -> Tensor:
-        x = _checked(x, self.domain_shape, "x", "A")
-        return _apply(x, self._engine, False)
 
     def memory_estimate(
         self, batch: int = 1, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
@@ -287,36 +277,6 @@ class Projector(Operator):
         if not batch:
             return 0
         return arrays + self._engine.workspace(batch, item, torch.device(device).type)
-
-    def extra_repr(self) -> str:
-        return f"{type(self.geometry).__name__}, {self.domain_shape} -> {self.range_shape}"
-
-
-class _Adjoint(Operator):
-    """``A.T``: the transpose of a :class:`Projector`."""
-
-    def __init__(self, projector: Projector) -> None:
-        super().__init__()
-        self._projector = [projector]
-
-    @property
-    def T(self) -> Projector:
-        return self._projector[0]
-
-    @property
-    def domain_shape(self) -> tuple[int, ...]:
-        return self.T.range_shape
-
-    @property
-    def range_shape(self) -> tuple[int, ...]:
-        return self.T.domain_shape
-
-    def forward(self, y: Tensor) -> Tensor:
-        y = _checked(y, self.domain_shape, "y", "A.T")
-        return _apply(y, self.T._engine, True)
-
-    def extra_repr(self) -> str:
-        return f"{type(self.T.geometry).__name__}, {self.domain_shape} -> {self.range_shape}"
 
 
 def _tables(geometry: Any, grid: Any, window: Any, motion: Any) -> Tables | VectorTables:

@@ -9,7 +9,6 @@ and starts at ``source + b * across``.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -197,22 +196,23 @@ def slab_lattice(center: Sequence[float], shape: Sequence[int], spacing: Sequenc
     return np.array([y, hy, x - hx / 2, hx, x, hx, y - hy / 2, hy])
 
 
-def check_source(rays: Rays, grid: VolumeGrid) -> None:
+def check_source(place: Floats, grid: VolumeGrid) -> None:
     """Refuse a source inside the grid: its line integrals would start in the middle of the object.
 
+    Args:
+        place: ``(views, axes)`` of the source in mm, axes as the grid has them.
+        grid: of the object.
+
     Raises:
-        ValueError: some view's source lies inside the grid's rectangle (or touches it).
+        ValueError: some view's source lies inside the grid (or touches it).
     """
-    if rays.parallel:
-        return
-    cy, cx = grid.center[-2:]
-    ey, ex = grid.extent[-2:]
-    inside = (np.abs(rays.source[:, 0] - cx) <= ex / 2) & (np.abs(rays.source[:, 1] - cy) <= ey / 2)
+    inside = (np.abs(place - np.array(grid.center)) <= np.array(grid.extent) / 2).all(1)
     if inside.any():
-        v = int(np.argmax(inside))
-        x, y = rays.source[v, :2]
+        view = int(inside.argmax())
+        x, extent, center = (
+            ", ".join(f"{v:.4g}" for v in values[::-1]) for values in (place[view], grid.extent, grid.center)
+        )
         raise ValueError(
-            f"the source of view {v} at x {x:.1f}, y {y:.1f} mm lies inside the grid "
-            f"({ex:g} × {ey:g} mm about x {cx:g}, y {cy:g}): shrink or move the grid, or increase sod "
-            f"(now {math.hypot(x, y):.1f} mm from the axis)"
+            f"the source of view {view} at {x} mm lies inside the grid of {extent} mm about {center} mm: shrink or "
+            "move the grid, or move the source away (a larger sod)"
         )

@@ -43,7 +43,8 @@ class Tables:
         self.rays = rays_of(geometry, window)
         if motion is not None:
             self.rays = self.rays.moved(check_motion(motion, geometry.views, grid.ndim))
-        check_source(self.rays, grid)
+        if not self.rays.parallel:
+            check_source(self.rays.source[:, 1::-1], grid.slice)  # in the plane, whatever the source's height
         self.lattice = slab_lattice(grid.center[-2:], grid.shape[-2:], grid.spacing[-2:])
 
     @property
@@ -96,16 +97,8 @@ class VectorTables:
         if grid.ndim != axes:
             raise ValueError(f"vectors of {len(geometry.vectors[0])} numbers need a {axes}-D grid, got {grid.shape}")
         self.geometry, self.grid = geometry, grid
-        if geometry.parallel:
-            return
-        place = geometry.poses[:, 0, :axes][:, ::-1]
-        inside = (np.abs(place - np.array(grid.center)) <= np.array(grid.extent) / 2).all(1)
-        if inside.any():
-            view = int(inside.argmax())
-            raise ValueError(
-                f"the source of view {view} at {', '.join(f'{x:.1f}' for x in place[view, ::-1])} mm lies inside the "
-                "grid: shrink or move the grid"
-            )
+        if not geometry.parallel:
+            check_source(geometry.poses[:, 0, :axes][:, ::-1], grid)
 
     @property
     def domain_shape(self) -> tuple[int, ...]:
