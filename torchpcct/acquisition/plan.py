@@ -3,8 +3,7 @@
 Every effect of the finite beam and of the spectrum can be switched off; a scene that does not need it should not pay
 for it. :func:`make_plan` computes a sparse sample of the scan with everything on and densely sampled, then without
 each effect in turn, and keeps the effects whose omission would cost more than the stated tolerance. What the detector
-makes of the readings is its own choice (dead time, charge sharing): the plan says so and holds the map that the scan
-applies.
+makes of the readings is its own choice (dead time, charge sharing): the plan says so.
 """
 
 from __future__ import annotations
@@ -21,7 +20,6 @@ from torchpcct.acquisition.bodies import Bodies
 from torchpcct.acquisition.transmission import SUB_RAY_COUNTS, Beam, expected_readings, sub_rays
 from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import ConeBeam, VolumeGrid
-from torchpcct.scanner.pileup import PileUpMap
 from torchpcct.scanner.scanner import Scanner
 from torchpcct.validate import number
 
@@ -67,7 +65,6 @@ class Plan:
         points: ``(sub-rays, 5)`` beam samples of :func:`torchpcct.acquisition.transmission.sub_rays`.
         active: the readings that see the varying bodies; None: no view differs from another.
         kept: the readings that the scan will hold; None: the whole detector.
-        pile_up: what the detector's dead time makes of the readings; None: it has none.
         sampling_error: rms error of a line integral by the finite number of sub-rays, relative to the inset's peak.
         readings, seconds, bytes: size, estimated time and memory.
         tolerance_hu: the tolerance that decided.
@@ -77,7 +74,6 @@ class Plan:
     points: Any
     active: DetectorWindow | None
     kept: DetectorWindow | None
-    pile_up: PileUpMap | None
     sampling_error: float
     readings: int
     seconds: float
@@ -270,7 +266,6 @@ def make_plan(
         points=points,
         active=window,
         kept=kept,
-        pile_up=scanner.pile_up(),
         sampling_error=error,
         readings=held,
         seconds=busy * len(points) * per_ray + held * 8e-9,

@@ -29,7 +29,7 @@ from torchpcct.geometry import VolumeGrid
 from torchpcct.kernel_cache import forget_outdated
 from torchpcct.scanner import Scanner
 from torchpcct.scene import Scene
-from torchpcct.scene.chords import interval
+from torchpcct.scene.chords import interval, pack
 from torchpcct.scene.materials import material
 from torchpcct.threads import run
 from torchpcct.validate import checked, choice, number, whole
@@ -172,7 +172,7 @@ def primary_dose(
     per_gram = mass_energy_absorption if quantity == "absorbed" else mass_interaction
     deposit = np.stack([per_gram(m, energies) * energies for m in media]) * MGY_PER_KEV_PER_G
 
-    kinds, params = scene.pack()
+    kinds, params = pack(scene.shapes)
     coefficients, basis = compress(scene.contrast(energies), tolerance=1e-6)
     beta = (np.arange(views) + 0.5) * (2.0 * math.pi / views)
     flat = points.reshape(-1, 2)

@@ -55,7 +55,6 @@ class MonteCarloDose:
     Attributes:
         grid: of the map.
         primary, scattered: ``(y, x)`` dose by unscattered and by scattered photons, mean over the scan length.
-        scattered_sd: ``(y, x)`` standard deviation of ``scattered`` by the finite number of histories.
         batches: ``(B, 2, y, x)`` the independent parts, primary and scattered, each an estimate of the whole.
         histories: number of photons.
     """
@@ -63,7 +62,6 @@ class MonteCarloDose:
     grid: VolumeGrid
     primary: Floats
     scattered: Floats
-    scattered_sd: Floats
     batches: Floats
     histories: int
 
@@ -187,5 +185,4 @@ def monte_carlo_dose(
     scale = photons * scanner.source.current_ma * exposure_s * MGY_PER_KEV_PER_G / (area * density)
     parts = tally * (scale * BATCHES / n)
     mean = parts.mean(0)
-    sd = parts[:, 1].std(0, ddof=1) / math.sqrt(BATCHES)
-    return MonteCarloDose(grid, mean[0], mean[1], sd, parts, n)
+    return MonteCarloDose(grid, mean[0], mean[1], parts, n)

@@ -140,28 +140,6 @@ class Scanner:
         """
         return _linearisation(_Optics.of(self), self.detector, self.pile_up())
 
-    def describe(self) -> dict[str, Any]:
-        """The scanner's numbers as JSON values, for reports and file headers."""
-        g, s = self.geometry, self.source
-        return {
-            "name": self.name,
-            "sod_mm": g.sod,
-            "sdd_mm": g.sdd,
-            "views": g.views,
-            "rows": g.rows,
-            "columns": g.columns,
-            "pitch_mm": list(g.pitch),
-            "offset_mm": list(g.offset),
-            "kvp": s.kvp,
-            "current_ma": s.current_ma,
-            "focal_spot_mm": list(s.focal_spot),
-            "filtration_mm": [[m.name, t] for m, t in (*s.filtration, *self.filters)],
-            "bowties": [b.name for b in self.bowties],
-            "detector": type(self.detector).__name__,
-            "bins": self.detector.bins,
-            "energy_bin_kev": self.energy_bin_kev,
-        }
-
 
 @dataclass(frozen=True)
 class _Optics:

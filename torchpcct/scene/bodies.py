@@ -139,11 +139,6 @@ class Shape:
         return np.stack([position - half, position + half])
 
     @property
-    def volume(self) -> float:
-        """Volume in mm³ (``inf`` for an infinite shape)."""
-        raise NotImplementedError
-
-    @property
     def rotationally_symmetric(self) -> bool:
         """Whether turning the shape about the scanner's z axis leaves it as it is (then every view sees the same)."""
         raise NotImplementedError
@@ -183,10 +178,6 @@ class Ellipsoid(Shape):
         object.__setattr__(self, "semi_axes", numbers("semi_axes", axes, 3, positive=True))
 
     @property
-    def volume(self) -> float:
-        return 4.0 / 3.0 * math.pi * math.prod(self.semi_axes)
-
-    @property
     def rotationally_symmetric(self) -> bool:
         form = self.matrix @ np.diag(np.array(self.semi_axes) ** -2.0) @ self.matrix.T
         upright = np.diag([form[0, 0], form[0, 0], form[2, 2]])
@@ -219,10 +210,6 @@ class EllipticCylinder(Shape):
         axes = (self.semi_axes,) * 2 if np.ndim(self.semi_axes) == 0 else self.semi_axes
         object.__setattr__(self, "semi_axes", numbers("semi_axes", axes, 2, positive=True))
         object.__setattr__(self, "half_length", number("half_length", self.half_length, positive=True, finite=False))
-
-    @property
-    def volume(self) -> float:
-        return 2.0 * math.pi * math.prod(self.semi_axes) * self.half_length
 
     @property
     def rotationally_symmetric(self) -> bool:
@@ -260,10 +247,6 @@ class Box(Shape):
         super().__post_init__()
         half = (self.half_lengths,) * 3 if np.ndim(self.half_lengths) == 0 else self.half_lengths
         object.__setattr__(self, "half_lengths", numbers("half_lengths", half, 3, positive=True))
-
-    @property
-    def volume(self) -> float:
-        return 8.0 * math.prod(self.half_lengths)
 
     @property
     def rotationally_symmetric(self) -> bool:

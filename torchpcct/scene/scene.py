@@ -274,12 +274,6 @@ class Scene:
         """The scene with further bodies behind the present ones; checked for overlap like a new scene."""
         return Scene((*self.bodies, *bodies), self.motion)
 
-    def pack(self) -> tuple[NDArray[np.int64], Floats]:
-        """The shapes at rest as arrays for the kernels of :mod:`torchpcct.scene.chords`: kinds ``(B,)``, params."""
-        from torchpcct.scene.chords import pack  # it stands beside kernels, which need numba, a slow import
-
-        return pack(self.shapes)
-
     def labels(self, where: Any) -> NDArray[np.int64]:
         """Index of the innermost body at points or voxel centres, −1 in the surroundings; at rest.
 

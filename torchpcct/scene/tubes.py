@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -88,14 +87,6 @@ class _Tube(Shape):
         """How far in mm the tube reaches beyond ``x = R``."""
         raise NotImplementedError
 
-    def _bulge_integral(self, function: Any) -> float:
-        """∫ function(d(z)) dz over the tube's length, by Gauss–Legendre on the smooth bulge, exact to 1e-12."""
-        reach = min(self.half_length, self.bulge_length / 2.0)
-        node, weight = np.polynomial.legendre.leggauss(96)
-        return float(reach * (weight * function(self.profile(node * reach))).sum()) + 2.0 * float(
-            function(np.zeros(()))
-        ) * (self.half_length - reach)
-
 
 @dataclass(frozen=True)
 class BulgedTube(_Tube):
@@ -111,10 +102,6 @@ class BulgedTube(_Tube):
     def section(self, z: ArrayLike) -> tuple[Floats, Floats, Floats]:
         d = self.profile(z)
         return d, self.radius + d, np.full_like(d, self.radius)
-
-    @property
-    def volume(self) -> float:
-        return math.pi * self.radius * self._bulge_integral(lambda d: self.radius + d)
 
     def _outward(self) -> float:
         return 2.0 * self.amplitude
@@ -137,10 +124,6 @@ class NarrowedTube(_Tube):
     def section(self, z: ArrayLike) -> tuple[Floats, Floats, Floats]:
         r = self.radius**2 / (self.radius + self.profile(z))
         return r - self.radius, r, r
-
-    @property
-    def volume(self) -> float:
-        return math.pi * self._bulge_integral(lambda d: (self.radius**2 / (self.radius + d)) ** 2)
 
     def _outward(self) -> float:
         return 0.0

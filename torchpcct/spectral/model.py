@@ -237,7 +237,7 @@ class SpectralModel:
             columns, scale: see :meth:`rays`.
 
         Returns:
-            ``(bins, ...)`` of the dtype of ``line_integrals``; differentiable by them (once).
+            ``(bins, ...)`` of the dtype of ``line_integrals``; not differentiable.
 
         Raises:
             ValueError: a wrong shape, indices outside the detector.
@@ -245,7 +245,8 @@ class SpectralModel:
         if line_integrals.ndim < 1 or line_integrals.shape[0] != 2:
             raise ValueError(f"line_integrals must have the shape (2, ...), got {tuple(line_integrals.shape)}")
         column, intensity = self.rays(tuple(line_integrals.shape[1:]), columns, scale)
-        return torch.as_tensor(_Expected.apply(line_integrals, self, column, intensity))
+        counts = torch.from_numpy(evaluate(self, line_integrals, column, intensity)[0])
+        return counts.reshape(-1, *line_integrals.shape[1:]).to(line_integrals.dtype)
 
 
 def evaluate(model: SpectralModel, line_integrals: Tensor, column: Any, intensity: Any) -> tuple[Floats, Floats]:
@@ -261,21 +262,6 @@ def evaluate(model: SpectralModel, line_integrals: Tensor, column: Any, intensit
         slopes, operations=6 * model.spectra[0].size,
     )  # fmt: skip
     return counts, slopes
-
-
-class _Expected(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, line_integrals: Tensor, model: SpectralModel, column: Any, intensity: Any) -> Tensor:
-        counts, slopes = evaluate(model, line_integrals, column, intensity)
-        ctx.slopes = torch.from_numpy(slopes[:2])
-        ctx.shape = line_integrals.shape
-        return torch.from_numpy(counts).reshape(-1, *line_integrals.shape[1:]).to(line_integrals.dtype)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> Any:
-        g = (ctx.slopes * grad.reshape(grad.shape[0], -1)).sum(1)
-        return g.reshape(ctx.shape).to(grad.dtype), None, None, None
 
 
 def _one_spectrum(spectra: Floats) -> NDArray[np.bool_]:

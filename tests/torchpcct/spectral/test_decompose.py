@@ -56,9 +56,6 @@ def test_expected_counts_are_the_sum_over_the_spectrum(model):
     transmitted = np.exp(-a.numpy().T @ model.attenuation)
     exact = scale * np.einsum("rbe,re->br", model.spectra[columns], transmitted)
     np.testing.assert_allclose(counts.numpy(), exact, rtol=1e-12)
-    assert torch.autograd.gradcheck(
-        lambda x: model.expected(x, columns=columns).log(), a[:, :4].repeat(1, 3).requires_grad_()
-    )
 
 
 def test_air_is_the_scanners():
