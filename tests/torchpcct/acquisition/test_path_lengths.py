@@ -1,4 +1,4 @@
-"""Path lengths of the tissues against chords of balls, and as what the readings see."""
+"""Path lengths of the tissues against chords of balls."""
 
 import math
 
@@ -7,12 +7,9 @@ import pytest
 import torch
 
 from torchpcct import ConeBeam, full_turn
-from torchpcct.acquisition.bodies import BodySet
 from torchpcct.acquisition.path_lengths import tissue_path_lengths
-from torchpcct.acquisition.transmission import Beam, expected_readings, sub_rays
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.scene import Body, Ellipsoid, EllipticCylinder, Scene, SinusoidalMotion
-from torchpcct.scene.chords import pack
 from torchpcct.scene.plaque import plaque_scene
 
 GEOMETRY = ConeBeam(full_turn(5, 0.3), 60.0, 110.0, 14, 6, (1.7, 2.5), (0.6, -0.625), "curved")
@@ -33,7 +30,8 @@ def ball_chord(center, radius, origin, direction):
 
 
 @pytest.mark.parametrize("detector", ["flat", "curved"])
-def test_path_lengths_of_single_rays(detector):
+def test_path_lengths_of_single_rays(detector, monkeypatch):
+    monkeypatch.setattr("torchpcct.acquisition.path_lengths._VIEWS", 2)
     g = ConeBeam(GEOMETRY.angles, 60.0, 110.0, 14, 6, (1.7, 2.5), (0.6, -0.625), detector)
     window = DetectorWindow([2, 0, 3, 1, 4], 9, 1, 4)
     lengths = tissue_path_lengths(SCENE, ["ball", "core"], g, window, sub_rays=1, dtype=torch.float64)
@@ -67,30 +65,14 @@ def test_path_lengths_add_up_and_average_over_the_beam():
     assert tissue_path_lengths(scene, names[:1], g, window, sub_rays=1).dtype == torch.float32
 
 
-def test_mass_is_kept_by_every_blur(monkeypatch):
+def test_mass_is_kept_by_every_blur():
     """The core's path lengths, summed over a fine detector, are its volume in every view, whatever the beam's width."""
-    monkeypatch.setattr("torchpcct.acquisition.path_lengths._LINES", 1000)
     g = ConeBeam(full_turn(3, 0.1), 600.0, 900.0, 60, 60, 0.2)
     scene = Scene([Body("ball", Ellipsoid((2.0, 1.5, 1.0)), "fibrous_tissue")])
     for beam in ({"sub_rays": 32}, {"sub_rays": 32, "focal_spot": (0.9, 0.7), "view_step": 0.01}):
         sums = tissue_path_lengths(scene, ["ball"], g, dtype=torch.float64, **beam).sum((0, 2, 3))
         volume = sums * (0.2 / 1.5) ** 2
         np.testing.assert_allclose(volume, 4 / 3 * math.pi * 3, rtol=5e-4)
-
-
-def test_path_lengths_see_the_beam_of_the_readings():
-    """Readings of one energy and a weak contrast are the path lengths times that contrast, finite beam included."""
-    g, views = GEOMETRY, GEOMETRY.views
-    kinds, params = pack([SCENE["core"].shape])
-    mu, zero = 1e-5, np.zeros((1, views, 3))
-    bodies = BodySet(kinds, params, np.full((1, 1), mu), zero, zero, (0.0, 0.0, np.inf))
-    beam = Beam(np.ones((1, g.columns, 1)), np.ones(g.rows), (0.9, 0.7), sub_rays(32))
-    window = DetectorWindow(np.zeros(views, np.int64), g.columns, 0, g.rows)
-    readings = expected_readings(g, window, bodies, beam, np.full(views, 0.02))[0]
-    lengths = tissue_path_lengths(
-        SCENE, ["core"], g, sub_rays=32, focal_spot=(0.9, 0.7), view_step=0.02, dtype=torch.float64
-    )
-    np.testing.assert_allclose(lengths[0], -np.log(readings.numpy()) / mu, atol=1e-4)
 
 
 @pytest.mark.parametrize(
