@@ -74,9 +74,12 @@ class Engine:
         """The Triton passes, with their tables on ``device``."""
         assert isinstance(self.tables, Tables)
         if device not in self._devices:
-            from torchpcct.projector.cpu.cone_kernels import MAX_LAYERS_PER_SLAB, NEAREST
+            from torchpcct.projector.cpu.cone_kernels import MAX_LAYERS_PER_SLAB, NEAREST, tabulate_cells
 
-            self._devices[device] = cuda.GpuPasses(self.tables, device, NEAREST, MAX_LAYERS_PER_SLAB)
+            t, r = self.tables, self.tables.rays
+            cells, axes = np.empty((r.views, r.columns, 8)), np.empty((r.views, r.columns), dtype=np.int32)
+            tabulate_cells(t.segments.table, t.pose, r.edges, r.centers, r.first, t.lattice, r.parallel, cells, axes)
+            self._devices[device] = cuda.GpuPasses(t, device, cells, axes, NEAREST, MAX_LAYERS_PER_SLAB)
         return self._devices[device]
 
     def shapes(self, transposed: bool) -> tuple[tuple[int, ...], tuple[int, ...]]:

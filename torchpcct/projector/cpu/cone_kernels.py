@@ -24,7 +24,7 @@ from torchpcct.projector.cpu.simd import add_lines, spread_line, spread_lines, s
 from torchpcct.projector.cpu.simd_interpolation import add_steps, set_steps
 from torchpcct.threads import run
 
-__all__ = ["backproject", "padded", "project"]
+__all__ = ["backproject", "padded", "project", "tabulate_cells"]
 
 # NaN and Inf must survive, so only the flags that leave them alone.
 _FLAGS = {"contract", "nsz", "arcp", "reassoc"}
@@ -88,6 +88,22 @@ def _cell(pose, edges, centers, j, axis, lattice):
     p1, q1 = _edge_line(pose, edges, j + 1, axis, lattice, False)
     l0, l1, path, square = _depth_line(pose, centers, j, axis, lattice, False)
     return p0, q0, p1, q1, l0, l1, path, square
+
+
+@_kernel
+def tabulate_cells(segments, pose, edges, centers, first, lattice, parallel, cells, axes):
+    """Per view and column ``p0, q0, p1, q1, l0, l1, path, square`` into ``cells``, and the main axis into ``axes``.
+
+    The lines of the cell's two edges (see ``_edge_line``) and of its depth (see ``_depth_line``), of any beam.
+    """
+    for s in range(segments.shape[0]):
+        v, axis, start, count = segments[s]
+        for j in range(start, start + count):
+            k, cell = first[v] + j, cells[v, j]
+            cell[0], cell[1] = _edge_line(pose[v], edges, k, axis, lattice, parallel)
+            cell[2], cell[3] = _edge_line(pose[v], edges, k + 1, axis, lattice, parallel)
+            cell[4], cell[5], cell[6], cell[7] = _depth_line(pose[v], centers, k, axis, lattice, parallel)
+            axes[v, j] = axis
 
 
 @_small

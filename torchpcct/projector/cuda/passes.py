@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import math
+from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,53 +19,20 @@ def available() -> bool:
     return importlib.util.find_spec("triton") is not None
 
 
-def cell_table(tables: Tables) -> tuple[np.ndarray, np.ndarray]:
-    """Per view and column ``p0, q0, p1, q1, l0, l1, path, square`` (see ``cone_kernels``) and the main axis."""
-    rays, lattice = tables.rays, tables.lattice
-    axes = np.zeros((rays.views, rays.columns), dtype=np.int32)
-    for v, axis, start, count in tables.segments.table:
-        axes[v, start : start + count] = axis
-    table = np.empty((rays.views, rays.columns, 8))
-    columns = np.arange(rays.columns)
-    for v in range(rays.views):
-        axis = axes[v]
-        own, other = np.where(axis == 0, 1, 0), np.where(axis == 0, 0, 1)  # coordinate across and along the slabs
-        slab0, pitch = np.where(axis == 0, lattice[0], lattice[4]), np.where(axis == 0, lattice[1], lattice[5])
-        edge0, step = np.where(axis == 0, lattice[2], lattice[6]), np.where(axis == 0, lattice[3], lattice[7])
-        for position, entries in ((0, rays.edges), (2, rays.edges[1:]), (4, rays.centers)):
-            a, b = entries[rays.first[v] + columns].T
-            point = np.broadcast_to(rays.source[v, :2], (rays.columns, 2))
-            if rays.parallel:
-                point = point + b[:, None] * rays.across[v]
-                direction = np.broadcast_to(rays.axial[v], point.shape)
-            else:
-                direction = a[:, None] * rays.axial[v] + b[:, None] * rays.across[v]
-            normal, along = direction[columns, own], direction[columns, other]
-            if position < 4:
-                slope = along / normal
-                table[v, :, position] = (point[columns, other] - edge0 + (slab0 - point[columns, own]) * slope) / step
-                table[v, :, position + 1] = slope * pitch / step
-            else:
-                square = (direction**2).sum(-1)
-                table[v, :, 4] = (slab0 - rays.source[v, own]) / normal
-                table[v, :, 5] = pitch / normal
-                table[v, :, 6] = pitch * np.sqrt(square) / np.abs(normal)
-                table[v, :, 7] = square
-    return table, axes
-
-
 class GpuPasses:
     """Forward and adjoint passes of a scan on one device (any device under the Triton interpreter).
 
     Args:
         tables: of the scan.
         device: where the tables live and the passes run.
+        cells, axes: of all cells, see ``cone_kernels.tabulate_cells``.
         nearest, layers_per_slab: limits of the CPU's cone-beam kernels (``NEAREST``, ``MAX_LAYERS_PER_SLAB``).
     """
 
-    def __init__(self, tables: Tables, device: torch.device, nearest: float, layers_per_slab: float) -> None:
+    def __init__(
+        self, tables: Tables, device: torch.device, cells: Any, axes: Any, nearest: float, layers_per_slab: float
+    ) -> None:
         self.tables, self.device = tables, device
-        cells, axes = cell_table(tables)
         self.cells, self.axes = torch.as_tensor(cells, device=device), torch.as_tensor(axes, device=device)
         self.pose = torch.as_tensor(tables.pose, device=device)
         self.segments = torch.as_tensor(tables.segments.table, device=device)
