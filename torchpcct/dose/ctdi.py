@@ -116,8 +116,7 @@ def ctdi_dose(
     pixels = 2 * math.ceil(half / _PIXEL_MM) + 4
     grid = VolumeGrid((pixels, pixels), _PIXEL_MM)
     result = monte_carlo_dose(scene, scanner, grid, exposure_s, histories=histories, seed=seed)
-    y, x = np.meshgrid(*grid.axes, indexing="ij")
-    labels = scene.labels(np.stack([x, y, np.zeros_like(x)], axis=-1))
+    labels = scene.labels(grid)
     index = [scene.index(name) for name in CTDI_HOLES]
     _, c, c_error = result.mean(labels == index[0])
     _, p, p_error = result.mean(np.isin(labels, index[1:]))

@@ -31,10 +31,11 @@ from torchpcct.scanner import Scanner
 from torchpcct.scene import Scene
 from torchpcct.scene.chords import interval, pack
 from torchpcct.scene.materials import material
+from torchpcct.scene.scene import voxel_centres
 from torchpcct.threads import run
 from torchpcct.validate import checked, choice, number, whole
 
-__all__ = ["QUANTITIES", "plane_points", "primary_dose"]
+__all__ = ["QUANTITIES", "primary_dose", "slice_points"]
 
 Floats = NDArray[np.float64]
 
@@ -90,8 +91,8 @@ def _dose(
         out[i] = total / cos_b.size
 
 
-def plane_points(where: Any) -> Floats:
-    """Points ``(..., 2)`` of x, y in mm: the voxel centres of a 2-D grid, or points as they are.
+def slice_points(where: Any, z_mm: float) -> Floats:
+    """Points ``(..., 3)`` of a slice in mm: the voxel centres of a 2-D grid, or points ``(..., 2)`` of x, y.
 
     Raises:
         ValueError: a 3-D grid, points of another shape or that are not finite.
@@ -99,12 +100,11 @@ def plane_points(where: Any) -> Floats:
     if isinstance(where, VolumeGrid):
         if where.ndim != 2:
             raise ValueError(f"the map needs a 2-D (y, x) grid, got {where.ndim} axes: use grid.slice")
-        y, x = np.meshgrid(*where.axes, indexing="ij")
-        return np.stack([x, y], axis=-1)
+        where = voxel_centres(where)[..., :2]
     points = np.asarray(where, dtype=np.float64)
     if points.shape[-1:] != (2,) or not np.isfinite(points).all():
         raise ValueError(f"points must be finite and have the shape (..., 2) of x, y in mm, got {points.shape}")
-    return points
+    return np.concatenate([points, np.full((*points.shape[:-1], 1), float(z_mm))], axis=-1)
 
 
 def check_static(scene: Scene) -> None:
@@ -157,14 +157,14 @@ def primary_dose(
     whole("views", views)
     number("exposure_s", exposure_s, positive=True, unit="s")
     check_static(scene)
-    points = plane_points(where)
+    points = slice_points(where, z_mm)
     g = scanner.geometry
     if points.size and float(np.hypot(points[..., 0], points[..., 1]).max()) >= g.sod:
         raise ValueError(f"points reach beyond the source orbit of {g.sod} mm: move or shrink the grid")
     half = fan_half_angle(scanner)
     energies, fluence = air_fluence(scanner, np.linspace(-half, half, _FAN_NODES), group_kev=group_kev)
     if medium is None:
-        labels = scene.labels(np.concatenate([points, np.full((*points.shape[:-1], 1), float(z_mm))], axis=-1))
+        labels = scene.labels(points)
         media = list(scene.materials)
     else:
         labels = np.zeros(points.shape[:-1], dtype=np.int64)
@@ -175,7 +175,7 @@ def primary_dose(
     kinds, params = pack(scene.shapes)
     coefficients, basis = compress(scene.contrast(energies), tolerance=1e-6)
     beta = (np.arange(views) + 0.5) * (2.0 * math.pi / views)
-    flat = points.reshape(-1, 2)
+    flat = points.reshape(-1, 3)
     out = np.zeros(len(flat))
     run(
         _dose, len(flat), np.ascontiguousarray(flat[:, 0]), np.ascontiguousarray(flat[:, 1]), float(z_mm), np.cos(beta),

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from torchpcct.counting_noise import seed_key
 from torchpcct.dose.coefficients import MGY_PER_KEV_PER_G, air_fluence, fan_half_angle, mass_energy_absorption
-from torchpcct.dose.primary import check_static, plane_points
+from torchpcct.dose.primary import check_static, slice_points
 from torchpcct.dose.transport_kernels import BATCHES, transport
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scanner import Scanner
@@ -138,7 +138,7 @@ def monte_carlo_dose(
         ValueError: a moving scene, voxels that are not square, a body outside of the grid, a bad length or count.
     """
     check_static(scene)
-    points = plane_points(grid)
+    points = slice_points(grid, z_mm)
     if abs(grid.spacing[0] / grid.spacing[1] - 1.0) > 1e-9:
         raise ValueError(f"the voxels must be square, got {grid.spacing} mm")
     whole("histories", histories, low=BATCHES)
@@ -147,7 +147,7 @@ def monte_carlo_dose(
             f"lengths must be 0 < scan_length_mm ≤ phantom_length_mm, got {scan_length_mm} and {phantom_length_mm} mm"
         )
     number("exposure_s", exposure_s, positive=True, unit="s")
-    labels = scene.labels(np.concatenate([points, np.full((*grid.shape, 1), float(z_mm))], axis=-1))
+    labels = scene.labels(points)
     if (labels[[0, -1]] >= 0).any() or (labels[:, [0, -1]] >= 0).any():
         raise ValueError("bodies reach the edge of the grid: give a larger grid, so that no scatter is lost")
     if (labels < 0).all():
