@@ -121,15 +121,15 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     used = {CASES[name].base for name in settings.cases}
     bases = {name: make(settings, pieces.within(name), progress) for name, make in _BASES.items() if name in used}
     clock.lap("simulate")
-    pieces.ahead(_sound, *((name, method) for name, base in bases.items() for method in _methods(base, settings)))
-    for name, base in bases.items():
-        for method in _methods(base, settings):
-            _sound(settings, pieces, name, method, base)
+    sound = [(b, m) for b, base in bases.items() for m in settings.methods if m != "tissues" or base.plaque is not None]
+    pieces.ahead(_sound, *sound)
+    for name, method in sound:
+        bases[name].sound(method)
     clock.lap("sound scans")
     pieces.ahead(_case, *((name,) for name in settings.cases))
     rows = []
     for k, name in enumerate(settings.cases):
-        rows += _case(settings, pieces, name, bases[CASES[name].base], progress)
+        rows += _case(settings, pieces, name, bases[CASES[name].base])
         progress("cases", (k + 1) / len(settings.cases))
     clock.lap("cases")
     counts = Counter(row["verdict"] for row in rows)
@@ -145,7 +145,7 @@ class _Base:
         scene, clean, noisy, grid, truth: of it.
         simulate, truth_of: of another scene.
         plaque: in it, or None.
-        sound: method → volume, warnings, rms noise, rms error against the truth.
+        pieces: keep what they give.
     """
 
     scene: Scene
@@ -157,7 +157,20 @@ class _Base:
     truth_of: Callable[[Scene], torch.Tensor]
     plaque: Plaque | None
     pieces: Pieces
-    sound: dict[str, tuple[torch.Tensor, list[str], float, float]] = field(default_factory=dict)
+    _sound: dict[str, tuple[torch.Tensor, list[str], float]] = field(default_factory=dict)
+
+    def sound(self, method: str) -> tuple[torch.Tensor, list[str], float]:
+        """What a method makes of it: volume, warnings, rms noise."""
+
+        def compute() -> tuple[torch.Tensor, list[str], float]:
+            with heard("recon", "torchpcct", alone=True) as messages:
+                volume = _reconstruct(self.noisy, self.grid, method)
+                noise = _rms(volume.data - _reconstruct(self.clean, self.grid, method).data)
+            return volume.data, [*volume.report.get("warnings", ()), *messages], noise
+
+        if method not in self._sound:
+            self._sound[method] = self.pieces(f"sound_{method}", compute)
+        return self._sound[method]
 
 
 def _plaque_base(settings: Settings, pieces: Pieces, progress: Progress) -> _Base:
@@ -189,37 +202,20 @@ def _body_base(settings: Settings, pieces: Pieces, progress: Progress) -> _Base:
 _BASES = {"plaque": _plaque_base, "body": _body_base}
 
 
-def _methods(base: _Base, settings: Settings) -> list[str]:
-    return [m for m in settings.methods if m != "tissues" or base.plaque is not None]
-
-
 def _reconstruct(scan: Scan, grid: VolumeGrid, method: str) -> Volume:
-    options: dict[str, Any] = {"tissues": True} if method == "tissues" else {}
-    return reconstruct(scan, grid, "mbir" if method == "tissues" else method, **options)
+    """By a method of :func:`recon.reconstruct`; "tissues": MBIR with them, "soft": FBP with that kernel."""
+    options: Any = {"tissues": {"tissues": True}, "soft": {"kernel": "soft"}}.get(method, {})
+    return reconstruct(scan, grid, {"tissues": "mbir", "soft": "fbp"}.get(method, method), **options)
 
 
-def _sound(settings: Settings, pieces: Pieces, name: str, method: str, base: _Base | None = None) -> None:
-    """What a method makes of the sound scan of this name, for ``base``."""
-    base = base or _BASES[name](settings, pieces.within(name), silent)
-
-    def compute() -> tuple[torch.Tensor, list[str], float, float]:
-        with heard("recon", "torchpcct", alone=True) as messages:
-            volume = _reconstruct(base.noisy, base.grid, method)
-            noise = _rms(volume.data - _reconstruct(base.clean, base.grid, method).data)
-        texts = [*volume.report.get("warnings", ()), *messages]
-        return volume.data, texts, noise, _rms(volume.data - base.truth)
-
-    base.sound[method] = base.pieces(f"sound_{method}", compute)
+def _sound(settings: Settings, pieces: Pieces, name: str, method: str) -> None:
+    """What a method makes of the sound scan of this name."""
+    _BASES[name](settings, pieces.within(name), silent).sound(method)
 
 
-def _case(
-    settings: Settings, pieces: Pieces, name: str, base: _Base | None = None, progress: Progress = silent
-) -> list[dict[str, Any]]:
+def _case(settings: Settings, pieces: Pieces, name: str, base: _Base | None = None) -> list[dict[str, Any]]:
     """A row for each method; without ``base``, its sound scan, this is computed or read first."""
-    if base is None:
-        base = _BASES[CASES[name].base](settings, pieces.within(CASES[name].base), progress)
-        for method in _methods(base, settings):
-            _sound(settings, pieces, CASES[name].base, method, base)
+    base = base or _BASES[CASES[name].base](settings, pieces.within(CASES[name].base), silent)
     pieces = pieces.within(f"case_{name}")
     case, clean, noisy, truth = CASES[name], base.clean, base.noisy, base.truth
     seen, lost = torch.ones(base.grid.shape).bool(), case.noise
@@ -238,7 +234,12 @@ def _case(
         scan: Scan | Exception = case.apply(clean, noisy, np.random.default_rng(settings.seed))
     except (ValueError, TypeError) as error:
         scan = error
-    soft = pieces("soft", partial(_from_truth, scan, base.grid, truth, seen))
+
+    def soft_error() -> float | None:
+        volume = _tried(scan, base.grid, "soft")[0]
+        return None if volume is None else _rms((volume.data - truth)[seen])
+
+    soft = pieces("soft", soft_error)
     rows = []
     for method in settings.methods:
         if method == "tissues" and not case.tissues:
@@ -257,16 +258,18 @@ def _truth(scene: Scene, scanner: Scanner, grid: VolumeGrid) -> torch.Tensor:
     return torch.from_numpy(scene.render(grid, values)).float()
 
 
-def _from_truth(scan: Scan | Exception, grid: VolumeGrid, truth: torch.Tensor, seen: torch.Tensor) -> float | None:
-    """Error of soft FBP against the truth, rms HU; None if it is refused."""
-    if isinstance(scan, Exception):
-        return None
-    with heard("recon", "torchpcct", alone=True):
+def _tried(scan: Scan | Exception, grid: VolumeGrid, method: str) -> tuple[Volume | None, list[str], float]:
+    """A volume, the warnings, and seconds; no volume but its message where the scan or method is refused."""
+    start = time.perf_counter()
+    with heard("recon", "torchpcct", alone=True) as messages:
         try:
-            volume = reconstruct(scan, grid, "fbp", kernel="soft")
-        except (ValueError, TypeError):
-            return None
-    return _rms((volume.data - truth)[seen])
+            if isinstance(scan, Exception):
+                raise scan
+            volume = _reconstruct(scan, grid, method)
+        except (ValueError, TypeError) as error:
+            return None, [str(error)], time.perf_counter() - start
+    seconds = time.perf_counter() - start
+    return volume, list(dict.fromkeys([*volume.report.get("warnings", []), *messages])), seconds
 
 
 def _row(
@@ -274,31 +277,21 @@ def _row(
     soft: float | None,
 ) -> dict[str, Any]:  # fmt: skip
     """A case by a method; ``seen``: the voxels that count, ``lost``: ``noise`` of :func:`verdict`."""
-    sound, usual, noise, _ = base.sound[method]
-    start = time.perf_counter()
-    with heard("recon", "torchpcct", alone=True) as messages:
-        try:
-            if isinstance(scan, Exception):
-                raise scan
-            volume = _reconstruct(scan, base.grid, method)
-        except (ValueError, TypeError) as error:
-            return {
-                "error_hu": None, "noise_hu": noise, "finite": True, "messages": [str(error)], "refused": True,
-                "seconds": time.perf_counter() - start, "verdict": verdict(None, noise, True, [str(error)]),
-                "truth_hu": None, "soft_hu": soft,
-            }  # fmt: skip
-    seconds = time.perf_counter() - start
-    finite = bool(torch.isfinite(volume.data).all())
-    error_hu, truth_hu = (_rms((volume.data - other)[seen]) for other in (sound, truth))
-    if case.other:
-        error_hu = max(truth_hu**2 - _rms((sound - base.truth)[seen]) ** 2, 0.0) ** 0.5
-    texts = list(dict.fromkeys([*volume.report.get("warnings", []), *messages]))
-    kinds = set(map(_kind, usual))
-    more = [t for t in texts if _kind(t) not in kinds]
-    # The standard kernel is sharper and noisier than the soft one by intent.
-    worse = 1.0 if soft is None or method == "fbp" else truth_hu / soft
+    sound, usual, noise = base.sound(method)
+    volume, texts, seconds = _tried(scan, base.grid, method)
+    error_hu = truth_hu = None
+    finite, more, worse = True, texts, 1.0
+    if volume is not None:
+        finite = bool(torch.isfinite(volume.data).all())
+        error_hu, truth_hu = (_rms((volume.data - other)[seen]) for other in (sound, truth))
+        if case.other:
+            error_hu = max(truth_hu**2 - _rms((sound - base.truth)[seen]) ** 2, 0.0) ** 0.5
+        kinds = set(map(_kind, usual))
+        more = [t for t in texts if _kind(t) not in kinds]
+        # The standard kernel is sharper and noisier than the soft one by intent.
+        worse = 1.0 if soft is None or method == "fbp" else truth_hu / soft
     return {
-        "error_hu": error_hu, "noise_hu": noise, "finite": finite, "messages": texts, "refused": False,
+        "error_hu": error_hu, "noise_hu": noise, "finite": finite, "messages": texts, "refused": volume is None,
         "seconds": seconds, "verdict": verdict(error_hu, noise, finite, more, lost, worse, case.unseen),
         "truth_hu": truth_hu, "soft_hu": soft,
     }  # fmt: skip
