@@ -107,7 +107,8 @@ class Settings(StudySettings):
     @property
     def table_exposure_s(self) -> float:
         """Exposure that the tables are shown for: the paper's, or the last."""
-        return paper.table_exposure(self.doses)
+        exposures = list(self.doses.values())
+        return paper.TABLE_EXPOSURE_S if paper.TABLE_EXPOSURE_S in exposures else exposures[-1]
 
 
 @dataclass
@@ -285,7 +286,7 @@ def _against_dose(s: Settings, m: Moments) -> dict[str, Any]:
 
 def _ten_run_experiments(s: Settings, m: Moments, exposure: float) -> dict[str, Any]:
     """How often each setting has the highest CNR in experiments of ten realisations."""
-    shared = few_run_tables(m.expected, m.covariance / exposure, _TEN, s.experiments, s.seed)
+    shared = few_run_tables(m.expected, m.covariance / exposure, s.experiments, s.seed)
     winners = np.bincount(shared.cnr.argmax(-1), minlength=len(s.axes)) / s.experiments
     return {
         "experiments": s.experiments,
@@ -352,40 +353,26 @@ def measured_table(means: Any) -> Table:
     return Table(values.mean(-3), values.std(-3, ddof=1))
 
 
-def few_run_tables(mean: Any, covariance: Any, realizations: int, draws: int, seed: int) -> Table:
-    """Tables that experiments of a few realisations would report.
+def few_run_tables(mean: Any, covariance: Any, draws: int, seed: int) -> Table:
+    """Tables that experiments of ten realisations would report.
 
     Args:
         mean: of the ROI means of a realisation, ``(settings, 2)`` HU.
         covariance: of the same, ``(2 · settings, 2 · settings)`` HU².
-        realizations: noise realisations per experiment, at least 2.
         draws: number of experiments.
         seed: of the random numbers.
-
-    Raises:
-        ValueError: fewer than 2 realisations.
     """
-    if realizations < 2:
-        raise ValueError(f"realizations must be at least 2, got {realizations}")
-    mean = np.asarray(mean, dtype=np.float64)
-    values, vectors = np.linalg.eigh(np.asarray(covariance, dtype=np.float64))
-    root = vectors * np.sqrt(np.clip(values, 0.0, None))
-    rng = np.random.default_rng(seed)
-    parts = []
+    rng, parts = np.random.default_rng(seed), []
     for start in range(0, draws, 1000):
-        count = min(1000, draws - start)
-        runs = rng.standard_normal((count, realizations, len(root))) @ root.T
-        parts.append(measured_table(mean + runs.reshape(count, realizations, *mean.shape)))
+        shape = (min(1000, draws - start), _TEN)
+        runs = rng.multivariate_normal(np.ravel(mean), covariance, shape, check_valid="ignore", method="eigh")
+        parts.append(measured_table(runs.reshape(*shape, *np.shape(mean))))
     return Table(np.concatenate([p.mean for p in parts]), np.concatenate([p.sd for p in parts]))
 
 
-def resampled_tables(means: Any, draws: int, seed: int) -> Table:
-    """Paired bootstrap of ``(n, settings, 2)`` ROI means: tables of ``draws`` resamples of the realisations."""
-    return _tables(np.asarray(means, dtype=np.float64), resampling(len(means), draws, seed))
-
-
-def _tables(values: Floats, indices: NDArray[np.int64]) -> Table:
-    """Tables of resamples, by counts: moments are linear in how often each realisation was drawn."""
+def resampled_tables(values: Floats, indices: NDArray[np.int64]) -> Table:
+    """Tables of resamples of ``(n, settings, 2)`` ROI means, by counts: moments are linear in how often each
+    realisation was drawn."""
     n = len(values)
     size = indices.shape[1]
     counts = np.zeros((len(indices), n))
@@ -440,8 +427,8 @@ def pair_differences(
     """
     values = np.asarray(means, dtype=np.float64)
     measured = measured_table(values).cnr
-    boot = resampled_tables(values, draws, seed).cnr
-    jackknife = _tables(values, leave_one_out(len(values))).cnr
+    boot = resampled_tables(values, resampling(len(values), draws, seed)).cnr
+    jackknife = resampled_tables(values, leave_one_out(len(values))).cnr
     result = []
     for a, b in pairs:
         value = float(measured[a] - measured[b])

@@ -41,7 +41,6 @@ RIGHT_NOISES = 0.5
 WORSE = 1.05
 """A method that is further from the truth than soft FBP of the same scan by more than this factor has to say so."""
 _ROWS, _GRID_MM = 20, (6.4, 9.2, 9.2)
-_ROD_VIEWS = 60
 _COLOURS = {"right": "tab:green", "warned": "tab:orange", "unseen": "tab:grey", "SILENT": "tab:red"}
 
 
@@ -253,7 +252,7 @@ def _case(settings: Settings, pieces: Pieces, name: str, base: _Base | None = No
 def _truth(scene: Scene, scanner: Scanner, grid: VolumeGrid) -> torch.Tensor:
     """``grid.shape`` HU of a scene at rest: each tissue reads what a rod of it does at the plaque's place."""
     tissues = {b.name: b.material for b in scene.bodies if b.name in plaque_scene()[0].names}
-    hu = rod_values(scene, scanner, grid.center[::-1], tissues=tissues, views=_ROD_VIEWS)
+    hu = rod_values(scene, scanner, grid.center[::-1], tissues)
     values = {name: hu.get(name, 0.0) for name in scene.names}  # what a case adds is left out
     return torch.from_numpy(scene.render(grid, values)).float()
 

@@ -31,7 +31,6 @@ __all__ = [
     "SPECTRAL",
     "TABLE_EXPOSURE_S",
     "VOXELS_MM",
-    "table_exposure",
 ]
 
 FULL_VIEWS = {"PCCT": presets.PCCT_VIEWS, "EID-CT": presets.EID_VIEWS}
@@ -49,12 +48,6 @@ TABLE_EXPOSURE_S = 2.00
 deviations point to the assumed 5.7× dose (an inference of ours)."""
 
 REALIZATIONS = 10
-
-
-def table_exposure(doses: Mapping[str, float]) -> float:
-    """The exposure of a study for which its tables are shown: the paper's, or the study's last."""
-    exposures = list(doses.values())
-    return TABLE_EXPOSURE_S if TABLE_EXPOSURE_S in exposures else exposures[-1]
 
 
 NOISE_FREE_ROI_HU = {"foreground": 40.1, "background": 91.8}

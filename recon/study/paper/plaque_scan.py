@@ -22,7 +22,6 @@ from torchpcct.scan import Scan
 from torchpcct.scanner import Scanner, presets
 from torchpcct.scene import Body, EllipticCylinder, Scene
 from torchpcct.scene.plaque import Plaque
-from torchpcct.validate import number, whole
 
 __all__ = [
     "INSET_MM",
@@ -145,24 +144,18 @@ def enclosing(grids: list[VolumeGrid]) -> VolumeGrid:
 # --- what each tissue reads ------------------------------------------------------------------------------------------
 
 
-_ROWS = 12
-"""Detector rows about the middle: more do not change what the middle slices read."""
-_LENGTH_MM = 8.0
+_ROWS, _ROD_VIEWS = 12, 60
+"""Detector rows about the middle and views per turn: more do not change what the middle slices read."""
+_ROD_MM, _LENGTH_MM = 4.0, 8.0
 _READ_SLICES, _ROD_VOXEL_MM = 3, 0.25
 _MARGIN_MM = 1.0
 """What is read keeps this far from the rod's edge: beyond the reach of every kernel's blur."""
 
 
 def rod_values(
-    scene: Scene,
-    scanner: Scanner,
-    position: tuple[float, ...],
-    *,
-    tissues: Mapping[str, Any] | None = None,
-    diameter_mm: float = 4.0,
-    views: int = 246,
+    scene: Scene, scanner: Scanner, position: tuple[float, ...], tissues: Mapping[str, Any]
 ) -> dict[str, float]:
-    """True values of tissues: the HU of a rod of each at the plaque's place, tissue → HU, about a second each.
+    """True values of tissues: the HU of a rod of each at the plaque's place, tissue → HU.
 
     The true value of a tissue in HU is a matter of definition: it hinges on the spectrum that arrives behind the
     patient and on the scanner's water correction. A least-squares fit of all tissues to one scan of the plaque has to
@@ -170,42 +163,32 @@ def rod_values(
     same place in the same patient, is large enough for the plateau of its FBP image (standard kernel) to be read
     directly: no fit, no edges, no noise.
 
-    Measured with the paper's scanner: core 41.1, wall 63.5, fibrous 103.2, blood 480.0, fat −92.7 HU.
-    246 views differ from 1968 by 0.01 HU at most, voxels of 0.1 mm from those of 0.25 mm too. Rods of 3, 4 and 6 mm
-    agree within 0.03 HU but for blood with iodine, which hardens its own beam and reads 1.2 HU less per mm of diameter:
-    rods should be about as thick as the vessel. All read 3–6 HU more than ``Material.hu`` of the spectrum behind the
-    patient says: that refers to water behind fat, the scanner's correction to water alone. The soft kernel is 2 % lower
-    in rods of this size.
+    Rods of 3, 4 and 6 mm agree within 0.03 HU but for blood with iodine, which hardens its own beam and reads 1.2 HU
+    less per mm of diameter: rods are about as thick as the vessel.
 
     Args:
-        scene: its first body is the patient, a cylinder about the scanner's axis, which stays as it is; of the others
-            only the materials count.
-        scanner: of the study; its views are thinned out to ``views``.
+        scene: its first body is the patient, a cylinder about the scanner's axis, which stays as it is.
+        scanner: of the study; its views are thinned out.
         position: ``(x, y, ...)`` mm of the plaque, e.g. ``Plaque.position``.
-        tissues: name → material; None: the bodies of the scene and their materials.
-        diameter_mm: of the rods, more than 2.5 mm.
-        views: per turn, at least 8.
+        tissues: name → material.
 
     Raises:
-        ValueError: a rod that leaves the patient or is too thin to be read, an unknown material.
+        ValueError: a rod that leaves the patient, an unknown material.
     """
-    diameter = number("diameter_mm", diameter_mm, low=2.5, unit="mm")
-    g = scanner.geometry
-    count = min(whole("views", views, 8), g.views)
+    g, radius = scanner.geometry, _ROD_MM / 2
+    count = min(_ROD_VIEWS, g.views)
     x, y = (float(v) for v in position[:2])
-    patient = scene.bodies[0]
-    materials = tissues or {body.name: body.material for body in scene.bodies}
     # The beam is on for as long as in one view of the whole scan.
     thinned = scanner.with_views(count)
     device = thinned.replace(geometry=replace(thinned.geometry, rows=min(g.rows, _ROWS)))
-    region = VolumeGrid((1, 1, 1), (_LENGTH_MM + 0.5, diameter + 0.5, diameter + 0.5), (0.0, y, x))
-    across = max(1, 2 * int((diameter - 2 * _MARGIN_MM) / 2 / _ROD_VOXEL_MM) + 1)
+    region = VolumeGrid((1, 1, 1), (_LENGTH_MM + 0.5, _ROD_MM + 0.5, _ROD_MM + 0.5), (0.0, y, x))
+    across = 2 * int((radius - _MARGIN_MM) / _ROD_VOXEL_MM) + 1
     grid = VolumeGrid((_READ_SLICES, across, across), _ROD_VOXEL_MM, (0.0, y, x))
-    read = _disc(grid, diameter / 2 - _MARGIN_MM)
-    shape = EllipticCylinder(diameter / 2, _LENGTH_MM / 2, position=(x, y, 0.0))
+    read = _disc(grid, radius - _MARGIN_MM)
+    shape = EllipticCylinder(radius, _LENGTH_MM / 2, position=(x, y, 0.0))
     hu = {}
-    for name, material in materials.items():
-        rod = Scene([replace(patient, name="patient"), Body("rod", shape, material, "patient")])
+    for name, material in tissues.items():
+        rod = Scene([replace(scene.bodies[0], name="patient"), Body("rod", shape, material, "patient")])
         scan = acquire(rod, device, region=region, duty=count / g.views)
         values = InsetFbp(scan, [grid], [REFERENCE_KERNEL])(scan)[0][0].double().numpy()[read]
         hu[str(name)] = float(values.mean())

@@ -2,6 +2,7 @@
 
 import pytest
 
+from recon.study.paper import plaque_scan
 from recon.study.paper.plaque_scan import rod_values
 from torchpcct.scanner import presets
 from torchpcct.scene.materials import MATERIALS
@@ -16,7 +17,11 @@ def setup():
 
 @pytest.fixture(scope="module")
 def found(setup):
-    return rod_values(*setup, views=30)
+    return rod_values(*setup, materials(setup))
+
+
+def materials(setup, *names):
+    return {name: setup[0][name].material for name in names or setup[0].names}
 
 
 def test_ct_numbers_behind_the_patient(setup, found):
@@ -33,30 +38,30 @@ def test_ct_numbers_behind_the_patient(setup, found):
     assert found["fibrous"] - found["core"] == pytest.approx(fibrous - core, abs=1.5)
 
 
-def test_neither_diameter_nor_views_matter(setup, found):
-    tissues = {name: setup[0][name].material for name in ("core", "fibrous")}
-    thick = rod_values(*setup, tissues=tissues, diameter_mm=6.0, views=30)
-    more = rod_values(*setup, tissues=tissues, views=60)
+def test_neither_diameter_nor_views_matter(setup, found, monkeypatch):
+    tissues = materials(setup, "core", "fibrous")
+    monkeypatch.setattr(plaque_scan, "_ROD_VIEWS", 30)
+    fewer = rod_values(*setup, tissues)
+    monkeypatch.setattr(plaque_scan, "_ROD_MM", 6.0)
+    thick = rod_values(*setup, tissues)
     for name in tissues:
         assert thick[name] == pytest.approx(found[name], abs=0.1)
-        assert more[name] == pytest.approx(found[name], abs=0.05)
+        assert fewer[name] == pytest.approx(found[name], abs=0.05)
 
 
-def test_blood_hardens_its_own_beam(setup, found):
-    blood = {"lumen": setup[0]["lumen"].material}
-    thick = rod_values(*setup, tissues=blood, diameter_mm=6.0, views=30)
+def test_blood_hardens_its_own_beam(setup, found, monkeypatch):
+    monkeypatch.setattr(plaque_scan, "_ROD_MM", 6.0)
+    thick = rod_values(*setup, materials(setup, "lumen"))
     assert -4.0 < thick["lumen"] - found["lumen"] < -1.5
 
 
 def test_another_material(setup, found):
-    own = rod_values(*setup, tissues={"own": MATERIALS["fibrous_tissue"], "core": "necrotic_core"}, views=30)
+    own = rod_values(*setup, {"own": MATERIALS["fibrous_tissue"], "core": "necrotic_core"})
     assert own == pytest.approx({"own": found["fibrous"], "core": found["core"]})
 
 
 def test_refusals(setup):
-    with pytest.raises(ValueError, match="diameter_mm"):
-        rod_values(*setup, diameter_mm=1.0)
     with pytest.raises(ValueError, match="leaves its parent"):
-        rod_values(setup[0], setup[1], (119.0, 0.0))
+        rod_values(setup[0], setup[1], (119.0, 0.0), {"core": "necrotic_core"})
     with pytest.raises(ValueError, match="unknown material"):
-        rod_values(*setup, tissues={"x": "cheese"}, views=8)
+        rod_values(*setup, {"x": "cheese"})
