@@ -9,8 +9,9 @@ most.) So what is linear is computed once, and the signal's noise-free part adde
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from dataclasses import replace
+from functools import cache, cached_property, partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -39,14 +40,6 @@ _SIGMA_SEEDS = (900_001, 900_002)
 """Draws that a denoiser's noise level is measured on; none of them is evaluated."""
 
 
-@dataclass(frozen=True, eq=False)
-class Functional:
-    """A mean over voxels, as :func:`recon.analytic.exact_noise.roi_covariance` takes it: weights ``grid.shape``
-    float64."""
-
-    weights: Tensor
-
-
 class Draws:
     """All realisations of one task.
 
@@ -69,14 +62,8 @@ class Draws:
     @cached_property
     def facts(self) -> Facts:
         """Of the task."""
-
-        def compute() -> dict[str, Any]:
-            f = self.task.facts(self.store)
-            return {"tissues": np.array(f.tissues), "values": np.array(f.values_hu), "limit": np.array(f.limit_hu)}
-
-        found = self.store.piece("facts", f"1 {self.task.fingerprint}", compute)
-        values = tuple(float(v) for v in found["values"])
-        return Facts(tuple(str(t) for t in found["tissues"]), values, float(found["limit"]))
+        found: Facts = self.store.piece("facts", f"1 {self.task.fingerprint}", lambda: self.task.facts(self.store))
+        return found
 
     @cached_property
     def problem(self) -> InsetProblem:
@@ -101,19 +88,19 @@ class Draws:
     def exact_covariances(self, kernels: Sequence[str]) -> dict[str, NDArray[np.float64]]:
         """Of the ROI means of FBP at 1 s, kernel → ``(rois, 2, rois, 2)`` HU²; it falls as 1 / exposure."""
         regions, key = self.task.regions, f"1 {self.task.fingerprint}"
-        functionals: list[Any] = [Functional(w) for pair in regions.values() for w in pair]
+        functionals: list[Any] = [SimpleNamespace(weights=w) for pair in regions.values() for w in pair]
 
         @cache
-        def together() -> dict[str, Any]:
+        def together() -> dict[str, NDArray[np.float64]]:
             # What costs most, the transposed backprojection, is the same for all kernels.
             fbp = InsetFbp(self.clean[0], [self.task.grid], kernels)
             found = roi_covariance(self.clean[0], fbp, [functionals], NOISE_FREE_EXPOSURE_S)[0]
-            return {k: {"c": c.reshape(len(regions), 2, len(regions), 2)} for k, c in zip(kernels, found, strict=True)}
+            return {k: c.reshape(len(regions), 2, len(regions), 2) for k, c in zip(kernels, found, strict=True)}
 
         def of(kernel: str) -> NDArray[np.float64]:
-            return np.asarray(self.store.piece(f"exact_{kernel}", key, lambda: together()[kernel])["c"])
+            return together()[kernel]
 
-        return {k: of(k) for k in kernels}
+        return {k: self.store.piece(f"exact_{k}", key, partial(of, k)) for k in kernels}
 
     def response(self, network: Mbir, reader: Any, exposure_s: float) -> dict[str, Any]:
         """``adjoints`` ``(2 · rois, z, y, x)`` of MBIR's ROI means, ``mean`` and ``covariance`` of what they give."""
@@ -139,7 +126,7 @@ class Draws:
     def sigma(self, method: Method, exposure_s: float, smooths: float) -> float:
         """Noise in HU of FBP in the largest tissue; kept, since every job of a filter needs it."""
 
-        def compute() -> dict[str, Any]:
+        def compute() -> float:
             largest = max(self.task.flat, key=lambda t: len(self.task.flat[t]), default=None)
             if largest is None:
                 raise ValueError(f"task {self.task.name}: no tissue fills a flat part of the inset: enlarge it")
@@ -148,10 +135,10 @@ class Draws:
                 noise_of(method.run(self.draw(exposure_s, k)[0]) - clean, self.task.flat[largest], smooths)
                 for k in _SIGMA_SEEDS
             ]
-            return {"sigma": np.sqrt(np.mean(np.square(found)))}
+            return float(np.sqrt(np.mean(np.square(found))))
 
         name = f"sigma_{method.kernels[0]}_{exposure_s:g}s_{smooths:g}"
-        return float(self.store.piece(name, f"1 {exposure_s} {smooths} {self.task.fingerprint}", compute)["sigma"])
+        return float(self.store.piece(name, f"1 {exposure_s} {smooths} {self.task.fingerprint}", compute))
 
 
 class Simulated:

@@ -26,8 +26,6 @@ log = logging.getLogger(__name__)
 
 _TRIES = 100
 """To write a piece, where others clear its folder; it is only kept for later, and a study goes on without."""
-_MARK = "\nSHA-256 "
-"""Parts the key from the checksum of the arrays. Pieces of earlier versions have none, and are taken as they are."""
 
 
 def _digest(key: str, arrays: Mapping[str, Any]) -> str:
@@ -40,7 +38,7 @@ def _digest(key: str, arrays: Mapping[str, Any]) -> str:
 
 
 class Store:
-    """A folder of ``.npz`` files, each with the key (settings, parameters) that it was made with.
+    """A folder of ``.npz`` files, each with the key (settings, parameters) that it was made with, and its checksum.
 
     Args:
         folder: made if need be.
@@ -60,33 +58,33 @@ class Store:
         """Whether a piece was finished with this key."""
         try:
             with np.load(self.folder / (name + ".npz"), allow_pickle=False) as file:
-                return str(file["key"]).partition(_MARK)[0] == key
+                return str(file["key"]) == key
         except Exception:  # none, or damaged
             return False
 
-    def piece(self, name: str, key: str, compute: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-        """The arrays of a piece: read if it was finished with the same key, else computed and written.
+    def piece(self, name: str, key: str, compute: Callable[[], Any]) -> Any:
+        """What a piece holds: read if it was finished with the same key, else computed and written.
 
         Args:
             name: path in the folder, without ending.
             key: everything that the piece depends on.
-            compute: gives the arrays.
+            compute: gives it, anything that :func:`packed` takes.
         """
         path = self.folder / (name + ".npz")
         if path.exists():
             try:
                 with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
-                    arrays = {k: file[k] for k in file.files if k != "key"}
-                    found, mark, digest = str(file["key"]).partition(_MARK)
-                if mark and digest != _digest(found, arrays):
+                    arrays = {k: file[k] for k in file.files}
+                found, digest = (str(arrays.pop(k)) for k in ("key", "sum"))
+                if digest != _digest(found, arrays):
                     raise ValueError("its content does not have its checksum")
                 if found == key:
-                    return arrays
+                    return unpacked(arrays)
                 log.info("%s was made with other settings: computed again", path)
             except Exception as error:  # a damaged archive can fail in any way
                 log.warning("%s cannot be read (%s): computed again", path, error)
-        arrays = compute()
-        sealed = {"key": np.array(key + _MARK + _digest(key, arrays)), **arrays}
+        arrays = packed(compute())
+        sealed = {"key": np.array(key), "sum": np.array(_digest(key, arrays)), **arrays}
         for _ in range(_TRIES):
             try:
                 with atomic_write(self.path(name + ".npz")) as part:  # its folder again, which others may clear
@@ -94,7 +92,7 @@ class Store:
                 break
             except (FileNotFoundError, FileExistsError) as error:  # of its folder
                 log.info("cleared while it was written: %s", error)
-        return arrays
+        return unpacked(arrays)
 
 
 T = TypeVar("T")
@@ -131,7 +129,7 @@ class Pieces:
         self._asked.add(self._prefix + name)
         if self._store is None:
             return compute()
-        found: T = unpacked(self._store.piece(self._prefix + name, self._key, lambda: packed(compute())))
+        found: T = self._store.piece(self._prefix + name, self._key, compute)
         return found
 
     def ahead(self, function: Callable[..., Any], *calls: tuple[Any, ...]) -> None:
@@ -146,7 +144,7 @@ class Pieces:
         executor = execute.current()
         if self._store is None or executor is None:
             return
-        name, root = function.__name__.strip("_"), self._store.folder
+        name = function.__name__.strip("_")
         jobs = [
             execute.Job(
                 " ".join(map(str, (name, *call))), _ahead, (self._settings, self._prefix, function, call),
@@ -156,12 +154,8 @@ class Pieces:
         ]  # fmt: skip
         done = {job.name: f"done/{hashlib.sha256((self._prefix + job.name).encode()).hexdigest()[:12]}" for job in jobs}
         left = [job for job in jobs if not self._store.has(done[job.name], self._key)]
-        execute.run(
-            left,
-            root,
-            executor,
-            finished=lambda job: self._store.piece(done[job.name], self._key, dict),  # type: ignore
-        )
+        store, key = self._store, self._key
+        execute.run(left, store.folder, executor, finished=lambda job: store.piece(done[job.name], key, dict))
 
     def within(self, prefix: str) -> Pieces:
         """The same, with names that begin with ``prefix/``."""
@@ -253,5 +247,5 @@ def _unpacked(tree: Any, arrays: Mapping[str, Any]) -> Any:
     ours = module.startswith(("torchpcct.", "recon."))
     made: Any = getattr(importlib.import_module(module), name) if ours else None
     if made is None or not is_dataclass(made):
-        raise ValueError(f"a piece of a study holds a {module}.{name}, which is no dataclass of this software")
+        raise ValueError(f"a piece holds a {module}.{name}, which is no dataclass of this software")
     return cast(Any, made)(**{k: _unpacked(v, arrays) for k, v in parts.items()})

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -161,7 +161,7 @@ def _image(
     sd = math.sqrt(float(np.trace(roi_covariance(scanned.clean, scanned.fbp, scanned.pairs, exposure_s)[0][0])))
     # The core's part of the contrast is what goes if the core goes; the rest is blood and fat blurred into the ROIs.
     own = fibrous - core - (empty_fibrous - empty_core)
-    width = pieces("wire", lambda: wire_width(scanner, plaque.position[:2], REFERENCE_KERNEL, duty=on))
+    width = pieces("wire", lambda: wire_width(scanner, plaque.position[:2], on))
     return Imaged(scanned, volume, series), {
         "roi_hu": (core, fibrous),
         "empty_hu": (empty_core, empty_fibrous),
@@ -170,7 +170,7 @@ def _image(
         "cnr": (fibrous - core) / sd,
         "own_cnr": own / sd,
         "exposure_s": exposure_s,
-        "fwhm_mm": asdict(width),
+        "fwhm_mm": width,
         "blurred": [b.as_dict() for b in series],
         "plan": dict(scanned.clean.info["plan"]),
     }
@@ -187,33 +187,19 @@ def _middle_slices(scene: Scene, plaque: Plaque, scanner: Scanner, on: float) ->
 # --- width of a point -----------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class SystemWidth:
-    """Full widths at half maximum in mm of a point in the axial plane.
-
-    Attributes:
-        area: diameter of the disc of the size of all that exceeds half of the maximum: the width to quote.
-        radial, tangential: along and across the direction from the isocentre.
-        undershoot: lowest value around the peak relative to it.
-    """
-
-    area: float
-    radial: float
-    tangential: float
-    undershoot: float
-
-
-def wire_width(scanner: Scanner, position: tuple[float, float], kernel: str, *, duty: float = 1.0) -> SystemWidth:
+def wire_width(scanner: Scanner, position: tuple[float, float], duty: float) -> dict[str, float]:
     """Width of the system's in-plane point spread: a thin wire along z in the fat cylinder, reconstructed by FBP.
 
     Args:
         scanner: its outer detector rows are left out (the wire does not change along z).
         position: ``(x, y)`` mm of the wire.
-        kernel: reconstruction kernel.
         duty: share of a view's time with the beam on.
 
     Returns:
-        Widths with the wire's own diameter (0.06 mm) taken off in quadrature.
+        Full widths at half maximum in mm with the wire's own diameter (0.06 mm) taken off in quadrature: ``area``,
+        diameter of the disc of the size of all that exceeds half of the maximum, the width to quote; ``radial`` and
+        ``tangential``, along and across the direction from the isocentre; and ``undershoot``, the lowest value around
+        the peak relative to it.
     """
     x, y = position
     scene = Scene(
@@ -225,11 +211,11 @@ def wire_width(scanner: Scanner, position: tuple[float, float], kernel: str, *, 
     flat = scanner.replace(geometry=replace(scanner.geometry, rows=_WIRE_ROWS))
     grid = VolumeGrid((1, _WIRE_PIXELS, _WIRE_PIXELS), _WIRE_PIXEL_MM, (0.0, y, x))
     scan = acquire(scene, flat, region=grid, duty=duty)
-    image = InsetFbp(scan, [grid], [kernel])(scan)[0][0, 0].double().numpy()
+    image = InsetFbp(scan, [grid], [REFERENCE_KERNEL])(scan)[0][0, 0].double().numpy()
     return point_width(image, grid.slice)
 
 
-def point_width(image: NDArray[np.float64], grid: VolumeGrid) -> SystemWidth:
+def point_width(image: NDArray[np.float64], grid: VolumeGrid) -> dict[str, float]:
     """Widths of the bright point in the middle of an image ``(y, x)`` on ``grid``; see :func:`wire_width`."""
     base = np.median(np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]]))
     point = (image - base) / (image - base).max()
@@ -249,7 +235,7 @@ def point_width(image: NDArray[np.float64], grid: VolumeGrid) -> SystemWidth:
     # The wire is a disc: its variance along a line is a quarter of its squared radius.
     own = FWHM_PER_SIGMA * _WIRE_RADIUS_MM / 2.0
     area, radial, tangential = (math.sqrt(max(w * w - own * own, 0.0)) for w in (area, *widths))
-    return SystemWidth(area, radial, tangential, float(point.min()))
+    return {"area": area, "radial": radial, "tangential": tangential, "undershoot": float(point.min())}
 
 
 # --- blur -----------------------------------------------------------------------------------------------------------
@@ -321,12 +307,7 @@ def crossing(x: Any, values: Any, limit: float) -> float:
     """First x at which ``values`` exceed ``limit``, by linear interpolation; NaN values count as exceeding, and the
     last x is returned where none does."""
     x, v = np.asarray(x, dtype=np.float64), np.asarray(values, dtype=np.float64)
-    for k in range(len(x)):
-        if not v[k] <= limit:
-            if k == 0 or math.isnan(v[k]):
-                return float(x[k])
-            return float(x[k - 1] + (limit - v[k - 1]) / (v[k] - v[k - 1]) * (x[k] - x[k - 1]))
-    return float(x[-1])
+    return first_below(x, -np.where(np.isnan(v), limit, v), -limit, float(x[-1]))
 
 
 # --- the report -----------------------------------------------------------------------------------------------------

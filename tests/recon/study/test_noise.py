@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,6 @@ from tiny_studies import TINY, assert_report_is_whole
 
 from recon.analytic.exact_noise import roi_adjoints, roi_covariance, voxel_covariance
 from recon.analytic.inset import InsetFbp
-from recon.evaluate.draws import Functional
 from recon.study.noise import (
     Settings,
     Table,
@@ -89,7 +89,7 @@ def test_covariance_of_a_voxel_is_that_of_two_functionals(measured):
     assert found.shape == grid.shape
     singles = torch.zeros(2, *grid.shape, dtype=torch.float64)
     singles[0][here] = singles[1][there] = 1.0
-    ((exact,),) = roi_covariance(scanned.clean, fbp, [[Functional(w) for w in singles]], 2.0)
+    ((exact,),) = roi_covariance(scanned.clean, fbp, [[SimpleNamespace(weights=w) for w in singles]], 2.0)
     assert [float(found[here]), float(found[there])] == pytest.approx(exact[0].tolist(), rel=1e-3)
     with pytest.raises(ValueError, match="one grid with one kernel"):
         voxel_covariance(scanned.clean, scanned.fbp, 2.0, here)

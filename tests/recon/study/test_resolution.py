@@ -44,10 +44,10 @@ def test_width_of_a_known_point(radial, tangential):
     own = 0.03 / 2.0
     image = 7.0 + 3.0 * np.exp(-0.5 * (r**2 / (s[0] ** 2 + own**2) + t**2 / (s[1] ** 2 + own**2)))
     found = point_width(image, grid)
-    assert found.radial == pytest.approx(radial, rel=0.01)
-    assert found.tangential == pytest.approx(tangential, rel=0.01)
-    assert found.area == pytest.approx(math.sqrt(radial * tangential), rel=0.02)
-    assert found.undershoot == pytest.approx(0.0, abs=1e-6)
+    assert found["radial"] == pytest.approx(radial, rel=0.01)
+    assert found["tangential"] == pytest.approx(tangential, rel=0.01)
+    assert found["area"] == pytest.approx(math.sqrt(radial * tangential), rel=0.02)
+    assert found["undershoot"] == pytest.approx(0.0, abs=1e-6)
 
 
 def test_crossing():
