@@ -36,7 +36,7 @@ from recon.study import registry
 from recon.evaluate.store import Store
 out, name = sys.argv[1:]
 kind = registry.part(name).Settings if name != "evaluate" else type("", (), {})
-kind.quick = classmethod(lambda cls, **changes: cls(**{**TINY[name], **changes}))
+kind.QUICK = TINY.get(name)
 piece = Store.piece
 def noted(self, at, key, compute):
     def computed():

@@ -9,7 +9,6 @@ import os
 import shlex
 import sys
 import time
-from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -192,10 +191,8 @@ def _study(arguments: argparse.Namespace, progress: ProgressBars) -> None:
 
 def _own_study(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     """A study that is a command of its own, with options named like its settings."""
-    kind = registry.part(arguments.command).Settings
-    given = {f.name: getattr(arguments, f.name, None) for f in fields(kind)}
-    changes = {name: tuple(v) if isinstance(v, list) else v for name, v in given.items() if v is not None}
-    settings = kind.quick(**changes) if arguments.quick else kind(**changes)
+    given = {name: value for name, value in vars(arguments).items() if value is not None}
+    settings = registry.part(arguments.command).Settings.of(given, arguments.quick)
     _run_study(arguments.command, settings, arguments, progress)
 
 
@@ -215,7 +212,7 @@ def _verify(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     changed = []
     for name in arguments.again:
         committed = json.loads((root / "notebooks" / registry.folder(name) / "report.json").read_text(encoding="utf-8"))
-        settings = registry.settings_of(name, committed["settings"])
+        settings = registry.part(name).Settings.of(committed["settings"])
         again = json.loads(registry.run(name, settings, progress).json)
         found = list(results.differences(committed, again))
         progress.close()

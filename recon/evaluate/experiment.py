@@ -178,13 +178,13 @@ def _jobs(
     first = f"{task.name}: facts"
     jobs, scans = [], {f"{task.name}: scan, signal {s}": s for s in ("present", "absent")}
     if not store.has("facts", f"1 {task.fingerprint}"):
-        jobs += [Job(name, _scan, (bench, signal)) for name, signal in scans.items()]
-        jobs.append(Job(first, _facts, (bench,), (f"{place}facts.npz",), tuple(scans)))
+        jobs += [Job(name, _do, (bench, "scan", signal)) for name, signal in scans.items()]
+        jobs.append(Job(first, _do, (bench, "facts"), (f"{place}facts.npz",), tuple(scans)))
     wanted = list(dict.fromkeys(m.kernels[0] for m in sent if m.is_fbp))
     exact = [kernel for kernel in wanted if not store.has(f"exact_{kernel}", f"1 {task.fingerprint}")]
     if exact:
         name, made = f"{task.name}: exact noise, {', '.join(exact)}", tuple(f"{place}exact_{k}.npz" for k in exact)
-        jobs.append(Job(name, _exact, (bench, exact), made, tuple(scans)))
+        jobs.append(Job(name, _do, (bench, "exact", exact), made, tuple(scans)))
     blocks = [range(start, min(start + BLOCK, n)) for start in range(0, n, BLOCK)]
     exposures = exposures or task.exposures_s
     groups = min(len(sent), -(-2 * getattr(executor, "workers", 16) // (len(blocks) * len(exposures)))) or 1
@@ -202,7 +202,7 @@ def _jobs(
                 name = f"{task.name}: {exposure:g} s, {k.start}-{k.stop}, {', '.join(asked)}" if k else known
                 seconds, kb = _estimate(task, [m for m in group if m.name in asked], max(len(k), 1))
                 jobs.append(
-                    Job(name, _block, (bench, exposure, asked, k), (*pieces, f"{place}sigma_*.npz"),
+                    Job(name, _do, (bench, "block", exposure, asked, k), (*pieces, f"{place}sigma_*.npz"),
                         (first, known) if k else (first,), seconds=seconds, mib=_MIB, bytes=kb)
                 )  # fmt: skip
     return jobs
@@ -229,10 +229,9 @@ def _estimate(task: Task, methods: Sequence[Method], n: int) -> tuple[float, flo
 
 
 class _Bench:
-    """What the jobs of a task share in a process."""
+    """What a process needs of a task: its draws, what reads their volumes, and the methods; then the jobs."""
 
-    def __init__(self, folder: Path, packed: bytes) -> None:
-        task, methods, seed, kernels = pickle.loads(zlib.decompress(packed))
+    def __init__(self, folder: Path, task: Task, methods: Sequence[Method], seed: int, kernels: Sequence[str]) -> None:
         self.draws = Draws(task, Store(folder / task.name), seed, kernels)
         self.methods = {m.name: m for m in methods}
 
@@ -241,32 +240,31 @@ class _Bench:
         """Of the task's volumes; it needs the facts."""
         return Reader(self.draws.task, self.draws.task.truth(self.draws.facts))
 
+    def scan(self, signal: str) -> None:
+        self.draws.task.scan(self.draws.store, signal)
 
-_bench = lru_cache(maxsize=1)(_Bench)
+    def facts(self) -> None:
+        _ = self.draws.facts
+
+    def exact(self, kernels: Sequence[str]) -> None:
+        self.draws.exact_covariances(kernels)
+
+    def block(self, exposure: float, names: Sequence[str], k: range) -> None:
+        """Pieces of methods at an exposure: of a block of realisations, or of none what is without noise."""
+        pairs = cache(partial(_pairs, self.draws, exposure, k))
+        for name in names:
+            measurement = Measurement(self.methods[name], self.draws, self.reader, exposure)
+            if k:
+                measurement.block(k, pairs)
 
 
-def _scan(folder: Path, packed: bytes, signal: str) -> None:
-    draws = _bench(folder, packed).draws
-    draws.task.scan(draws.store, signal)
+@lru_cache(maxsize=1)
+def _bench(folder: Path, packed: bytes) -> _Bench:
+    return _Bench(folder, *pickle.loads(zlib.decompress(packed)))
 
 
-def _facts(folder: Path, packed: bytes) -> None:
-    _ = _bench(folder, packed).draws.facts
-
-
-def _exact(folder: Path, packed: bytes, kernels: Sequence[str]) -> None:
-    _bench(folder, packed).draws.exact_covariances(kernels)
-
-
-def _block(folder: Path, packed: bytes, exposure: float, names: Sequence[str], k: range) -> None:
-    """Pieces of methods at an exposure: of a block of realisations, or of none what is without noise."""
-    bench = _bench(folder, packed)
-    draws = bench.draws
-    pairs = cache(partial(_pairs, draws, exposure, k))
-    for name in names:
-        measurement = Measurement(bench.methods[name], draws, bench.reader, exposure, draws.store)
-        if k:
-            measurement.block(k, pairs)
+def _do(folder: Path, packed: bytes, job: str, *given: Any) -> None:
+    getattr(_bench(folder, packed), job)(*given)
 
 
 # --- the loop -----------------------------------------------------------------------------------------------------
@@ -276,20 +274,18 @@ def _task(
     task: Task, methods: Sequence[Method], exposures: Sequence[float], n: int, seed: int, folder: Path,
     progress: Progress | None,
 ) -> tuple[list[Record], TaskResult]:  # fmt: skip
-    store, everyone = Store(folder / task.name), _everyone(task, methods)
+    everyone = _everyone(task, methods)
     reference = everyone[0]
-    draws = Draws(task, store, seed, [k for m in everyone for k in m.kernels])
+    bench = _Bench(folder, task, everyone, seed, [k for m in everyone for k in m.kernels])
     if progress is not None:
         progress(f"{task.name}: scan", 0.0)
-    facts = draws.facts
-    truth = task.truth(facts)
-    reader = Reader(task, truth)
+    draws, reader, facts, truth = bench.draws, bench.reader, bench.draws.facts, bench.reader.truth
     true = np.array([float(((truth[0] - truth[1]).double() * (b - a)).sum()) for a, b in task.regions.values()])
     records: list[Record] = []
     volumes = {}
     at_1_s = draws.exact_covariances(list(dict.fromkeys(m.kernels[0] for m in everyone if m.is_fbp)))
     for exposure in exposures:
-        running = [Measurement(method, draws, reader, exposure, store) for method in everyone]
+        running = [Measurement(method, draws, reader, exposure) for method in everyone]
         for start in range(0, n, BLOCK):
             k = range(start, min(start + BLOCK, n))
             # Drawn once for all methods, if one needs them.

@@ -20,7 +20,6 @@ from torch import Tensor
 
 from recon.evaluate.draws import Draws
 from recon.evaluate.methods import Draw, Method
-from recon.evaluate.store import Store
 from recon.evaluate.task import Task
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.observer import dog_channels, template_channel
@@ -195,11 +194,10 @@ class Measurement:
         method: what reconstructs.
         draws: of the task; reader: of its volumes.
         exposure_s: in s.
-        store: keeps what is finished.
     """
 
-    def __init__(self, method: Method, draws: Draws, reader: Reader, exposure_s: float, store: Store) -> None:
-        self.method, self.reader, self.store = method, reader, store
+    def __init__(self, method: Method, draws: Draws, reader: Reader, exposure_s: float) -> None:
+        self.method, self.reader, self.store = method, reader, draws.store
         self._place, self._key = kept_as(method, exposure_s, draws.task, draws.seed)
         self._pieces: list[dict[str, Any]] = []
 
@@ -207,12 +205,12 @@ class Measurement:
             pair = [draws.noise_free(p, exposure_s) for p in (True, False)]
             return _of([pair], method, reader, keep=True, fbp=pair[0].fbp(draws.kernels[0]))
 
-        self._clean = store.piece(f"{self._place}/clean", self._key, clean)
+        self._clean = self.store.piece(f"{self._place}/clean", self._key, clean)
         self._known: dict[str, Any] | None = None
         self._adjoints: Tensor | None = None
         if method.network is not None:
             respond = partial(draws.response, method.network, reader, exposure_s)
-            self._known = store.piece(f"{self._place}/response", self._key, respond)
+            self._known = self.store.piece(f"{self._place}/response", self._key, respond)
             self._adjoints = torch.from_numpy(self._known["adjoints"])
 
     def block(self, k: range, pairs: Callable[[], Sequence[Sequence[Draw]]]) -> None:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -191,13 +191,9 @@ class VesselTask(Task):
             straight = super().scans(store)
             facts = self._facts_of(*straight)
             values = {("core" if t == "signal" else t): v for t, v in zip(facts.tissues, facts.values_hu, strict=True)}
-            plain = _without_inset(straight[1])
-            fine = VolumeGrid(tuple(2 * n for n in self.grid.shape), self.grid.spacing[0] / 2, self.grid.center)
-            project = Projector(plain.geometry, fine, plain.window)
             for path, core in zip(paths, (values["core"], values["fibrous"]), strict=True):
                 hu = {n: v - values[self.scene.names[0]] for n, v in {**values, "core": core}.items()}
-                x = torch.from_numpy(self._vessel.painted(fine, hu) * (plain.linearisation.mu_ref / 1000.0)).float()
-                replace(plain, counts=_behind(plain, project(x))).save(path)
+                _with(_without_inset(straight[1]), self.grid, partial(self._vessel.painted, values=hu)).save(path)
         present, absent = (Scan.load(p) for p in paths)
         return present, absent
 
@@ -278,15 +274,15 @@ class VoxelTask(Task):
         path = self.scan_file(store, signal)
         if not path.exists():
             plain = self._alone(store)
-            fine = VolumeGrid(tuple(2 * n for n in self.grid.shape), self.grid.spacing[0] / 2, self.grid.center)
-            values = dict(self.tissues)
-            if signal == "absent":
-                values[self.signal[0]] = (values[self.signal[0]][0], values[self.background][1])
             here = self._patient_hu(plain)
-            x = sum((share * (values[t][1] - here) for t, share in self._painted(fine).items()), np.zeros(fine.shape))
-            mu = torch.from_numpy(x * (plain.linearisation.mu_ref / 1000.0)).float()
-            added = Projector(plain.geometry, fine, plain.window)(mu)
-            replace(plain, counts=_behind(plain, added)).save(path)
+            hu = {t: value - here for t, (_, value) in self.tissues.items()}
+            if signal == "absent":
+                hu[self.signal[0]] = hu[self.background]
+
+            def painted(grid: VolumeGrid) -> Floats:
+                return np.sum([share * hu[t] for t, share in self._painted(grid).items()], axis=0)
+
+            _with(plain, self.grid, painted).save(path)
         return Scan.load(path)
 
     def _alone(self, store: Store) -> Scan:
@@ -337,9 +333,12 @@ def _without_inset(scan: Scan) -> Scan:
     return replace(scan, counts=scan.window.take(scan.surround).to(scan.counts))
 
 
-def _behind(scan: Scan, added: Any) -> Any:
-    """Counts of a noise-free scan with linearised line integrals ``added`` on its window."""
+def _with(scan: Scan, inset: VolumeGrid, painted: Callable[[VolumeGrid], Floats]) -> Scan:
+    """A noise-free scan, and in its inset the HU that are painted on a grid of half its voxels added."""
+    fine = VolumeGrid(tuple(2 * n for n in inset.shape), inset.spacing[0] / 2, inset.center)
+    mu = torch.from_numpy(painted(fine) * (scan.linearisation.mu_ref / 1000.0)).float()
+    added = Projector(scan.geometry, fine, scan.window)(mu)
     p = scan._at_window(scan.air.log()) - scan.counts.log()
     # One Newton step of the linearisation: what is added is a few per cent of what is there.
     half = p + 0.5 * added / scan.linearisation.slope(p, scan.window)
-    return scan.counts * (-added / scan.linearisation.slope(half, scan.window)).exp()
+    return replace(scan, counts=scan.counts * (-added / scan.linearisation.slope(half, scan.window)).exp())

@@ -104,9 +104,6 @@ class Settings(StudySettings):
         plaque_doses: exposures of the plaque's scans in s.
         plaque_realizations: paired realisations for MBIR; controlling them needs at least 8.
         seed: of the first realisation and of the Monte Carlo.
-
-    Raises:
-        ValueError, TypeError: a value out of range or of the wrong kind.
     """
 
     exposure_s: float = 0.35
@@ -248,9 +245,6 @@ def polynomial_linearisation(scanner: Scanner) -> WaterLinearisation:
     """The paper's beam-hardening correction: per column a polynomial through 0, fitted to equal steps of water.
 
     The value of water is that of the library's own correction, so that images of both compare.
-
-    Args:
-        scanner: of one energy bin.
     """
     step = CALIBRATION_STEP_MM
     thickness = np.arange(step, CALIBRATION_MAX_MM + 0.5 * step, step)
@@ -299,14 +293,7 @@ def phantom_grid(name: str, spacing: float) -> VolumeGrid:
 def noise(
     name: str, scene: Scene, scanners: dict[str, Scanner], exposure_s: float, kernel: str, seeds: range
 ) -> tuple[dict[str, Any], Floats]:
-    """Mean and noise of a phantom's regions with both bowties.
-
-    Args:
-        name, scene: one of :func:`phantoms`.
-        scanners: of :func:`wide_scanners`.
-        exposure_s: of the scans.
-        kernel: of FBP.
-        seeds: of the noise, one realisation each.
+    """Mean and noise of the regions of one of :func:`phantoms` with both bowties, a realisation for each seed.
 
     Returns:
         JSON values by region (and of the CTDI phantom the noise against the radius), and the first realisation's
@@ -390,11 +377,8 @@ def region_ratio(maps: DoseMaps, scene: Scene, begins: tuple[str, ...]) -> dict[
 def ratios(doses: dict[str, CtdiDose]) -> dict[str, float]:
     """With over without the ROI bowtie: peripheral, central, weighted."""
     large, roi = (doses[b] for b in BOWTIES)
-    return {
-        "peripheral": roi.total_peripheral / large.total_peripheral,
-        "central": roi.total_central / large.total_central,
-        "weighted": roi.weighted / large.weighted,
-    }
+    figures = {"peripheral": "total_peripheral", "central": "total_central", "weighted": "weighted"}
+    return {name: getattr(roi, of) / getattr(large, of) for name, of in figures.items()}
 
 
 def transmission(scanners: dict[str, Scanner]) -> dict[str, Any]:
@@ -419,13 +403,7 @@ def transmission(scanners: dict[str, Scanner]) -> dict[str, Any]:
 
 
 def _combined(s: Settings, saved: dict[str, float], folder: Path | None, progress: Progress) -> list[dict[str, Any]]:
-    """Scan, reconstruct, measure.
-
-    Args:
-        s: of the study.
-        saved: kind of dose → factor that the ROI bowtie saves at equal exposure.
-        folder: keeps what is finished; None: nothing is kept.
-        progress: of the evaluation.
+    """Scan, reconstruct, measure; ``saved``: kind of dose → factor that the ROI bowtie saves at equal exposure.
 
     Returns:
         JSON values of each exposure. Factors ``[value, low, high]`` in the paper's ROIs: of MBIR with either bowtie

@@ -53,9 +53,6 @@ class Settings(StudySettings):
         seed: of their random numbers.
         dead_times_ns: dead times looked at, ns (assumed; the merging time is half of each).
         charge_sharing: shares of split pulses looked at (assumed), in (0, 1].
-
-    Raises:
-        TypeError, ValueError: a value of the wrong kind or out of range.
     """
 
     photons: int = 200_000

@@ -20,7 +20,7 @@ from typing import Any, ClassVar
 import numpy as np
 from torch import Tensor
 
-from recon.analytic.inset import InsetFbp, view_motion
+from recon.analytic.inset import view_motion
 from recon.evaluate.store import Pieces
 from recon.least_squares.inset_problem import InsetProblem
 from recon.least_squares.qggmrf import DEFAULT_PRIOR
@@ -28,13 +28,13 @@ from recon.mbir.mbir import Mbir
 from recon.study.figures import curve_axes, middle_panel, plaque_panel
 from recon.study.paper import facts as paper
 from recon.study.paper.plaque_scan import (
-    REFERENCE_KERNEL,
     SCANNERS,
     PlaqueImage,
     Truth,
     duty,
     inset_grid,
     measure_plaque,
+    reference_fbp,
 )
 from recon.study.report import Check
 from recon.study.study import Clock, Measured, Progress, StudySettings, silent
@@ -83,10 +83,6 @@ class Settings(StudySettings):
         exposure_s: of the noisy reconstructions.
         seed, realizations: of their noise; realisation i uses ``seed + i``.
         methods: of the compensation, of ``"fbp"`` (always), ``"pwls"``, ``"mbir"``.
-
-    Raises:
-        TypeError: a value of a wrong type.
-        ValueError: a value out of range, an unknown method.
     """
 
     thinning: int = 1
@@ -199,7 +195,7 @@ def _residual(
     """Images with residual motion; returns the scans at rest and of the largest motion."""
     grid = reference.grid
     still = moving = _scan(s, pieces, name, 0.0)
-    rest = reconstruct_fbp(still, grid)
+    rest = reference_fbp(still, grid)
     m.at_rest[name] = observe(rest, reference, rest)
     path = view_motion(s.motion, still.geometry, s.rotation_s)
     if name == "PCCT":
@@ -210,7 +206,7 @@ def _residual(
     for done, fraction in enumerate(fractions):
         moving = _scan(s, pieces, name, fraction)
         mean = np.tile(fraction * path.mean(0), (len(path), 1))
-        in_place, back = reconstruct_fbp(moving, grid), reconstruct_fbp(moving, grid, mean)
+        in_place, back = reference_fbp(moving, grid), reference_fbp(moving, grid, mean)
         m.residual[name, fraction] = (observe(in_place, reference, rest), observe(back, reference, rest))
         progress(name, (done + 1) / len(fractions))
     return still, moving
@@ -267,13 +263,7 @@ class Observed(PlaqueImage):
 
 
 def observe(volume: Tensor, reference: Reference, rest: Tensor) -> Observed:
-    """Measure a volume.
-
-    Args:
-        volume: ``(z, y, x)`` HU.
-        reference: where things are at rest.
-        rest: ``(z, y, x)`` HU, the same without motion.
-    """
+    """Measure a volume ``(z, y, x)`` HU; ``rest``: the same without motion."""
     image = sample_axial(volume.double(), reference.grid, reference.truth.image)[0]
     core, fibrous = (float(r(volume)) for r in reference.rois)
     # Fat fills most of the inset.
@@ -289,22 +279,14 @@ def observe(volume: Tensor, reference: Reference, rest: Tensor) -> Observed:
 # --- motion known ---------------------------------------------------------------------------------------------------
 
 
-def reconstruct_fbp(scan: Scan, grid: VolumeGrid, motion: Any = None) -> Tensor:
-    """FBP with the study's kernel, ``(z, y, x)`` HU; ``motion``: of :class:`recon.analytic.inset.InsetFbp`."""
-    return InsetFbp(scan, [grid], [REFERENCE_KERNEL], motion=motion)(scan)[0][0]
-
-
 def compensate(
     s: Settings, still: Scan, moving: Scan, reference: Reference, pieces: Pieces, progress: Callable[[float], None]
 ) -> dict[Key, list[Observed]]:
     """Reconstruct the noise-free scans of the still and of the moving vessel and their noisy realisations.
 
     PWLS, whose solution is to be certified by exact projections, is run without noise and for the first noise
-    realisation, at rest and with the true motion; FBP and MBIR with every estimate of the motion. Every volume is kept
-    in ``pieces``.
-
-    Returns:
-        One entry per realisation.
+    realisation, at rest and with the true motion; FBP and MBIR with every estimate of the motion. One entry per
+    realisation.
     """
     grid = reference.grid
     path = view_motion(s.motion.scaled(s.worst), moving.geometry, s.rotation_s)
@@ -318,7 +300,7 @@ def compensate(
 
     def reconstruct(method: str, scan: Scan, error: float | None) -> Tensor:
         if method == "fbp":
-            return reconstruct_fbp(scan, grid, estimates[error])
+            return reference_fbp(scan, grid, estimates[error])
         if network is None or method == "pwls":
             found, _ = problems[error].solve([scan], DEFAULT_PRIOR, tolerance=_PWLS_TOLERANCE_HU)
             return found[0].float()

@@ -25,11 +25,10 @@ from scipy import stats
 from torch import Tensor
 
 from recon.analytic.exact_noise import roi_adjoints
-from recon.analytic.inset import InsetFbp
 from recon.evaluate.store import Pieces
 from recon.study.figures import extent, roi_outlines
 from recon.study.paper import facts as paper
-from recon.study.paper.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM, PlaqueScan, prepare
+from recon.study.paper.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM, PlaqueScan, prepare, reference_fbp
 from recon.study.report import Check, around
 from recon.study.study import Clock, Measured, Progress, StudySettings, silent
 from torchpcct.metrics.cnr import cnr_from_moments, cnr_interval, cnr_range, sd_interval
@@ -66,10 +65,6 @@ class Settings(StudySettings):
         doses: name → exposure in s.
         reconstructed: realisations at the tables' dose that are reconstructed in full, at least 1.
         experiments: number of simulated experiments of 10 realisations.
-
-    Raises:
-        TypeError: a value of a wrong type.
-        ValueError: a value out of range.
     """
 
     realizations: int = 200
@@ -143,7 +138,7 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     scanned = prepare(s.kernels, s.voxels_mm, plaque_scene(), scanner, full, partial(progress, "simulate"), pieces)
     clean = scanned.clean
     clock.lap("simulate")
-    fine = InsetFbp(clean, [scanned.fine], [REFERENCE_KERNEL])(clean)[0][0]
+    fine = reference_fbp(clean, scanned.fine)
     core, fibrous = (float(roi(fine)) for roi in scanned.rois.on(scanned.fine))
     expected = scanned.roi_means(scanned.fbp(clean))
     clock.lap("noise-free FBP")
@@ -185,13 +180,8 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
 def _realisations(
     settings: Settings, near: Scan, matrix: Tensor, expected: Any, pieces: Pieces, progress: Progress
 ) -> tuple[dict[float, Any], dict[float, Any]]:
-    """ROI means of every realisation, and their variances from the readings; see :class:`Measured`.
-
-    Args:
-        near: the noise-free readings that the ROIs see.
-        matrix: adjoint vectors, a row for every ROI mean.
-        expected: ``(S, 2)`` exact ROI means.
-    """
+    """``means`` and ``variances`` of :class:`Moments`, from the noise-free readings that the ROIs see and the adjoint
+    vectors, a row of ``matrix`` for every ROI mean."""
     quiet = near.line_integrals().flatten()
     means: dict[float, Any] = {}
     variances: dict[float, Any] = {}
@@ -354,14 +344,8 @@ def measured_table(means: Any) -> Table:
 
 
 def few_run_tables(mean: Any, covariance: Any, draws: int, seed: int) -> Table:
-    """Tables that experiments of ten realisations would report.
-
-    Args:
-        mean: of the ROI means of a realisation, ``(settings, 2)`` HU.
-        covariance: of the same, ``(2 · settings, 2 · settings)`` HU².
-        draws: number of experiments.
-        seed: of the random numbers.
-    """
+    """Tables that so many experiments of ten realisations would report, whose ROI means ``(settings, 2)`` HU have this
+    covariance ``(2 · settings, 2 · settings)`` HU²."""
     rng, parts = np.random.default_rng(seed), []
     for start in range(0, draws, 1000):
         shape = (min(1000, draws - start), _TEN)
@@ -416,14 +400,9 @@ class Pair:
 def pair_differences(
     means: Any, exact: Table, pairs: Sequence[tuple[int, int]], *, level: float = 0.95, draws: int = 4000, seed: int = 0
 ) -> list[Pair]:
-    """Differences of CNR between settings with paired bootstrap intervals (BCa).
+    """Differences of CNR between settings with paired bootstrap intervals (BCa) of coverage ``level``.
 
-    Args:
-        means: ``(n, settings, 2)`` ROI means.
-        exact: the truth.
-        pairs: of settings.
-        level: coverage of each interval.
-        draws, seed: of the bootstrap; the same resamples serve all pairs.
+    ``means``: ``(n, settings, 2)`` HU; the same resamples serve all pairs.
     """
     values = np.asarray(means, dtype=np.float64)
     measured = measured_table(values).cnr
@@ -464,12 +443,8 @@ def published(table: Any, kernel: str, voxel_mm: float, exposure_s: float) -> An
 
 
 def table_checks(kernel: str, voxel_mm: float, means_hu: Sequence[float], covariance_hu2: Any) -> list[Check]:
-    """The paper's tables against the exact expectation and covariance of the same ROI means: no sampling error.
-
-    Args:
-        kernel, voxel_mm: of FBP.
-        means_hu: expectation of the core's and the fibrous ROI.
-        covariance_hu2: ``(2, 2)`` of the two ROI means at the tables' exposure.
+    """The paper's tables against the exact expectation and covariance of the core's and the fibrous ROI mean at their
+    exposure: no sampling error.
 
     Returns:
         Means ± 10 HU, SDs within a factor of 1.5, and the paper's CNR inside the range that 95 of 100 experiments with

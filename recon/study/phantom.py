@@ -49,9 +49,6 @@ class Settings(StudySettings):
         voxel_mm: of the raster that is measured [paper: 0.021].
         sections: of the vessel beyond the plaque, on which diameter, wall and place are measured.
         energies_kev: of the monochromatic CT numbers.
-
-    Raises:
-        TypeError, ValueError: a value of the wrong kind or out of range.
     """
 
     voxel_mm: float = paper.PHANTOM_VOXEL_MM

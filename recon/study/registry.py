@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import ast
 import importlib
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, fields
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from recon.study.report import Report
     from recon.study.study import Measured, Progress
 
-__all__ = ["STUDIES", "build_settings", "folder", "part", "report_of", "run", "settings_of"]
+__all__ = ["STUDIES", "build_settings", "folder", "part", "report_of", "run"]
 
 STUDIES: dict[str, str] = {
     "compare": "what dose MBIR saves at the paper's plaque, beside FBP, PWLS and the best simple filter",
@@ -55,17 +55,6 @@ def part(name: str) -> Any:
     return importlib.import_module(f"recon.study.{folder(name)}")
 
 
-def settings_of(name: str, values: Mapping[str, Any]) -> Any:
-    """Settings from the JSON values of a report.
-
-    Raises:
-        ValueError, TypeError: an unknown study; values that its settings refuse.
-    """
-    kind = part(name).Settings
-    known = {f.name for f in fields(kind) if f.init}
-    return kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items() if k in known})
-
-
 def build_settings(name: str, *, quick: bool = False, seed: int | None = None, changes: Sequence[str] = ()) -> Any:
     """Settings of a study from command-line values.
 
@@ -80,7 +69,7 @@ def build_settings(name: str, *, quick: bool = False, seed: int | None = None, c
         TypeError: a value of a wrong type.
     """
     kind = part(name).Settings
-    known = {f.name for f in fields(kind) if f.init}
+    known = kind.names()
     values: dict[str, Any] = {} if seed is None or "seed" not in known else {"seed": seed}
     for change in changes:
         key, equals, text = change.partition("=")
@@ -91,9 +80,7 @@ def build_settings(name: str, *, quick: bool = False, seed: int | None = None, c
             values[key] = ast.literal_eval(text)
         except (SyntaxError, ValueError):
             values[key] = text
-        if isinstance(values[key], list):
-            values[key] = tuple(values[key])
-    return kind.quick(**values) if quick else kind(**values)
+    return kind.of(values, quick)
 
 
 def run(name: str, settings: Any, progress: Progress | None = None, pieces: str | Path | None = None) -> Report:

@@ -25,7 +25,6 @@ from scipy.ndimage import map_coordinates
 from torch import Tensor
 
 from recon.analytic.exact_noise import roi_covariance
-from recon.analytic.inset import InsetFbp
 from recon.evaluate.store import Pieces
 from recon.study.figures import curve_axes, middle_panel, plaque_panel
 from recon.study.paper import facts as paper
@@ -40,6 +39,7 @@ from recon.study.paper.plaque_scan import (
     equal_dose,
     measure_plaque,
     prepare,
+    reference_fbp,
 )
 from recon.study.report import Check, around
 from recon.study.study import Clock, Measured, Progress, StudySettings, silent
@@ -77,10 +77,6 @@ class Settings(StudySettings):
         sigmas_px: standard deviations of the blur in pixels of 0.035 mm, from 0, rising.
         tolerance: relative error of lumen area and cap thickness that is accepted.
         exposure_s: of the PCCT in the comparison of CNRs; the EID-CT gets the same fluence at the isocentre.
-
-    Raises:
-        TypeError: a value of a wrong type.
-        ValueError: a value out of range.
     """
 
     thinning: int = 1
@@ -181,19 +177,14 @@ def _middle_slices(scene: Scene, plaque: Plaque, scanner: Scanner, on: float) ->
     grid = VolumeGrid((_MIDDLE_SLICES, 90, 90), REFERENCE_VOXEL_MM, plaque.position[::-1])
     scanner = scanner.replace(geometry=replace(scanner.geometry, rows=_MIDDLE_ROWS))
     scan = acquire(scene, scanner, region=grid, duty=on)
-    return grid, InsetFbp(scan, [grid], [REFERENCE_KERNEL])(scan)[0][0]
+    return grid, reference_fbp(scan, grid)
 
 
 # --- width of a point -----------------------------------------------------------------------------------------------
 
 
 def wire_width(scanner: Scanner, position: tuple[float, float], duty: float) -> dict[str, float]:
-    """Width of the system's in-plane point spread: a thin wire along z in the fat cylinder, reconstructed by FBP.
-
-    Args:
-        scanner: its outer detector rows are left out (the wire does not change along z).
-        position: ``(x, y)`` mm of the wire.
-        duty: share of a view's time with the beam on.
+    """Width of the system's in-plane point spread: a thin wire along z at ``(x, y)`` mm in the fat cylinder, by FBP.
 
     Returns:
         Full widths at half maximum in mm with the wire's own diameter (0.06 mm) taken off in quadrature: ``area``,
@@ -211,8 +202,7 @@ def wire_width(scanner: Scanner, position: tuple[float, float], duty: float) -> 
     flat = scanner.replace(geometry=replace(scanner.geometry, rows=_WIRE_ROWS))
     grid = VolumeGrid((1, _WIRE_PIXELS, _WIRE_PIXELS), _WIRE_PIXEL_MM, (0.0, y, x))
     scan = acquire(scene, flat, region=grid, duty=duty)
-    image = InsetFbp(scan, [grid], [REFERENCE_KERNEL])(scan)[0][0, 0].double().numpy()
-    return point_width(image, grid.slice)
+    return point_width(reference_fbp(scan, grid)[0].double().numpy(), grid.slice)
 
 
 def point_width(image: NDArray[np.float64], grid: VolumeGrid) -> dict[str, float]:
@@ -242,12 +232,7 @@ def point_width(image: NDArray[np.float64], grid: VolumeGrid) -> dict[str, float
 
 
 def blur(image: Tensor, sigma_px: float) -> Tensor:
-    """Gaussian blur of an image ``(y, x)``, cut at 4 σ, with its border repeated.
-
-    Args:
-        image: float tensor.
-        sigma_px: standard deviation in pixels; 0 returns the image.
-    """
+    """Gaussian blur of an image ``(y, x)``, cut at 4 σ, with its border repeated; 0 returns the image."""
     if sigma_px == 0:
         return image
     from kornia.filters import gaussian_blur2d

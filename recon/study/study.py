@@ -22,8 +22,8 @@ import os
 import platform
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar, Self, cast
 
 import numpy as np
 
@@ -83,14 +83,28 @@ class StudySettings:
 
     Attributes:
         QUICK: the values of a first look, by field; a comment beside says what is left out.
+
+    Raises:
+        TypeError, ValueError: a value of the wrong kind, or out of range.
     """
 
     QUICK: ClassVar[Mapping[str, Any]] = {}
 
     @classmethod
-    def quick(cls, **changes: Any) -> Self:
-        """Settings of a first look in under a minute, with ``changes`` on top."""
-        return cls(**{**cls.QUICK, **changes})
+    def of(cls, values: Mapping[str, Any], quick: bool = False) -> Self:
+        """Settings from the values of a report or a command, whose lists are tuples here; what is no field is left out.
+
+        Args:
+            values: by field.
+            quick: those of a first look in under a minute where ``values`` has none.
+        """
+        given = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items() if k in cls.names()}
+        return cls(**{**(cls.QUICK if quick else {}), **given})
+
+    @classmethod
+    def names(cls) -> set[str]:
+        """Of the fields."""
+        return {f.name for f in fields(cast(Any, cls)) if f.init}
 
     def check_whole(self, **least: int) -> None:
         """Check fields that count something: field → the least value.

@@ -74,16 +74,8 @@ class Case:
 
 
 def untouched(scene: Scene, sound: Scene, grid: VolumeGrid) -> NDArray[np.bool_]:
-    """Voxels that no body which ``scene`` has beyond those of ``sound`` touches, nor a neighbour of theirs.
-
-    Args:
-        scene: of a case.
-        sound: of the sound scan.
-        grid: ``(z, y, x)``.
-
-    Returns:
-        ``grid.shape``, True where the case shows what the sound scan does.
-    """
+    """Mask ``grid.shape`` of the voxels that no body which ``scene`` has beyond those of ``sound`` touches, nor a
+    neighbour of theirs: there the case shows what the sound scan does."""
     added = [k for k, name in enumerate(scene.names) if name not in set(sound.names)]
     if not added:
         return np.ones(grid.shape, dtype=bool)

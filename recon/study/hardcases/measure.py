@@ -55,9 +55,6 @@ class Settings(StudySettings):
         seed: of the noise, and of what is broken at random.
         methods: of :func:`recon.reconstruct`; ``"tissues"``: MBIR with them, of some scans of the plaque.
         cases: names of :data:`recon.study.hardcases.cases.CASES`.
-
-    Raises:
-        TypeError, ValueError: a value of the wrong kind or out of range; an unknown case.
     """
 
     views: int = 360

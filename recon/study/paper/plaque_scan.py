@@ -37,6 +37,7 @@ __all__ = [
     "inset_grid",
     "measure_plaque",
     "prepare",
+    "reference_fbp",
     "rod_values",
 ]
 
@@ -111,15 +112,7 @@ def prepare(
     progress: Callable[[float], None] | None = None,
     pieces: Pieces | None = None,
 ) -> PlaqueScan:
-    """Simulate the noise-free scan of a plaque and place grids and ROIs.
-
-    Args:
-        kernels, voxels_mm: of the study.
-        scene: a scene and its plaque, as :func:`torchpcct.scene.plaque.plaque.plaque_scene` gives.
-        scanner: with the number of views to simulate.
-        full_views: views of the complete scan, see :func:`duty`.
-        progress: called with the finished fraction of the simulation.
-        pieces: keep the scan.
+    """Simulate the noise-free scan of a plaque in its scene and place grids and ROIs; ``pieces`` keep the scan.
 
     Raises:
         ValueError: ROIs that come out empty; an inset outside the field of view.
@@ -133,6 +126,11 @@ def prepare(
     keep = pieces or Pieces(None, None)
     clean = keep("scan", lambda: acquire(bodies, scanner, region=region, duty=on, progress=progress))
     return PlaqueScan(clean, fine, grids, [rois.on(g) for g in grids], rois, InsetFbp(clean, grids, kernels))
+
+
+def reference_fbp(scan: Scan, grid: VolumeGrid, motion: Any = None) -> Tensor:
+    """FBP with the reference kernel, ``(z, y, x)`` HU; ``motion``: of :class:`recon.analytic.inset.InsetFbp`."""
+    return InsetFbp(scan, [grid], [REFERENCE_KERNEL], motion=motion)(scan)[0][0]
 
 
 def enclosing(grids: list[VolumeGrid]) -> VolumeGrid:
@@ -190,8 +188,7 @@ def rod_values(
     for name, material in tissues.items():
         rod = Scene([replace(scene.bodies[0], name="patient"), Body("rod", shape, material, "patient")])
         scan = acquire(rod, device, region=region, duty=count / g.views)
-        values = InsetFbp(scan, [grid], [REFERENCE_KERNEL])(scan)[0][0].double().numpy()[read]
-        hu[str(name)] = float(values.mean())
+        hu[str(name)] = float(reference_fbp(scan, grid).double().numpy()[read].mean())
     return hu
 
 

@@ -89,13 +89,8 @@ def calibration_cases(s: Any, bins: int) -> list[CalibrationError]:
 
 
 def decomposed(scan: SpectralScan, error: CalibrationError, calibrated: Scanner) -> tuple[Tensor, float]:
-    """Noise-free basis images of a scan, ``(2, z, y, x)``, and the share of its rays that found no solution.
-
-    Args:
-        scan: the true one.
-        error: of the calibration.
-        calibrated: the scanner that the decomposition knew before the error.
-    """
+    """Noise-free basis images of the true scan, ``(2, z, y, x)``, and the share of its rays that found no solution;
+    ``calibrated``: the scanner that the decomposition knew before the error."""
     model = SpectralModel.of(error.assumed(calibrated), NOISE_FREE_EXPOSURE_S)
     air = torch.from_numpy(model.air).to(scan.clean.air)
     factor = air / scan.clean.air if error.air_scan else torch.ones_like(air)
@@ -111,12 +106,8 @@ def decomposed(scan: SpectralScan, error: CalibrationError, calibrated: Scanner)
 
 
 def calibration_costs(s: Any, tissues: Tissues, progress: Callable[[float], None]) -> dict[str, Any]:
-    """HU of the tissues, contrast and tissue maps with every wrong calibration.
-
-    Args:
-        s: of the study; its calibration's fields.
-        tissues: of the study's own scan, whose noise is the unit of the maps' distances.
-        progress: called with the finished fraction.
+    """HU of the tissues, contrast and tissue maps with every wrong calibration; the noise of the study's own scan, of
+    which ``tissues`` are, is the unit of the maps' distances.
 
     Returns:
         JSON values: ``cases``, one row per error (the first is none) with HU by energy and tissue, contrast, Dice, and

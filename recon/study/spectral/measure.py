@@ -78,9 +78,6 @@ class Settings(StudySettings):
         gain_error: relative error of the counts since the air scan, in all energy bins or in one.
         transport_photons: followed through the silicon for a scan with all their interactions; 0: no such scan.
         seed: first seed of the noise.
-
-    Raises:
-        TypeError, ValueError: a value of the wrong kind or out of range.
     """
 
     exposure_s: float = 2.0

@@ -132,12 +132,7 @@ class SpectralScan:
         return self.exact.covariance * (NOISE_FREE_EXPOSURE_S / exposure_s)
 
     def noisy(self, exposure_s: float, seed: int, step: int = 1) -> tuple[Tensor, dict[str, Any]]:
-        """A noisy scan, decomposed.
-
-        Args:
-            exposure_s: in s.
-            seed: of the noise.
-            step: only every so many views.
+        """A noisy scan, only every ``step``-th view of it, decomposed.
 
         Returns:
             Line integrals ``(2, views, rows, columns)`` in mm, and how they scatter about the true ones:
@@ -219,12 +214,8 @@ class Tissues:
         self.corners = np.stack(corners, axis=1)
 
     def labels(self, images: Tensor, rule: str = "nearest") -> Tensor:
-        """Tissue of every voxel of the slices, ``(slices, y, x)``.
-
-        Args:
-            images: ``(2, z, y, x)`` basis coefficients on the inset's grid.
-            rule: one of :data:`RULES`.
-        """
+        """Tissue of every voxel of the slices, ``(slices, y, x)``, from basis images ``(2, z, y, x)`` by one of
+        :data:`RULES`."""
         choice("rule", rule, RULES)
         fractions = mmd(images[:, self.slices], self.basis, self.corners, self.covariance)
         if rule == "nearest":
