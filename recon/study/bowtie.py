@@ -26,7 +26,7 @@ from recon.evaluate.store import Pieces
 from recon.evaluate.tasks import read_task
 from recon.study.paper import facts as paper
 from recon.study.report import Check, around
-from recon.study.study import Clock, Measured, Progress, StudySettings, silent
+from recon.study.study import Measured, Progress, StudySettings, silent
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.dose import CtdiDose, ctdi_dose, monte_carlo_dose, primary_dose
 from torchpcct.geometry import VolumeGrid
@@ -136,7 +136,7 @@ class Settings(StudySettings):
 
 def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
     """Dose, noise, and the plaque by FBP and MBIR, in resumable pieces."""
-    s, clock, pieces = settings, Clock(), Pieces(folder, settings)
+    s, pieces = settings, Pieces(folder, settings)
     data: dict[str, Any] = {}
     scenes = phantoms()
 
@@ -160,20 +160,17 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     data["thorax_dose_ratio"] = {t: region_ratio(maps["thorax"], scenes["thorax"], b) for t, b in TISSUES.items()}
     data["patient_dose_ratio"] = _kept(s, pieces, "patient")
     progress("dose", 1.0)
-    clock.lap("dose")
 
     found = {}
     for k, name in enumerate(scenes):
         found[name] = _kept(s, pieces, f"noise_{name}")
         progress("noise", (k + 1) / len(scenes))
     data["noise"] = {name: values for name, (values, _) in found.items()}
-    clock.lap("noise")
 
     saved: dict[str, float] = {k: 1.0 / data["ctdi_ratios"][k]["weighted"] for k in ("plane", "total") if k in doses}
     data["combined"] = _combined(s, saved, pieces.folder("evaluate"), progress)
-    clock.lap("plaque: MBIR and ROI bowtie")
     images = {name: image for name, (_, image) in found.items()}
-    return Measured(s, data, clock.seconds, (maps, images))
+    return Measured(s, data, (maps, images))
 
 
 def _kept(settings: Settings, pieces: Pieces, name: str) -> Any:

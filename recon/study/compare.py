@@ -20,7 +20,7 @@ from recon.evaluate.store import Pieces
 from recon.evaluate.tasks import read_task
 from recon.study.figures import extent
 from recon.study.paper import facts as paper
-from recon.study.study import Clock, Measured, Progress, StudySettings, silent
+from recon.study.study import Measured, Progress, StudySettings, silent
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.roi import axial_grid, sample_axial
 from torchpcct.scanner import presets
@@ -67,17 +67,16 @@ class Settings(StudySettings):
 
 def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
     """Simulate, reconstruct, measure; see :mod:`recon.study.study`."""
-    s, clock = settings, Clock()
+    s = settings
     task = replace(read_task("plaque"), scanner=presets.pcct(views=s.views))
     kept = Pieces(folder, settings).folder("evaluate")
     found = evaluate(task, s.methods, exposures_s=s.exposures_s, n=s.n, seed=s.seed, folder=kept, progress=progress)
-    clock.lap("evaluation")
     records = plain(found.records)
     data = {
         "claim": claim(records), "records": records, "reference": task.reference,
         "tables": "\n\n".join(task_sections(found)), "peak_memory_gib": _peak_memory_gib(),
     }  # fmt: skip
-    return Measured(s, data, clock.seconds, found)
+    return Measured(s, data, found)
 
 
 def claim(records: list[dict[str, Any]]) -> dict[str, Any] | None:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from recon.evaluate.store import Pieces
 from recon.study.report import Check
-from recon.study.study import Clock, Measured, Progress, StudySettings, silent
+from recon.study.study import Measured, Progress, StudySettings, silent
 from torchpcct.scanner import Scanner, SiliconDetector, presets
 from torchpcct.scanner.pileup import recorded_rates
 from torchpcct.scanner.silicon_transport import Stack, efficiency, follow
@@ -70,7 +70,7 @@ class Settings(StudySettings):
 
 def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
     """Follow photons and compute rates, in resumable pieces."""
-    s, clock, rng = settings, Clock(), np.random.default_rng(settings.seed)
+    s, rng = settings, np.random.default_rng(settings.seed)
     pieces = Pieces(folder, settings)
 
     def followed(name: str, compute: Callable[[], Any]) -> Any:
@@ -83,11 +83,9 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     for i, case in enumerate(looked_at):
         efficiency.append(followed(f"case_{i}", partial(efficiencies, case, s.photons, rng)))
         progress("photons followed, thresholds", (i + 1) / len(looked_at))
-    clock.lap("thresholds")
     for i, energy in enumerate(ENERGIES_KEV):
         spectrum.append(followed(f"energy_{i}", partial(at_energy, energy, max(1000, s.photons // 4), rng)))
         progress("photons followed, energies", (i + 1) / len(ENERGIES_KEV))
-    clock.lap("energies")
     pieces.ahead(_pile_up, *((t,) for t in s.dead_times_ns))
     data = {
         "counts": counts(),
@@ -99,8 +97,8 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
         ],
         "pile_up": [_pile_up(s, pieces, t) for t in s.dead_times_ns],
     }
-    clock.lap("rates")
-    return Measured(s, data, clock.seconds)
+    progress("rates", 1.0)
+    return Measured(s, data)
 
 
 def _pile_up(settings: Settings, pieces: Pieces, dead_time_ns: float) -> Any:

@@ -37,7 +37,7 @@ from recon.study.paper.plaque_scan import (
     reference_fbp,
 )
 from recon.study.report import Check
-from recon.study.study import Clock, Measured, Progress, StudySettings, silent
+from recon.study.study import Measured, Progress, StudySettings, silent
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.placement import place_rois
@@ -157,7 +157,7 @@ class Found:
 
 def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
     """Simulate and reconstruct residual motion in both scanners, and compensate the PCCT's, in resumable pieces."""
-    s, clock, pieces, m = settings, Clock(), Pieces(folder, settings), Found()
+    s, pieces, m = settings, Pieces(folder, settings), Found()
     scene, plaque = plaque_scene()
     reference = Reference.of(scene, plaque, inset_grid(plaque, s.voxel_mm))
     fractions = {"PCCT": (0.0, *s.fractions), "EID-CT": (0.0, *s.eid_fractions)}
@@ -165,12 +165,10 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     plan: dict[str, Any] = {}
     for name in SCANNERS:
         still, moving = _residual(s, m, name, reference, pieces, progress)
-        clock.lap(f"{name}, residual motion")
         if name == "PCCT":
             plan = dict(moving.info["plan"])
             told = partial(progress, "compensation")
             m.compensated = compensate(s, still, moving, reference, pieces.within("compensation"), told)
-            clock.lap("compensation")
     data = {
         "range_mm": m.range_mm,
         "step_mm": m.step_mm,
@@ -186,7 +184,7 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
         "plan": plan,
     }
     data["borne"] = _borne({**data, "settings": vars(s)})
-    return Measured(s, data, clock.seconds, m)
+    return Measured(s, data, m)
 
 
 def _residual(

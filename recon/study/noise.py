@@ -30,7 +30,7 @@ from recon.study.figures import extent, roi_outlines
 from recon.study.paper import facts as paper
 from recon.study.paper.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM, PlaqueScan, prepare, reference_fbp
 from recon.study.report import Check, around
-from recon.study.study import Clock, Measured, Progress, StudySettings, silent
+from recon.study.study import Measured, Progress, StudySettings, silent
 from torchpcct.metrics.cnr import cnr_from_moments, cnr_interval, cnr_range, sd_interval
 from torchpcct.metrics.intervals import bca_interval, leave_one_out, resampling
 from torchpcct.metrics.roi import sample_axial
@@ -133,28 +133,24 @@ class Moments:
 
 def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
     """Simulate, take exact moments, draw realisations, reconstruct a few in full, in resumable pieces."""
-    s, clock, pieces = settings, Clock(), Pieces(folder, settings)
+    s, pieces = settings, Pieces(folder, settings)
     scanner, full = presets.pcct(views=s.views), paper.FULL_VIEWS["PCCT"]
     scanned = prepare(s.kernels, s.voxels_mm, plaque_scene(), scanner, full, partial(progress, "simulate"), pieces)
     clean = scanned.clean
-    clock.lap("simulate")
     fine = reference_fbp(clean, scanned.fine)
     core, fibrous = (float(roi(fine)) for roi in scanned.rois.on(scanned.fine))
     expected = scanned.roi_means(scanned.fbp(clean))
-    clock.lap("noise-free FBP")
-    progress("exact noise", 0.0)
+    progress("noise-free FBP", 1.0)
     adjoints = roi_adjoints(clean, scanned.fbp, scanned.pairs)
     covariance = adjoints.joint_covariance(clean, 1.0)
     near, matrix = clean.crop(adjoints.window), adjoints.matrix
     del adjoints
-    clock.lap("exact noise")
+    progress("exact noise", 1.0)
     means, variances = _realisations(s, near, matrix, expected, pieces, progress)
-    clock.lap("noise realisations")
     m = Moments(scanned, expected, covariance, means, variances)
     exposure = s.table_exposure_s
     full_runs = partial(_reconstructions, s, scanned, means[exposure], m.exact(exposure).sd, progress)
     m.images, compared = pieces("full_reconstructions", full_runs)
-    clock.lap("full reconstructions")
     data = {
         "plan": dict(clean.info["plan"]),
         "rois": scanned.rois.as_dict(),
@@ -173,8 +169,8 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
         "ten_run_experiments": _ten_run_experiments(s, m, exposure),
         "pairs": _pairs(s, m, exposure),
     }  # fmt: skip
-    clock.lap("statistics")
-    return Measured(s, data, clock.seconds, m)
+    progress("statistics", 1.0)
+    return Measured(s, data, m)
 
 
 def _realisations(

@@ -16,7 +16,7 @@ from scipy.ndimage import distance_transform_edt
 
 from recon.study.paper import facts as paper
 from recon.study.report import Check, around
-from recon.study.study import Clock, Measured, Progress, StudySettings, silent
+from recon.study.study import Measured, Progress, StudySettings, silent
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scanner import presets
 from torchpcct.scene import Scene
@@ -66,7 +66,6 @@ class Settings(StudySettings):
 
 def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
     """Materials and lengths; nothing is kept in ``folder``."""
-    clock = Clock()
     scene, plaque = plaque_scene()
     hu = ct_numbers(settings.energies_kev)
     published = {name: value for name, (_, value, _) in paper.MATERIALS.items()}
@@ -75,16 +74,14 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
         "materials": compositions(), "hu": hu, "published_hu": published,
         "nearest": {"soft": _nearest(hu, {n: published[n] for n in soft}), "all": _nearest(hu, published)},
     }  # fmt: skip
-    clock.lap("materials")
     progress("materials", 1.0)
     data["lengths_mm"] = {
         "bodies": analytic_lengths(scene, plaque),
         "raster": raster_lengths(scene, plaque, settings.voxel_mm, settings.sections),
     }
     data |= {"published_mm": dict(paper.PHANTOM_MM), "assumed_mm": assumptions(plaque)}
-    clock.lap("lengths")
     progress("lengths", 1.0)
-    return Measured(settings, data, clock.seconds)
+    return Measured(settings, data)
 
 
 def compositions() -> list[dict[str, Any]]:

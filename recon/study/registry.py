@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from recon.study.report import Report
     from recon.study.study import Measured, Progress
 
-__all__ = ["STUDIES", "build_settings", "folder", "part", "report_of", "run"]
+__all__ = ["STUDIES", "build_settings", "folder", "measured", "part", "report_of", "run"]
 
 STUDIES: dict[str, str] = {
     "compare": "what dose MBIR saves at the paper's plaque, beside FBP, PWLS and the best simple filter",
@@ -84,7 +84,12 @@ def build_settings(name: str, *, quick: bool = False, seed: int | None = None, c
 
 
 def run(name: str, settings: Any, progress: Progress | None = None, pieces: str | Path | None = None) -> Report:
-    """Measure a study and build its report, which is not saved.
+    """Measure a study and build its report, which is not saved; see :func:`measured`."""
+    return report_of(name, measured(name, settings, progress, pieces))
+
+
+def measured(name: str, settings: Any, progress: Progress | None = None, pieces: str | Path | None = None) -> Measured:
+    """Measure a study.
 
     Args:
         name: of the study.
@@ -96,13 +101,16 @@ def run(name: str, settings: Any, progress: Progress | None = None, pieces: str 
         ValueError: an unknown study; what the study itself refuses.
         TypeError: settings of another study.
     """
-    from recon.study.study import silent  # loads torch
+    from recon.study.study import Timed, silent  # loads torch
 
     study = part(name)
     if not isinstance(settings, study.Settings):
         kind = study.Settings
         raise TypeError(f"settings must be {kind.__module__}.Settings, got {type(settings).__name__}")
-    return report_of(name, study.measure(settings, progress or silent, pieces))
+    timed = Timed(progress or silent)
+    found: Measured = study.measure(settings, timed, pieces)
+    found.seconds = timed.seconds
+    return found
 
 
 def report_of(name: str, measured: Measured) -> Report:

@@ -42,7 +42,7 @@ from recon.study.paper.plaque_scan import (
     reference_fbp,
 )
 from recon.study.report import Check, around
-from recon.study.study import Clock, Measured, Progress, StudySettings, silent
+from recon.study.study import Measured, Progress, StudySettings, silent
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.resolution import first_below
@@ -108,7 +108,7 @@ class Imaged:
 
 def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
     """Simulate, blur, segment, measure, in resumable pieces."""
-    clock, pieces = Clock(), Pieces(folder, settings)
+    pieces = Pieces(folder, settings)
     scene, plaque = plaque_scene()
     seen: dict[str, Imaged] = {}
     entries: dict[str, dict[str, Any]] = {}
@@ -116,7 +116,7 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
         seen[name], entries[name] = _image(
             name, (scene, plaque), settings, pieces.within(name), partial(progress, name)
         )
-        clock.lap(name)
+        progress(name, 1.0)
     series = seen["PCCT"].blurred
     found = limits(series, settings.tolerance)
     margin = _PX_FWHM * min(found["cap"], found["lumen"])
@@ -130,7 +130,7 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
         "final_fwhm_mm": math.hypot(entries["PCCT"]["fwhm_mm"]["area"], margin),
         "cap_excess": series[0].cap_line / plaque.cap_thickness - 1.0,
     }
-    return Measured(settings, data, clock.seconds, seen)
+    return Measured(settings, data, seen)
 
 
 def _image(

@@ -1,4 +1,4 @@
-"""What every study is made of: its settings, its clock, what it measured, and what it tells whoever waits.
+"""What every study is made of: its settings, what it measured, and what it tells whoever waits.
 
 A study is a module (or a package that exports the same names) of :mod:`recon.study`, listed in
 :mod:`recon.study.registry`, which runs it by its name. It has
@@ -20,9 +20,10 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar, Self, cast
 
 import numpy as np
@@ -30,7 +31,7 @@ import numpy as np
 import torchpcct
 from torchpcct.validate import whole
 
-__all__ = ["Clock", "Measured", "Progress", "ProgressBars", "StudySettings", "environment", "silent"]
+__all__ = ["Measured", "Progress", "ProgressBars", "StudySettings", "Timed", "environment", "silent"]
 
 Progress = Callable[[str, float], None]
 """Called with the name of a step (after a bar, ``|``, what changes in the meantime) and its finished fraction, 0…1."""
@@ -117,22 +118,22 @@ class StudySettings:
             whole(name, getattr(self, name), low)
 
 
-class Clock:
-    """Seconds of every step, by the wall.
+class Timed:
+    """Progress that counts the seconds of every step, by the wall: each time until the step that is told next.
 
     Attributes:
-        seconds: step → seconds, in the order in which the steps came first.
+        seconds: step, up to a colon in its name, → seconds, in the order in which the steps came first.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, progress: Progress) -> None:
         self.seconds: dict[str, float] = {}
-        self._last = time.perf_counter()
+        self._progress, self._last = progress, time.perf_counter()
 
-    def lap(self, step: str) -> None:
-        """Count the time since the last lap (or the start) to ``step``."""
-        now = time.perf_counter()
-        self.seconds[step] = self.seconds.get(step, 0.0) + now - self._last
+    def __call__(self, step: str, fraction: float) -> None:
+        name, now = re.split("[:|]", step)[0], time.perf_counter()
+        self.seconds[name] = self.seconds.get(name, 0.0) + now - self._last
         self._last = now
+        self._progress(step, fraction)
 
 
 @dataclass
@@ -142,14 +143,14 @@ class Measured:
     Attributes:
         settings: of the study.
         data: JSON values by part (NumPy arrays and scalars among them), of which the report is made.
-        seconds: step → seconds.
         seen: what its pictures show besides, the study's own.
+        seconds: step → seconds.
     """
 
     settings: Any
     data: dict[str, Any]
-    seconds: dict[str, float]
     seen: Any = None
+    seconds: dict[str, float] = field(default_factory=dict)
 
 
 def environment() -> dict[str, Any]:

@@ -71,10 +71,8 @@ class TinyStudy:
 def run_tiny(name: str, folder: Path) -> TinyStudy:
     """Measure a study at its smallest scale."""
     steps: list[tuple[str, float]] = []
-    study = registry.part(name)
-    measured = study.measure(
-        study.Settings(**TINY[name]), lambda step, fraction: steps.append((step, fraction)), folder
-    )
+    settings = registry.part(name).Settings(**TINY[name])
+    measured = registry.measured(name, settings, lambda step, fraction: steps.append((step, fraction)), folder)
     return TinyStudy(name, measured, registry.report_of(name, measured), folder, steps)
 
 

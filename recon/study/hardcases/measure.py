@@ -23,7 +23,7 @@ from recon.evaluate.execute import heard
 from recon.evaluate.store import Pieces
 from recon.study.hardcases.cases import CASES, GRID, Case, body_scan, body_truth, untouched
 from recon.study.paper.plaque_scan import rod_values
-from recon.study.study import Clock, Measured, Progress, StudySettings, silent
+from recon.study.study import Measured, Progress, StudySettings, silent
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
@@ -113,24 +113,22 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     ``refused``, ``seconds``, ``verdict``, ``truth_hu`` (rms of the difference to the truth), ``soft_hu`` (that of soft
     FBP from the same scan; either is None if refused).
     """
-    clock, pieces = Clock(), Pieces(folder, settings)
+    pieces = Pieces(folder, settings)
     used = {CASES[name].base for name in settings.cases}
     bases = {name: make(settings, pieces.within(name), progress) for name, make in _BASES.items() if name in used}
-    clock.lap("simulate")
     sound = [(b, m) for b, base in bases.items() for m in settings.methods if m != "tissues" or base.plaque is not None]
     pieces.ahead(_sound, *sound)
-    for name, method in sound:
+    for k, (name, method) in enumerate(sound):
         bases[name].sound(method)
-    clock.lap("sound scans")
+        progress("sound scans", (k + 1) / len(sound))
     pieces.ahead(_case, *((name,) for name in settings.cases))
     rows = []
     for k, name in enumerate(settings.cases):
         rows += _case(settings, pieces, name, bases[CASES[name].base])
         progress("cases", (k + 1) / len(settings.cases))
-    clock.lap("cases")
     counts = Counter(row["verdict"] for row in rows)
     data = {"rows": rows, "cases": len(settings.cases), "verdicts": dict(counts), "silent": counts["SILENT"]}
-    return Measured(settings, data, clock.seconds)
+    return Measured(settings, data)
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ from recon.study.paper import facts as paper
 from recon.study.report import Check, around
 from recon.study.spectral.calibration import calibration_costs
 from recon.study.spectral.scan import RULES, SpectralScan, Tissues
-from recon.study.study import Clock, Measured, Progress, StudySettings, silent
+from recon.study.study import Measured, Progress, StudySettings, silent
 from torchpcct.spectral import (
     MMD_TISSUES,
     VMI_ENERGIES_KEV,
@@ -143,16 +143,11 @@ class Seen:
 
 def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
     """Scan, decompose, reconstruct, label, in resumable pieces."""
-    s, clock, spent = settings, Clock(), time.process_time()
-    pieces = Pieces(folder, settings)
-
-    def done(step: str) -> None:
-        clock.lap(step)
-        progress(step, 1.0)
+    s, pieces, spent = settings, Pieces(folder, settings), time.process_time()
 
     scan = SpectralScan(s, lambda fraction: progress("simulate", fraction), pieces=pieces)
     data: dict[str, Any] = {"plan": scan.clean.info["plan"]}
-    done("simulate")
+    progress("simulate", 1.0)
     noise_free = scan.fbp.images(scan.exact.line_integrals)[0][0]
     lines, volumes, data["rays"] = [], [], []
     pieces.ahead(_noisy, *((k,) for k in range(s.realizations)))
@@ -165,26 +160,25 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     low = pieces("noisy_low", lambda: scan.noisy(LOW_EXPOSURE_S, s.seed, _LOW_EXPOSURE_STEP)[1])
     data["rays"].append(low)
     images = Images(noise_free, torch.stack(volumes))
-    done("decompose noisy scans")
+    progress("decompose noisy scans", 1.0)
     data["vmi"] = _vmi(scan, images)
-    done("monochromatic images")
+    progress("monochromatic images", 1.0)
     tissues = Tissues(scan, data["vmi"]["voxel_covariance"])
     data["slices"] = len(tissues.truth)
     data["dice"] = {
         name: [_scores(level, tissues, images.fbp(level), rule) for level in s.noise_levels]
         for rule, name in RULES.items()
     }
-    done("tissue maps")
+    progress("tissue maps", 1.0)
     if lines:
         data["mbir"], data["dice"]["joint MBIR"] = _mbir(scan, tissues, lines, images, data["vmi"], pieces, progress)
-        done("joint MBIR")
+        progress("joint MBIR", 1.0)
     if s.calibration_views:
         costs = partial(calibration_costs, s, tissues, lambda fraction: progress("wrong calibrations", fraction))
         data["calibration"] = pieces("calibration", costs)
-        clock.lap("wrong calibrations")
     residual = {name: float(np.abs(pe_pvc().residual(name)).max()) for name in ("necrotic_core", "blood_iodine")}
     data |= {"basis_residual_hu": residual, "processor_seconds": time.process_time() - spent}
-    return Measured(s, data, clock.seconds, Seen(scan, tissues, images))
+    return Measured(s, data, Seen(scan, tissues, images))
 
 
 def _noisy(
