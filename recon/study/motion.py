@@ -144,13 +144,13 @@ class Found:
         range_mm: smallest and largest displacement of the whole motion; step_mm: largest from view to view.
     """
 
-    at_rest: dict[str, Observed] = field(default_factory=dict)
-    residual: dict[tuple[str, float], tuple[Observed, Observed]] = field(default_factory=dict)
-    compensated: dict[Key, list[Observed]] = field(default_factory=dict)
+    at_rest: dict[str, PlaqueImage] = field(default_factory=dict)
+    residual: dict[tuple[str, float], tuple[PlaqueImage, PlaqueImage]] = field(default_factory=dict)
+    compensated: dict[Key, list[PlaqueImage]] = field(default_factory=dict)
     range_mm: tuple[float, float] = (0.0, 0.0)
     step_mm: float = 0.0
 
-    def residuals(self, scanner: str) -> dict[float, tuple[Observed, Observed]]:
+    def residuals(self, scanner: str) -> dict[float, tuple[PlaqueImage, PlaqueImage]]:
         """``residual`` of one scanner, by fraction."""
         return {fraction: pair for (name, fraction), pair in self.residual.items() if name == scanner}
 
@@ -172,13 +172,13 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     data = {
         "range_mm": m.range_mm,
         "step_mm": m.step_mm,
-        "at_rest": {name: o.as_dict() for name, o in m.at_rest.items()},
+        "at_rest": {name: o.measures for name, o in m.at_rest.items()},
         "residual": [
-            {"scanner": name, "fraction": f, "in_place": here.as_dict(), "moved_back": back.as_dict()}
+            {"scanner": name, "fraction": f, "in_place": here.measures, "moved_back": back.measures}
             for (name, f), (here, back) in m.residual.items()
         ],
         "compensated": [
-            {"method": method, "error": error, "noisy": noisy, "realizations": [o.as_dict() for o in found]}
+            {"method": method, "error": error, "noisy": noisy, "realizations": [o.measures for o in found]}
             for (method, error, noisy), found in m.compensated.items()
         ],
         "plan": plan,
@@ -238,40 +238,18 @@ class Reference:
         return cls(grid, truth, place_rois(scene, truth.image).on(grid))
 
 
-@dataclass(frozen=True, eq=False)
-class Observed(PlaqueImage):
-    """Measures of one volume, and of its axial image.
+def observe(volume: Tensor, reference: Reference, rest: Tensor) -> PlaqueImage:
+    """Measure a volume ``(z, y, x)`` HU; ``rest``: the same without motion.
 
-    Attributes:
-        nrmse: rms difference to the reference volume over the rms of the reference's deviation from fat.
-        roi_hu: means of the core's and the fibrous ROI.
+    ``nrmse``: rms difference to it over the rms of its deviation from fat; ``roi_hu``: of core and fibrous tissue.
     """
-
-    nrmse: float
-    roi_hu: tuple[float, float]
-
-    @property
-    def contrast_hu(self) -> float:
-        """Fibrous ROI minus core ROI."""
-        return self.roi_hu[1] - self.roi_hu[0]
-
-    def as_dict(self) -> dict[str, Any]:
-        """JSON values."""
-        return {"nrmse": self.nrmse, **super().as_dict(), "roi_hu": self.roi_hu, "contrast_hu": self.contrast_hu}
-
-
-def observe(volume: Tensor, reference: Reference, rest: Tensor) -> Observed:
-    """Measure a volume ``(z, y, x)`` HU; ``rest``: the same without motion."""
     image = sample_axial(volume.double(), reference.grid, reference.truth.image)[0]
     core, fibrous = (float(r(volume)) for r in reference.rois)
     # Fat fills most of the inset.
     fat = float(rest.median())
     error = (volume.double() - rest.double()).square().mean().sqrt()
-    return Observed(
-        **vars(measure_plaque(image, reference.truth)),
-        nrmse=float(error / (rest.double() - fat).square().mean().sqrt()),
-        roi_hu=(core, fibrous),
-    )
+    nrmse = float(error / (rest.double() - fat).square().mean().sqrt())
+    return measure_plaque(image, reference.truth, nrmse=nrmse, roi_hu=(core, fibrous), contrast_hu=fibrous - core)
 
 
 # --- motion known ---------------------------------------------------------------------------------------------------
@@ -279,7 +257,7 @@ def observe(volume: Tensor, reference: Reference, rest: Tensor) -> Observed:
 
 def compensate(
     s: Settings, still: Scan, moving: Scan, reference: Reference, pieces: Pieces, progress: Callable[[float], None]
-) -> dict[Key, list[Observed]]:
+) -> dict[Key, list[PlaqueImage]]:
     """Reconstruct the noise-free scans of the still and of the moving vessel and their noisy realisations.
 
     PWLS, whose solution is to be certified by exact projections, is run without noise and for the first noise
@@ -307,7 +285,7 @@ def compensate(
         return network(problems[error], b[None], s.exposure_s)[0]
 
     noise: list[int | None] = [None, *range(s.seed, s.seed + s.realizations)]
-    found: dict[Key, list[Observed]] = {}
+    found: dict[Key, list[PlaqueImage]] = {}
     rest: dict[str, Tensor] = {}
     for k, seed in enumerate(noise):
         # The same draws at rest and in motion: noise belongs to the reading, not to what is seen.
@@ -423,7 +401,7 @@ def figures(measured: Measured) -> dict[str, Any]:
     return {"motion_images.png": _images(m), "motion.png": _curves(s, m)}
 
 
-def _error_map(found: Observed, rest: Observed) -> Panel:
+def _error_map(found: PlaqueImage, rest: PlaqueImage) -> Panel:
     # The one grey scale of the figure is that of images: stretch the error to its window.
     center, width = WINDOW_HU
     return middle_panel((found.image - rest.image) * (width / _ERROR_WIDTH_HU) + center)
@@ -464,12 +442,11 @@ def _curves(s: Settings, m: Found) -> Any:
     """NRMSE, lumen area and depth of the core's basin against residual motion, uncompensated and compensated."""
     figure, axes = curve_axes("residual motion, mm", ["NRMSE, %", "lumen area, of that at rest", "core's basin, HU"])
 
-    def draw(x: list[float], found: list[Observed], rest: Observed, marker: str, color: str, label: str) -> None:
-        area = rest.segmentation.lumen_area
+    def draw(x: list[float], found: list[PlaqueImage], rest: PlaqueImage, marker: str, color: str, label: str) -> None:
         curves = (
-            [100 * o.nrmse for o in found],
-            [o.segmentation.lumen_area / area for o in found],
-            [o.depth for o in found],
+            [100 * o["nrmse"] for o in found],
+            [o["lumen_mm2"] / rest["lumen_mm2"] for o in found],
+            [o["basin_depth_hu"] for o in found],
         )
         for ax, values in zip(axes, curves, strict=True):
             # Moving the image back does not change an area.

@@ -103,7 +103,7 @@ class Imaged:
 
     scanned: PlaqueScan
     volume: Tensor
-    blurred: list[Blurred]
+    blurred: list[PlaqueImage]
 
 
 def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
@@ -128,7 +128,7 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
         "limits_fwhm_mm": {name: _PX_FWHM * found[name] for name in ("cap", "lumen")},
         "margin_fwhm_mm": margin,
         "final_fwhm_mm": math.hypot(entries["PCCT"]["fwhm_mm"]["area"], margin),
-        "cap_excess": series[0].cap_line / plaque.cap_thickness - 1.0,
+        "cap_excess": series[0]["cap_line_mm"] / plaque.cap_thickness - 1.0,
     }
     return Measured(settings, data, seen)
 
@@ -167,7 +167,7 @@ def _image(
         "own_cnr": own / sd,
         "exposure_s": exposure_s,
         "fwhm_mm": width,
-        "blurred": [b.as_dict() for b in series],
+        "blurred": [b.measures for b in series],
         "plan": dict(scanned.clean.info["plan"]),
     }
 
@@ -242,29 +242,18 @@ def blur(image: Tensor, sigma_px: float) -> Tensor:
     return blurred[0, 0]
 
 
-@dataclass(frozen=True, eq=False)
-class Blurred(PlaqueImage):
-    """Measures of a blurred image; ``sigma_px``: of the blur, pixels."""
-
-    sigma_px: float
-
-    @property
-    def fwhm_mm(self) -> float:
-        """Full width at half maximum of the blur."""
-        return FWHM_PER_SIGMA * self.sigma_px * self.segmentation.grid.spacing[0]
-
-    def as_dict(self) -> dict[str, Any]:
-        """JSON values."""
-        cap = self.segmentation.cap_thickness
-        return {"sigma_px": self.sigma_px, "fwhm_mm": self.fwhm_mm, "cap_mm": cap, **super().as_dict()}
-
-
-def blur_series(image: Tensor, truth: Truth, sigmas_px: Sequence[float]) -> list[Blurred]:
+def blur_series(image: Tensor, truth: Truth, sigmas_px: Sequence[float]) -> list[PlaqueImage]:
     """Blur an axial image ``(y, x)`` HU on ``truth.image`` by every σ, and measure it."""
-    return [Blurred(**vars(measure_plaque(blur(image, s), truth)), sigma_px=s) for s in sigmas_px]
+    series = []
+    for sigma in sigmas_px:
+        fwhm = FWHM_PER_SIGMA * sigma * truth.image.spacing[-1]
+        found = measure_plaque(blur(image, sigma), truth, sigma_px=sigma, fwhm_mm=fwhm)
+        found.measures["cap_mm"] = found.segmentation.cap_thickness
+        series.append(found)
+    return series
 
 
-def limits(series: list[Blurred], tolerance: float) -> dict[str, Any]:
+def limits(series: list[PlaqueImage], tolerance: float) -> dict[str, Any]:
     """Where a blur series loses what: blurs in pixels.
 
     Returns:
@@ -272,19 +261,15 @@ def limits(series: list[Blurred], tolerance: float) -> dict[str, Any]:
         lumen's area; ``core_lost``: first blur of the series at which the core is not segmented (None: at none);
         ``basin``: blur at which the core's basin has half of its depth.
     """
-    sigmas = [b.sigma_px for b in series]
-    sharp = series[0]
-    lost = [b.sigma_px for b in series if not b.segmentation.core_found]
-
-    def change(values: list[float], reference: float) -> list[float]:
-        return [abs(v / reference - 1.0) for v in values]
-
-    areas = [b.segmentation.lumen_area for b in series]
+    sigmas, caps, areas, depths = (
+        np.array([b[name] for b in series]) for name in ("sigma_px", "cap_line_mm", "lumen_mm2", "basin_depth_hu")
+    )
+    lost = [b["sigma_px"] for b in series if not b["core_found"]]
     return {
-        "cap": crossing(sigmas, change([b.cap_line for b in series], sharp.cap_line), tolerance),
-        "lumen": crossing(sigmas, change(areas, areas[0]), tolerance),
+        "cap": crossing(sigmas, np.abs(caps / caps[0] - 1.0), tolerance),
+        "lumen": crossing(sigmas, np.abs(areas / areas[0] - 1.0), tolerance),
         "core_lost": lost[0] if lost else None,
-        "basin": crossing(sigmas, [sharp.depth - b.depth for b in series], 0.5 * sharp.depth),
+        "basin": crossing(sigmas, depths[0] - depths, 0.5 * depths[0]),
     }
 
 
@@ -350,8 +335,8 @@ def _images(scanners: dict[str, Imaged]) -> Any:
     top = []
     for name, s in scanners.items():
         top += [middle_panel(s.blurred[0].image, f"{name}, axial"), middle_panel(_sagittal(s), "along the vessel")]
-    middle = [plaque_panel(b, f"σ = {b.sigma_px:g}", f"{b.fwhm_mm:.2f} mm") for b in series]
-    bottom = [middle_panel(blur(_sagittal(scanners["PCCT"]), b.sigma_px)) for b in series]
+    middle = [plaque_panel(b, f"σ = {b['sigma_px']:g}", f"{b['fwhm_mm']:.2f} mm") for b in series]
+    bottom = [middle_panel(blur(_sagittal(scanners["PCCT"]), b["sigma_px"])) for b in series]
     return panels(
         [top, middle, bottom], ("no blur", "PCCT axial", "PCCT along"),
         "Noise-free plaque in different resolutions",
@@ -366,22 +351,22 @@ def _curves(m: Measured) -> Any:
         ["lumen area, of the sharp image's", "cap thickness, mm", "depth of the core's basin, HU"],
     )
     series = m.seen["PCCT"].blurred
-    x = [b.sigma_px for b in series]
-    areas = np.array([b.segmentation.lumen_area for b in series])
+    x = [b["sigma_px"] for b in series]
+    areas = np.array([b["lumen_mm2"] for b in series])
     lumen.plot(x, areas / areas[0], "o-", color="black")
     lumen.axhspan(1 - m.settings.tolerance, 1, color="0.92", label="within tolerance")
     lumen.set_ylim(0.75, 1.02)
-    values = np.array([b.cap_line for b in series])
+    values = np.array([b["cap_line_mm"] for b in series])
     cap.plot(x, values, "o-", color="black", label="on the line")
-    closest = np.array([b.segmentation.cap_thickness for b in series])
+    closest = np.array([b["cap_mm"] for b in series])
     cap.plot(x, closest, "x", color="tab:blue", label="smallest distance")
     low, high = values[0] * (1 - m.settings.tolerance), values[0] * (1 + m.settings.tolerance)
     cap.axhspan(low, high, color="0.92", label="within tolerance")
     cap.axhline(m.data["truth"]["cap_mm"], color="0.5", linestyle=":", label="true")
     cap.axvline(float(paper.RESOLUTION["cap_limit_px"]), color="tab:red", linestyle="--", label="paper's limit")
     cap.legend(fontsize=7)
-    basin.plot(x, [b.depth for b in series], "o-", color="black")
-    kept = [(b.sigma_px, b.depth) for b in series if b.segmentation.core_found]
+    basin.plot(x, [b["basin_depth_hu"] for b in series], "o-", color="black")
+    kept = [(b["sigma_px"], b["basin_depth_hu"]) for b in series if b["core_found"]]
     if kept:
         basin.plot(*zip(*kept, strict=True), "s", color="black", markersize=7, label="core segmented")
         basin.legend(fontsize=7)

@@ -228,45 +228,35 @@ class Truth:
 
 @dataclass(frozen=True, eq=False)
 class PlaqueImage:
-    """Measures of one axial image.
+    """One axial image, and what is measured of it.
 
     Attributes:
         image: ``(y, x)`` HU.
         segmentation: of it.
-        cap_line: cap thickness in mm on the line from the lumen's to the core's centre; NaN where there is no lumen.
-        depth: of the core's basin, HU (:func:`torchpcct.metrics.plaque_measures.basin_depth`).
-        lumen_dice, core_dice: overlap of the segmented regions with the true ones.
+        measures: JSON values: ``lumen_mm2``, ``core_mm2``: areas; ``core_found``; ``cap_line_mm``: cap thickness on the
+            line from the lumen's to the core's centre, NaN where there is no lumen; ``lumen_dice``, ``core_dice``:
+            overlap of the segmented regions with the true ones; ``basin_depth_hu``: of the core's basin
+            (:func:`torchpcct.metrics.plaque_measures.basin_depth`); and what a study adds.
     """
 
     image: Tensor
     segmentation: PlaqueSegmentation
-    cap_line: float
-    depth: float
-    lumen_dice: float
-    core_dice: float
+    measures: dict[str, Any]
 
-    def as_dict(self) -> dict[str, Any]:
-        """JSON values."""
-        s = self.segmentation
-        return {
-            "lumen_mm2": s.lumen_area,
-            "core_found": s.core_found,
-            "core_mm2": s.core_area,
-            "cap_line_mm": self.cap_line,
-            "lumen_dice": self.lumen_dice,
-            "core_dice": self.core_dice,
-            "basin_depth_hu": self.depth,
-        }
+    def __getitem__(self, name: str) -> Any:
+        return self.measures[name]
 
 
-def measure_plaque(image: Tensor, truth: Truth) -> PlaqueImage:
-    """Segment and measure an axial image ``(y, x)`` HU on ``truth.image``."""
+def measure_plaque(image: Tensor, truth: Truth, **more: Any) -> PlaqueImage:
+    """Segment and measure an axial image ``(y, x)`` HU on ``truth.image``; ``more``: measures of the study's own."""
     found = segment_plaque(image, truth.image)
-    return PlaqueImage(
-        image,
-        found,
-        cap_on_line(image, truth.image, *truth.line),
-        basin_depth(image, truth.image, truth.masks["core"]),
-        dice(found.lumen, truth.masks["lumen"]),
-        dice(found.core, truth.masks["core"]),
-    )
+    measures = {
+        "lumen_mm2": found.lumen_area,
+        "core_found": found.core_found,
+        "core_mm2": found.core_area,
+        "cap_line_mm": cap_on_line(image, truth.image, *truth.line),
+        "lumen_dice": dice(found.lumen, truth.masks["lumen"]),
+        "core_dice": dice(found.core, truth.masks["core"]),
+        "basin_depth_hu": basin_depth(image, truth.image, truth.masks["core"]),
+    }
+    return PlaqueImage(image, found, {**more, **measures})
