@@ -141,14 +141,11 @@ class Found:
         residual: (scanner, fraction) → the uncompensated image, in place and moved back by the mean displacement.
         compensated: (method, error of the estimate, noisy) → one entry per realisation; error 0: the true motion;
             None: the still vessel by the same method.
-        range_mm: smallest and largest displacement of the whole motion; step_mm: largest from view to view.
     """
 
     at_rest: dict[str, PlaqueImage] = field(default_factory=dict)
     residual: dict[tuple[str, float], tuple[PlaqueImage, PlaqueImage]] = field(default_factory=dict)
     compensated: dict[Key, list[PlaqueImage]] = field(default_factory=dict)
-    range_mm: tuple[float, float] = (0.0, 0.0)
-    step_mm: float = 0.0
 
     def residuals(self, scanner: str) -> dict[float, tuple[PlaqueImage, PlaqueImage]]:
         """``residual`` of one scanner, by fraction."""
@@ -162,16 +159,20 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     reference = Reference.of(scene, plaque, inset_grid(plaque, s.voxel_mm))
     fractions = {"PCCT": (0.0, *s.fractions), "EID-CT": (0.0, *s.eid_fractions)}
     pieces.ahead(_scan, *((name, f) for name in SCANNERS for f in dict.fromkeys(fractions[name])))
-    plan: dict[str, Any] = {}
+    data: dict[str, Any] = {}
     for name in SCANNERS:
         still, moving = _residual(s, m, name, reference, pieces, progress)
         if name == "PCCT":
-            plan = dict(moving.info["plan"])
+            path = view_motion(s.motion, moving.geometry, s.rotation_s)
+            along = path @ np.array([0.0, math.sin(s.direction), math.cos(s.direction)])
+            data = {
+                "range_mm": (float(along.min()), float(along.max())),
+                "step_mm": float(np.linalg.norm(np.diff(path, axis=0), axis=1).max()),
+                "plan": dict(moving.info["plan"]),
+            }
             told = partial(progress, "compensation")
             m.compensated = compensate(s, still, moving, reference, pieces.within("compensation"), told)
-    data = {
-        "range_mm": m.range_mm,
-        "step_mm": m.step_mm,
+    data |= {
         "at_rest": {name: o.measures for name, o in m.at_rest.items()},
         "residual": [
             {"scanner": name, "fraction": f, "in_place": here.measures, "moved_back": back.measures}
@@ -181,7 +182,6 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
             {"method": method, "error": error, "noisy": noisy, "realizations": [o.measures for o in found]}
             for (method, error, noisy), found in m.compensated.items()
         ],
-        "plan": plan,
     }
     data["borne"] = _borne({**data, "settings": vars(s)})
     return Measured(s, data, m)
@@ -196,10 +196,6 @@ def _residual(
     rest = reference_fbp(still, grid)
     m.at_rest[name] = observe(rest, reference, rest)
     path = view_motion(s.motion, still.geometry, s.rotation_s)
-    if name == "PCCT":
-        along = path @ np.array([0.0, math.sin(s.direction), math.cos(s.direction)])
-        m.range_mm = (float(along.min()), float(along.max()))
-        m.step_mm = float(np.linalg.norm(np.diff(path, axis=0), axis=1).max())
     fractions = s.fractions if name == "PCCT" else s.eid_fractions
     for done, fraction in enumerate(fractions):
         moving = _scan(s, pieces, name, fraction)

@@ -317,9 +317,8 @@ _PLAQUE: dict[str, Case] = {
 # --- a whole body -----------------------------------------------------------------------------------------------------
 
 
-def body_scan(scene: Scene | None = None) -> Scan:
-    """The noise-free scan of the thorax, or of a scene."""
-    scene = scene or thorax()
+def body_scan(scene: Scene) -> Scan:
+    """The noise-free scan of a body, the thorax or another."""
     g = GEOMETRY
     row = ConeBeam(g.angles, g.sod, g.sdd, g.columns, 1, g.pitch)
     groups: dict[float, list[str]] = {}
@@ -331,10 +330,10 @@ def body_scan(scene: Scene | None = None) -> Scan:
     return Scan((air * torch.exp(-lines)).float(), air, g, _water(g.columns, WATER))
 
 
-def body_truth(scene: Scene | None = None) -> Tensor:
+def body_truth(scene: Scene) -> Tensor:
     """``GRID.shape`` HU."""
     section = VolumeGrid((1, *GRID.shape), (1.0, *GRID.spacing), (0.0, *GRID.center))
-    return torch.from_numpy((scene or thorax()).material_map(section, KEV)[0] / WATER * 1000.0 - 1000.0).float()
+    return torch.from_numpy(scene.material_map(section, KEV)[0] / WATER * 1000.0 - 1000.0).float()
 
 
 def _water(columns: int, mu: float) -> WaterLinearisation:

@@ -39,8 +39,9 @@ def test_measures_of_a_known_volume(drawn):
 
 
 def test_motion_spoils_and_its_knowledge_repairs(tiny):
-    m = tiny("motion").measured.seen
-    assert m.range_mm == pytest.approx((0.0, 2.0), abs=0.01)
+    measured = tiny("motion").measured
+    m = measured.seen
+    assert measured.data["range_mm"] == pytest.approx((0.0, 2.0), abs=0.01)
     small, large = (m.residual["PCCT", f] for f in (0.2, 1.0))
     assert 0.05 < small[0]["nrmse"] < large[0]["nrmse"]
     assert large[1]["nrmse"] < large[0]["nrmse"]  # the shift alone taken out
