@@ -177,8 +177,7 @@ class VesselTask(Task):
 
     @cached_property
     def _vessel(self) -> Vessel:
-        line, branch = SHAPES[self.direction]
-        return Vessel(line, self.grid.center, branch)
+        return Vessel(SHAPES[self.direction], self.grid.center)
 
     def scan(self, store: Store, signal: str) -> Scan:
         """See :meth:`Task.scan`: of the same plaque along z, on the same scanner."""
