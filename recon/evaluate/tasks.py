@@ -177,7 +177,8 @@ class VesselTask(Task):
 
     @cached_property
     def _vessel(self) -> Vessel:
-        return Vessel(SHAPES[self.direction], self.grid.center)
+        line, branch = SHAPES[self.direction]
+        return Vessel(line, self.grid.center, branch)
 
     def scan(self, store: Store, signal: str) -> Scan:
         """See :meth:`Task.scan`: of the same plaque along z, on the same scanner."""

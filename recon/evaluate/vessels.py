@@ -1,4 +1,4 @@
-"""The paper's plaque on a vessel of any direction: tilted, in plane, curved.
+"""The paper's plaque on a vessel of any direction: tilted, in plane, curved, bifurcating.
 
 The analytic scenes know vessels along z only. Here a point of space is taken to the vessel's own coordinates (across
 towards the plaque, across, along the centreline) and there asked which tissue of the straight plaque it lies in. So all
@@ -22,7 +22,7 @@ from torchpcct.scene import Scene
 from torchpcct.scene.plaque import Plaque, plaque_scene
 from torchpcct.scene.scene import voxel_centres
 
-__all__ = ["LENGTH_MM", "SHAPES", "Centreline", "Vessel"]
+__all__ = ["LENGTH_MM", "SHAPES", "Branch", "Centreline", "Vessel"]
 
 Floats = NDArray[np.float64]
 
@@ -68,10 +68,34 @@ class Centreline:
         left = self.radius - across
         return np.stack([towards, self.radius - np.hypot(along, left), self.radius * np.arctan2(along, left)], axis=-1)
 
+    def point(self, local: ArrayLike) -> Floats:
+        """The inverse of :meth:`local`."""
+        towards, across, along = np.moveaxis(np.asarray(local, dtype=np.float64), -1, 0)
+        if not math.isinf(self.radius):
+            angle, distance = along / self.radius, self.radius - across
+            across, along = self.radius - distance * np.cos(angle), distance * np.sin(angle)
+        result: Floats = np.stack([towards, across, along], axis=-1) @ np.asarray(self.axes, np.float64)
+        return result
+
     @property
     def axes(self) -> tuple[Any, Any, Any]:
         """Unit vectors at the origin: towards the plaque, across, along."""
         return self.side, np.cross(self.tangent, self.side), self.tangent
+
+
+@dataclass(frozen=True)
+class Branch:
+    """A healthy side branch, away from the plaque; lengths in mm.
+
+    Args:
+        angle: to the vessel, rad.
+        diameter: outer; its wall is as thick as the vessel's.
+        length: from the vessel's lumen to its flat end.
+    """
+
+    angle: float = math.pi / 4
+    diameter: float = 2.24
+    length: float = 4.5
 
 
 @dataclass(frozen=True)
@@ -81,11 +105,13 @@ class Vessel:
     Args:
         line: the vessel's, in a frame about ``center``.
         center: ``(z, y, x)`` mm of the vessel's axis in the middle of the plaque.
+        branch: None for none.
         plaque: its geometry, in the vessel's own coordinates.
     """
 
     line: Centreline
     center: tuple[float, float, float]
+    branch: Branch | None = None
     plaque: Plaque = _PLAQUE
 
     @cached_property
@@ -93,9 +119,25 @@ class Vessel:
         """The plaque in the vessel's own coordinates."""
         return plaque_scene(self.plaque)[0]
 
+    def local(self, points: Floats) -> Floats:
+        """Points ``(..., 3)`` of the scanner's frame in the vessel's coordinates, mm."""
+        return self.line.local(points - np.array(self.center[::-1]))
+
     def labels(self, points: Floats) -> NDArray[np.int64]:
         """Index of the tissue in :attr:`straight` at points ``(..., 3)`` x, y, z in mm."""
-        return self.straight.labels(self.line.local(points - np.array(self.center[::-1])))
+        local = self.local(points)
+        labels = self.straight.labels(local)
+        if self.branch is not None:
+            index, b = self.straight.index, self.branch
+            along = np.array([-math.sin(b.angle), 0.0, math.cos(b.angle)])
+            start = np.array([float(self.plaque.section("lumen", 0.0)[0]), 0.0, 0.0])
+            depth = (local - start) @ along
+            off = np.linalg.norm(local - start - depth[..., None] * along, axis=-1)
+            within = (depth >= 0) & (depth <= b.length)
+            labels[within & (off <= b.diameter / 2) & (labels == index("patient"))] = index("wall")
+            blood = within & (off <= b.diameter / 2 - self.plaque.wall_thickness)
+            labels[blood & (labels != index("core"))] = index("lumen")
+        return labels
 
     def painted(self, grid: VolumeGrid, values: Mapping[str, Any], samples: int = 2) -> Floats:
         """Mean over each voxel of ``values`` of the tissues, from ``samples ** 3`` points; of other tissues 0.
@@ -127,12 +169,13 @@ class Vessel:
 _X, _Y, _Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 _HALF = math.sqrt(0.5)
 
-SHAPES: dict[str, Centreline] = {
-    "straight": Centreline(_Z, _X),
-    "tilted": Centreline((0.0, _HALF, _HALF), _X),
-    "in_plane_x": Centreline(_X, (0.0, -1.0, 0.0)),
-    "in_plane_y": Centreline(_Y, _X),
-    "curved_8mm": Centreline(_Z, _X, 8.0),
-    "curved_5mm": Centreline(_Z, _X, 5.0),
+SHAPES: dict[str, tuple[Centreline, Branch | None]] = {
+    "straight": (Centreline(_Z, _X), None),
+    "tilted": (Centreline((0.0, _HALF, _HALF), _X), None),
+    "in_plane_x": (Centreline(_X, (0.0, -1.0, 0.0)), None),
+    "in_plane_y": (Centreline(_Y, _X), None),
+    "curved_8mm": (Centreline(_Z, _X, 8.0), None),
+    "curved_5mm": (Centreline(_Z, _X, 5.0), None),
+    "bifurcating": (Centreline(_Z, _X), Branch()),
 }
-"""Centreline of every vessel; ``in_plane_x`` is ``in_plane_y`` turned by a right angle about z."""
+"""Centreline and side branch of every vessel; ``in_plane_x`` is ``in_plane_y`` turned by a right angle about z."""
