@@ -41,6 +41,12 @@ def set_version(version):
     execute.VERSION = version
 
 
+def kills(folder, process):
+    """Another process, and with it what this job was given by."""
+    os.kill(process, signal.SIGKILL)
+    time.sleep(60)
+
+
 def waits(folder, seconds):
     """Take so long, and no processor."""
     time.sleep(seconds)

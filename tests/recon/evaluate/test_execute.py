@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 import torch
 from fresh_python import run_python
-from some_jobs import compiles, dies, full, noted, refuses, set_version, threads, waits
+from some_jobs import compiles, dies, full, kills, noted, refuses, set_version, threads, waits
 from tiny_studies import INSERT, TINY
 
 from recon.analytic.slabs import reconstruct_to
@@ -334,6 +334,31 @@ def test_an_unreachable_scheduler_is_told_in_one_sentence(tmp_path, capsys):
     assert "no Dask scheduler answers at tcp://127.0.0.1:9" in output
     assert main([*command, str(tmp_path / "none.json")]) == 2
     assert "dask scheduler --scheduler-file writes it" in capsys.readouterr().err
+
+
+@pytest.mark.cluster
+def test_a_scheduler_that_dies_is_told_in_one_sentence_and_what_is_done_is_kept(tmp_path):
+    pytest.importorskip("distributed")
+    file = tmp_path / "scheduler.json"
+    words = ("scheduler --host 127.0.0.1 --port 0", "worker --nthreads 1 --no-nanny --death-timeout 60")
+    started = [
+        subprocess.Popen(
+            [sys.executable, "-m", "dask", *text.split(), "--no-dashboard", "--scheduler-file", file],
+            cwd=tmp_path, stderr=subprocess.DEVNULL, env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        )
+        for text in words
+    ]  # fmt: skip
+    try:
+        while not file.exists():
+            time.sleep(0.05)
+        jobs = [Job("first", noted, ("first", 1)), Job("second", kills, (started[0].pid,), after=("first",))]
+        with pytest.raises(ConnectionError, match="is gone: what is done is kept"):
+            run(jobs, tmp_path, Cluster(str(file)))
+    finally:
+        for process in started:
+            process.kill()
+            process.wait()
+    assert (tmp_path / "first.txt").read_text() == "1"
 
 
 @pytest.mark.cluster
