@@ -6,8 +6,6 @@ that is forked after the slow imports. A fault that its test does not notice is 
 every test must pass on the sound copy. What was found is kept in ``mutation.json`` beside this file, fault by fault.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -12,8 +12,6 @@ package's weights over the regions of the finished draws. True values are those 
 place (least squares on noise-free readings), areas and volumes those of the scene.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import time

@@ -9,8 +9,6 @@ noise and 10⁴ HU. With ``--keep`` the figures go to ``precision.json`` and ``p
 ones hardly depend on the processor and are pinned by ``tests/test_precision.py``.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

@@ -10,8 +10,6 @@ and so many steps. Trainings and figures are kept in the folder RUNS; the same c
 ``prior_parts.json`` and ``prior_parts.md`` beside this file.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import subprocess

@@ -8,8 +8,6 @@ relative L2 against exact, cell-averaged line integrals. The medians
 depend on what else the machine does; the ratios within a run less: the load average stands above the table.
 """
 
-from __future__ import annotations
-
 import argparse
 import ctypes
 import datetime

@@ -5,8 +5,6 @@ Vessels of four directions are painted on 0.1 mm voxels and projected. Noise is 
 per cent at most.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache

@@ -9,8 +9,6 @@ methods ``FILTER@fbp:KERNEL`` of :mod:`recon.evaluate` find them, and kept: the 
 non-commercial) counts where it is installed.
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib.util
 import itertools

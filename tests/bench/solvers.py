@@ -8,8 +8,6 @@ of data and prior (Beck, Teboulle 2009; Erdogan, Fessler 1999); OS-SQS replaces 
 12 subsets of the views, with momentum (Kim, Ramani, Fessler 2015). One pair is one A and one Aᵀ of all views.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

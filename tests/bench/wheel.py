@@ -6,8 +6,6 @@ Nothing of the repository is on the path of that environment: what the wheel lac
 dependency) fails here. Options go to ``pip install``, e.g. ``--extra-index-url https://download.pytorch.org/whl/cpu``.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

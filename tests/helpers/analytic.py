@@ -6,8 +6,6 @@ integral of ``exp(-|M (x - c)|² / 2)``: ``√(2π) / |a| · exp(-(|b|² - (a·b
 each cell give the cell average.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

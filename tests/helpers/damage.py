@@ -5,8 +5,6 @@ outside: ``python damage.py READER FOLDER COPIES [SECONDS [SEED]]`` prints a JSO
 stops when they are over; COPIES is then the largest number.
 """
 
-from __future__ import annotations
-
 import collections
 import json
 import math

@@ -1,7 +1,5 @@
 """A registry of small scans: every geometry, with what can go wrong in each. Contract tests run over all of them."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

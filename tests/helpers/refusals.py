@@ -9,3 +9,13 @@ def refused(*cases):
         with pytest.raises((ValueError, TypeError), match=pattern):  # noqa: PT012
             call()
             pytest.fail(f"was not refused: {pattern}")
+
+
+def refusals(*cases):
+    """A test of each case of :func:`refused` by itself."""
+
+    @pytest.mark.parametrize(("pattern", "call"), cases, ids=[pattern for pattern, _ in cases])
+    def test(pattern, call):
+        refused((pattern, call))
+
+    return test

@@ -1,7 +1,5 @@
 """Scans whose geometry is given view by view: readings, files, methods and command line, against a ball's chords."""
 
-from __future__ import annotations
-
 import json
 import math
 

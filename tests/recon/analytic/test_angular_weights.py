@@ -1,7 +1,5 @@
 """Angular weights: pairs of opposite rays, spacing, short and over-scans."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

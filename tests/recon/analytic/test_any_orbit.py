@@ -1,7 +1,5 @@
 """FBP of detectors that tilt, roll, jitter and mirror: exact lines along the vectors, compared with exact bodies."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Detectors as they are: half fans, rows that end inside the object, dead cells. Compared with exact bodies."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """FBP as a differentiable linear operator: dense matrices, transposes, gradients, batches."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from refusals import refused
 from small_scan import SPECTRAL_GRID as GRID
 
 from recon.analytic.exact_noise import functional_covariance
@@ -40,19 +41,16 @@ def test_channels_take_batches_kernels_and_motion(spectral, run):
 
 def test_refusals(spectral, run):
     clean, _, inside, around = spectral
-    with pytest.raises(ValueError, match="channels"):
-        run.images(inside[:1])
-    with pytest.raises(ValueError, match="surround must have the shape"):
-        InsetFbp(clean, [GRID], ["standard"], surround=around[..., :9])
-    with pytest.raises(ValueError, match="decompose or sum"):
-        InsetFbp(clean, [GRID], ["standard"])
-    with pytest.raises(ValueError, match="beyond the region"):
-        InsetFbp(clean, [VolumeGrid((6, 12, 12), 0.4, (0.0, 30.0, 30.0))], ["standard"], surround=around)
-    with pytest.raises(ValueError, match="ray_covariance"):
-        functional_covariance(run, torch.zeros(2, *GRID.shape), torch.zeros(2, 3))
-    w = clean.window
-    with pytest.raises(ValueError, match="functionals"):
-        functional_covariance(run, torch.zeros(2, 3), torch.zeros(3, w.views, w.rows, w.columns))
+    beside, w = VolumeGrid((6, 12, 12), 0.4, (0.0, 30.0, 30.0)), clean.window
+    spread = torch.zeros(3, w.views, w.rows, w.columns)
+    refused(
+        ("channels", lambda: run.images(inside[:1])),
+        ("surround must have the shape", lambda: InsetFbp(clean, [GRID], ["standard"], surround=around[..., :9])),
+        ("decompose or sum", lambda: InsetFbp(clean, [GRID], ["standard"])),
+        ("beyond the region", lambda: InsetFbp(clean, [beside], ["standard"], surround=around)),
+        ("ray_covariance", lambda: functional_covariance(run, torch.zeros(2, *GRID.shape), torch.zeros(2, 3))),
+        ("functionals", lambda: functional_covariance(run, torch.zeros(2, 3), spread)),
+    )
 
 
 def test_covariance_of_functionals_is_that_of_their_responses(spectral, run):

@@ -1,11 +1,10 @@
 """Apodisation windows and ramp filters against integrals, published points and closed forms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import refused
 
 from recon.analytic.ramp import KERNELS, apodization, fast_length, ramp_kernel
 
@@ -84,11 +83,9 @@ def test_fast_length(n):
 
 
 def test_bad_kernels_name_the_options():
-    with pytest.raises(ValueError, match=r"unknown kernel 'sharp': use one of soft, standard, detail, bone, ram-lak"):
-        ramp_kernel(3, 1.0, "sharp")
-    with pytest.raises(ValueError, match="at least 1 sample"):
-        ramp_kernel(0, 1.0)
-    with pytest.raises(ValueError, match="greater than 0"):
-        ramp_kernel(3, 0.0)
-    with pytest.raises(ValueError, match="180°"):
-        ramp_kernel(400, 0.01, equiangular=True)
+    refused(
+        ("one of soft, standard, detail, bone, ram-lak", lambda: ramp_kernel(3, 1.0, "sharp")),
+        ("at least 1 sample", lambda: ramp_kernel(0, 1.0)),
+        ("greater than 0", lambda: ramp_kernel(3, 0.0)),
+        ("180°", lambda: ramp_kernel(400, 0.01, equiangular=True)),
+    )

@@ -6,6 +6,7 @@ import drawn_vessel
 import numpy as np
 import pytest
 from drawn_vessel import VALUES
+from refusals import refused
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from recon.plaque import TissueData, read_plaque, reading
@@ -83,18 +84,14 @@ def test_files(strong, absent, tmp_path, gram):
 
 def test_refusals(gram):
     data = drawn_vessel.data(gram, drawn_vessel.image(gram.finer, 0.0, samples=1))
-    with pytest.raises(ValueError, match="point_sd"):
-        read_plaque(data, point_sd=0.0)
-    with pytest.raises(ValueError, match="particles"):
-        read_plaque(data, particles=3)
-    with pytest.raises(ValueError, match="point must be 3 numbers"):
-        read_plaque(data, (1.0, 2.0))
-    with pytest.raises(TypeError, match="VesselPrior, got tuple"):
-        read_plaque(data, vessel_prior=(50.0, 15.0))
-    with pytest.raises(ValueError, match="NaN"):
-        TissueData(data.b * float("nan"), gram, 1.0)
-    with pytest.raises(ValueError, match="one \\(z, y, x\\) grid"):
-        TissueData(data.b[1:], gram, 1.0)
+    refused(
+        ("point_sd", lambda: read_plaque(data, point_sd=0.0)),
+        ("particles", lambda: read_plaque(data, particles=3)),
+        ("point must be 3 numbers", lambda: read_plaque(data, (1.0, 2.0))),
+        ("VesselPrior, got tuple", lambda: read_plaque(data, vessel_prior=(50.0, 15.0))),
+        ("NaN", lambda: TissueData(data.b * float("nan"), gram, 1.0)),
+        ("one \\(z, y, x\\) grid", lambda: TissueData(data.b[1:], gram, 1.0)),
+    )
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """Study ``bowtie``: noise model and corrections of its slices, intervals, and a run at the smallest scale."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

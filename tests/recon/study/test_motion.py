@@ -1,7 +1,5 @@
 """The motion study: its measures, its settings, and a whole run at small scale."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Study ``phantom``: materials and lengths beside the paper's, and that wrong ones are seen."""
 
-from __future__ import annotations
-
 import copy
 
 import pytest

@@ -1,7 +1,5 @@
 """Checks, effects, and what the registry promises of every study; see also :mod:`tiny_studies`."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import FrozenInstanceError, fields
 

@@ -1,7 +1,5 @@
 """The resolution study: its measures against closed forms, its limits, and a whole run at small scale."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from refusals import refused
 
 from torchpcct.acquisition.acquire import acquire, plan
 from torchpcct.acquisition.transmission import SUB_RAY_COUNTS, compress, sub_rays
@@ -230,8 +231,6 @@ def test_sub_rays_do_not_shift_a_reading():
         assert np.abs(points.mean(0)).max() < 1e-12
         assert np.abs(points).max() <= 0.55
     assert np.abs(sub_rays(16, (True, False, True, False, False))[:, [1, 3, 4]]).max() == 0
-    with pytest.raises(ValueError, match="sub-rays"):
-        sub_rays(7)
 
 
 def test_compression_of_the_contrast_is_exact_to_its_tolerance(plaque):
@@ -242,27 +241,21 @@ def test_compression_of_the_contrast_is_exact_to_its_tolerance(plaque):
     assert np.abs(coefficients @ basis - contrast).max() * 1000 <= 1e-9
 
 
-@pytest.mark.parametrize(
-    ("changes", "match"),
-    [
-        ({"exposure_s": 0.0}, "exposure_s"),
-        ({"exposure_s": float("nan")}, "exposure_s"),
-        ({"exposure_s": 0.35, "seed": -1}, "seed"),
-        ({"duty": 0.0}, "duty"),
-        ({"sub_rays": 5}, "sub-rays"),
-        ({"region": VolumeGrid((4, 4, 4), 0.2, (0, 0, 60.0))}, "region"),
-        ({"region": VolumeGrid((4, 4, 4), 0.2, (0, 0, 500.0))}, "field of view|orbit"),
-    ],
-)
-def test_refusals_come_early(plaque, changes, match):
-    with pytest.raises(ValueError, match=match):
-        acquire(plaque[0], scanner(8, 2), **{"region": INSET, **changes})
+def test_refusals_come_early(plaque):
+    def scan(scene=plaque[0], **changes):
+        return acquire(scene, scanner(8, 2), **{"region": INSET, **changes})
 
-
-def test_moving_scene_needs_a_rotation_time():
-    scene, _ = plaque_scene(motion_amplitude=2.0)
-    with pytest.raises(ValueError, match="rotation_s"):
-        acquire(scene, scanner(8, 2))
+    refused(
+        ("exposure_s", lambda: scan(exposure_s=0.0)),
+        ("exposure_s", lambda: scan(exposure_s=float("nan"))),
+        ("seed", lambda: scan(exposure_s=0.35, seed=-1)),
+        ("duty", lambda: scan(duty=0.0)),
+        ("sub-rays", lambda: scan(sub_rays=5)),
+        ("sub-rays", lambda: sub_rays(7)),
+        ("region", lambda: scan(region=VolumeGrid((4, 4, 4), 0.2, (0, 0, 60.0)))),
+        ("field of view|orbit", lambda: scan(region=VolumeGrid((4, 4, 4), 0.2, (0, 0, 500.0)))),
+        ("rotation_s", lambda: scan(plaque_scene(motion_amplitude=2.0)[0])),
+    )
 
 
 SMALL = ConeBeam(full_turn(360), 626.0, 1098.0, 1500, 4, (0.5, 0.35), detector="curved")

@@ -1,7 +1,5 @@
 """Readings: wrong descriptions come out right, or are named, sound scans are not; dead ones are bridged exactly."""
 
-from __future__ import annotations
-
 import math
 import re
 

@@ -1,7 +1,5 @@
 """Absorbed dose: closed forms, conservation of energy, invariances, and Monte Carlo against the exact primary map."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Every reader on damaged copies of its file: a clear error, or data; no crash, no hang."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

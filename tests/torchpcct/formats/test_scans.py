@@ -1,7 +1,5 @@
 """Readers of foreign scans: files that h5py, pydicom, tifffile and numpy wrote, and damaged ones."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Volumes in and out: what SimpleITK, nibabel and pydicom see of ours, and we of theirs."""
 
-from __future__ import annotations
-
 import shutil
 
 import nibabel

@@ -7,6 +7,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import refusals
 
 from torchpcct.metrics import ceiling, information_matrix
 
@@ -64,22 +65,17 @@ def test_tissues_of_different_size_keep_their_digits():
     np.testing.assert_allclose(scaled * units[:, None] * units, ceiling(f, np.eye(4)), rtol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("call", "match"),
-    [
-        (lambda f, m, w: information_matrix([], w), "empty"),
-        (lambda f, m, w: information_matrix(m, w[:2]), "same detector window"),
-        (lambda f, m, w: information_matrix(m, -w), "negative"),
-        (lambda f, m, w: information_matrix(m, w * np.nan), "NaN"),
-        (lambda f, m, w: information_matrix(m, w, scale=0), "scale"),
-        (lambda f, m, w: information_matrix([m[0], m[0] * 0], w) is ceiling(np.diag([1.0, 0]), [1, 0]), "tissue 1"),
-        (lambda f, m, w: ceiling(information_matrix([m[0], 2 * m[0]], w), [1, 0]), "tell the tissues apart"),
-        (lambda f, m, w: ceiling(f[:2], [1, 0]), "square"),
-        (lambda f, m, w: ceiling(f + np.triu(f, 1), [1, 0, 0, 0]), "symmetric"),
-        (lambda f, m, w: ceiling(f, [1, 0]), "functionals"),
-    ],
+MAPS, WEIGHT = system(5)
+INFORMATION = information_matrix(MAPS, WEIGHT)
+test_refusals = refusals(
+    ("empty", lambda: information_matrix([], WEIGHT)),
+    ("same detector window", lambda: information_matrix(MAPS, WEIGHT[:2])),
+    ("negative", lambda: information_matrix(MAPS, -WEIGHT)),
+    ("NaN", lambda: information_matrix(MAPS, WEIGHT * np.nan)),
+    ("scale", lambda: information_matrix(MAPS, WEIGHT, scale=0)),
+    ("tissue 1", lambda: ceiling(np.diag([1.0, 0]), [1, 0])),
+    ("tell the tissues apart", lambda: ceiling(information_matrix([MAPS[0], 2 * MAPS[0]], WEIGHT), [1, 0])),
+    ("square", lambda: ceiling(INFORMATION[:2], [1, 0])),
+    ("symmetric", lambda: ceiling(INFORMATION + np.triu(INFORMATION, 1), [1, 0, 0, 0])),
+    ("functionals", lambda: ceiling(INFORMATION, [1, 0])),
 )
-def test_refusals(call, match):
-    maps, weight = system(5)
-    with pytest.raises(ValueError, match=match):
-        call(information_matrix(maps, weight), maps, weight)

@@ -1,7 +1,5 @@
 """Noise and resolution from two halves of one scan, against repeated draws and known spectra."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

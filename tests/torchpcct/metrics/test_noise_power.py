@@ -7,6 +7,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import refusals
 
 from torchpcct.metrics import noise_power_spectrum
 
@@ -56,16 +57,11 @@ def test_radial_mean_of_an_isotropic_spectrum():
     np.testing.assert_allclose(power[strong][1:], expected[strong][1:], rtol=0.08)
 
 
-@pytest.mark.parametrize(
-    ("x", "spacing", "match"),
-    [
-        (np.zeros((1, 4, 4)), 0.2, "n ≥ 2"),
-        (np.zeros((5, 4)), 0.2, "n ≥ 2"),
-        (np.zeros((5, 4, 4)), (0.2,), "spacing"),
-        (np.zeros((5, 4, 4)), -0.2, "spacing"),
-        (np.full((5, 4, 4), np.nan), 0.2, "NaN"),
-    ],
+ZEROS = np.zeros((5, 4, 4))
+test_refusals = refusals(
+    ("n ≥ 2", lambda: noise_power_spectrum(ZEROS[:1], 0.2)),
+    ("n ≥ 2", lambda: noise_power_spectrum(ZEROS[0], 0.2)),
+    ("spacing", lambda: noise_power_spectrum(ZEROS, (0.2,))),
+    ("spacing", lambda: noise_power_spectrum(ZEROS, -0.2)),
+    ("NaN", lambda: noise_power_spectrum(ZEROS * np.nan, 0.2)),
 )
-def test_refusals(x, spacing, match):
-    with pytest.raises(ValueError, match=match):
-        noise_power_spectrum(x, spacing)

@@ -1,7 +1,5 @@
 """The projector, of grids at rest and moving ones, against exact line integrals, and those against closed forms."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

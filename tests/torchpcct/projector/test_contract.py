@@ -1,7 +1,5 @@
 """What every projector must do, over the registry of geometries; degenerate sizes, extreme numbers, odd orders."""
 
-from __future__ import annotations
-
 import math
 import tracemalloc
 

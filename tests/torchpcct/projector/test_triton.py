@@ -1,7 +1,5 @@
 """The Triton kernels against the CPU kernels, run by Triton's interpreter (``tests/conftest.py`` asks for it)."""
 
-from __future__ import annotations
-
 import sys
 
 import pytest

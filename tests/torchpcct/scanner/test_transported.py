@@ -1,7 +1,5 @@
 """A silicon detector that follows its photons: against the reference that it is made from, and in a scanner."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

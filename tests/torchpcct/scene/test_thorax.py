@@ -1,7 +1,5 @@
 """The thorax: nesting, tissues, adult dimensions."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
