@@ -1,8 +1,11 @@
-"""The small noise-free scans that several tests reconstruct."""
+"""The command line, and the small noise-free scans that several tests reconstruct."""
+
+import shlex
 
 import pytest
 from small_scan import GRID, SCENE, SPECTRAL_GRID, scanner
 
+from recon.cli import main
 from recon.least_squares.inset_problem import InsetProblem
 from torchpcct import acquire
 from torchpcct.spectral import SpectralModel, decompose_scan, decompose_surround
@@ -24,3 +27,27 @@ def spectral():
     s = scanner("spectral", rows=10)
     clean, model = acquire(SCENE, s, region=SPECTRAL_GRID, duty=0.06, sub_rays=16), SpectralModel.of(s, 1.0)
     return clean, model, decompose_scan(clean, model).line_integrals, decompose_surround(clean, model)
+
+
+@pytest.fixture
+def cli(capsys):
+    """``cli("info scan.h5", status=0)``: what a command says; on the standard error if it ends with another status."""
+
+    def run(words, status=0):
+        capsys.readouterr()
+        try:
+            found = main(shlex.split(words))
+        except SystemExit as stop:
+            found = stop.code
+        said = capsys.readouterr()
+        assert found == status, said
+        return said.err if status else said.out
+
+    return run
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """An empty working directory."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path

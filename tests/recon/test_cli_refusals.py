@@ -15,46 +15,44 @@ import pytest
 import torch
 from fresh_python import run_python
 
-from recon.cli import main
 from recon.evaluate.store import Store
 from torchpcct import ParallelBeam, Scan, Volume, VolumeGrid
 from torchpcct.files import _part, atomic_write, require_writable
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("words", "message"),
     [
-        (["reconstruct", "{tmp}/f", "--voxel", "1e-9", "--out", "{tmp}/a.h5"], "--voxel makes 1000000000"),
-        (["reconstruct", "{tmp}/f", "--extent", "inf", "1", "1", "--out", "{tmp}/a.h5"], "--extent[0] must be finite"),
-        (["reconstruct", "{tmp}/f", "--extent", "1", "-1", "1", "--out", "{tmp}/a.h5"], "--extent[1] must be greater"),
-        (["reconstruct", "{tmp}/f", "--center", "1", "nan", "1", "--out", "{tmp}/a.h5"], "--center[1] must be finite"),
-        (["reconstruct", "{tmp}/f", "--out", "{tmp}/a.h5"], "unknown scan format 'f'"),
-        (["reconstruct", "{tmp}/f", "--out", "{tmp}/none/a.h5"], "create it first"),
-        (["reconstruct", "{tmp}/f", "--tissues", "--out", "{tmp}/a.h5"], "--tissues is an option of --method mbir"),
-        (["reconstruct", "{tmp}/f", "--method", "pwls", "--fidelity", "0", "--out", "{tmp}/a.h5"], "not of pwls"),
-        (["simulate", "--views", "0", "--out", "{tmp}/a.h5"], "--views must be at least 1"),
-        (["simulate", "--exposure", "nan", "--out", "{tmp}/a.h5"], "--exposure must be finite"),
-        (["compare", "--out", "{tmp}/f"], "is a file"),
-        (["study", "noise", "--seed", "-3", "--out", "{tmp}/o"], "seed must be at least 0"),
-        (["study", "noise", "--out", "{tmp}/f/g"], "cannot write into"),
-        (["compare", "--device", "cuda", "--out", "{tmp}/o"], "use --device cpu"),
-        (["simulate", "--out", "{tmp}/a.png"], "unknown ending of 'a.png'"),
-        (["simulate", "--config", "{tmp}/none.yaml", "--out", "{tmp}/a.h5"], "none.yaml"),
-        (["reconstruct", "{tmp}", "--method", "art", "--out", "{tmp}/a.h5"], "unknown method 'art'"),
-        (["view", "{tmp}/none.h5", "--out", "{tmp}/a.bmp"], "unknown ending of 'a.bmp'"),
-        (["info", "{tmp}/none.h5"], "none.h5"),
-        (["simulate", "--exposure", "0", "--out", "{tmp}/a.h5"], "--exposure must be greater than 0 s"),
-        (["simulate", "--seed", "-1", "--exposure", "1", "--out", "{tmp}/a.h5"], "seed"),
-        (["reconstruct", "{tmp}/none.h5", "--out", "{tmp}/a.png"], "unknown volume format"),
-        (["reconstruct", "{tmp}/none.h5", "--voxel", "0", "--out", "{tmp}/a.h5"], "--voxel must be greater than 0 mm"),
-        (["plaque", "{tmp}/none.h5", "--out", "{tmp}/a"], "none.h5"),
+        ("reconstruct f --voxel 1e-9 --out a.h5", "--voxel makes 1000000000"),
+        ("reconstruct f --extent inf 1 1 --out a.h5", "--extent[0] must be finite"),
+        ("reconstruct f --extent 1 -1 1 --out a.h5", "--extent[1] must be greater"),
+        ("reconstruct f --center 1 nan 1 --out a.h5", "--center[1] must be finite"),
+        ("reconstruct f --out a.h5", "unknown scan format 'f'"),
+        ("reconstruct f --out none/a.h5", "create it first"),
+        ("reconstruct f --tissues --out a.h5", "--tissues is an option of --method mbir"),
+        ("reconstruct f --method pwls --fidelity 0 --out a.h5", "not of pwls"),
+        ("simulate --views 0 --out a.h5", "--views must be at least 1"),
+        ("simulate --exposure nan --out a.h5", "--exposure must be finite"),
+        ("compare --out f", "is a file"),
+        ("study noise --seed -3 --out o", "seed must be at least 0"),
+        ("study noise --out f/g", "cannot write into"),
+        ("compare --device cuda --out o", "use --device cpu"),
+        ("simulate --out a.png", "unknown ending of 'a.png'"),
+        ("simulate --config none.yaml --out a.h5", "none.yaml"),
+        ("reconstruct . --method art --out a.h5", "unknown method 'art'"),
+        ("view none.h5 --out a.bmp", "unknown ending of 'a.bmp'"),
+        ("info none.h5", "none.h5"),
+        ("simulate --exposure 0 --out a.h5", "--exposure must be greater than 0 s"),
+        ("simulate --seed -1 --exposure 1 --out a.h5", "seed"),
+        ("reconstruct none.h5 --out a.png", "unknown volume format"),
+        ("reconstruct none.h5 --voxel 0 --out a.h5", "--voxel must be greater than 0 mm"),
+        ("plaque none.h5 --out a", "none.h5"),
     ],
 )
-def test_refusals_name_value_and_remedy_and_leave_nothing(tmp_path, capsys, arguments, message):
-    (tmp_path / "f").write_bytes(b"no scan")
-    assert main([a.format(tmp=tmp_path) for a in arguments]) == 2
-    assert message in capsys.readouterr().err
-    assert [p.name for p in tmp_path.iterdir()] == ["f"]
+def test_refusals_name_value_and_remedy_and_leave_nothing(here, cli, words, message):
+    (here / "f").write_bytes(b"no scan")
+    assert message in cli(words, 2)
+    assert [p.name for p in here.iterdir()] == ["f"]
 
 
 def test_help_and_refusals_load_neither_torch_nor_numba():
@@ -163,15 +161,16 @@ def _contents(folder):
     return {p.name: p.read_bytes() for p in folder.iterdir()}
 
 
-def test_no_command_writes_onto_what_it_reads(tmp_path, lines, capsys):
-    shutil.copy(lines / "one.h5", tmp_path / "one.h5")
-    shutil.copy(lines / "one.h5", tmp_path / "v.h5.yaml")  # any content: it is never read
-    (tmp_path / "link.h5").symlink_to("one.h5")
-    os.link(tmp_path / "one.h5", tmp_path / "hard.h5")
-    (tmp_path / "a.h5.yaml").write_text("scene: {kind: water}", encoding="utf-8")
-    Volume(torch.zeros(2, 2, 2), VolumeGrid((2, 2, 2), 1.0)).save(tmp_path / "patient.h5")
-    (tmp_path / "b.yaml").write_text("scene: {kind: volume, file: patient.h5}", encoding="utf-8")
-    before = _contents(tmp_path)
+def test_no_command_writes_onto_what_it_reads(here, lines, cli):
+    shutil.copy(lines / "one.h5", "one.h5")
+    shutil.copy(lines / "one.h5", "v.h5.yaml")  # any content: it is never read
+    (here / "link.h5").symlink_to("one.h5")
+    os.link("one.h5", "hard.h5")
+    os.link("one.h5", "b.png")
+    (here / "a.h5.yaml").write_text("scene: {kind: water}", encoding="utf-8")
+    Volume(torch.zeros(2, 2, 2), VolumeGrid((2, 2, 2), 1.0)).save("patient.h5")
+    (here / "b.yaml").write_text("scene: {kind: volume, file: patient.h5}", encoding="utf-8")
+    before = _contents(here)
     for command in (
         "reconstruct one.h5 --out one.h5",
         "reconstruct one.h5 --out link.h5",
@@ -183,102 +182,89 @@ def test_no_command_writes_onto_what_it_reads(tmp_path, lines, capsys):
         "simulate --config b.yaml --out patient.h5",
         "view one.h5 --out b.png",
     ):
-        words = [str(tmp_path / w) if w.endswith((".h5", ".yaml", ".png")) else w for w in command.split()]
-        if words[0] == "view":
-            os.link(tmp_path / "one.h5", tmp_path / "b.png")
-            before = _contents(tmp_path)
-        assert main([*words, "--force"]) == 2, command
-        assert "which is read: name another file" in capsys.readouterr().err
-        assert _contents(tmp_path) == before
+        assert "which is read: name another file" in cli(f"{command} --force", 2)
+        assert _contents(here) == before
 
 
-def test_files_of_others_are_replaced_by_force_only(tmp_path, lines, capsys):
-    scan = str(lines / "two.h5")
-    nibabel.save(nibabel.Nifti1Image(np.zeros((2, 2, 2), np.float32), np.eye(4)), tmp_path / "patient.nii.gz")
-    with h5py.File(tmp_path / "tooth.h5", "w") as file:
+def test_files_of_others_are_replaced_by_force_only(here, lines, cli):
+    scan = lines / "two.h5"
+    nibabel.save(nibabel.Nifti1Image(np.zeros((2, 2, 2), np.float32), np.eye(4)), here / "patient.nii.gz")
+    with h5py.File(here / "tooth.h5", "w") as file:
         file["exchange/data"] = np.zeros(3)
-    (tmp_path / "w.mha.json").write_text('{"mine": 1}', encoding="utf-8")
-    (tmp_path / "x.nii.yaml").write_text("mine: 1", encoding="utf-8")
-    (tmp_path / "picture.png").write_text("no picture", encoding="utf-8")
-    (tmp_path / "study").mkdir()
-    (tmp_path / "study" / "report.md").write_text("mine", encoding="utf-8")
-    (tmp_path / "d.nii").mkdir()
-    before = _contents(tmp_path / "study")
+    (here / "w.mha.json").write_text('{"mine": 1}', encoding="utf-8")
+    (here / "x.nii.yaml").write_text("mine: 1", encoding="utf-8")
+    (here / "picture.png").write_text("no picture", encoding="utf-8")
+    (here / "study").mkdir()
+    (here / "study" / "report.md").write_text("mine", encoding="utf-8")
+    (here / "d.nii").mkdir()
+    before = _contents(here / "study")
     for words, expected_text in (
-        (["reconstruct", scan, "--out", "patient.nii.gz"], "patient.nii.gz exists and was not made by torchpcct recon"),
-        (["reconstruct", scan, "--out", "tooth.h5"], "tooth.h5 exists and was not made by torchpcct reconstruct: name"),
-        (["reconstruct", scan, "--out", "w.mha"], "w.mha.json exists"),
-        (["reconstruct", scan, "--out", "x.nii"], "x.nii.yaml exists"),
-        (["reconstruct", scan, "--out", "d.nii"], "is a folder"),
-        (["simulate", "--out", "tooth.h5"], "tooth.h5 exists and was not made by torchpcct simulate"),
-        (["lower-dose", scan, "--fraction", "0.5", "--out", "tooth.h5"], "not made by torchpcct lower-dose"),
-        (["view", scan, "--out", "picture.png"], "picture.png exists and was not made"),
-        (["study", "noise", "--quick", "--out", "study"], "study holds report.md, not made by torchpcct study"),
-        (["compare", "--quick", "--out", "study"], "not made by torchpcct compare: name another folder, or --force"),
-        (["plaque", scan, "--out", "study"], "study holds report.md, not made by torchpcct plaque"),
+        (f"reconstruct {scan} --out patient.nii.gz", "patient.nii.gz exists and was not made by torchpcct recon"),
+        (f"reconstruct {scan} --out tooth.h5", "tooth.h5 exists and was not made by torchpcct reconstruct: name"),
+        (f"reconstruct {scan} --out w.mha", "w.mha.json exists"),
+        (f"reconstruct {scan} --out x.nii", "x.nii.yaml exists"),
+        (f"reconstruct {scan} --out d.nii", "is a folder"),
+        ("simulate --out tooth.h5", "tooth.h5 exists and was not made by torchpcct simulate"),
+        (f"lower-dose {scan} --fraction 0.5 --out tooth.h5", "not made by torchpcct lower-dose"),
+        (f"view {scan} --out picture.png", "picture.png exists and was not made"),
+        ("study noise --quick --out study", "study holds report.md, not made by torchpcct study"),
+        ("compare --quick --out study", "not made by torchpcct compare: name another folder, or --force"),
+        (f"plaque {scan} --out study", "study holds report.md, not made by torchpcct plaque"),
     ):
-        words[-1] = str(tmp_path / words[-1])
-        assert main(words) == 2, words
-        assert expected_text in capsys.readouterr().err
-    assert _contents(tmp_path / "study") == before
+        assert expected_text in cli(words, 2)
+    assert _contents(here / "study") == before
     for name in ("patient.nii.gz", "w.mha", "x.nii"):
-        command = ["reconstruct", scan, "--out", str(tmp_path / name)]
-        assert main([*command, "--force"]) == 0
-        assert main(command) == 0  # ours by now
-        assert Volume.load(tmp_path / name).grid.shape[0] == 2
+        cli(f"reconstruct {scan} --out {name} --force")
+        cli(f"reconstruct {scan} --out {name}")  # ours by now
+        assert Volume.load(name).grid.shape[0] == 2
 
 
-def test_a_result_that_cannot_be_written_is_found_before_it_is_computed(tmp_path, lines, capsys, monkeypatch):
+def test_a_result_that_cannot_be_written_is_found_before_it_is_computed(here, lines, cli, monkeypatch):
     monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=100_000))
     monkeypatch.setattr("recon.api.reconstruct", lambda *_, **__: pytest.fail("computed"))
-    (tmp_path / "full").mkdir()
-    (tmp_path / "full" / "a").write_text("")
-    one, two = str(lines / "one.h5"), str(lines / "two.h5")
+    (here / "full").mkdir()
+    (here / "full" / "a").write_text("")
+    one, two = lines / "one.h5", lines / "two.h5"
     for words, expected_text in (
-        ([one, "--out", "series"], "a DICOM CT series holds HU, this volume is in mm^-1"),
-        ([two, "--out", "full"], "is not empty: series in one folder mix"),
-        ([two, "--out", "slice.dcm"], "a DICOM series is a folder"),
-        ([one, "--extent", "2", "4", "4", "--out", "a.h5"], "--extent takes two numbers, Y X"),
-        ([one, "--center", "2", "4", "4", "--out", "a.h5"], "--center takes two numbers, Y X"),
-        ([one, "--extent", "4", "--out", "a.h5"], "of slices two, Y X; got 1"),
-        ([two, "--voxel", "0.01", "--extent", "3", "3", "--out", "a.h5"], "a.h5 needs 0.00 GiB, 0.00 GiB are free"),
+        (f"{one} --out series", "a DICOM CT series holds HU, this volume is in mm^-1"),
+        (f"{two} --out full", "is not empty: series in one folder mix"),
+        (f"{two} --out slice.dcm", "a DICOM series is a folder"),
+        (f"{one} --extent 2 4 4 --out a.h5", "--extent takes two numbers, Y X"),
+        (f"{one} --center 2 4 4 --out a.h5", "--center takes two numbers, Y X"),
+        (f"{one} --extent 4 --out a.h5", "of slices two, Y X; got 1"),
+        (f"{two} --voxel 0.01 --extent 3 3 --out a.h5", "a.h5 needs 0.00 GiB, 0.00 GiB are free"),
     ):
-        assert main(["reconstruct", *words[:-1], str(tmp_path / words[-1])]) == 2, words
-        assert expected_text in capsys.readouterr().err
-    assert [p.name for p in tmp_path.iterdir()] == ["full"]
+        assert expected_text in cli(f"reconstruct {words}", 2)
+    assert [p.name for p in here.iterdir()] == ["full"]
 
 
-def test_one_slice_is_a_volume_of_one_slice(tmp_path, lines):
+def test_one_slice_is_a_volume_of_one_slice(here, lines, cli):
     for name in ("v.nii.gz", "v.mha", "v.h5"):
-        grid = ["--voxel", "0.5", "--extent", "4", "5", "--center", "1", "2"]
-        assert main(["reconstruct", str(lines / "one.h5"), *grid, "--out", str(tmp_path / name)]) == 0
-        found = Volume.load(tmp_path / name).grid
+        cli(f"reconstruct {lines / 'one.h5'} --voxel 0.5 --extent 4 5 --center 1 2 --out {name}")
+        found = Volume.load(name).grid
         np.testing.assert_allclose([*found.shape, *found.spacing, *found.center], [1, 8, 10, 0.5, 0.5, 0.5, 0, 1, 2])
-        assert json.loads((tmp_path / f"{name}.json").read_text())["shape"] == [1, 8, 10]
-    grid = ["--extent", "4", "4", "--center", "7", "0", "0"]
-    assert main(["reconstruct", str(lines / "two.h5"), *grid, "--out", str(tmp_path / "series")]) == 0
-    assert Volume.load(tmp_path / "series").grid.center == (7.0, 0.0, 0.0)
+        assert json.loads((here / f"{name}.json").read_text())["shape"] == [1, 8, 10]
+    cli(f"reconstruct {lines / 'two.h5'} --extent 4 4 --center 7 0 0 --out series")
+    assert Volume.load("series").grid.center == (7.0, 0.0, 0.0)
 
 
-def test_a_dicom_slice_is_shown(tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_a_dicom_slice_is_shown(here, cli):
     data = 300 * torch.arange(2.0 * 6 * 5).reshape(2, 6, 5) / 60
     Volume(data, VolumeGrid((2, 6, 5), (2.5, 1.0, 1.0))).save("series")
     shutil.copy("series/0002.dcm", "IM2")
     for name in ("series/0002.dcm", "IM2"):
-        assert main(["info", name]) == 0
-        assert "shape: [1, 6, 5]\nspacing_mm: [2.5, 1.0, 1.0]" in capsys.readouterr().out
-        assert main(["view", name]) == 0
-    assert sorted(p.name for p in tmp_path.glob("*.png")) == ["0002.png", "IM2.png"]
+        assert "shape: [1, 6, 5]\nspacing_mm: [2.5, 1.0, 1.0]" in cli(f"info {name}")
+        cli(f"view {name}")
+    assert sorted(p.name for p in here.glob("*.png")) == ["0002.png", "IM2.png"]
 
 
-def test_a_full_disk_is_one_sentence_and_status_1(tmp_path, lines, capsys):
+def test_a_full_disk_is_one_sentence_and_status_1(here, lines, cli):
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (300, limits[1]))
     try:
         for name in ("v.h5", "v.nii.gz", "v.mha", "series"):
-            assert main(["reconstruct", str(lines / "two.h5"), "--out", str(tmp_path / name)]) == 1
-            assert capsys.readouterr().err == f"torchpcct reconstruct: cannot write {tmp_path / name}: File too large\n"
+            said = cli(f"reconstruct {lines / 'two.h5'} --out {here / name}", 1)
+            assert said == f"torchpcct reconstruct: cannot write {here / name}: File too large\n"
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert list(tmp_path.iterdir()) == []
+    assert list(here.iterdir()) == []

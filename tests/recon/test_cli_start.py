@@ -22,9 +22,8 @@ def _commands():
     return make_parser()[1].choices
 
 
-def test_without_a_command_it_says_where_to_begin(capsys):
-    assert main([]) == 0
-    output = capsys.readouterr().out
+def test_without_a_command_it_says_where_to_begin(cli):
+    output = cli("")
     assert len(output.splitlines()) <= 24
     assert max(map(len, output.splitlines())) <= 120
     examples = re.findall(r" {2}(torchpcct .*)", output)
@@ -35,17 +34,12 @@ def test_without_a_command_it_says_where_to_begin(capsys):
         assert re.search(rf"\b{name}\b", output)
 
 
-def test_every_command_stands_in_the_help_once_and_has_examples_that_it_takes(capsys, monkeypatch):
+def test_every_command_stands_in_the_help_once_and_has_examples_that_it_takes(cli, monkeypatch):
     monkeypatch.setenv("COLUMNS", "120")
-    with pytest.raises(SystemExit):
-        main(["--help"])
-    output = capsys.readouterr().out
+    output = cli("--help")
     for name in _commands():
         assert len(re.findall(rf"^  {name} ", output, re.MULTILINE)) == 1
-        with pytest.raises(SystemExit) as stop:
-            main([name, "--help"])
-        assert stop.value.code == 0
-        text = capsys.readouterr().out
+        text = cli(f"{name} --help")
         assert text.startswith(f"usage: torchpcct {name} ")
         examples = re.findall(rf"^  torchpcct ({name}.*)$", text, re.MULTILINE)
         assert examples
@@ -60,54 +54,46 @@ def test_every_command_stands_in_the_help_once_and_has_examples_that_it_takes(ca
         ("recontruct scan.h5", "unknown command 'recontruct' (did you mean 'reconstruct'?)"),
         ("reconstruct scan.h5 --kernal soft", "unrecognized arguments: --kernal soft (did you mean '--kernel'?)"),
         ("simulate --out a.h5 --device cdua", "(did you mean 'cuda'?)"),
-        ("evaluate --task nodul --out {out}", "(did you mean 'nodule'?)"),
-        ("evaluate --method pwsl --out {out}", "(did you mean 'pwls'?)"),
-        ("evaluate --method mbri:fidelity=1 --out {out}", "(did you mean 'mbir'?)"),
-        ("evaluate --method fbp:sotf --out {out}", "(did you mean 'soft'?)"),
-        ("evaluate --exposure -1 --out {out}", "--exposure[0] must be greater than 0 s"),
-        ("study nosie --out {out}", "(did you mean 'noise'?)"),
-        ("study noise --set view=3 --out {out}", "(did you mean 'views'?)"),
+        ("evaluate --task nodul --out out", "(did you mean 'nodule'?)"),
+        ("evaluate --method pwsl --out out", "(did you mean 'pwls'?)"),
+        ("evaluate --method mbri:fidelity=1 --out out", "(did you mean 'mbir'?)"),
+        ("evaluate --method fbp:sotf --out out", "(did you mean 'soft'?)"),
+        ("evaluate --exposure -1 --out out", "--exposure[0] must be greater than 0 s"),
+        ("study nosie --out out", "(did you mean 'noise'?)"),
+        ("study noise --set view=3 --out out", "(did you mean 'views'?)"),
         ("view a.h5 b.h5", "add --html FILE"),
         ("view a.h5 --html a.html --slice 3", "--slice and --plane belong to a picture"),
     ],
 )
-def test_a_slip_is_answered_with_what_was_meant(words, expected_text, capsys, tmp_path):
-    try:
-        status = main(shlex.split(words.format(out=tmp_path / "out")))
-    except SystemExit as stop:
-        status = stop.code
-    assert status == 2
-    assert expected_text in capsys.readouterr().err
+def test_a_slip_is_answered_with_what_was_meant(here, cli, words, expected_text):
+    assert expected_text in cli(words, 2)
 
 
 @pytest.mark.parametrize("quick", [True, pytest.param(False, marks=pytest.mark.slow)])
-def test_the_demo_does_what_its_lines_do(quick, tmp_path, capsys, monkeypatch):
+def test_the_demo_does_what_its_lines_do(quick, tmp_path, cli, monkeypatch):
     if quick:  # FBP in place of MBIR
         real = recon.api.reconstruct
         monkeypatch.setattr(starting, "_DEMO_VIEWS", 12)
         monkeypatch.setattr("recon.api.reconstruct", lambda scan, grid, method, **_: real(scan, grid, "fbp"))
     first, second = tmp_path / "first", tmp_path / "second"
     second.mkdir()
-    assert main(["demo", "--out", str(first)]) == 0
-    lines = re.findall(r"^\$ (torchpcct .*)$", capsys.readouterr().out, re.MULTILINE)
-    assert [shlex.split(line)[1] for line in lines] == ["simulate", "reconstruct", "reconstruct", "view"]
+    lines = re.findall(r"^\$ torchpcct (.*)$", cli(f"demo --out {first}"), re.MULTILINE)
+    assert [line.split()[0] for line in lines] == ["simulate", "reconstruct", "reconstruct", "view"]
     for line in lines:
-        assert main(shlex.split(line.replace(str(first), str(second)))[1:]) == 0
+        cli(line.replace(str(first), str(second)))
     for name in ("fbp.nii.gz", "mbir.nii.gz"):
         assert torch.equal(Volume.load(first / name).data, Volume.load(second / name).data)
     assert (first / "view.html").read_bytes() == (second / "view.html").read_bytes()
     # What is there of others stays, and is named.
     shutil.copy(first / "view.html", second / "scan.h5")
     (second / "view.html").write_text("mine", encoding="utf-8")
-    assert main(["demo", "--out", str(second)]) == 2
-    assert "not made by torchpcct simulate" in capsys.readouterr().err
+    assert "not made by torchpcct simulate" in cli(f"demo --out {second}", 2)
     assert (second / "view.html").read_text(encoding="utf-8") == "mine"
-    assert main(["demo", "--out", str(second / "view.html")]) == 2
+    cli(f"demo --out {second / 'view.html'}", 2)
 
 
-def test_doctor_names_what_is_broken_and_what_to_do(capsys, monkeypatch):
-    assert main(["doctor"]) == 0
-    output = capsys.readouterr().out
+def test_doctor_names_what_is_broken_and_what_to_do(capsys, cli, monkeypatch):
+    output = cli("doctor")
     assert len(re.findall("^ok ", output, re.MULTILINE)) == len(doctor._CHECKS)
     assert re.search("weights +sha256 [0-9a-f]{64}, as their card says", output)
     monkeypatch.setattr("torchpcct.projector.Projector.T", lambda self, y: 1.001 * torch.ones(8, 20, 20))
@@ -140,17 +126,11 @@ def test_train_is_ours_whatever_lies_in_the_folder(tmp_path):
         assert run.stdout.count("MINE") == (words[0] == "-c")
 
 
-def test_the_completion_knows_commands_and_options(capsys, monkeypatch):
+def test_the_completion_knows_commands_and_options(cli, monkeypatch):
     pytest.importorskip("shtab")
-    with pytest.raises(SystemExit) as stop:
-        main(["--print-completion", "bash"])
-    assert stop.value.code == 0
-    script = capsys.readouterr().out
+    script = cli("--print-completion bash")
     subprocess.run(["bash", "-n"], input=script, text=True, check=True)
     assert "--find-axis" in script
     assert all(name in script for name in _commands())
     monkeypatch.setitem(sys.modules, "shtab", None)
-    with pytest.raises(SystemExit) as stop:
-        main(["--print-completion", "bash"])
-    assert stop.value.code == 2
-    assert "pip install 'torchpcct[completion]'" in capsys.readouterr().err
+    assert "pip install 'torchpcct[completion]'" in cli("--print-completion bash", 2)

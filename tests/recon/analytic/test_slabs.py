@@ -18,7 +18,6 @@ from fresh_python import run_python
 import recon
 from recon.analytic import slabs
 from recon.analytic.slabs import ScanSlices, plan_slabs, reconstruct_to
-from recon.cli import main
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Projector, Scan, Volume, VolumeGrid, full_turn
 from torchpcct.files import WriteError
 from torchpcct.formats.scans import open_scan
@@ -298,20 +297,15 @@ def test_the_plan_of_a_volume_of_2048_cubed():
     assert re.search(r"\d+ slabs of up to \d+ slices, .* writes 34\.36 GB, about \d+ s on one core", str(plan))
 
 
-def test_on_the_command_line(tmp_path, capsys):
-    scan, out = tmp_path / "scan.h5", tmp_path / "v.zarr"
-    made(CONE).save(scan)
-    start = ["reconstruct", str(scan), "--voxel", "1", "--out", str(out), "--no-progress"]
-    assert main([*start, "--memory", "4.2MB", "--dry-run"]) == 0
-    assert re.search(r"v\.zarr: \d+ slabs of up to \d+ slices", capsys.readouterr().out)
-    assert main([*start, "--memory", "4.3MB"]) == 0
-    assert "readings, rotation axis and edges were tested in rows" in capsys.readouterr().out
-    whole = tmp_path / "whole.nii"
-    assert main([*start[:4], "--out", str(whole)]) == 0
-    assert float((Volume.load(out).data - Volume.load(whole).data).abs().max()) <= 1e-4
-    for more, text in ((["--clean"], "--clean is not done slab by slab"), (["--find-axis"], "give --axis COLUMN")):
-        assert main([*start, "--memory", "4.3MB", *more]) != 0
-        assert text in capsys.readouterr().err
+def test_on_the_command_line(here, cli):
+    made(CONE).save("scan.h5")
+    start = "reconstruct scan.h5 --voxel 1 --out v.zarr --no-progress --memory"
+    assert re.search(r"v\.zarr: \d+ slabs of up to \d+ slices", cli(f"{start} 4.2MB --dry-run"))
+    assert "readings, rotation axis and edges were tested in rows" in cli(f"{start} 4.3MB")
+    cli("reconstruct scan.h5 --voxel 1 --out whole.nii")
+    assert float((Volume.load("v.zarr").data - Volume.load("whole.nii").data).abs().max()) <= 1e-4
+    assert "--clean is not done slab by slab" in cli(f"{start} 4.3MB --clean", 2)
+    assert "give --axis COLUMN" in cli(f"{start} 4.3MB --find-axis", 2)
 
 
 LIMITED = """

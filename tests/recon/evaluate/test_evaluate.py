@@ -10,7 +10,6 @@ import yaml
 from scipy import ndimage
 from tiny_studies import INSERT
 
-from recon.cli import main
 from recon.evaluate.estimates import pivot
 from recon.evaluate.experiment import evaluate, export_scans
 from recon.evaluate.methods import Method, deepinv_denoiser, denoiser, method_of
@@ -250,25 +249,19 @@ def test_rivals_come_with_their_tuned_settings():
     assert tuned("bilateral", "bone", 2.0) == {}
 
 
-def test_commands(tmp_path, capsys, monkeypatch):
+def test_commands(here, cli):
     """Ready tasks are listed and printed; a user's task and denoiser from the folder where the command runs."""
-    monkeypatch.chdir(tmp_path)
-    assert main(["show-task"]) == 0
-    assert {line.split()[0] for line in capsys.readouterr().out.splitlines()} == set(TASKS)
-    assert main(["show-task", "rod"]) == 0
-    assert yaml.safe_load(capsys.readouterr().out)["signal"] == "rod"
-    (tmp_path / "insert.yaml").write_text(INSERT, encoding="utf-8")
-    (tmp_path / "my_own_filter.py").write_text("def half(volume):\n    return volume / 2\n", encoding="utf-8")
-    command = ["evaluate", "--task", "insert.yaml", "--denoiser", "my_own_filter:half@fbp:soft", "--n", "8"]
-    assert main([*command, "--out", "o", "--no-progress"]) == 0
-    out = capsys.readouterr().out
+    assert {line.split()[0] for line in cli("show-task").splitlines()} == set(TASKS)
+    assert yaml.safe_load(cli("show-task rod"))["signal"] == "rod"
+    (here / "insert.yaml").write_text(INSERT, encoding="utf-8")
+    (here / "my_own_filter.py").write_text("def half(volume):\n    return volume / 2\n", encoding="utf-8")
+    command = "evaluate --task insert.yaml --denoiser my_own_filter:half@fbp:soft --n 8"
+    out = cli(f"{command} --out o --no-progress")
     assert "my_own_filter:half@fbp:soft" in out
     assert "o/report.csv" in out
-    assert main([*command, "--denoiser", "my_own_filter:half", "--out", "o"]) == 2
-    assert "needs a base" in capsys.readouterr().err
-    (tmp_path / "f").write_bytes(b"mine")
-    assert main([*command, "--out", "f"]) == 2
-    assert "is a file" in capsys.readouterr().err
+    assert "needs a base" in cli(f"{command} --denoiser my_own_filter:half --out o", 2)
+    (here / "f").write_bytes(b"mine")
+    assert "is a file" in cli(f"{command} --out f", 2)
 
 
 def test_two_measured_scans(tmp_path):
@@ -286,7 +279,7 @@ def test_two_measured_scans(tmp_path):
         evaluate_scans([scans[0], object()], task.grid, "fbp:soft")
 
 
-def test_volumes_in_two_folders(tmp_path, capsys):
+def test_volumes_in_two_folders(here, cli):
     """Of other programs: noise at equal resolution, a row a method. A blur saves nothing; half of its noise is four
     times the dose."""
     generator, grid = torch.Generator().manual_seed(0), VolumeGrid((4, 64, 64), 0.5)
@@ -294,21 +287,17 @@ def test_volumes_in_two_folders(tmp_path, capsys):
     object_[:, 20:44, 20:44] = 100.0
     pairs = {"fbp": [], "mine": [], "half": []}
     for folder in ("one", "two"):
-        (tmp_path / folder).mkdir()
+        (here / folder).mkdir()
         plain = object_ + torch.randn(grid.shape, generator=generator) * 10
         soft, clean = (torch.from_numpy(ndimage.gaussian_filter(v.numpy(), [0, 1.5, 1.5])) for v in (plain, object_))
         for name, data in (("fbp", plain), ("mine", soft), ("half", (clean + soft) / 2)):
-            Volume(data, grid).save(tmp_path / folder / f"{name}.nii.gz")
+            Volume(data, grid).save(here / folder / f"{name}.nii.gz")
             pairs[name].append(data)
-    folders = [str(tmp_path / folder) for folder in ("one", "two")]
-    assert main(["evaluate", "--volumes", *folders]) == 0
-    rows = {r[0]: r for line in capsys.readouterr().out.splitlines() if (r := line.split())}
+    rows = {r[0]: r for line in cli("evaluate --volumes one two").splitlines() if (r := line.split())}
     assert float(rows["mine"][3]) == pytest.approx(1.0, rel=0.2)
     assert float(rows["half"][3]) == pytest.approx(4.0 * float(rows["mine"][3]), rel=0.1)
-    assert main(["evaluate", "--volumes", *folders, "--reference", "other"]) == 2
-    assert "hold fbp, half, mine" in capsys.readouterr().err
-    assert main(["evaluate", "--volumes", folders[0], str(tmp_path / "no")]) == 2
-    assert "is no folder" in capsys.readouterr().err
+    assert "hold fbp, half, mine" in cli("evaluate --volumes one two --reference other", 2)
+    assert "is no folder" in cli("evaluate --volumes one no", 2)
     reference = pairs.pop("fbp")
     (soft, half) = evaluate_volumes(pairs, reference, 0.5)
     assert 0.1 < soft["f50"] < 0.4

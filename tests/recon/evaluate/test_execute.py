@@ -124,25 +124,22 @@ def run_tiny_with(name, settings, folder):
     registry.run(name, made, pieces=folder).save(folder)
 
 
-def test_many_scans_are_reconstructed_as_if_each_were_alone(processes, tmp_path, capsys):
+def test_many_scans_are_reconstructed_as_if_each_were_alone(processes, here, capsys, cli):
     g = ConeBeam(full_turn(24), 300.0, 500.0, 24, 4, 1.0)
     for k in range(3):
-        Scan.from_counts(torch.full(g.shape, 900.0 + k), g, air=1000.0).save(tmp_path / f"s{k}.h5")
-    (tmp_path / "bad.h5").write_bytes(b"no scan")
-    scans = [str(tmp_path / f"{name}.h5") for name in ("s0", "bad", "s1", "s2")]
-    out, alone = tmp_path / "out", tmp_path / "alone"
-    assert main(["reconstruct", *scans, "--out", str(out), "--workers", "2"]) == 2
+        Scan.from_counts(torch.full(g.shape, 900.0 + k), g, air=1000.0).save(f"s{k}.h5")
+    (here / "bad.h5").write_bytes(b"no scan")
+    command = "reconstruct s0.h5 bad.h5 s1.h5 s2.h5"
+    assert main([*command.split(), "--out", "out", "--workers", "2"]) == 2
     text = capsys.readouterr()
     assert "1 of 4 scans are not reconstructed" in text.err
     assert text.out.count("voxels of") == 3
-    assert main(["reconstruct", *scans, "--out", str(alone)]) == 2
+    cli(f"{command} --out alone", 2)
     for k in range(3):
-        a, b = (Volume.load(folder / f"s{k}_fbp.nii.gz").data for folder in (out, alone))
+        a, b = (Volume.load(f"{folder}/s{k}_fbp.nii.gz").data for folder in ("out", "alone"))
         assert torch.equal(a, b)
-    assert main(["reconstruct", *scans]) == 2
-    assert "--out FOLDER says where" in capsys.readouterr().err
-    assert main(["reconstruct", *scans, "--out", str(out), "--dry-run"]) == 0
-    assert "4 jobs" in capsys.readouterr().out
+    assert "--out FOLDER says where" in cli(command, 2)
+    assert "4 jobs" in cli(f"{command} --out out --dry-run")
 
 
 def test_many_scans_go_on_after_an_interruption(tmp_path, monkeypatch, capsys):
@@ -324,16 +321,14 @@ def test_another_version_is_refused(processes, tmp_path, monkeypatch):
 
 
 @pytest.mark.cluster
-def test_an_unreachable_scheduler_is_told_in_one_sentence(tmp_path, capsys):
+def test_an_unreachable_scheduler_is_told_in_one_sentence(here, cli):
     pytest.importorskip("distributed")
     start = time.monotonic()
-    command = ["evaluate", "--out", str(tmp_path), "--scheduler"]
-    assert main([*command, "tcp://127.0.0.1:9"]) == 2
+    said = cli("evaluate --out out --scheduler tcp://127.0.0.1:9", 2)
     assert time.monotonic() - start < 10.0
-    (output,) = [line for line in capsys.readouterr().err.splitlines() if line]
+    (output,) = [line for line in said.splitlines() if line]
     assert "no Dask scheduler answers at tcp://127.0.0.1:9" in output
-    assert main([*command, str(tmp_path / "none.json")]) == 2
-    assert "dask scheduler --scheduler-file writes it" in capsys.readouterr().err
+    assert "dask scheduler --scheduler-file writes it" in cli("evaluate --out out --scheduler none.json", 2)
 
 
 @pytest.mark.cluster
@@ -417,12 +412,11 @@ def test_the_recipe_of_srun(tmp_path):
     assert sum(map(int, tasks)) == int(re.search(r"#SBATCH --ntasks=(\d+)", script)[1])
 
 
-def test_a_dry_run_lists_the_jobs(task, tmp_path, capsys):
-    assert main(["evaluate", "--task", "plaque", "--n", "16", "--dry-run", "--out", str(tmp_path / "x")]) == 0
-    text = capsys.readouterr().out
+def test_a_dry_run_lists_the_jobs(here, cli):
+    text = cli("evaluate --task plaque --n 16 --dry-run --out x")
     assert "plaque: 2 s, 8-16, fbp:soft" in text
     assert "core hours" in text
-    assert not list((tmp_path / "x").rglob("*.npz"))
+    assert not list((here / "x").rglob("*.npz"))
 
 
 CALLED = """

@@ -4,17 +4,13 @@ import json
 
 import pytest
 
-from recon.cli import main
-
 
 @pytest.mark.slow
-def test_reads_a_scan_and_says_what_fbp_reads(tmp_path, capsys):
-    scan, out = tmp_path / "scan.h5", tmp_path / "reading"
-    assert main(["simulate", "--views", "984", "--exposure", "20", "--seed", "1", "--out", str(scan)]) == 0
-    capsys.readouterr()
-    point = ["--point", "0", "-30.4", "-28.1", "--particles", "100", "--voxel", "0.25"]
-    assert main(["plaque", str(scan), *point, "--out", str(out), "--no-progress"]) == 0
-    assert "soft FBP, same regions" in capsys.readouterr().out
+def test_reads_a_scan_and_says_what_fbp_reads(here, cli):
+    out = here / "reading"
+    cli("simulate --views 984 --exposure 20 --seed 1 --out scan.h5")
+    more = "--particles 100 --voxel 0.25 --out reading --no-progress"
+    assert "soft FBP, same regions" in cli(f"plaque scan.h5 --point 0 -30.4 -28.1 {more}")
     told = json.loads((out / "report.json").read_text())
     assert told["figures"]["lumen"]["value"] == pytest.approx(480, abs=15)
     assert told["figures"]["lumen area"]["value"] == pytest.approx(4.11, abs=0.4)
@@ -24,14 +20,10 @@ def test_reads_a_scan_and_says_what_fbp_reads(tmp_path, capsys):
     }  # fmt: skip
 
 
-def test_refuses_a_point_outside(tmp_path, capsys):
-    scan = tmp_path / "scan.h5"
-    assert main(["simulate", "--views", "8", "--out", str(scan)]) == 0
-    capsys.readouterr()
-    arguments = ["plaque", str(scan), "--voxel", "0.5", "--point", "90", "0", "0", "--out", str(tmp_path / "reading")]
-    assert main([*arguments, "--no-progress"]) == 2
-    assert "outside of the volume" in capsys.readouterr().err
-    assert not (tmp_path / "reading").exists()
+def test_refuses_a_point_outside(here, cli):
+    cli("simulate --views 8 --out scan.h5")
+    assert "outside of the volume" in cli("plaque scan.h5 --voxel 0.5 --point 90 0 0 --out reading --no-progress", 2)
+    assert not (here / "reading").exists()
 
 
 @pytest.mark.parametrize(
@@ -39,15 +31,9 @@ def test_refuses_a_point_outside(tmp_path, capsys):
     [("--wall 50 0", "standard deviation of wall"), ("--beside zzz", "invalid choice: 'zzz'"),
      ("--particles 3", "--particles must be at least 50"), ("--point-sd 0", "--point-sd must be greater than 0"),
      ("--point 1 nan 2", "--point[1] must be finite"), ("--extent 1 -2 3", "--extent[1] must be greater than 0"),
-     ("--seed -1", "--seed must be at least 0"), ("--out {tmp}/scan.h5", "is a file")],
+     ("--seed -1", "--seed must be at least 0"), ("--out scan.h5", "is a file")],
 )  # fmt: skip
-def test_arguments_are_refused_before_the_scan_is_read(tmp_path, capsys, monkeypatch, option, why):
+def test_arguments_are_refused_before_the_scan_is_read(here, cli, monkeypatch, option, why):
     monkeypatch.setattr("torchpcct.scan.Scan.load", lambda path: pytest.fail("the scan was read"))
-    (tmp_path / "scan.h5").write_bytes(b"")
-    arguments = ["plaque", str(tmp_path / "scan.h5"), "--no-progress", *option.format(tmp=tmp_path).split()]
-    try:
-        status = main(arguments)
-    except SystemExit as error:  # argparse's own
-        status = error.code
-    assert status == 2
-    assert why in capsys.readouterr().err
+    (here / "scan.h5").write_bytes(b"")
+    assert why in cli(f"plaque scan.h5 --no-progress {option}", 2)
