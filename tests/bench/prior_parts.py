@@ -1,19 +1,15 @@
 """What each part of the learned prior brings, on held-out vessels.
 
-    python tests/bench/prior_parts.py RUNS [--train STEPS]
+    python tests/bench/prior_parts.py RUNS
 
 The weights that ship, whole and with one part left out, are measured on the four held-out vessels that simple filters
 are tuned on (``rival_scenes.py``: along z, tilted, in plane, curved; other diameters, plaques and tissues than the
-paper's), with and without the core, so nothing here was chosen on a scene that a report quotes. With ``--train`` parts
-of the training are left out as well: every such row is a training of its own from random weights, of a small network
-and so many steps. Trainings and figures are kept in the folder RUNS; the same command goes on. It writes
-``prior_parts.json`` and ``prior_parts.md`` beside this file.
+paper's), with and without the core, so nothing here was chosen on a scene that a report quotes. Figures are kept
+in the folder RUNS; the same command goes on. It writes ``prior_parts.json`` and ``prior_parts.md`` beside this file.
 """
 
 import argparse
 import json
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -23,7 +19,6 @@ from typing import Any
 from unittest import mock
 
 import torch
-import yaml
 from rival_scenes import DIRECTIONS, Bench, Place
 from torch import Tensor
 
@@ -33,22 +28,8 @@ from recon.mbir.outlines import Drawn, OutlineMbir
 from recon.plaque.layer import LayerField
 
 HERE = Path(__file__).parent
-DEFAULT = HERE.parents[1] / "train" / "configs" / "default.yaml"
 DOSES, DRAWS, FIRST_DRAW = (0.35, 2.0), 6, 100
 MOVED_HU = 150.0
-
-TRAININGS: dict[str, dict[str, Any]] = {
-    "all parts": {},
-    "all parts, another seed": {"seed": 17},
-    "without the filtered view": {"network": {"bilateral": False}},
-    "relative to the surround, not to a local mean": {"network": {"local_mm": 0.0}},
-    "error in the data's metric alone": {"objective": {"white": 0.0}},
-    "edges count as all else": {"objective": {"edge": 0.0}},
-    "bodies count as all else": {"objective": {"body": 0.0}},
-    "without the contrast term": {"objective": {"contrast": 0.0}},
-    "without noise-free scenes": {"objective": {"noise_free": 0.0}},
-    "lumens up to 500 HU": {"data": {"scenes": {"lumen_hu": [150.0, 500.0]}}},
-}
 
 
 def _one_orientation(network: Mbir) -> Mbir:
@@ -80,25 +61,6 @@ USES: dict[str, Callable[[Mbir], Mbir]] = {
     "without outlines, the filtered view alone, no network": lambda n: Mbir(n.model, prior=bilateral_prior),
     "the linear start alone": lambda n: Mbir(n.model, steps=0),
 }
-
-
-def trained(name: str, changes: dict[str, Any], folder: Path, steps: int) -> Mbir:
-    """Weights of one training; what has finished is not repeated."""
-    out = folder / name.replace(" ", "_").replace(",", "")
-    weights = out / "weights.safetensors"
-    if not weights.exists():
-        plain: dict[str, Any] = yaml.safe_load(DEFAULT.read_text(encoding="utf-8"))
-        plain |= {"steps": steps, "learning_rate": 1.2e-3, "validate_every": steps}
-        plain["network"] |= {"channels": [20, 32, 36]}
-        for key, value in changes.items():
-            plain[key] = {**plain[key], **value} if isinstance(value, dict) else value
-        out.mkdir(parents=True, exist_ok=True)
-        config = out.with_suffix(".yaml")
-        config.write_text(yaml.safe_dump(plain), encoding="utf-8")
-        command = [sys.executable, "-m", "train", "--config", str(config), "--out", str(out), "--threads", "1",
-                   "--no-progress", "--no-tensorboard"]  # fmt: skip
-        subprocess.run([*command, *(["--resume"] if (out / "checkpoint.safetensors").exists() else [])], check=True)
-    return Mbir.load(weights)
 
 
 @torch.no_grad()
@@ -174,35 +136,25 @@ def table(results: dict[str, Any]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("runs", type=Path)
-    parser.add_argument("--train", type=int, metavar="STEPS", help="parts of the training, too")
     a = parser.parse_args()
     bench = Bench(a.runs / "bench")
     began = time.perf_counter()
     results: dict[str, Any] = {}
 
-    def measured(name: str, make: Callable[[], Mbir]) -> None:
-        kept = a.runs / f"{name.replace(' ', '_').replace(',', '')}.json"
+    for use, make in USES.items():
+        kept = a.runs / f"{use.replace(' ', '_').replace(',', '')}.json"
         if not kept.exists():
-            kept.write_text(json.dumps(figures(make(), bench)), encoding="utf-8")
-        results[name] = json.loads(kept.read_text(encoding="utf-8"))
-        trainings = (
-            f" Rows that begin with “training” are trainings of {a.train} steps of a network of 20-32-36 channels."
-        )
+            kept.write_text(json.dumps(figures(make(Mbir.load()), bench)), encoding="utf-8")
+        results[use] = json.loads(kept.read_text(encoding="utf-8"))
         text = (
             f"0.35 / 2.0 s; means over four held-out vessels and {DRAWS} noise draws. Undershoot: the darkest fat "
             "beside the vessel without noise, against the truth. Constant added: change of the volume, HU rms, beside "
-            f"the {MOVED_HU:g} HU that were added to the inset.{trainings if a.train else ''}\n\n{table(results)}\n"
+            f"the {MOVED_HU:g} HU that were added to the inset.\n\n{table(results)}\n"
         )
         (HERE / "prior_parts.md").write_text(f"# What each part of the prior brings\n\n{text}", encoding="utf-8")
-        plain = {"steps": a.train, "draws": DRAWS, "results": results}
+        plain = {"draws": DRAWS, "results": results}
         (HERE / "prior_parts.json").write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
-        print(f"{time.perf_counter() - began:.0f} s: {name}", flush=True)
-
-    for use, make in USES.items():
-        measured(use, lambda make=make: make(Mbir.load()))
-    if a.train:
-        for name, changes in TRAININGS.items():
-            measured(f"training: {name}", lambda c=changes, n=name: trained(n, c, a.runs, a.train))
+        print(f"{time.perf_counter() - began:.0f} s: {use}", flush=True)
 
 
 if __name__ == "__main__":

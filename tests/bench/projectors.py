@@ -352,24 +352,6 @@ def picture(rows: list[dict[str, Any]], path: Path) -> None:
     plt.close(figure)
 
 
-def growth(repeats: int) -> dict[str, Any]:
-    """Time against size over a decade of pixels: fan beam, views and columns growing with the grid's edge n."""
-    sizes, seconds = [162, 256, 362, 512], []
-    for n in sizes:
-        geometry = FanBeam(full_turn(2 * n - n % 4), 626.0, 1098.0, int(1.75 * n), 0.6 * 512 / n)
-        A = Projector(geometry, VolumeGrid((n, n), 250 / n))
-        x = torch.rand(n, n)
-        A(x)
-        best = math.inf
-        for _ in range(repeats):
-            begin = time.perf_counter()
-            A(x)
-            best = min(best, time.perf_counter() - begin)
-        seconds.append(best)
-    exponent = float(np.polyfit(np.log(sizes), np.log(seconds), 1)[0])
-    return {"edge": sizes, "seconds": seconds, "exponent (3 is n views × n² pixels)": exponent}
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=5)
@@ -382,10 +364,9 @@ def main() -> None:
         library = str(candidate) if candidate.exists() else None
     options.out.mkdir(parents=True, exist_ok=True)
     rows: list[dict[str, Any]] = []
-    grown = growth(options.repeats)
     for make in cases():
         rows += measure(make(), options.repeats, library)
-        print(_write(rows, grown, options.out).splitlines()[-3], flush=True)  # a run cut short keeps what it measured
+        print(_write(rows, options.out).splitlines()[-1], flush=True)  # a run cut short keeps what it measured
 
 
 def _machine() -> str:
@@ -397,15 +378,14 @@ def _machine() -> str:
     return f"{names[0] if names else platform.machine()}, {os.cpu_count()} cores"
 
 
-def _write(rows: list[dict[str, Any]], grown: dict[str, Any], out: Path) -> str:
+def _write(rows: list[dict[str, Any]], out: Path) -> str:
     now = datetime.datetime.now(datetime.UTC)
     report = (
         f"{_machine()}, torch {torch.__version__}, {now:%Y-%m-%d %H:%M} UTC, load {os.getloadavg()[0]:.1f} at the end"
     )
     report += f"\n\n{table(rows)}\n"
-    report += f"\nTime against size: {grown}\n"
     (out / "projectors.md").write_text(report)
-    (out / "projectors.json").write_text(json.dumps({"rows": rows, "growth": grown}, indent=1))
+    (out / "projectors.json").write_text(json.dumps(rows, indent=1))
     picture(rows, out / "projectors.png")
     return report
 
