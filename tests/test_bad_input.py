@@ -29,10 +29,9 @@ from torchpcct import (
 )
 from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.metrics import cnr, cnr_interval, sd_interval
-from torchpcct.metrics.residual_test import residual_test
 from torchpcct.scanner import SiliconDetector, Source, TransportedSilicon, presets
 from torchpcct.scanner.linearisation import WaterLinearisation
-from torchpcct.scene import Body, Ellipsoid, EllipticCylinder, Scene, chord_lengths
+from torchpcct.scene import Ellipsoid, Scene, chord_lengths
 from torchpcct.scene.materials import MATERIALS, Material
 
 NAN, INF = math.nan, math.inf
@@ -162,17 +161,8 @@ CALLS = {
     "cnr: one": (lambda: cnr([1.0], [1.0]), "at least 2"),
     "cnr: NaN": (lambda: cnr([1.0, NAN], [1.0, 2.0]), "NaN"),
     "cnr: constants": (lambda: cnr([1.0, 1.0], [2.0, 2.0]), "do not vary"),
-    "residual: shapes": (lambda: residual_test(Y, Y, Y[1:]), "shape"),
     "volume: numpy": (lambda: Volume(np.zeros(GRID.shape), GRID), "data"),
     "volume: shape": (lambda: Volume(torch.zeros(1, 4, 4), GRID), "data"),
-    "body: radius": (lambda: Ellipsoid((1.0, -1.0, 1.0)), ""),
-    "body: endless": (lambda: EllipticCylinder(NAN), ""),
-    "body: material": (lambda: Scene([Body("a", EllipticCylinder(1.0), "unobtainium")]), "unobtainium"),
-    "source: voltage": (lambda: Source(kvp=-1), ""),
-}
-
-
-CALLS |= {
     "cnr_from_moments: shapes": (
         lambda: metrics.cnr_from_moments([1.0, 2.0], 1.0, [1.0, 2.0, 3.0], 1.0),
         "fg_mean (2,)",

@@ -24,6 +24,15 @@ def expected():
     return np.broadcast_to(4000 * np.exp(-lines)[:, None, :], (VIEWS, ROWS, COLUMNS))
 
 
+def behind_lead(width, swing, left):
+    """Counts of a bar of lead so many cells wide that walks over the columns."""
+    opaque = np.array(expected())
+    for v, angle in enumerate(full_turn(VIEWS)):
+        c = int(left + swing * np.sin(angle))
+        opaque[v, :, c : c + width] = 0.01
+    return torch.from_numpy(np.random.default_rng(2).poisson(opaque).astype(np.float32))
+
+
 @pytest.fixture
 def counts():
     return torch.from_numpy(np.random.default_rng(0).poisson(expected()).astype(np.float32))
@@ -40,12 +49,7 @@ def test_starved_data_are_left_alone(level):
     """Zeros of noise, anywhere and behind metal, are no defects."""
     low = np.random.default_rng(1).poisson(expected() * level / 60).astype(np.float32)
     assert not find_defects(torch.from_numpy(low), AIR * level / 60).mask.any()
-    opaque = np.array(expected())
-    for v in range(VIEWS):  # a bar of lead, three cells wide
-        c = int(30 + 14 * np.sin(full_turn(VIEWS)[v]))
-        opaque[v, :, c : c + 3] = 0.01
-    metal = np.random.default_rng(2).poisson(opaque).astype(np.float32)
-    assert not find_defects(torch.from_numpy(metal), AIR).mask.any()
+    assert not find_defects(behind_lead(3, 14, 30), AIR).mask.any()
 
 
 def test_every_kind_of_defect_is_found_and_nothing_else(counts):
@@ -69,12 +73,8 @@ def test_readings_lost_at_random_are_found(counts, share, least):
     assert not (found & ~lost).any()
     bright = torch.from_numpy(expected() > 150)
     assert float((found & lost & bright).sum() / (lost & bright).sum()) > least
-    opaque = np.array(expected())
-    for v in range(VIEWS):  # a bar of lead, eight cells wide: zeros at its edges are bright on one side only
-        c = int(26 + 10 * np.sin(full_turn(VIEWS)[v]))
-        opaque[v, :, c : c + 8] = 0.01
-    metal = torch.from_numpy(np.random.default_rng(2).poisson(opaque).astype(np.float32))
-    found = find_defects(torch.where(lost, 0.0, metal), AIR).mask
+    # Zeros at the edges of a wide bar of lead are bright on one side only.
+    found = find_defects(torch.where(lost, 0.0, behind_lead(8, 10, 26)), AIR).mask
     assert not (found & ~lost & ~found.all(0)).any()  # single readings: no cell that is left out in all views
 
 

@@ -210,16 +210,12 @@ def test_windowed_scan():
 
 def test_errors(model):
     good = torch.ones(8, 4)
-    for counts, message in (
-        (torch.ones(7, 4), "8 bins"),
-        (-good, "finite and ≥ 0"),
-        (good * torch.nan, "finite and ≥ 0"),
-        (good * torch.inf, "finite and ≥ 0"),
-        (torch.ones(8, 5), "last axis"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            decompose(counts, model)
     refused(
+        ("8 bins", lambda: decompose(torch.ones(7, 4), model)),
+        ("finite and ≥ 0", lambda: decompose(-good, model)),
+        ("finite and ≥ 0", lambda: decompose(good * torch.nan, model)),
+        ("finite and ≥ 0", lambda: decompose(good * torch.inf, model)),
+        ("last axis", lambda: decompose(torch.ones(8, 5), model)),
         ("float", lambda: decompose(good.int(), model)),
         ("tolerance", lambda: decompose(good, model, tolerance=0.0)),
         (r"0…3", lambda: decompose(good, model, columns=[4])),
