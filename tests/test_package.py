@@ -32,9 +32,9 @@ SLOW = {
 }
 
 
-@pytest.mark.parametrize(("package", "more"), [("torchpcct", {"torch", "numba", "scipy"}), ("recon", set())])
+@pytest.mark.parametrize(("package", "more"), [("torchpcct.scene", {"torch", "numba", "scipy"}), ("recon", set())])
 def test_importing_loads_nothing_that_is_used_later(package, more):
-    """Kernels, figures, files and spectra come with their first use: ``import torchpcct`` not even needs torch."""
+    """Kernels, figures, files and spectra come with their first use: scenes not even need torch."""
     code = f"import sys, {package}; print(*sys.modules)"
     loaded = set(run_python(code).stdout.split())
     assert not loaded & (SLOW | more)

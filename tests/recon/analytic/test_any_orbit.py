@@ -92,6 +92,9 @@ def test_parallel_vectors_with_roll_and_jitter():
     image = fbp(lines(v, 100, 9, parallel=True), VectorGeometry(v, 100, 9, True), grid, outside=0.0)
     assert image.shape == grid.shape
     assert worst(image, grid) < 0.015
+    thick = VolumeGrid((3, 48, 48), (9.0, 2.0, 2.0))
+    with pytest.raises(ValueError, match="slices must lie in the rows'"):
+        fbp(lines(v, 100, 9, parallel=True), VectorGeometry(v, 100, 9, True), thick, outside=0.0)
 
 
 def test_what_fbp_cannot_do_is_refused():

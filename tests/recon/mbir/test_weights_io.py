@@ -51,15 +51,9 @@ def test_one_changed_byte_anywhere_is_found(shipped, tmp_path, bit):
             read_tensors(path, WEIGHTS_FORMAT)
 
 
-def test_damaged_weights_are_refused(shipped, tmp_path):
-    good = shipped.read_bytes()
-    path = tmp_path / "weights.safetensors"
-    path.write_bytes(good)
-    Mbir.load(path)
-    for at in (*range(9999, len(good), 19999), len(good) - 1):
-        path.write_bytes(good[:at] + bytes([good[at] ^ 1]) + good[at + 1 :])
-        with pytest.raises(ValueError, match=rf"{re.escape(str(path))} .*checksum.*another copy.*new installation"):
+def test_damaged_weights_are_refused_with_the_remedy(shipped, tmp_path):
+    good, path = shipped.read_bytes(), tmp_path / "weights.safetensors"
+    for bad in (good[:-1] + bytes([good[-1] ^ 1]), good[:-1]):
+        path.write_bytes(bad)
+        with pytest.raises(ValueError, match=rf"{re.escape(str(path))} .*another copy.*new installation"):
             Mbir.load(path)
-    path.write_bytes(good[:-1])
-    with pytest.raises(ValueError, match="damaged"):
-        Mbir.load(path)

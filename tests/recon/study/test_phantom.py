@@ -42,17 +42,6 @@ def test_the_raster_sees_other_lengths():
         assert raster[name] == pytest.approx(value, abs=1.7 * voxel), name
 
 
-def test_known_ct_numbers(tiny):
-    """Soft tissue reads the paper's HU at 64 keV; iodine and fat do not (fat loses contrast with energy)."""
-    hu = tiny("phantom").measured.data["hu"]
-    for name in ("vessel_wall", "fibrous_tissue", "necrotic_core"):
-        assert hu["64 keV"][name] == pytest.approx(paper.MATERIALS[name][1], abs=0.5)
-    assert hu["55 keV"]["blood_iodine"] == pytest.approx(522, abs=3)
-    assert hu["55 keV"]["pericoronary_fat"] == pytest.approx(-98.6, abs=0.5)
-    assert 440 < hu[TRANSMITTED]["blood_iodine"] < 480
-    assert hu["100 kVp, filtered, in air"]["blood_iodine"] > hu[TRANSMITTED]["blood_iodine"]
-
-
 def test_checks_see_what_is_wrong(tiny):
     parts = copy.deepcopy(tiny("phantom").measured.data)
     failed = {c.name for c in checks(parts) if not c.ok and "raster" not in c.name}

@@ -20,7 +20,7 @@ from torchpcct.checks.rotation_axis import axis_column
 from torchpcct.formats.damage import read_yaml
 from torchpcct.formats.dicom_ct_pd import read_dicom_ct_pd
 from torchpcct.formats.geometry_yaml import geometry_of, geometry_values
-from torchpcct.formats.preprocess import centred, cleaned, find_axis
+from torchpcct.formats.preprocess import cleaned
 from torchpcct.formats.rtk import read_rtk
 from torchpcct.formats.scans import open_scan
 from torchpcct.vector_geometry import VectorGeometry
@@ -141,14 +141,6 @@ def test_options_fit_every_format_or_are_refused_by_name(tmp_path):
     expected = {("tooth.h5", "photons"), ("a.prep", "slices")}
     expected |= {("own.h5", option) for option in ("pitch", "photons")}
     assert refused == {(name, option, f"{option}=") for name, option in expected}
-
-
-def test_the_axis_is_found(tmp_path):
-    scan = open_scan(tooth(tmp_path / "tooth.h5"), slices=slice(0, 1))
-    assert scan.geometry.offset == 0.0
-    found = find_axis(scan)
-    assert abs(found.column - 31.5 - 1.75) <= found.error < 0.2
-    assert centred(scan).geometry.offset == pytest.approx(-1.75, abs=0.3)
 
 
 def test_stripes_of_a_part_of_the_turn_go_and_the_rest_stays():

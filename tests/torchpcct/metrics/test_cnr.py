@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from recon.study.paper import facts as paper
 from torchpcct.metrics import cnr, cnr_from_moments, cnr_interval, sd_interval
@@ -20,14 +18,6 @@ def test_definition_by_hand():
     assert cnr([1.0, 3.0], [11.0, 15.0]) == pytest.approx((13 - 2) / np.sqrt(2 + 8))
     batch = cnr(np.array([[1.0, 3.0], [2.0, 6.0]]), np.array([[11.0, 15.0], [22.0, 30.0]]))
     np.testing.assert_allclose(batch, [(13 - 2) / np.sqrt(10)] * 2)
-
-
-@given(st.floats(0.01, 100), st.floats(-1e4, 1e4), st.integers(2, 40))
-def test_invariant_under_offset_and_scale(scale, offset, n):
-    rng = np.random.default_rng(n)
-    fg, bg = rng.normal(40, 10, n), rng.normal(90, 20, n)
-    assert cnr(scale * fg + offset, scale * bg + offset) == pytest.approx(cnr(fg, bg), rel=1e-6)
-    assert cnr(bg, fg) == pytest.approx(-cnr(fg, bg))
 
 
 def test_sd_interval_matches_the_known_factors():

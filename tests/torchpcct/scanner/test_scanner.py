@@ -75,12 +75,6 @@ def test_weights_are_quanta_times_response(make):
     assert (weights.sum(-1) > 0).all()
 
 
-def test_noise_weights(pcct, eid):
-    np.testing.assert_array_equal(pcct.noise_weights()[1], pcct.weights()[1])
-    energies, weights = eid.weights()
-    np.testing.assert_allclose(eid.noise_weights()[1], weights * energies, rtol=1e-14)
-
-
 def test_the_number_of_views_changes_the_load_only(pcct):
     few = pcct.with_views(123)
     assert few.geometry.views == 123

@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from fresh_python import run_python
 from refusals import refusals, refused
 
 from torchpcct.geometry import VolumeGrid
@@ -290,8 +289,3 @@ def test_ctdi():
     assert [s.position for s in scene.shapes[2:4]] == [(150.0, 0.0, 0.0), pytest.approx((0.0, 150.0, 0.0))]
     lengths = chord_lengths(scene, (-626.0, 0.0, 0.0), (1.0, 0.0, 0.0))[:, 0]
     assert lengths == pytest.approx([320.0, 13.0, 13.0, 0.0, 13.0, 0.0], abs=1e-9)
-
-
-def test_import_does_not_load_numba():
-    code = "import sys, torchpcct.scene; assert not {'numba', 'scipy', 'xraydb'} & set(sys.modules)"
-    run_python(code)
