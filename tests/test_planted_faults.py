@@ -1,4 +1,4 @@
-"""The table of planted faults (bench/mutation.py): it must not fall behind the source that it breaks."""
+"""The table of planted faults (bench/faults.yaml): it must not fall behind the source that it breaks."""
 
 import ast
 import importlib.util
