@@ -2,6 +2,7 @@
 
 import shlex
 
+import drawn_vessel
 import pytest
 from small_scan import GRID, SCENE, SPECTRAL_GRID, scanner
 
@@ -27,6 +28,24 @@ def spectral():
     s = scanner("spectral", rows=10)
     clean, model = acquire(SCENE, s, region=SPECTRAL_GRID, duty=0.06, sub_rays=16), SpectralModel.of(s, 1.0)
     return clean, model, decompose_scan(clean, model).line_integrals, decompose_surround(clean, model)
+
+
+@pytest.fixture(scope="session")
+def gram():
+    """The operator of a drawn vessel's scan."""
+    return drawn_vessel.operator()
+
+
+@pytest.fixture(scope="session")
+def drawn():
+    """An inset with it, as MBIR asks for one."""
+    return drawn_vessel.inset()
+
+
+@pytest.fixture(scope="session")
+def network():
+    """For that inset, not trained."""
+    return drawn_vessel.untrained()
 
 
 @pytest.fixture

@@ -136,25 +136,20 @@ def test_crash_at_any_write(tmp_path, uninterrupted, crash_before):
     assert not [p for p in out.iterdir() if "part" in p.name or "next" in p.name]
 
 
-@pytest.mark.parametrize("damage", ["cut", "flip", "missing", "foreign", "pickle"])
+DAMAGE = {
+    "cut": lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3]),
+    "flip": lambda path: path.write_bytes((data := path.read_bytes())[:-10] + bytes([data[-10] ^ 1]) + data[-9:]),
+    "missing": lambda path: path.unlink(),
+    "foreign": lambda path: save_file({"model.0.weight": torch.zeros(3)}, path),
+    "pickle": lambda path: path.write_bytes(pickle.dumps({"model": [1.0]})),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
 def test_damaged_checkpoint_falls_back_to_the_previous_one(tmp_path, uninterrupted, damage, caplog):
     out = tmp_path / "x"
     run(out, objective=StubObjective({6: send(signal.SIGTERM)}))
-    store = Store(out)
-
-    def spoil(path):
-        data = path.read_bytes()
-        if damage == "cut":
-            path.write_bytes(data[: len(data) * 2 // 3])
-        elif damage == "flip":
-            path.write_bytes(data[:-10] + bytes([data[-10] ^ 1]) + data[-9:])
-        elif damage == "missing":
-            path.unlink()
-        elif damage == "foreign":
-            save_file({"model.0.weight": torch.zeros(3)}, path)
-        else:
-            path.write_bytes(pickle.dumps({"model": [1.0]}))
-
+    store, spoil = Store(out), DAMAGE[damage]
     older = read_tensors(store.previous, CHECKPOINT_FORMAT)[1]["state"]["step"]
     spoil(store.current)
     metadata, warning = store.load()[1:]

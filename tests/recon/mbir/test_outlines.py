@@ -9,17 +9,6 @@ from recon.mbir import outlines
 from recon.mbir.outlines import ARTERY, OutlineMbir
 from recon.plaque import VesselPrior
 
-
-@pytest.fixture(scope="module")
-def drawn():
-    return drawn_vessel.inset()
-
-
-@pytest.fixture(scope="module")
-def network():
-    return drawn_vessel.untrained()
-
-
 EXPOSURE_S = 0.25
 
 

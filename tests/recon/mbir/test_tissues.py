@@ -24,21 +24,11 @@ BALL = np.s_[2:5, 2:5, 2:5]
 
 
 @pytest.fixture(scope="module")
-def drawn():
-    return drawn_vessel.inset()
-
-
-@pytest.fixture(scope="module")
 def fine(drawn):
     """What is seen, on voxels of half the size."""
     image = drawn_vessel.image(drawn.gram.finer, 100.0, samples=3)
     image[tuple(slice(2 * s.start, 2 * s.stop) for s in BALL)] += 300.0
     return image
-
-
-@pytest.fixture(scope="module")
-def network():
-    return drawn_vessel.untrained()
 
 
 @pytest.fixture(scope="module")

@@ -16,11 +16,6 @@ from recon.plaque.vessel import Vessel
 from torchpcct.volume import Volume
 
 
-@pytest.fixture(scope="module")
-def gram():
-    return drawn_vessel.operator()
-
-
 def fitted(gram, volume, seed):
     data = drawn_vessel.data(gram, volume, seed)
     vessel = Vessel(data, find_vessel(data.pilot(), data.grid, None))

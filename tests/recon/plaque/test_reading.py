@@ -18,11 +18,6 @@ POINT_OFF = (0.0, 0.0, drawn_vessel.CORE_OFF)
 
 
 @pytest.fixture(scope="module")
-def gram():
-    return drawn_vessel.operator()
-
-
-@pytest.fixture(scope="module")
 def strong(gram):
     """A core 100 HU below the fibrous tissue, with noise."""
     return read_plaque(drawn_vessel.data(gram, drawn_vessel.image(gram.finer, 100.0), seed=1), particles=150)

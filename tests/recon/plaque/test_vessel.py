@@ -12,8 +12,7 @@ from recon.plaque.vessel import FAT, FIBROUS, LUMEN, THICKNESS, Vessel
 
 
 @pytest.fixture(scope="module")
-def vessel():
-    gram = drawn_vessel.operator()
+def vessel(gram):
     data = drawn_vessel.data(gram, drawn_vessel.image(gram.finer, 0.0))
     return Vessel(data, find_vessel(data.pilot(), data.grid, None))
 

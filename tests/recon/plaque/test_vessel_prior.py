@@ -31,8 +31,7 @@ def test_what_cannot_be_believed_is_refused(values, error, match):
 
 
 @pytest.fixture(scope="module")
-def seen():
-    gram = drawn_vessel.operator()
+def seen(gram):
     data = drawn_vessel.data(gram, drawn_vessel.image(gram.finer, 0.0))
     return data, find_vessel(data.pilot(), data.grid, None)
 
