@@ -10,7 +10,7 @@ from pathlib import Path
 ROOT = Path(__file__).parent.parent
 UPWARDS = ("torchpcct", "recon", "recon.study", "recon.cli", "train")
 LONGEST, MOST_AT_THE_TOP = 800, 6
-BUDGETS = {"torchpcct": 20_690, "recon": 14_580, "recon.evaluate": 4_235, "recon.study": 5_590, "train": 3_120}
+BUDGETS = {"torchpcct": 20_270, "recon": 14_330, "recon.evaluate": 4_190, "recon.study": 5_295, "train": 2_960}
 """Lines of a package, without those packages in it that are named here. What does not fit must make room."""
 
 
