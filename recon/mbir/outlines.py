@@ -36,12 +36,7 @@ from recon.plaque.start import find_vessel
 from recon.plaque.vessel import Vessel
 from recon.plaque.vessel_prior import VesselPrior
 
-__all__ = ["ARTERY", "Drawn", "OutlineMbir"]
-
-ARTERY = VesselPrior(shift=200.0, freedom=0.4)
-"""For pictures: whatever the tube voltage and the zero of the scanner, and with outlines of the least error. Drawn on
-four held-out vessels at 0.35 s / 2 s the error is 37.3 / 24.0 HU, with a freedom of 1 (as a reading, which must not be
-surer than it is) 41.0 / 25.0, without noise 19.8 / 16.9 for 17.5 / 16.0; contrast and its noise are the same."""
+__all__ = ["Drawn", "OutlineMbir"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +67,7 @@ class OutlineMbir(Mbir):
 
     Args:
         network: gives weights, fidelity and parts.
-        vessel_prior: what is believed of the vessel before the data; None: a coronary artery (:data:`ARTERY`).
+        vessel_prior: what is believed of the vessel before the data; None: a coronary artery.
     """
 
     def __init__(self, network: Mbir, vessel_prior: VesselPrior | None = None) -> None:
@@ -118,7 +113,7 @@ class OutlineMbir(Mbir):
         try:
             # Many small matrices: BLAS threads would wait for each other.
             with threadpool_limits(limits=1, user_api="blas"):
-                vessel = Vessel(data, find_vessel(data.pilot(), data.grid, None), self.vessel_prior or ARTERY)
+                vessel = Vessel(data, find_vessel(data.pilot(), data.grid, None), self.vessel_prior)
                 estimate = LayerEstimate(vessel.fit(vessel.first_guess(), expected=True), layer_sd_hu(self.fidelity))
         except (ValueError, np.linalg.LinAlgError) as error:
             return Drawn(None, _unused(str(error)))
