@@ -75,7 +75,7 @@ class Store:
             try:
                 with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
                     arrays = {k: file[k] for k in file.files}
-                found, digest = (str(arrays.pop(k)) for k in ("key", "sum"))
+                found, digest = (str(arrays.pop(k, "")) for k in ("key", "sum"))
                 if digest != _digest(found, arrays):
                     raise ValueError("its content does not have its checksum")
                 if found == key:
