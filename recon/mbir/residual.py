@@ -76,10 +76,13 @@ def _significant(step: Tensor, window: Tensor, noise: Tensor) -> Tensor:
     padded = F.pad(step, [p for pair in zip(before[::-1], after[::-1], strict=True) for p in pair])
     counts = [(n - e) // hop + 1 for n, e, hop in zip(padded.shape, edges, hops, strict=True)]
 
+    def row(volume: Tensor, z: int, y: int) -> Tensor:
+        """What the blocks of a row along x hold of it."""
+        return volume[z * hops[0] : z * hops[0] + edges[0], y * hops[1] : y * hops[1] + edges[1]]
+
     def blocks(z: int, y: int) -> Tensor:
-        """Those of a row along x, ``(count, z, y, x)``."""
-        row = padded[z * hops[0] : z * hops[0] + edges[0], y * hops[1] : y * hops[1] + edges[1]]
-        return row.unfold(-1, edges[2], hops[2]).movedim(-2, 0)
+        """Those of a row, ``(count, z, y, x)``."""
+        return row(padded, z, y).unfold(-1, edges[2], hops[2]).movedim(-2, 0)
 
     rows = list(itertools.product(range(counts[0]), range(counts[1])))
     found = []
@@ -101,9 +104,8 @@ def _significant(step: Tensor, window: Tensor, noise: Tensor) -> Tensor:
         beside[(torch.searchsorted(own, which), *near[pair, 1:].T)] = 1.0
         kept = coefficients * _structure(beside * (power > _CONTINUED**2), power)
         made = torch.fft.irfftn(kept, s=edges, dim=_AXES) * window
-        row = out[z * hops[0] : z * hops[0] + edges[0], y * hops[1] : y * hops[1] + edges[1]]
         for k, block in zip(own.tolist(), made, strict=True):
-            row[..., k * hops[2] : k * hops[2] + edges[2]] += block
+            row(out, z, y)[..., k * hops[2] : k * hops[2] + edges[2]] += block
     times = math.prod(e / (2 * hop) if e > 1 else 1.0 for e, hop in zip(edges, hops, strict=True))
     inside = tuple(slice(b, b + n) for b, n in zip(before, step.shape, strict=True))
     return out[inside] / times
