@@ -17,7 +17,7 @@ from scipy.linalg import solve_triangular
 
 from recon.plaque.kernels import core_fractions, sharpened
 from recon.plaque.local_gram import LocalGram
-from recon.plaque.vessel import BLUR, BLUR_UNIT, EXCESS, Fit, Vessel
+from recon.plaque.vessel import EXCESS, Fit, Vessel
 from torchpcct.threads import run
 
 __all__ = ["CorePrior", "CoreSpace", "Evidence"]
@@ -100,7 +100,7 @@ class CoreSpace:
         self.lumen = np.ascontiguousarray(drawing.lumen_distance[self.chosen])
         self.lumen_normal = np.ascontiguousarray(drawing.lumen_normal[self.chosen])
         self.lumen_sd = np.ascontiguousarray(drawing.lumen_sd[self.chosen])
-        self.blur = BLUR_UNIT * float(fit.parameters[BLUR])
+        self.blur = fit.blur
         self.frames = vessel.lumen_at.frame
         self.deep = deep
         grid = vessel.grid

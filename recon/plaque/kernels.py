@@ -79,7 +79,7 @@ def core_fractions(begin, end, centres, axes, semi, caps, points, sd, inner, lum
             else:
                 nz, ny, nx = gz / g, gy / g, gx / g
                 variance = (sd[0] * nz) ** 2 + (sd[1] * ny) ** 2 + (sd[2] * nx) ** 2
-                variance = max(variance + blur * (1.0 - nz * nz), 0.2 * variance)
+                variance = variance + blur * (1.0 - nz * nz)
                 # The distance's own average under the blur: half the sum of the curvatures times its variance.
                 d = (r - 1.0) * r / g + 0.5 * (flattest - q / f) * r / g * variance
             share = 0.5 * math.erfc(d / math.sqrt(2.0 * variance))

@@ -19,8 +19,8 @@ Floats = NDArray[np.float64]
 _KNOT_MM = 0.9
 _CORRELATION_MM = 2.0
 """ℓ of the prior's correlation along the vessel, Matérn's of order 5/2: smooth, but for sudden bends."""
-_SD_MM = (0.7, 0.5, 0.3, 0.1, 0.05)
-"""Prior standard deviation of every order."""
+_SD = (0.4, 0.3, 0.17, 0.06, 0.03)
+"""Prior standard deviation of every order, as a share of the vessel's radius: narrow arteries are as round as wide ones."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,10 +98,11 @@ class Outline:
         shape[:, 0] = (weight @ radius) / weight.sum(1)
         return shape
 
-    def precision(self, freedom: float = 1.0, least_order: int = 0) -> Floats:
+    def precision(self, radius: float, freedom: float = 1.0, least_order: int = 0) -> Floats:
         """Prior inverse covariance of all coefficients, mm⁻²; 0 for those of a smaller Fourier order.
 
         Args:
+            radius: of the vessel, mm.
             freedom: of all but the radius, factor on their standard deviations.
             least_order: the smallest that counts.
         """
@@ -109,5 +110,5 @@ class Outline:
         lag = math.sqrt(5.0) * np.abs(centres[:, None] - centres) / _CORRELATION_MM
         k = (1 + lag + lag**2 / 3) * np.exp(-lag)
         order = np.concatenate([[0], np.arange(1, self.orders + 1), np.arange(1, self.orders + 1)])
-        sd = np.array(_SD_MM)[order] * np.where(order > 0, freedom, 1.0)
+        sd = radius * np.array(_SD)[order] * np.where(order > 0, freedom, 1.0)
         return np.kron(np.linalg.inv(k), np.diag((order >= least_order) / sd**2))

@@ -31,14 +31,14 @@ from recon.plaque.local_gram import LocalGram
 from recon.plaque.outline import Outline, OutlineAt
 from recon.plaque.vessel_prior import VesselPrior
 
-__all__ = ["BLUR", "BLUR_UNIT", "FAT", "FIBROUS", "LUMEN", "THICKNESS", "WALL", "Drawing", "Fit", "Start", "Vessel"]
+__all__ = ["FAT", "FIBROUS", "LUMEN", "THICKNESS", "WALL", "Drawing", "Fit", "Start", "Vessel"]
 
 Floats = NDArray[np.float64]
 
 FAT, WALL, FIBROUS, LUMEN, THICKNESS, BLUR, ENDS = 0, 1, 2, 3, 4, 5, 6
 _FIRST = 12
-"""Positions of the first parameters: values, log wall thickness, variance of the edges' blur in 0.01 mm², three for
-each end (position and tilts of a plane); then the lumen's and the outer outline's coefficients."""
+"""Positions of the first parameters: values, logs of the wall thickness and of the edges' blur, three for each end
+(position and tilts of a plane); then the lumen's and the outer outline's coefficients."""
 
 _FAT_SD, _LUMEN_SD = 100.0, 300.0
 """Prior of fat and lumen about what the start reads, HU."""
@@ -48,10 +48,14 @@ _EXPECTED_ROUND = 4.0
 """So much less than else the outlines leave an ellipse in such a fit: a calcification beside the lumen would otherwise
 be taken for a bulge of it, and leave no trace."""
 _WALL_MM, _WALL_LOG_SD = 0.2, 0.2
-_BLUR, _BLUR_SD, BLUR_UNIT = 0.2, 1.0, 0.01
-"""Variance by which edges are softer than the operator's: focal spot, turning gantry, tissue; in units of 0.01 mm²."""
+_BLUR_MM2, _BLUR_LOG_SD = 0.004, 0.7
+"""Variance by which edges are softer than the operator's, and standard deviation of its logarithm: a focal spot of
+0.5 mm makes 0.004 mm² at half of the distance to the detector, one of 1 mm makes 0.016."""
 SOFT = 0.5
 """Standard deviation of an outline as drawn, in voxels: narrower aliases, wider needs more of what noise hides."""
+_LEFT = 0.06
+"""Squared voxels that sharpening to second order leaves of an outline's softness: fits of vessels painted on finer
+voxels, without any blur, ask for outlines so much harder (0.058 on voxels of 0.2 mm, 0.068 on 0.3 mm)."""
 BOX = 1 / 12
 """Variance of a voxel's box, in squared voxels: the operator takes a value for that of a whole voxel."""
 EXCESS = SOFT**2 + BOX
@@ -164,6 +168,11 @@ class Fit:
         return np.asarray(cho_solve(self.factor, np.eye(len(self.parameters))))
 
     @property
+    def blur(self) -> float:
+        """Variance in mm² by which edges in the plane are softer than the operator's."""
+        return math.exp(self.parameters[BLUR])
+
+    @property
     def image(self) -> NDArray[np.float32]:
         """``grid.shape`` HU, the vessel as means over the voxels."""
         fat, vessel = self.parameters[FAT], self.vessel
@@ -215,7 +224,7 @@ class Vessel:
         self.lookup = np.full(grid.shape, -1, np.int64)  # position of each of the grid's voxels in the index
         self.lookup.ravel()[flat] = np.arange(len(flat))
         self.points = points[flat]
-        self.sd = SOFT * np.array(grid.spacing)
+        self.sd = math.sqrt(SOFT**2 - _LEFT) * np.array(grid.spacing)
         self.outer_at = Coordinates(near.s[own], near.rho[own], near.theta[own], near.frame[own])
         self.lumen_at = start.lumen.coordinates(self.points)
         low, high = min(low, float(self.lumen_at.s.min())), max(high, float(self.lumen_at.s.max()))
@@ -230,6 +239,7 @@ class Vessel:
         self.ones_energy = float(ones.sum())
         self.b = data.b.double().numpy()[tuple(self.index.T)]
         self.b_sum = float(data.b.double().sum())
+        self._radius = float(np.median(start.radii[1][1]))
         self._prior_mean, self._prior = self._prior_of()
         # Beyond the rim of the volume it goes on as it ends, elsewhere there is fat beside the vessel's voxels.
         beside = np.pad(self.lookup, 1, mode="edge")
@@ -267,18 +277,18 @@ class Vessel:
         fat, blood = self.start.values
         ends = [v for e in self.start.ends for v in (e if math.isfinite(e) else 0.0, 0.0, 0.0)]
         (wall, wall_sd), (fibrous, fibrous_sd) = self.prior.wall, self.prior.fibrous
-        first = [fat, wall, fibrous, blood, math.log(_WALL_MM), _BLUR, *ends]
+        first = [fat, wall, fibrous, blood, math.log(_WALL_MM), math.log(_BLUR_MM2), *ends]
         mean = np.concatenate([first, np.zeros(self.size - _FIRST)])
         precision = np.zeros((self.size, self.size))
         values = (_FAT_SD, wall_sd, fibrous_sd, _LUMEN_SD)
-        sd = np.array([*values, _WALL_LOG_SD, _BLUR_SD, *_END_SD_MM, *_END_SD_MM])
+        sd = np.array([*values, _WALL_LOG_SD, _BLUR_LOG_SD, *_END_SD_MM, *_END_SD_MM])
         precision[range(_FIRST), range(_FIRST)] = sd**-2.0
         parts = ((self.lumen_part, self.lumen_outline), (self.outer_part, self.outer_outline))
         for (part, outline), (_, radii) in zip(parts, self.start.radii, strict=True):
             shape = np.zeros((outline.splines, outline.size // outline.splines))
             shape[:, 0] = np.median(radii)
             mean[part] = shape.ravel()
-            precision[part, part] = outline.precision(self.prior.freedom)
+            precision[part, part] = outline.precision(self._radius, self.prior.freedom)
         return mean, precision
 
     def first_guess(self) -> Floats:
@@ -322,7 +332,7 @@ class Vessel:
     def draw(self, parameters: Floats, bodies: Floats, *, jacobian: bool = True) -> Drawing:
         """The vessel with parameters ``(p,)`` and bodies ``(k, n)``, shares of the fibrous layer."""
         fat, wall, fibrous, blood = parameters[:4]
-        thickness = math.exp(parameters[THICKNESS])
+        thickness, blur = math.exp(parameters[THICKNESS]), math.exp(parameters[BLUR])
         contrasts = parameters[self.size :]
         n = len(self.index)
         lumen_d, lumen_n, lumen_rate, lumen_bend = self._distance(
@@ -337,12 +347,12 @@ class Vessel:
         )  # fmt: skip
         for k, (d, normal, bend) in enumerate(outlines):
             # Focal spot and gantry blur in the plane, not along z.
-            own, flat = (normal**2) @ self.sd**2, 1.0 - normal[:, 0] ** 2
-            variance = np.maximum(own + BLUR_UNIT * parameters[BLUR] * flat, 0.2 * own)
+            wider = blur * (1.0 - normal[:, 0] ** 2)
+            variance = (normal**2) @ self.sd**2 + wider
             # A bent outline's mean distance grows with the blur.
             mean = d + bend * variance
             share[k], slope[k] = _behind(mean, variance)
-            softer[k] = slope[k] * (0.5 * mean / variance - bend) * flat * BLUR_UNIT * (variance > 0.2 * own)
+            softer[k] = slope[k] * (0.5 * mean / variance - bend) * wider
         lumen_d, lumen_sd = mean, np.sqrt(variance)
         end_share, end_slope = np.ones((2, n)), np.zeros((2, n))
         along = (self.lumen_at.frame[:, 2] ** 2) @ self.sd**2
@@ -385,7 +395,7 @@ class Vessel:
         if expected:
             sd = np.minimum(_EXPECTED_SD, sd)
             for part, outline in ((self.lumen_part, self.lumen_outline), (self.outer_part, self.outer_outline)):
-                rounder = outline.precision(self.prior.freedom, least_order=3)
+                rounder = outline.precision(self._radius, self.prior.freedom, least_order=3)
                 precision[part, part] += (_EXPECTED_ROUND**2 - 1) * rounder
         precision[WALL : FIBROUS + 1, WALL : FIBROUS + 1] = np.linalg.inv(np.diag(sd**2) + self.prior.shift**2)
         precision[range(self.size, self.size + k), range(self.size, self.size + k)] = _BODY_SD**-2.0

@@ -27,11 +27,9 @@ class VesselPrior:
         orders: Fourier orders of lumen and outer outline, 2 to 4: the more, the flatter the ellipses they can be, and
             the less the data say of what lies between them.
         shift: standard deviation of what both differ by from their means together, HU; 0: the scanner is calibrated.
-            With 200 HU the outlines do not depend on where its zero lies: 150 HU added to everything change an image
-            by 2 HU instead of 9.
-        freedom: how far sections may move and leave a circle, relative to arteries at large. With 0.4 images of
-            held-out vessels have 9 % less error at 0.35 s, 4 % at 2 s, of a vessel of 2 mm 19 and 7 %; outlines are
-            rounder, and where there is no core the contrast read in the paper's plaque at 0.35 s is -9 HU, not -5.
+            MBIR draws outlines with 200, so that it does not matter to them where the scanner's zero lies.
+        freedom: how far sections may move and leave a circle, relative to arteries at large of the same size. With 0.4
+            outlines are rounder: less error, and more contrast read where there is no core (``train/size.md``).
 
     Raises:
         ValueError: a value that is not finite, a standard deviation or freedom that is not positive, a negative shift,
