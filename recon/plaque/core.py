@@ -100,7 +100,7 @@ class CoreSpace:
         self.lumen = np.ascontiguousarray(drawing.lumen_distance[self.chosen])
         self.lumen_normal = np.ascontiguousarray(drawing.lumen_normal[self.chosen])
         self.lumen_sd = np.ascontiguousarray(drawing.lumen_sd[self.chosen])
-        self.blur = fit.blur
+        self.blur = fit.vessel.softer_by(fit.parameters)
         self.frames = vessel.lumen_at.frame
         self.deep = deep
         grid = vessel.grid

@@ -48,7 +48,7 @@ def core_fractions(begin, end, centres, axes, semi, caps, points, sd, inner, lum
         inner: ``(n,)`` share of each voxel inside the wall's inner surface.
         lumen: ``(n,)`` distance from the lumen, mm; lumen_sd: ``(n,)`` of its edge, mm;
             lumen_normal: ``(n, 3)``.
-        blur: variance of the edges' blur in the plane, mm².
+        blur: variance that the edges' blur adds in the plane, mm².
         out: ``(bodies, n)``, filled.
     """
     for p in range(begin, end):

@@ -20,7 +20,7 @@ _KNOT_MM = 0.9
 _CORRELATION_MM = 2.0
 """ℓ of the prior's correlation along the vessel, Matérn's of order 5/2: smooth, but for sudden bends."""
 _SD = (0.4, 0.3, 0.17, 0.06, 0.03)
-"""Prior standard deviation of every order, as a share of the vessel's radius: narrow arteries are as round as wide ones."""
+"""Prior standard deviation of every order, as a share of the radius: narrow arteries are as round as wide ones."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -54,8 +54,8 @@ _BLUR_MM2, _BLUR_LOG_SD = 0.004, 0.7
 SOFT = 0.5
 """Standard deviation of an outline as drawn, in voxels: narrower aliases, wider needs more of what noise hides."""
 _LEFT = 0.06
-"""Squared voxels that sharpening to second order leaves of an outline's softness: fits of vessels painted on finer
-voxels, without any blur, ask for outlines so much harder (0.058 on voxels of 0.2 mm, 0.068 on 0.3 mm)."""
+"""Squared voxels that sharpening to second order leaves of an outline's softness in the plane: fits of vessels painted
+on finer voxels, without any blur, ask for outlines so much harder (0.058 on voxels of 0.2 mm, 0.068 on 0.3 mm)."""
 BOX = 1 / 12
 """Variance of a voxel's box, in squared voxels: the operator takes a value for that of a whole voxel."""
 EXCESS = SOFT**2 + BOX
@@ -168,11 +168,6 @@ class Fit:
         return np.asarray(cho_solve(self.factor, np.eye(len(self.parameters))))
 
     @property
-    def blur(self) -> float:
-        """Variance in mm² by which edges in the plane are softer than the operator's."""
-        return math.exp(self.parameters[BLUR])
-
-    @property
     def image(self) -> NDArray[np.float32]:
         """``grid.shape`` HU, the vessel as means over the voxels."""
         fat, vessel = self.parameters[FAT], self.vessel
@@ -224,7 +219,7 @@ class Vessel:
         self.lookup = np.full(grid.shape, -1, np.int64)  # position of each of the grid's voxels in the index
         self.lookup.ravel()[flat] = np.arange(len(flat))
         self.points = points[flat]
-        self.sd = math.sqrt(SOFT**2 - _LEFT) * np.array(grid.spacing)
+        self.sd = SOFT * np.array(grid.spacing)
         self.outer_at = Coordinates(near.s[own], near.rho[own], near.theta[own], near.frame[own])
         self.lumen_at = start.lumen.coordinates(self.points)
         low, high = min(low, float(self.lumen_at.s.min())), max(high, float(self.lumen_at.s.max()))
@@ -321,6 +316,10 @@ class Vessel:
         sharpened(columns, self.neighbours, excess, out)
         return out.reshape(soft.shape)
 
+    def softer_by(self, parameters: Floats) -> float:
+        """Variance in mm² that the edges' blur adds to that of an outline, in the plane."""
+        return math.exp(parameters[BLUR]) - _LEFT * self.grid.spacing[1] * self.grid.spacing[2]
+
     def _distance(self, at: OutlineAt, c: Coordinates, shape: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """Signed distance, unit normal, change of the distance per change of the radius, and half the curvature."""
         r, turn, slope = at.radius(shape)
@@ -333,6 +332,7 @@ class Vessel:
         """The vessel with parameters ``(p,)`` and bodies ``(k, n)``, shares of the fibrous layer."""
         fat, wall, fibrous, blood = parameters[:4]
         thickness, blur = math.exp(parameters[THICKNESS]), math.exp(parameters[BLUR])
+        softer_by = self.softer_by(parameters)
         contrasts = parameters[self.size :]
         n = len(self.index)
         lumen_d, lumen_n, lumen_rate, lumen_bend = self._distance(
@@ -347,12 +347,12 @@ class Vessel:
         )  # fmt: skip
         for k, (d, normal, bend) in enumerate(outlines):
             # Focal spot and gantry blur in the plane, not along z.
-            wider = blur * (1.0 - normal[:, 0] ** 2)
-            variance = (normal**2) @ self.sd**2 + wider
+            flat = 1.0 - normal[:, 0] ** 2
+            variance = (normal**2) @ self.sd**2 + softer_by * flat
             # A bent outline's mean distance grows with the blur.
             mean = d + bend * variance
             share[k], slope[k] = _behind(mean, variance)
-            softer[k] = slope[k] * (0.5 * mean / variance - bend) * wider
+            softer[k] = slope[k] * (0.5 * mean / variance - bend) * flat * blur
         lumen_d, lumen_sd = mean, np.sqrt(variance)
         end_share, end_slope = np.ones((2, n)), np.zeros((2, n))
         along = (self.lumen_at.frame[:, 2] ** 2) @ self.sd**2
