@@ -25,6 +25,8 @@ Floats = NDArray[np.float64]
 
 _STEP_MM = 0.4
 """Of the walk along a vessel, and between the points that its line goes through."""
+_AHEAD_MM = np.array([[0.5], [1.0], [1.5], [2.0]])
+"""Where a walk that no longer moves on looks whether the vessel does."""
 _SMOOTH_MM = 1.0
 """Length along the vessel below which bends of the points found are taken for noise."""
 _FINE_MM = 0.05
@@ -189,8 +191,11 @@ def follow(
         while len(walked) < _MOST_STEPS:
             moved, turned, full = ball(at + _STEP_MM * along)
             turned = turned if turned @ along >= 0 else -turned
-            # At an end the ball's mass stays behind: it no longer moves on.
-            if full < 0.25 * mass or (moved - at) @ along < 0.25 * _STEP_MM:
+            # At an end the ball's mass stays behind: it no longer moves on. Noise holds it back too, where it is bright
+            # ahead.
+            ahead = at + _AHEAD_MM * along
+            there = ndimage.map_coordinates(excess, ((ahead - origin) / step).T, order=1)
+            if (full < 0.25 * mass or (moved - at) @ along < 0.25 * _STEP_MM) and not there.all():
                 ended = True
                 break
             on = moved - along * ((moved - at) @ along - _STEP_MM)

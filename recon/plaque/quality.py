@@ -31,8 +31,6 @@ _BODY_MM = (0.4, 1.2)
 """Gaussians whose difference finds a body of half a millimetre to some millimetres, such as a second vessel."""
 STRIKING = 6.5
 """Standard deviations of the noise; noise alone reached 4.8 in four volumes, sound readings reached 5.4."""
-
-
 _SHARE, _SEEN_HU = 0.25, 60.0
 """What is beside shows where a smooth estimate has this share of its height, and so much."""
 _APART_MM, _EDGE_MM = 0.2, 0.4

@@ -215,32 +215,31 @@ def read_plaque(
         TypeError: values of the wrong kind.
     """
     where = None if point is None else numbers("point", point, 3)
-    place = None if where is None else (where[0], where[1], where[2])
     point_sd = number("point_sd", point_sd, positive=True, unit="mm")
     particles, seed = whole("particles", particles, 50), whole("seed", seed, 0)
     prior = number("prior", prior, low=0.0, high=1.0)
     if not isinstance(vessel_prior, VesselPrior | None):
         raise TypeError(f"vessel_prior must be a recon.plaque.VesselPrior, got {type(vessel_prior).__name__}")
     rng = np.random.default_rng(seed)
-    start = find_vessel(data.pilot(), data.grid, None if where is None else np.array(where))
-    vessel = Vessel(data, start, vessel_prior)
-    fit = vessel.fit(vessel.first_guess(), expected=True)
+
+    def fitted(seen: TissueData) -> tuple[Vessel, Fit]:
+        start = find_vessel(seen.pilot(), seen.grid, None if where is None else np.array(where))
+        vessel = Vessel(seen, start, vessel_prior)
+        return vessel, vessel.fit(vessel.first_guess(), expected=True)
+
+    vessel, fit = fitted(data)
     taken = 0.0
     for _ in range(_ROUNDS):
         foreign = beside(data, vessel, fit)
         if foreign is None:
             break
         taken = float(foreign.abs().max())
-        cleared = replace(data, b=data.b - data.apply(foreign))
-        vessel = Vessel(
-            cleared, find_vessel(cleared.pilot(), data.grid, None if where is None else np.array(where)), vessel_prior
-        )
-        fit = vessel.fit(vessel.first_guess(), expected=True)
+        vessel, fit = fitted(replace(data, b=data.b - data.apply(foreign)))
     stands = leftover(vessel, fit)
     if stands.score <= STRIKING or not stands.beside:
         # Bodies in the vessel do not explain what lies beside it; they would only stand in for it.
         fit = _calcified(vessel, fit, particles, rng)
-    core = CorePrior(point=place, point_sd=point_sd)
+    core = CorePrior(point=None if where is None else (where[0], where[1], where[2]), point_sd=point_sd)
     reading = _read(vessel, fit, core, particles, prior, rng, seed)
     if not taken:
         return reading
@@ -357,8 +356,7 @@ def _read(
         given, _regions(vessel, fit, space, shares, calcifications), fit.image, square, spread, left, tau.sd_hu,
         tau.high_hu,
         {"particles": particles, "seed": seed, "log_evidence": cloud.log_evidence, "log_evidence_first": first,
-         "point": prior_of_core.point, "vessel_prior": asdict(vessel.prior),
-         "voxels": len(vessel.index),
+         "point": prior_of_core.point, "vessel_prior": asdict(vessel.prior), "voxels": len(vessel.index),
          "core_center_mm": cloud.points[:, :3].mean(0).tolist(), "prior": prior, "second_core": other_core},
         third_core=None if found is None else _core_told(*found, more),
     )  # fmt: skip

@@ -19,8 +19,11 @@ Floats = NDArray[np.float64]
 _BALLS_MM = (1.8, 0.9)
 """Larger than any lumen's radius; and for a narrow one, whose noise along it holds the walk of a large ball back."""
 _LEAST_STEP_HU = 120.0
-_LEAST_LUMEN_HU = 180.0
-"""Where the lumen reads less, its outline is that of the noise: fibrous tissue has up to 150 HU."""
+_LEAST_LUMEN_HU = 270.0
+"""Where the lumen stands out less, its outline is that of the noise: fibrous tissue is up to 240 HU above fat."""
+_LUMEN_AT, _WALL_AT = 0.69, 0.175
+"""Where between the surroundings and the lumen their outlines are first looked for: half-way between fat and wall,
+half-way between fibrous tissue and lumen, wherever the scanner's zero lies."""
 _LEAST_LENGTH_MM = 2.0
 _LEAST_SECTIONS = 4
 """A line needs so many points."""
@@ -65,12 +68,13 @@ def find_vessel(pilot: Floats, grid: VolumeGrid, point: Floats | None) -> Start:
         # The part of the lumen beside the point.
         voxels = origin + np.argwhere(lumen) * step
         middle = voxels[np.argsort(np.linalg.norm(voxels - point, axis=1))[:50]].mean(0)
-    if blood < _LEAST_LUMEN_HU:
+    if blood - fat < _LEAST_LUMEN_HU:
         raise ValueError(
-            f"the brightest tissue at {np.round(middle, 1).tolist()} mm (z, y, x) reads {blood:.0f} HU: the outline of "
-            f"a lumen is determined only with contrast agent (at least {_LEAST_LUMEN_HU:.0f} HU)"
+            f"the brightest tissue at {np.round(middle, 1).tolist()} mm (z, y, x) reads {blood:.0f} HU in surroundings "
+            f"of {fat:.0f} HU: the outline of a lumen is determined only with contrast agent (at least "
+            f"{_LEAST_LUMEN_HU:.0f} HU above fat)"
         )
-    half = 0.5 * (blood + 100.0)
+    half = fat + _LUMEN_AT * (blood - fat)
     try:
         line, ends = follow(pilot, grid, half, middle, _BALLS_MM[0])
     except ValueError:
@@ -84,7 +88,7 @@ def find_vessel(pilot: Floats, grid: VolumeGrid, point: Floats | None) -> Start:
     lumen_line = Centreline(smooth_line(centres))
     shift = lumen_line.coordinates(line.point(np.array([0.0])))
     ends = ends + float(shift.s[0])
-    wall = 0.5 * (fat + 80.0)
+    wall = fat + _WALL_AT * (blood - fat)
     outside, _ = ndimage.label(pilot > wall)
     vessel = outside == outside[at]
     low, high = max(ends[0], -0.5), min(ends[1], lumen_line.length + 0.5)

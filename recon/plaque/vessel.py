@@ -62,7 +62,8 @@ EXCESS = SOFT**2 + BOX
 """Variance of outline and operator together, in squared voxels."""
 _END_SD_MM = (1.0, 0.1, 0.1)
 _FAR = 15.0
-"""A step that gains more of the log posterior than this makes the curvature worth computing again."""
+"""A step that gains more of the log posterior than this, or less than half of what its linear model says, makes the
+curvature worth computing again."""
 _SHORTER = 3
 """Lengths of a step that are tried: the noise of single voxels bends the energy more than its linear model says."""
 _DAMPING = 0.03
@@ -427,8 +428,8 @@ class Vessel:
         bodies: Floats | None = None,
         *,
         expected: bool = False,
-        steps: int = 12,
-        tolerance: float = 0.3,
+        steps: int = 20,
+        tolerance: float = 0.03,
     ) -> Fit:
         """Gauss and Newton's steps, shortened or damped where they lead up, from given parameters to the mode.
 
@@ -439,7 +440,8 @@ class Vessel:
                 that the model does not have yet would otherwise pull the fibrous value to its own, and make wall of
                 the fibrous tissue.
             steps: largest number of them.
-            tolerance: stop when a step gains less than this of the log posterior.
+            tolerance: stop where the next step would gain less than this of the log posterior by its linear model: a
+                shortened step may gain as little far from the mode.
         """
         bodies = np.zeros((0, len(self.index))) if bodies is None else bodies
         precision = self._prior_with(len(bodies), expected)
@@ -452,6 +454,8 @@ class Vessel:
             gradient = self._gradient(theta, drawing, curved_image, precision)
             step = cho_solve(cho_factor(hessian + damping * np.diag(np.diag(hessian)), lower=True), gradient)
             along, share = float(gradient @ step), 1.0
+            if 0.5 * along < tolerance:
+                break
             for _ in range(_SHORTER):
                 tried = theta + share * step
                 other = self.draw(tried, bodies)
@@ -466,9 +470,7 @@ class Vessel:
                 continue
             damping *= 0.1
             theta, drawing, energy, curved_image = tried, other, lower, curved_other
-            if gain < tolerance:
-                break
-            if gain > _FAR:
+            if gain > _FAR or gain < 0.25 * along:
                 hessian = self.hessian(drawing, precision)
         gradient = self._gradient(theta, drawing, curved_image, precision)
         residual = self.b - theta[FAT] * self.ones - curved_image
