@@ -61,23 +61,13 @@ class Texture:
     """A Gaussian texture of the soft tissues.
 
     Attributes:
-        variance_hu2: posterior mean of its variance; high_hu2: its 95 % limit.
+        sd_hu: √ of the posterior mean of its variance; high_hu: 95 % limit of its standard deviation.
         responses: figure → standard deviation of its estimate by a texture of 1 HU.
     """
 
-    variance_hu2: float
-    high_hu2: float
+    sd_hu: float
+    high_hu: float
     responses: dict[str, float]
-
-    @property
-    def sd_hu(self) -> float:
-        """√ of the posterior mean of the variance."""
-        return math.sqrt(self.variance_hu2)
-
-    @property
-    def high_hu(self) -> float:
-        """95 % limit of the standard deviation."""
-        return math.sqrt(self.high_hu2)
 
     def sd_of(self, name: str) -> float:
         """What the texture adds to the uncertainty of a tissue's value (or of ``"contrast"``), HU."""
@@ -223,7 +213,7 @@ def texture(vessel: Vessel, fit: Fit, rng: np.random.Generator) -> Texture:
         # An estimate is wᵀb with w = J C v; an image t adds (G w)ᵀ t.
         response = fit.curved @ (fit.covariance @ v).astype(np.float32)
         responses[name] = float(np.linalg.norm(smooth((soft * response)[:, None])))
-    return Texture(max(float(mean), 0.0), max(float(top), 0.0), responses)
+    return Texture(math.sqrt(max(float(mean), 0.0)), math.sqrt(max(float(top), 0.0)), responses)
 
 
 def _correlating(vessel: Vessel, length_mm: float) -> Callable[[NDArray[Any]], NDArray[Any]]:

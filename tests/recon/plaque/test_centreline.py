@@ -1,5 +1,6 @@
 """Lines through vessels: coordinates about an arc, and the walk along tubes of any direction."""
 
+import drawn_vessel
 import numpy as np
 import pytest
 
@@ -71,3 +72,24 @@ def test_a_narrow_lumen_is_followed_though_it_is_brighter_in_its_middle():
     assert start.lumen.length > 6.0
     assert not np.isfinite(start.ends).any()
     assert np.abs(start.lumen.points[:, 1:] - np.array(GRID.center)[1:]).max() < 0.1
+
+
+def test_what_holds_a_walk_back_is_no_end():
+    """A bright place held the walk back 1 mm beside it: the vessel was taken to leave the volume there, and narrowed to
+    nothing where it did not."""
+    z, y, x = np.meshgrid(*(a - c for a, c in zip(GRID.axes, GRID.center, strict=True)), indexing="ij", sparse=True)
+    rho = np.hypot(y, x)
+    lumen = 300.0 / (1.0 + np.exp((rho - 0.7) / 0.1)) * (1.0 + 8.0 * np.exp(-(((z + 1.5) / 0.4) ** 2)))
+    pilot = np.where(np.abs(z) < 4.0, -90.0 + 150.0 / (1.0 + np.exp((rho - 1.2) / 0.1)) + lumen, -90.0)
+    line, ends = follow(pilot, GRID, 230.0, np.array(GRID.center) - (1.5, 0.0, 0.0), 1.8)
+    reached = np.sort(line.point(ends)[:, 0]) - GRID.center[0]
+    assert np.allclose(reached, (-4.0, 4.0), atol=0.3)
+
+
+def test_a_vessel_is_found_wherever_the_zero_lies(gram):
+    pilot = drawn_vessel.data(gram, drawn_vessel.image(gram.finer, 0.0, samples=2)).pilot()
+    still, moved = (find_vessel(pilot + zero, gram.grid, None) for zero in (0.0, -150.0))
+    assert np.allclose(moved.lumen.points, still.lumen.points, atol=1e-6)
+    assert np.allclose(moved.outer.points, still.outer.points, atol=1e-6)
+    assert np.allclose(moved.radii, still.radii, atol=1e-6)
+    assert np.allclose(moved.values, np.array(still.values) - 150.0)
