@@ -39,7 +39,7 @@ from recon.plaque.vessel_prior import VesselPrior
 __all__ = ["Drawn", "OutlineMbir"]
 
 _SHIFT_HU = 200.0
-"""Where the zero lies does not matter to an image: 150 HU added to everything change it by 2 HU rms instead of 9."""
+"""Where the zero lies does not matter to an image: 150 HU added to everything change it by 1 HU rms instead of 9."""
 
 
 @dataclass(frozen=True, eq=False)
