@@ -18,6 +18,9 @@ from train.config import TrainConfig
 from train.data import Data, seed_of
 from train.objective import Objective
 
+if distributed.is_available():
+    import torch.distributed.nn  # now: it keeps the group that exists at its import, whose threads then abort the exit
+
 __all__ = ["Group", "gradient"]
 
 
