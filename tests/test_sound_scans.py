@@ -1,0 +1,51 @@
+"""Sound scans are told nothing wrong: some that ``tests/bench/false_alarms.py`` draws; and how they are made."""
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+from analytic import Ellipsoid, line_integrals
+from sound_scans import BALL, BOX, CYLINDER, Solid, draw, transmissions
+
+from torchpcct import ConeBeam, FanBeam, ParallelBeam
+
+_SPEC = importlib.util.spec_from_file_location("false_alarms", Path(__file__).parent / "bench/false_alarms.py")
+false_alarms = importlib.util.module_from_spec(_SPEC)
+_SPEC.loader.exec_module(false_alarms)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_sound_scans_raise_no_alarm(seed):
+    drawn = draw(seed, kind=("parallel", "fan")[seed % 2], readings=40_000)
+    assert false_alarms.alarms(drawn) == [], drawn.text
+
+
+@pytest.mark.parametrize(
+    "geometry",
+    [
+        ParallelBeam([0.3, 2.0], 24, 4.0, 1.0),
+        FanBeam([0.3, -2.0], 150.0, 260.0, 24, 8.0, 1.0),
+        ConeBeam([0.3, 2.0], 150.0, 260.0, 24, 5, (6.0, 8.0), (1.0, 2.0), "curved"),
+    ],
+)
+def test_transmissions_are_those_of_exact_chords(geometry):
+    cone = geometry.has_rows
+    place, radii = (2.0, 10.0, -15.0), (5.0, 20.0, 28.0)
+    bodies = [Ellipsoid(place if cone else place[1:], radii if cone else radii[1:], 0.4, 0.02)]
+    solids = [Solid(BALL if cone else CYLINDER, (-15.0, 10.0, 2.0), (28.0, 20.0, 5.0 if cone else 1e5), 0.02, 0.4)]
+    expected = np.exp(-line_integrals(geometry, bodies, sub=1))
+    np.testing.assert_allclose(transmissions(geometry, solids, subs=(1, 1, 1)), expected, rtol=1e-12)
+
+
+def test_chords_of_tilted_boxes_and_cylinders():
+    along = ParallelBeam([0.0], 1, 1.0)
+    box = [Solid(BOX, (3.0, 0.0, 0.0), (4.0, 2.0, 1.0), 0.1)]
+    rod = [Solid(CYLINDER, (3.0, 0.0, 0.0), (4.0, 4.0, 1.0), 0.1, 0.0, 0.3)]
+    upright = [Solid(CYLINDER, (0.0, 3.0, 0.0), (4.0, 4.0, 1.0), 0.1, 0.0, np.pi / 4)]
+    across = ParallelBeam([np.pi / 2], 1, 1.0)
+    one = {"subs": (1, 1, 1)}
+    assert -np.log(transmissions(along, box, **one)).item() == pytest.approx(0.8)
+    assert -np.log(transmissions(along, rod, **one)).item() == pytest.approx(0.8)
+    # Along y through a disc 2 mm thick that is tilted by 45° about x: 2 mm · √2.
+    assert -np.log(transmissions(across, upright, **one)).item() == pytest.approx(0.2 * np.sqrt(2.0))
