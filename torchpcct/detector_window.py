@@ -16,7 +16,12 @@ from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, Volume
 from torchpcct.validate import checked, whole
 from torchpcct.vector_geometry import VectorGeometry, check_motion
 
-__all__ = ["DetectorWindow", "footprint"]
+__all__ = ["NOISE_MARGIN_COLUMNS", "DetectorWindow", "footprint"]
+
+NOISE_MARGIN_COLUMNS = 128
+"""Columns kept on either side of a region's footprint. The ramp filter reaches further, but its tail falls as 1 / n²:
+noise beyond 128 columns adds less than 1 % to the spectrum of the filtered noise at the lowest frequency that a
+1 mm ROI can tell from zero."""
 
 
 @dataclass(frozen=True, eq=False)

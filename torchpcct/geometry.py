@@ -344,6 +344,29 @@ class VolumeGrid:
         set_(self, "spacing", per_axis("spacing", self.spacing, self.ndim, positive=True, unit="mm"))
         set_(self, "center", per_axis("center", self.center, self.ndim, unit="mm"))
 
+    @classmethod
+    @checked
+    def of(cls, scan: Any, *, voxel: float | None = None, extent: Any = None, center: Any = None) -> VolumeGrid:
+        """The grid of what a scan sees.
+
+        A scan that was acquired for a region (:func:`torchpcct.acquire`) gives that region. Of an earlier file, which
+        does not say for which, and of a part of a scan (:meth:`torchpcct.Scan.crop`): a box that all views see. Of a
+        whole detector: the square about the field of view, of a cone beam as high as all views see it.
+
+        Args:
+            scan: a :class:`torchpcct.Scan`, or the :class:`recon.analytic.slabs.ScanSlices` of a file.
+            voxel: edge length in mm; None: of the region's voxels, or, of a whole detector and of a region given as
+                one voxel, of a detector cell as it is seen at the axis.
+            extent: edge lengths in mm: z, y, x of a scan with rows, y, x of slices, which are those of the readings.
+                None: all that is seen.
+            center: in mm, z, y, x, or y, x of slices. None: of what is seen.
+
+        Raises:
+            ValueError: values out of range, another number of axes, a part of a detector that sees no box in all views.
+        """
+        found: VolumeGrid = scan.seen_grid(voxel, extent, center)
+        return found
+
     @property
     def axes(self) -> tuple[Floats, ...]:
         """Voxel centres per axis in mm, in the order of ``shape``."""

@@ -15,9 +15,10 @@ from torch import Tensor
 from torchpcct import counting_noise as noise
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.files import read_hdf5
-from torchpcct.geometry import ConeBeam, Geometry
+from torchpcct.geometry import ConeBeam, Geometry, VolumeGrid
 from torchpcct.readings import MANY, bridge, counted, inverse_variance, log_bias, logged, smoothed
 from torchpcct.scan_file import scan_fields, write_scan
+from torchpcct.scan_grid import grid_of
 from torchpcct.scanner.linearisation import WaterLinearisation
 from torchpcct.validate import UNITS, checked, choice, number, whole
 
@@ -84,6 +85,7 @@ class Scan:
     dead: Tensor | None = None
     logged: bool = False
     unit: str = "HU"
+    region: VolumeGrid | None = None
 
     def __post_init__(self) -> None:
         _check(self)
@@ -262,7 +264,7 @@ class Scan:
         )
 
     def crop(self, window: DetectorWindow) -> Scan:
-        """The same scan on a part of its window; its noise is that of the whole.
+        """The same scan on a part of its window; its noise is that of the whole. A smaller one has no region.
 
         Raises:
             ValueError: the scan is not windowed, or ``window`` reaches beyond its window.
@@ -270,12 +272,17 @@ class Scan:
         if self.window is None:
             raise ValueError("only a windowed scan can be cropped: acquire it with region=")
         outer = self.window
-        return replace(self, window=window, **self.each(lambda readings: outer.crop(readings, window)))
+        region = self.region if window == outer else None
+        return replace(self, window=window, region=region, **self.each(lambda readings: outer.crop(readings, window)))
 
     def each(self, change: Callable[[Tensor], Tensor]) -> dict[str, Any]:
         """What has a value for each reading (``counts``, ``quantum``, ``dead``), changed alike; None stays."""
         held = {name: getattr(self, name) for name in ("counts", "quantum", "dead")}
         return {name: None if values is None else change(values) for name, values in held.items()}
+
+    def seen_grid(self, voxel: float | None = None, extent: Any = None, center: Any = None) -> VolumeGrid:
+        """What :meth:`torchpcct.VolumeGrid.of` gives."""
+        return grid_of(self, voxel, extent, center)
 
     def select(self, views: Any) -> Scan:
         """The same scan with a subset (or reordering) of the views: an index array, mask or slice."""
@@ -458,6 +465,8 @@ def _check(scan: Scan) -> None:
         raise ValueError(f"air has shape {tuple(scan.air.shape)}, expected {expected_air}")
     if (w is None) != (scan.surround is None):
         raise ValueError("a windowed scan needs the readings of its surround, a full scan has none")
+    if scan.region is not None and (w is None or scan.region.ndim != 3):
+        raise ValueError("region must be the (z, y, x) grid that a windowed scan was kept for; a full scan has none")
     if w is not None:
         w.check(g)
     if scan.linearisation.scale.size != g.columns:
@@ -494,6 +503,8 @@ def _check_kinds(scan: Scan) -> None:
             raise TypeError(f"{name} must be a {kind.__name__}, got {type(getattr(scan, name)).__name__}")
     if scan.window is not None and not isinstance(scan.window, DetectorWindow):
         raise TypeError(f"window must be a DetectorWindow or None, got {type(scan.window).__name__}")
+    if scan.region is not None and not isinstance(scan.region, VolumeGrid):
+        raise TypeError(f"region must be a VolumeGrid or None, got {type(scan.region).__name__}")
     for name in ("counts", "air", "surround", "quantum"):
         values = getattr(scan, name)
         if values is None and name in ("surround", "quantum"):

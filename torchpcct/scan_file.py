@@ -10,18 +10,23 @@ import torch
 
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.files import VERSION, write_hdf5
-from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam
+from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
 from torchpcct.scanner.linearisation import WaterLinearisation
 from torchpcct.vector_geometry import VectorGeometry
 
-__all__ = ["read_geometry", "scan_fields", "slice_axis", "sliced", "write_geometry", "write_scan"]
+__all__ = ["NoSlicesError", "read_geometry", "scan_fields", "slice_axis", "sliced", "write_geometry", "write_scan"]
 
 _VERSION = 5
 """2: energy-integrating scans with their noise model. 3: with a checksum (:func:`torchpcct.files.write_hdf5`). 4:
-parallel and fan beams, flux, dead readings, units. 5: geometries given view by view."""
+parallel and fan beams, flux, dead readings, units. 5: geometries given view by view; the region of a window, which
+earlier files lack and earlier readers leave aside."""
 # Compress in blocks of one view: fast to write, and a window of views, or of rows, can be read without the rest.
 _CHUNK_ROWS = 64
 _HDF5_COMPRESSION = {"compression": "lzf", "shuffle": True}
+
+
+class NoSlicesError(ValueError):
+    """A scan that has to be read as a whole was asked for some of its slices."""
 
 
 def write_scan(scan: Any, path: str | os.PathLike[str]) -> None:
@@ -57,6 +62,9 @@ def write_scan(scan: Any, path: str | os.PathLike[str]) -> None:
             window["first_column"] = scan.window.first_column
             window["surround"] = scan.surround.numpy()
             window.attrs.update(columns=scan.window.columns, first_row=scan.window.first_row, rows=scan.window.rows)
+            if scan.region is not None:
+                r = scan.region
+                window.attrs.update(region_shape=r.shape, region_spacing_mm=r.spacing, region_center_mm=r.center)
         # Written last: a file without it was cut off.
         file.attrs["complete"] = True
 
@@ -74,20 +82,28 @@ def scan_fields(file: Any, path: str | os.PathLike[str], slices: slice | None = 
         )
     if not file.attrs.get("complete", False):
         raise ValueError(f"{path} was not written to its end: simulate it again")
-    window = surround = None
+    window = surround = region = None
     if "window" in file:
         w = file["window"]
         window = DetectorWindow(
             w["first_column"][()], int(w.attrs["columns"]), int(w.attrs["first_row"]), int(w.attrs["rows"])
         )
         surround = torch.from_numpy(w["surround"][()])
+        if "region_shape" in w.attrs:
+            shape, spacing, center = (
+                w.attrs[f"region_{name}"].tolist() for name in ("shape", "spacing_mm", "center_mm")
+            )
+            region = VolumeGrid(shape, spacing, center)
 
     geometry, info = read_geometry(file["geometry"]), json.loads(file.attrs["info"])
     axis = 0
     if slices is not None:
         shape = tuple(file["counts"].shape)
-        axis = slice_axis(geometry, shape, window)
-        geometry, info["slices"] = sliced(geometry, slices, shape[axis])
+        try:
+            axis = slice_axis(geometry, shape, window)
+            geometry, info["slices"] = sliced(geometry, slices, shape[axis])
+        except ValueError as error:
+            raise type(error)(f"{path}: {error}") from error  # what was asked for is wrong, not the file
         slices = slice(*info["slices"][:2])
 
     def given(name: str, axis: int = axis) -> Any:
@@ -112,6 +128,7 @@ def scan_fields(file: Any, path: str | os.PathLike[str], slices: slice | None = 
         "dead": given("dead"),
         "logged": bool(file.attrs.get("logged", False)),
         "unit": str(file.attrs.get("unit", "HU")),
+        "region": region,
     }
 
 
@@ -119,11 +136,11 @@ def slice_axis(geometry: Geometry, shape: tuple[int, ...], window: Any = None) -
     """Axis of the slices of a stack, or of the rows of a cone beam, in counts of a shape.
 
     Raises:
-        ValueError: there is none.
+        NoSlicesError: there is none.
     """
     if len(shape) != 3 or window is not None or (geometry.has_rows and not isinstance(geometry, ConeBeam)):
-        kind = "part of a detector" if window is not None else type(geometry).__name__
-        raise ValueError(
+        kind = "part of a detector (a region)" if window is not None else type(geometry).__name__
+        raise NoSlicesError(
             f"slices= picks slices of parallel and fan beams or rows of a cone beam, this is one {kind} of "
             f"{len(shape)} axes"
         )

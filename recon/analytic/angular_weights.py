@@ -9,26 +9,20 @@ from __future__ import annotations
 
 import logging
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from torchpcct.angles import OPEN_GAP_STEPS, SAME_VIEW, is_offset, view_steps
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
 from torchpcct.validate import checked
 
-__all__ = ["angular_weights", "check_gaps", "is_offset", "offset_share", "parker_share", "view_steps"]
+__all__ = ["angular_weights", "check_gaps", "offset_share", "parker_share"]
 
 _LOG = logging.getLogger(__name__)
 
 Floats = NDArray[np.float64]
 
-#: A gap between neighbouring views counts as the end of the scan when it exceeds this many median steps.
-OPEN_GAP_STEPS = 3.0
-#: Views closer than this share of the mean step are repetitions of one view (angles are stored with few digits).
-SAME_VIEW = 0.02
-#: A detector is an offset one if it reaches farther to one side by more than this share of its width.
-OFFSET_SHARE = 0.02
 #: A parallel-beam scan may lack this angle in rad before it is refused; below it the neighbours fill in.
 PARALLEL_GAP_RAD = math.radians(5.0)
 #: Views that lack inside of the covered arc: neighbours stand for them up to this angle in rad, with a warning.
@@ -38,58 +32,12 @@ WIDEST_STEP_RAD = math.radians(75.0)
 
 
 @checked
-def view_steps(
-    angles: Floats, period: float = 2.0 * math.pi, smallest_opening: float = 0.0
-) -> tuple[Floats, float, float]:
-    """Angle each view stands for, whatever the order, the spacing and the repetitions of the views.
-
-    Args:
-        angles: ``(views,)`` rad, any order, any number of turns.
-        period: angle after which the scan repeats: 2π, or π for parallel rays.
-        smallest_opening: gaps up to this angle in rad never end the scan; the views beside them fill in.
-
-    Returns:
-        ``steps`` ``(views,)`` rad: half the gap to the neighbours on either side, shared among views at the same angle;
-        ``start`` and ``span`` of the covered arc in rad. A gap of more than three median steps ends the scan: the views
-        beside it then stand for as much on the open side as on the other, and ``span < period``. Without such a gap the
-        scan is closed, ``span == period`` and the steps add up to it.
-    """
-    wrapped = np.mod(angles, period)
-    order = np.argsort(wrapped, kind="stable")
-    ordered = wrapped[order]
-    same = SAME_VIEW * period / angles.size
-    group = np.concatenate([[0], np.cumsum(np.diff(ordered) > same)])
-    distinct = ordered[np.concatenate([[True], np.diff(group) > 0])]
-    if distinct.size > 1 and distinct[0] + period - distinct[-1] <= same:
-        group[group == group[-1]] = 0  # 0 and the period are the same view
-        distinct = distinct[:-1]
-    gaps = np.append(np.diff(distinct), distinct[0] + period - distinct[-1])  # gap after each distinct view
-    last = int(np.argmax(gaps))
-    start, span = float(distinct[0]), period
-    if distinct.size > 1 and gaps[last] > max(OPEN_GAP_STEPS * float(np.median(gaps)), smallest_opening):
-        before, after = gaps[last - 1], gaps[(last + 1) % distinct.size]
-        open_gap = gaps[last]
-        right, left = gaps.copy(), np.roll(gaps, 1)
-        first = (last + 1) % distinct.size
-        right[last], left[first] = min(before, open_gap), min(after, open_gap)
-        steps = (left + right) / 2.0
-        start = float(distinct[first] - left[first] / 2.0)
-        span = float(steps.sum())
-    else:
-        steps = (gaps + np.roll(gaps, 1)) / 2.0
-    share = steps / np.bincount(group, minlength=distinct.size)
-    out = np.empty_like(wrapped)
-    out[order] = share[group]
-    return out, start, span
-
-
-@checked
 def check_gaps(angles: Floats, period: float = 2.0 * math.pi) -> None:
     """Refuse views that are too few, or that lack inside of the arc they cover; log a warning where a few lack.
 
     Args:
         angles: ``(views,)`` rad, any order.
-        period: see :func:`view_steps`.
+        period: see :func:`torchpcct.angles.view_steps`.
 
     Raises:
         ValueError: fewer than two distinct views, steps wider than 75°, or an inner gap of more than 5° and three
@@ -146,17 +94,6 @@ def parker_share(beta: Floats, gamma: Floats, half_fan: float) -> Floats:
 
 
 @checked
-def is_offset(geometry: Any) -> bool:
-    """Whether the detector reaches farther to one side by more than ``OFFSET_SHARE`` of its width and two columns.
-
-    Quarter-column offsets are not meant: there nearly every line is measured twice.
-    """
-    u = geometry.column_positions
-    width = u[-1] - u[0]
-    return bool(abs(u[0] + u[-1]) > max(OFFSET_SHARE * width, 2.0 * width / max(u.size - 1, 1)) * (1.0 + 1e-9))
-
-
-@checked
 def offset_share(position: Floats) -> Floats:
     """Share of a reading in a full turn of an offset detector (Wang, Med. Phys. 29, 1634, 2002).
 
@@ -196,7 +133,7 @@ def angular_weights(geometry: Geometry, grid: VolumeGrid | None = None) -> Float
     Returns:
         ``(views, columns)``, or ``(views, 1)`` where all columns share one weight; float64, rad.
         Parallel: the steps over π. Divergent: half the steps over a closed circle, Parker's smooth weights over an arc.
-        A full turn of an offset detector (:func:`is_offset`): the steps times :func:`offset_share`.
+        A full turn of an offset detector (:func:`torchpcct.angles.is_offset`): the steps times :func:`offset_share`.
 
     Raises:
         ValueError: the views cover less than π (parallel) or π plus the fan angle (divergent), or less than a full

@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from recon.analytic.angular_weights import SAME_VIEW, angular_weights, is_offset
+from recon.analytic.angular_weights import angular_weights
 from recon.analytic.any_orbit import rebin_to_circle
 from recon.analytic.detector_edges import cut_off
+from torchpcct.angles import SAME_VIEW, is_offset
 from torchpcct.checks.defects import BRIGHT, GAIN_ERROR
 from torchpcct.detector_window import footprint
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid, view_step

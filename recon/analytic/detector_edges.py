@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.analytic.angular_weights import is_offset
+from torchpcct.angles import is_offset
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid
 from torchpcct.readings import MEDIAN_TO_SD
 from torchpcct.validate import checked

@@ -14,12 +14,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from recon.analytic.angular_weights import angular_weights, view_steps
+from recon.analytic.angular_weights import angular_weights
 from recon.analytic.any_orbit import at_slices, rebin_to_circle
 from recon.analytic.backproject import backproject, check_data, data_shape
 from recon.analytic.coverage import check_rows, refuse_helix
 from recon.analytic.detector_edges import Rows, continued, cut_off, mirrored
 from recon.analytic.filter_plan import FilterPlan, kernel_names
+from torchpcct.angles import view_steps
 from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid, view_step
 from torchpcct.projector.operator import apply_linear

@@ -58,6 +58,8 @@ from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, Volume
 from torchpcct.projector import Projector
 from torchpcct.readings import MOST_DEAD
 from torchpcct.scan import Scan
+from torchpcct.scan_file import NoSlicesError
+from torchpcct.scan_grid import grid_of
 from torchpcct.validate import checked, choice
 from torchpcct.volume import from_hu, to_hu
 
@@ -129,7 +131,10 @@ class ScanSlices:
         self.source, self.options = scan, options
         self.cells: Cells | None = None
         self.photon: float | None = None
-        self.first = self._open(0, 4)
+        try:
+            self.first = self._open(0, 4)
+        except NoSlicesError as error:
+            raise ValueError(f"{scan} can only be read as a whole: leave out memory= ({error})") from error
         # What the readers estimate from the readings must not differ from slab to slab.
         info = self.first.info
         if "gain" in takes and "signal_of_one_photon" in info:
@@ -154,6 +159,10 @@ class ScanSlices:
         if isinstance(self.source, Scan):
             return adapted(self.source, slices=part, **self.options)
         return open_scan(self.source, slices=part, **self.options)
+
+    def seen_grid(self, voxel: float | None = None, extent: Any = None, center: Any = None) -> VolumeGrid:
+        """What :meth:`torchpcct.VolumeGrid.of` gives."""
+        return grid_of(self, voxel, extent, center)
 
     def read(self, first: int, stop: int) -> Part:
         """The slices ``first`` … ``stop - 1``, impossible readings replaced."""

@@ -182,24 +182,44 @@ def command(
     return parser
 
 
+_ENDS = r"(?=[,;:.)]*(?:\s|$))"
+"""After a word of a sentence: a name that goes on is a part of a path or of a value."""
+
+
+def _in_brackets(deep: int) -> str:
+    """Pattern of what stands between a pair of brackets, with pairs in it so many levels deep."""
+    return r"[^()]*" if deep == 0 else rf"(?:[^()]|\({_in_brackets(deep - 1)}\))*"
+
+
+_VALUES = re.compile(
+    rf"[A-Za-z_][\w.]*\({_in_brackets(4)}\)"  # VolumeGrid(shape=(8, 8), center=(0.0, 0.0)): what an object prints
+    r"""|(?<![\w=])'[^']*'(?!\w)|(?<![\w=])"[^"]*"(?!\w)"""  # what the user gave
+)
+
+
 def as_options(text: str, actions: Sequence[argparse.Action]) -> str:
     """A message of the library with the command's options in place of its arguments: ``--pitch MM`` for ``pitch=``.
+
+    Values that the message shows stay as they are: quoted ones, printed objects, paths.
 
     Args:
         text: arguments stand in it as ``name=`` or ``name=value``, or before "must" or "needs" at its start.
         actions: of the command's parser.
     """
+    shown = _VALUES.findall(text)
+    text = _VALUES.sub("\0", text)
     for action in actions:
         flag = next((o for o in action.option_strings if o.startswith("--")), "")
         if not flag:
             continue
         kind = action.metavar or (None if action.nargs == 0 else action.dest.upper())
         value = " ".join(kind) if isinstance(kind, tuple) else kind
-        text = re.sub(rf"(?<![\w.-]){action.dest}=True\b", flag, text)
-        text = re.sub(rf"(?<![\w.-]){action.dest}=[\"']?([\w.-]*\w)[\"']?", rf"{flag} \1", text)
-        text = re.sub(rf"(?<![\w.-]){action.dest}=", f"{flag} {value}" if value else flag, text)
+        name = rf"(?<![^\s(]){action.dest}"
+        text = re.sub(rf"{name}=True{_ENDS}", flag, text)
+        text = re.sub(rf"{name}=([\"']?)([+-]?[\w-]+(?:\.\d+)?)\1{_ENDS}", rf"{flag} \2", text)
+        text = re.sub(rf"{name}={_ENDS}", f"{flag} {value}" if value else flag, text)
         text = re.sub(rf"(^|: ){action.dest}(?=(\[\d\])? (must|needs)\b)", rf"\g<1>{flag}", text)
-    return text
+    return re.sub("\0", lambda _: shown.pop(0), text)
 
 
 class _ShownOnce(logging.Handler):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -32,16 +31,18 @@ def _plaque(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     from recon.plaque.report import save, table
     from recon.plaque.start import require_within
     from recon.plaque.vessel_prior import VesselPrior
-    from recon.study.paper.plaque_scan import INSET_MM
     from torchpcct.scan import Scan
-    from torchpcct.scene.plaque import PAPER_POSITION
 
     believed = VesselPrior(tuple(arguments.wall or VesselPrior.wall), tuple(arguments.fibrous or VesselPrior.fibrous))
-    shape = tuple(math.ceil(e / arguments.voxel - 1e-6) for e in arguments.extent or INSET_MM)
-    grid = VolumeGrid(shape, arguments.voxel, tuple(arguments.center or PAPER_POSITION[::-1]))
+    scan = Scan.load(arguments.scan)
+    if scan.window is None and (arguments.center is None or arguments.extent is None):
+        raise ValueError(
+            f"{arguments.scan} holds the whole detector, and a vessel is read in a small inset: --center Z Y X and "
+            "--extent Z Y X say which"
+        )
+    grid = VolumeGrid.of(scan, voxel=arguments.voxel, extent=arguments.extent, center=arguments.center)
     if arguments.point is not None:
         require_within(arguments.point, grid)
-    scan = Scan.load(arguments.scan)
     start = time.perf_counter()
     problem = InsetProblem(scan, grid)
     data = TissueData.of_scan(scan, problem)
@@ -85,6 +86,6 @@ def add_plaque(commands: Commands) -> None:
         ("--fibrous", float, ("HU", "SD"), believed, {"nargs": 2}),
         ("--beside", str, None, "read these images, too", {"nargs": "*", "default": [], "choices": ("pwls", "mbir")}),
         ("--voxel", float, "MM", "voxel size (default 0.2)", {"default": 0.2, "limits": length}),
-        ("--center", float, axes, "centre in mm (default: the plaque)", place),
-        ("--extent", float, axes, "edge lengths in mm (default: the inset)", {"nargs": 3, "limits": length}),
+        ("--center", float, axes, "centre in mm (default: of the region that was scanned)", place),
+        ("--extent", float, axes, "edge lengths in mm (default: the region)", {"nargs": 3, "limits": length}),
     )

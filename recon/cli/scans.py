@@ -63,7 +63,7 @@ def _paper(arguments: argparse.Namespace) -> SimulationConfig:
 
     scene, plaque = plaque_scene()
     views = _PAPER_VIEWS if arguments.views is None else arguments.views
-    region = None if arguments.whole else inset_grid(plaque, 0.1)
+    region = None if arguments.whole else inset_grid(plaque, 0.25)
     kept = None if region is None else {
         "shape": list(region.shape), "spacing": list(region.spacing), "center": list(region.center)
     }  # fmt: skip
@@ -218,75 +218,8 @@ def _reader_options(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def grid_of_scan(scan: Any, arguments: argparse.Namespace) -> VolumeGrid:
-    """The grid that was asked for; else the plaque's inset for a windowed scan, the field of view for any other.
-
-    Args:
-        scan: a scan, or the :class:`recon.analytic.slabs.ScanSlices` of one.
-    """
-    import numpy as np
-
-    from recon.analytic.angular_weights import is_offset, view_steps
-    from torchpcct.geometry import ConeBeam, ParallelBeam
-    from torchpcct.vector_geometry import VectorGeometry
-
-    voxel, lengths, place = arguments.voxel, *_of_axes(scan, arguments)
-    if scan.window is not None:
-        from recon.study.paper.plaque_scan import INSET_MM
-        from torchpcct.scene.plaque import PAPER_POSITION
-
-        voxel = voxel or 0.25
-        shape = tuple(math.ceil(e / voxel - 1e-6) for e in lengths or INSET_MM)
-        return VolumeGrid(shape, voxel, tuple(place or PAPER_POSITION[::-1]))
-    g: Any = scan.geometry
-    if isinstance(g, VectorGeometry):
-        distance, heights, _ = g.border_rays()
-        cell, radius = g.cell, float(distance.max())
-    elif isinstance(g, ParallelBeam):
-        u = g.column_positions
-        cell, radius = g.pitch, max(-u[0], u[-1])
-    else:
-        pitch = g.pitch[1] if isinstance(g, ConeBeam) else g.pitch
-        cell, radius = pitch / g.magnification, g.sod * math.sin(float(np.abs(g.fan_angles).max()))
-        if is_offset(g) and view_steps(g.angles)[2] < 2.0 * math.pi:
-            radius = g.fov_radius  # of a short scan the lines that the short side measures, too
-    voxel = voxel or cell
-    side = 2.0 * radius
-    extent, center = lengths or [0.0, side, side], place or [0.0, 0.0, 0.0]
-    plane = [max(1, math.ceil(e / voxel - 1e-6)) for e in extent[1:]]
-    if isinstance(g, VectorGeometry) and g.has_rows:
-        # What views above and below see together: a helix covers more than its rows.
-        low, high = float(heights.min()), float(heights.max())
-        orbit = math.inf if g.parallel else float(np.hypot(*g.poses[:, 0, :2].T).mean())
-        height = extent[0] or high - low - float(np.median(np.ptp(heights, axis=1))) * radius / orbit
-        center[0] = center[0] if place else 0.5 * (low + high)
-        return VolumeGrid((max(1, math.floor(height / voxel)), *plane), voxel, tuple(center))
-    if isinstance(g, ConeBeam):
-        height = extent[0] or g.rows * g.pitch[0] / g.magnification * (1.0 - radius / g.sod)
-        return VolumeGrid((max(1, math.floor(height / voxel)), *plane), voxel, tuple(center))
-    slices = tuple(scan.counts.shape[:-2])
-    return VolumeGrid((*slices, *plane), voxel, tuple(center[3 - len(slices) - 2 :]))
-
-
-def _of_axes(scan: Any, arguments: argparse.Namespace) -> tuple[list[float] | None, list[float] | None]:
-    """``--extent`` and ``--center`` as z, y, x, where they are given.
-
-    Raises:
-        ValueError: two numbers of a volume; a height of slices that are those of the readings.
-    """
-    flat = not scan.geometry.has_rows
-    if arguments.extent is not None and (len(arguments.extent) == 2) != flat:
-        raise ValueError(
-            "--extent takes two numbers, Y X: this scan's slices are those of its readings"
-            if flat else "--extent takes three numbers, Z Y X, in this scan"
-        )  # fmt: skip
-    single = flat and scan.counts.ndim == 2
-    if arguments.center is not None and len(arguments.center) == (3 if single else 2) and (single or not flat):
-        raise ValueError(f"--center takes {'two numbers, Y X' if single else 'three numbers, Z Y X'}, in this scan")
-    return _three(arguments.extent), _three(arguments.center)
-
-
-def _three(given: list[float] | None) -> list[float] | None:
-    return given and [0.0] * (3 - len(given)) + given
+    """The grid that was asked for, see :meth:`torchpcct.VolumeGrid.of`."""
+    return VolumeGrid.of(scan, voxel=arguments.voxel, extent=arguments.extent, center=arguments.center)
 
 
 def _length(text: str) -> float:
@@ -417,7 +350,7 @@ def _reconstruct_scan(arguments: argparse.Namespace, progress: ProgressBars) -> 
     for name in ("extent", "center"):
         given = getattr(arguments, name)
         if given is not None and len(given) not in (2, 3):
-            raise ValueError(f"--{name} takes three numbers, Z Y X, of slices two, Y X; got {len(given)}")
+            raise ValueError(f"--{name} must be three numbers, Z Y X, of slices two, Y X; got {len(given)}")
     if arguments.voxel is not None and not slabs:
         _require_voxels(tuple(math.ceil(e / arguments.voxel) for e in arguments.extent or (1.0, 1.0, 1.0)))
     if not arguments.scan.exists():
@@ -569,8 +502,8 @@ def add_reconstruct(commands: Commands) -> None:
     )
     add_options(
         parser,
-        ("--voxel", float, "MM", "voxel size (default: the detector's; inset: 0.25)", {"limits": _LENGTH}),
-        ("--center", _length, "MM", f"centre, Z Y X (default: axis or plaque); {own}",
+        ("--voxel", float, "MM", "voxel size (default: the region's or the detector's)", {"limits": _LENGTH}),
+        ("--center", _length, "MM", f"centre, Z Y X (default: region or axis); {own}",
          {"nargs": "+", "limits": {"unit": "mm"}}),
         ("--extent", _length, "MM", f"edge lengths, Z Y X (default: what is seen); {own}",
          {"nargs": "+", "limits": _LENGTH}),

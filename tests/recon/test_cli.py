@@ -13,11 +13,12 @@ import torch
 import yaml
 from analytic import Ellipsoid, line_integrals
 from foreign_files import data_exchange
+from small_scan import GRID
 
 from recon.cli import main
 from recon.cli.parsing import as_options, saying
 from recon.study.results import README_MARKS
-from torchpcct import ParallelBeam, Scan, Volume, VolumeGrid, __version__
+from torchpcct import ConeBeam, ParallelBeam, Scan, Volume, VolumeGrid, __version__, full_turn
 from torchpcct.acquisition.config import read_config
 from torchpcct.formats.geometry_yaml import geometry_of
 from torchpcct.formats.stack import _COUNTS, _LINES
@@ -284,3 +285,46 @@ def test_a_warning_is_said_once_and_in_the_words_of_the_command(capsys):
     assert capsys.readouterr().err == "warning: too few: give --pitch MM\n"
     assert as_options("pitch=0.5 or pitch='x'; pitch must be 1", actions) == "--pitch 0.5 or --pitch x; pitch must be 1"
     assert as_options("pitch must be 1", actions) == "--pitch must be 1"
+    assert as_options("a: pitch[1] needs 1 (pitch=)", actions) == "a: --pitch[1] needs 1 (--pitch MM)"
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        "VolumeGrid(shape=(8, 8), spacing=(1.0, 1.0), pitch=(0.0, 0.0))",
+        "Scan(1 view\n  ConeBeam(pitch=(0.5, 0.35), offset=np.array((1, (2,))), pitch=1.0))",
+        "'pitch=1'",
+        '"pitch=1 and pitch= must be"',
+        "/data/pitch=0.5/scan.h5",
+        "pitch=0.5/scan.h5",
+        "pitch=0.5.h5",
+        "pitch=(1, 2)",
+        "pitch=[1, 2]",
+        "x-pitch=3",
+    ],
+)
+def test_a_value_in_a_message_stays_as_it_is(value):
+    actions = [argparse.ArgumentParser().add_argument("--pitch", metavar="MM")]
+    assert (
+        as_options(f"{value} does not fit the scan's pitch=", actions) == f"{value} does not fit the scan's --pitch MM"
+    )
+
+
+def test_a_scan_of_a_region_is_reconstructed_there(here, cli, clean):
+    """The user's own, wherever it lies: the paper's plaque was the default once."""
+    clean.with_noise(1.0, 0).save("mine.h5")
+    cli("reconstruct mine.h5 --out mine.nii.gz")
+    assert Volume.load("mine.nii.gz").grid.shape == GRID.shape
+    np.testing.assert_allclose(Volume.load("mine.nii.gz").grid.center, GRID.center, atol=1e-4)
+    elsewhere = yaml.safe_load(cli("reconstruct mine.h5 --voxel 0.8 --extent 1.6 3.2 4 --dry-run").rpartition("\n")[0])
+    assert elsewhere["grid"] == {"shape": [2, 4, 5], "spacing": [0.8] * 3, "center": list(GRID.center)}
+    said = cli("reconstruct mine.h5 --memory 2GB --out mine.nii", 2)
+    assert "mine.h5 can only be read as a whole: leave out --memory SIZE" in said
+    assert "damaged" not in said
+    assert "--slices A:B" in cli("reconstruct mine.h5 --slices 1:2 --out other.nii", 2)
+
+
+def test_a_vessel_is_read_where_the_scan_was_taken_or_said(here, cli):
+    cone = ConeBeam(full_turn(8), 60.0, 100.0, 6, 4, 1.0)
+    Scan.from_counts(np.ones((8, 4, 6), np.float32), cone, air=2.0).save("whole.h5")
+    assert "--center Z Y X and --extent Z Y X say which" in cli("plaque whole.h5 --out reading", 2)

@@ -229,8 +229,8 @@ def test_a_result_that_cannot_be_written_is_found_before_it_is_computed(here, li
         (f"{one} --out series", "a DICOM CT series holds HU, this volume is in mm^-1"),
         (f"{two} --out full", "is not empty: series in one folder mix"),
         (f"{two} --out slice.dcm", "a DICOM series is a folder"),
-        (f"{one} --extent 2 4 4 --out a.h5", "--extent takes two numbers, Y X"),
-        (f"{one} --center 2 4 4 --out a.h5", "--center takes two numbers, Y X"),
+        (f"{one} --extent 2 4 4 --out a.h5", "--extent must be two numbers, Y X: this scan"),
+        (f"{one} --center 2 4 4 --out a.h5", "--center must be two numbers, Y X; got 3"),
         (f"{one} --extent 4 --out a.h5", "of slices two, Y X; got 1"),
         (f"{two} --voxel 0.01 --extent 3 3 --out a.h5", "a.h5 needs 0.00 GiB, 0.00 GiB are free"),
     ):

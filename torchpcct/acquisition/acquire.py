@@ -120,6 +120,7 @@ def acquire(
     }
     kept = None if plan_.kept is None else surround
     scan = detected(scanner, counts, air, energies, info, kept, plan_.kept)
+    scan = scan if plan_.kept is None else replace(scan, region=region)
     return scan if exposure_s is None else scan.with_noise(exposure_s, seed)
 
 

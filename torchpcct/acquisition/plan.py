@@ -18,17 +18,12 @@ import numpy as np
 
 from torchpcct.acquisition.bodies import Bodies
 from torchpcct.acquisition.transmission import SUB_RAY_COUNTS, Beam, expected_readings, sub_rays
-from torchpcct.detector_window import DetectorWindow, footprint
+from torchpcct.detector_window import NOISE_MARGIN_COLUMNS, DetectorWindow, footprint
 from torchpcct.geometry import ConeBeam, VolumeGrid
 from torchpcct.scanner.scanner import Scanner
 from torchpcct.validate import number
 
-__all__ = ["NOISE_MARGIN_COLUMNS", "Effect", "Plan", "make_plan"]
-
-NOISE_MARGIN_COLUMNS = 128
-"""Columns kept on either side of a region's footprint. The ramp filter reaches further, but its tail falls as 1 / n²:
-noise beyond 128 columns adds less than 1 % to the spectrum of the filtered noise at the lowest frequency that a
-1 mm ROI can tell from zero."""
+__all__ = ["Effect", "Plan", "make_plan"]
 
 _PROBE_VIEWS, _PROBE_ROWS = 6, 3
 # Sub-rays of the runs that weigh the effects, and of the one that a smaller number of sub-rays must reproduce.

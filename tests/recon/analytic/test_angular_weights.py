@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recon.analytic.angular_weights import angular_weights, parker_share, view_steps
+from recon.analytic.angular_weights import angular_weights, parker_share
 from recon.analytic.coverage import view_notes
+from torchpcct.angles import view_steps
 from torchpcct.geometry import FanBeam, ParallelBeam, full_turn
 
 FAN = dict(sod=570.0, sdd=1040.0, columns=81, pitch=8.0)

@@ -8,9 +8,10 @@ import pytest
 import torch
 from analytic import Ellipsoid, Gaussian, line_integrals
 
-from recon.analytic.angular_weights import angular_weights, is_offset, offset_share
+from recon.analytic.angular_weights import angular_weights, offset_share
 from recon.analytic.detector_edges import Rows, continued, cut_off
 from recon.analytic.fbp import fbp
+from torchpcct.angles import is_offset
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
 
 MU = 0.02
