@@ -16,7 +16,7 @@ from recon.least_squares.pwls import PwlsOptions
 from recon.least_squares.reconstruct import reconstruct_pwls
 from recon.mbir.reconstruct import reconstruct_mbir
 from recon.metal import metal_warnings
-from recon.solution import Solution
+from recon.solution import Solution, tested
 from torchpcct.checks.defects import dead_readings, repair_defects
 from torchpcct.checks.readings import reading_warnings
 from torchpcct.geometry import VolumeGrid
@@ -170,10 +170,14 @@ def _finished(scan: Scan, grid: VolumeGrid, solution: Solution) -> tuple[Tensor,
     if tests:
         report.setdefault("chi2", sum(t.chi2 for t in tests) / len(tests))
         report["residual_p"] = {n: min(t.p_values.get(n, 1.0) for t in tests) for n in tests[0].p_values}
-    found = [*consistency_warnings(scan, grid), *solution.warnings, *(text for t in tests for text in t.findings)]
+    failed: list[str] = []
+    consistency = tested("the test of the scan against its description", failed, consistency_warnings, scan, grid)
+    found = [text for texts in consistency for text in texts]
+    found += [*solution.warnings, *(text for t in tests for text in t.findings)]
     # MBIR says itself what lies beyond its training.
     if report["method"] != "mbir" and scan.unit == "HU":
-        found += metal_warnings(values)
+        found += [text for texts in tested("the search for metal", failed, metal_warnings, values) for text in texts]
+    found += failed
     data = values if scan.unit == "HU" else from_hu(values, scan.linearisation.mu_ref)
     return data, report, list(dict.fromkeys(found))
 

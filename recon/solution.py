@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+import logging
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from torch import Tensor
 
 if TYPE_CHECKING:
     from torchpcct.metrics.residual_test import ResidualTest  # loads scipy.stats
 
-__all__ = ["Solution"]
+__all__ = ["RESIDUAL_TEST", "Solution", "tested"]
+
+_LOG = logging.getLogger(__name__)
+
+RESIDUAL_TEST = "the test of what the volume leaves of the readings"
+
+T = TypeVar("T")
 
 
 class Solution(NamedTuple):
@@ -27,3 +34,22 @@ class Solution(NamedTuple):
     report: dict[str, Any]
     warnings: Sequence[str] = ()
     tests: Sequence[ResidualTest] = ()
+
+
+def tested(name: str, said: list[str], test: Callable[..., T], *args: Any) -> list[T]:
+    """What a test of a finished volume finds. A test that fails must not lose the volume: it becomes a warning.
+
+    Args:
+        name: of the test, for the warning.
+        said: warnings of the volume's report; a failure is added.
+        test: called with ``args``.
+
+    Returns:
+        The test's result alone, or nothing if it failed.
+    """
+    try:
+        return [test(*args)]
+    except Exception as error:
+        _LOG.debug("%s failed", name, exc_info=True)
+        said.append(f"{name} failed ({type(error).__name__}: {error}), so the volume is not tested by it")
+        return []

@@ -19,9 +19,9 @@ from torch.nn import functional as F
 
 from recon.analytic.coverage import check_rows
 from recon.analytic.fbp import fbp
-from recon.least_squares.pwls import PwlsOptions, pwls
+from recon.least_squares.pwls import PwlsOptions, PwlsResult, pwls
 from recon.least_squares.qggmrf import DEFAULT_PRIOR, QGGMRF
-from recon.solution import Solution
+from recon.solution import RESIDUAL_TEST, Solution, tested
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid
 from torchpcct.projector import Projector
 from torchpcct.scan import Scan
@@ -173,14 +173,15 @@ class FieldProblem:
         hu = self.mu_ref / 1000.0
         for i, scan in enumerate(scans):
             slices = self.slices(scan)
-            results, tests = [], []
+            results: list[PwlsResult] = []
+            tests: list[ResidualTest] = []
+            found: list[str] = []
             for k, (y, w) in enumerate(slices):
                 results.append(pwls(self.projector, y, w, prior, mu_per_hu=hu, start=self.start(y), **options))
                 if not scan.noise_free:
-                    tests.append(self.residual_test(y, w, results[-1].x))
+                    tests += tested(RESIDUAL_TEST, found, self.residual_test, y, w, results[-1].x)
                 advance((i + (k + 1) / len(slices)) / len(scans))
             report = {**joined([dict(r.report) for r in results]), "work_grid": self.work.shape}
-            found = []
             if report["undetermined_rmsd_hu"] > UNDETERMINED_HU:
                 found.append(
                     f"{100 * report['undetermined']:.0f} % of the voxels are missed by some views (corners beyond the "

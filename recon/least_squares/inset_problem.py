@@ -19,7 +19,7 @@ from recon.least_squares.field_problem import is_whole_field
 from recon.least_squares.pwls import PwlsOptions, data_model, pwls
 from recon.least_squares.qggmrf import DEFAULT_PRIOR, QGGMRF
 from recon.least_squares.surround import UnknownSurround
-from recon.solution import Solution
+from recon.solution import RESIDUAL_TEST, Solution, tested
 from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import VolumeGrid
 from torchpcct.projector import Projector
@@ -242,5 +242,7 @@ class InsetProblem:
         data = [self.data(s) for s in scans]
         found, report = self.solve(scans, prior, data, **options)
         for scan, lines, values in zip(scans, data, found.to(torch.float32), strict=True):
-            yield Solution(values, report, (), [] if scan.noise_free else [self.residual_test(scan, values, lines)])
+            said: list[str] = []
+            tests = [] if scan.noise_free else tested(RESIDUAL_TEST, said, self.residual_test, scan, values, lines)
+            yield Solution(values, report, said, tests)
         advance(1.0)

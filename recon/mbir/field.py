@@ -26,7 +26,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -39,10 +39,13 @@ from recon.least_squares.qggmrf import QGGMRF
 from recon.mbir.mbir import Mbir, average_onto
 from recon.mbir.problem import NormalisedProblem
 from recon.mbir.unrolled import REFERENCE_SCALE_HU, Prior, low_residual
-from recon.solution import Solution
+from recon.solution import RESIDUAL_TEST, Solution, tested
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
 from torchpcct.volume import to_hu
+
+if TYPE_CHECKING:
+    from torchpcct.metrics.residual_test import ResidualTest  # loads scipy.stats
 
 __all__ = ["FieldGram", "blockwise", "field_solutions", "trained_grid"]
 
@@ -232,9 +235,10 @@ def field_solutions(
         slices = problem.slices(scan)
         require_memory(problem.projector, slices[0][0], None)
         found, report, warnings = _one(problem, slices, network)
-        tests = []
+        tests: list[ResidualTest] = []
         if not scan.noise_free:
-            tests = [problem.residual_test(y, w, x) for (y, w), x in zip(slices, found, strict=True)]
+            for (y, w), x in zip(slices, found, strict=True):
+                tests += tested(RESIDUAL_TEST, warnings, problem.residual_test, y, w, x)
         hu = problem.hu(found)
         if work is not asked:
             hu = _onto(hu, work, asked)

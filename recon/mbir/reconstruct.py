@@ -15,7 +15,7 @@ from recon.mbir.outlines import OutlineMbir
 from recon.mbir.tissues import TissueMbir
 from recon.mbir.unrolled import low_residual
 from recon.plaque.vessel_prior import VesselPrior
-from recon.solution import Solution
+from recon.solution import RESIDUAL_TEST, Solution, tested
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
 from torchpcct.validate import renamed
@@ -119,7 +119,9 @@ def reconstruct_mbir(
             }  # fmt: skip
             seen = network.check([float(normal.scale_hu[k])], float(volume.max()), scan.unit, problem.mu_ref)
             warnings = [*report.pop("warnings", []), *seen]
-            tests = [] if scan.noise_free else [problem.residual_test(scan, volume, data[k])]
+            tests = []
+            if not scan.noise_free:
+                tests = tested(RESIDUAL_TEST, warnings, problem.residual_test, scan, volume, data[k])
             if noise_map:
                 sd = network.noise_map(problem, statistic.b, exposure)
                 report["noise_sd_hu"] = sd if work is grid else average_onto(sd, work, grid)

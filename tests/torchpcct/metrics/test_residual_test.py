@@ -1,5 +1,6 @@
 """The residual's tests: their rate of false alarms, their power, and what they refuse."""
 
+import itertools
 import math
 
 import numpy as np
@@ -8,7 +9,7 @@ import torch
 from refusals import refused
 from scipy import stats
 
-from torchpcct.metrics.residual_test import residual_test
+from torchpcct.metrics.residual_test import _upper_tail, residual_test
 
 SHAPE = (60, 6, 24)
 W = torch.linspace(500.0, 1500.0, math.prod(SHAPE), dtype=torch.float64).reshape(SHAPE)
@@ -109,3 +110,31 @@ def test_bad_input_is_named():
         ("false_alarms", lambda: residual_test(r, W, LINES, false_alarms=1.5)),
     )
     assert np.isfinite(residual_test(r.float(), W.float(), LINES.float()).chi2)
+
+
+@pytest.mark.parametrize("degrees", [1, 2, 37, 10**5])
+@pytest.mark.parametrize("noncentrality", [0.0, 1e-30, 1.0, 576.0, 9.9e4, 1e6, 1e15])
+def test_tails_of_any_size_are_probabilities_that_fall(degrees, noncentrality):
+    """Also where SciPy's own function overflows: far below a large mean, and where it takes seconds."""
+    mean = degrees + noncentrality
+    sd = math.sqrt(2 * (degrees + 2 * noncentrality))
+    at = sorted(
+        {0.0, 1e-300, mean / 100, max(mean - 4 * sd, 0.0), mean, mean + 3 * sd, mean + 60 * sd, 1e300, math.inf}
+    )
+    tails = [_upper_tail(x, degrees, noncentrality) for x in at]
+    assert all(0.0 <= p <= 1.0 for p in tails)
+    assert all(later <= earlier + 1e-12 for earlier, later in itertools.pairwise(tails))
+    assert (tails[0], tails[-1]) == (1.0, 0.0)
+    if mean < 1e7:
+        assert _upper_tail(mean + 2 * sd, degrees, noncentrality) == pytest.approx(
+            stats.ncx2.sf(mean + 2 * sd, degrees, noncentrality), abs=2e-4
+        )
+
+
+def test_a_single_row_that_fits_exactly():
+    """Its gain is fitted to rounding by a volume that has converged; the non-central χ² is then asked far below 1."""
+    w = torch.full((120, 1, 160), 3e4, dtype=torch.float64)
+    r = torch.randn(w.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64) / w.sqrt()
+    found = residual_test(r - r.mean(), w, torch.ones_like(r).cumsum(-1) / 100)
+    assert found.findings == ()
+    assert found.p_values["rows"] == 1.0
