@@ -21,6 +21,7 @@ from numba import njit
 from torch import Tensor
 
 from torchpcct.threads import run
+from torchpcct.validate import number
 
 __all__ = ["compound_poisson", "draw", "normal", "poisson", "seed_key", "stream", "thinned"]
 
@@ -30,6 +31,12 @@ _MIX2 = np.uint64(0x94D049BB133111EB)
 _S30, _S27, _S31, _S11 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(11)
 _OPERATIONS = 50  # about those of a random number
 _TO_UNIT = 1.0 / 9007199254740992.0  # 2**-53
+_BELOW_ONE = 1.0 - _TO_UNIT
+_NORMAL = 1e12
+"""Mean from which on Poisson numbers are drawn as normal ones: their skewness is a millionth, and the logarithms of
+probabilities would lose their last digit to rounding."""
+_RARE = 1e-6
+"""Of so many events, the probability below which those that happen are Poisson, to as much."""
 
 
 @njit(inline="always", cache=True)
@@ -49,11 +56,22 @@ def stream(key: Any, index: Any) -> Any:
 def draw(state: Any) -> Any:
     """Next state of a stream and a uniform number in the open interval (0, 1)."""
     state = state + _GOLDEN
-    return state, (np.float64(_mix(state) >> _S11) + 0.5) * _TO_UNIT
+    # The largest of them is rounded up to 1 before it is scaled.
+    return state, min((np.float64(_mix(state) >> _S11) + 0.5) * _TO_UNIT, _BELOW_ONE)
+
+
+@njit(inline="always", cache=True)
+def _normal_one(state: Any) -> float:
+    state, u = draw(state)
+    state, v = draw(state)
+    return math.sqrt(-2.0 * math.log(u)) * math.cos(2.0 * math.pi * v)
 
 
 @njit(cache=True)
 def _poisson_one(mean: float, state: Any) -> float:
+    # Whole numbers stay floats: math.floor gives int64, which ends at 9e18.
+    if mean >= _NORMAL:
+        return np.floor(mean + math.sqrt(mean) * _normal_one(state) + 0.5)
     if mean < 10.0:
         state, u = draw(state)
         p = math.exp(-mean)
@@ -71,7 +89,7 @@ def _poisson_one(mean: float, state: Any) -> float:
         u -= 0.5
         state, v = draw(state)
         us = 0.5 - abs(u)
-        k = math.floor((2.0 * a / us + b) * u + mean + 0.43)
+        k = np.floor((2.0 * a / us + b) * u + mean + 0.43)
         if us >= 0.07 and v <= v_r:
             return k
         if k < 0.0 or (us < 0.013 and v > us):
@@ -89,6 +107,10 @@ def _binomial_one(n: float, p: float, state: Any) -> float:
     """Of ``n`` events those that happen, each with the probability ``p`` ≤ ½."""
     q = 1.0 - p
     ratio = p / q
+    if n >= _NORMAL:
+        if p < _RARE:
+            return min(_poisson_one(n * p, state), n)
+        return min(max(np.floor(n * p + math.sqrt(n * p * q) * _normal_one(state) + 0.5), 0.0), n)
     if n * p < 10.0:
         state, u = draw(state)
         share = math.exp(n * math.log1p(-p))
@@ -103,14 +125,14 @@ def _binomial_one(n: float, p: float, state: Any) -> float:
     a = -0.0873 + 0.0248 * b + 0.01 * p
     v_r = 0.92 - 4.2 / b
     alpha = (2.83 + 5.1 / b) * sd
-    mode = math.floor((n + 1.0) * p)
+    mode = np.floor((n + 1.0) * p)
     top = math.lgamma(mode + 1.0) + math.lgamma(n - mode + 1.0)
     while True:
         state, u = draw(state)
         u -= 0.5
         state, v = draw(state)
         us = 0.5 - abs(u)
-        k = math.floor((2.0 * a / us + b) * u + n * p + 0.5)
+        k = np.floor((2.0 * a / us + b) * u + n * p + 0.5)
         if us >= 0.07 and v <= v_r:
             return k
         if k < 0.0 or k > n:
@@ -132,7 +154,9 @@ def _thinned_rows(begin: int, end: int, counts: Any, first: Any, fraction: float
                 # A gain has made them no whole numbers: up or down, so that the mean stays.
                 state, u = draw(state)
                 n += 1.0 if u < given - n else 0.0
-            if n <= 0.0:
+            if not abs(given) < math.inf:
+                out[i, j] = np.nan
+            elif n <= 0.0:
                 out[i, j] = fraction * min(given, 0.0)
             elif fraction <= 0.5:
                 out[i, j] = _binomial_one(n, fraction, state)
@@ -145,7 +169,7 @@ def _poisson_rows(begin: int, end: int, mean: Any, first: Any, scale: float, key
     for i in range(begin, end):
         for j in range(mean.shape[1]):
             lam = np.float64(mean[i, j]) * scale
-            if lam > 0.0:
+            if 0.0 < lam < math.inf:
                 out[i, j] = _poisson_one(lam, stream(key, first[i] + j))
             elif lam == 0.0:
                 out[i, j] = 0.0
@@ -157,9 +181,7 @@ def _poisson_rows(begin: int, end: int, mean: Any, first: Any, scale: float, key
 def _normal_rows(begin: int, end: int, first: Any, key: Any, out: Any) -> None:
     for i in range(begin, end):
         for j in range(out.shape[1]):
-            state, u = draw(stream(key, first[i] + j))
-            state, v = draw(state)
-            out[i, j] = math.sqrt(-2.0 * math.log(u)) * math.cos(2.0 * math.pi * v)
+            out[i, j] = _normal_one(stream(key, first[i] + j))
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -168,7 +190,7 @@ def _compound_rows(begin: int, end: int, mean: Any, quantum: Any, first: Any, sc
         for j in range(mean.shape[1]):
             q = np.float64(quantum[i, j])
             lam = np.float64(mean[i, j]) * scale / q
-            if lam > 0.0 and q > 0.0:
+            if 0.0 < lam < math.inf and q > 0.0:
                 out[i, j] = q * _poisson_one(lam, stream(key, first[i] + j))
             elif lam == 0.0 and q > 0.0:
                 out[i, j] = 0.0
@@ -192,15 +214,34 @@ def seed_key(seed: int, purpose: int = _QUANTA) -> Any:
 
 
 def _first(first: Any, rows: int) -> Any:
-    index = np.ascontiguousarray(first, dtype=np.int64).reshape(-1)
+    given = np.asarray(first)
+    if given.dtype.kind not in "iu" and given.size:
+        raise TypeError(f"first_index must hold whole numbers, got {given.dtype}")
+    index = np.ascontiguousarray(given, dtype=np.int64).reshape(-1)
     if index.size != rows:
         raise ValueError(f"first_index must hold one index per row of the last axis, {rows}, got {index.size}")
     return index
 
 
+def _like(name: str, values: Tensor, other: str, like: Tensor) -> None:
+    """Refuse readings of another shape than those they belong to."""
+    if values.shape != like.shape:
+        raise ValueError(f"{name} has shape {tuple(values.shape)}, {other} {tuple(like.shape)}: they must be equal")
+
+
 def _drawn(kernel: Any, readings: tuple[Tensor, ...], first_index: Any, *parameters: Any) -> Tensor:
     """What a kernel draws for readings ``(..., n)``, of the shape and dtype of the first."""
-    shape = readings[0].shape
+    like = readings[0]
+    for values in readings:
+        if not isinstance(values, Tensor) or values.dtype not in (torch.float32, torch.float64):
+            kind = values.dtype if isinstance(values, Tensor) else type(values).__name__
+            raise TypeError(f"readings must be float32 or float64 tensors, got {kind}: use .float() or .double()")
+        if values.shape != like.shape or values.dtype != like.dtype or not values.ndim:
+            raise ValueError(
+                f"readings must have one shape (..., n) and one dtype, got {tuple(values.shape)} {values.dtype} beside "
+                f"{tuple(like.shape)} {like.dtype}"
+            )
+    shape = like.shape
     rows = [values.detach().cpu().contiguous().reshape(-1, shape[-1]) for values in readings]
     out = torch.empty_like(rows[0])
     arrays = [values.numpy() for values in rows]
@@ -219,12 +260,14 @@ def poisson(mean: Tensor, first_index: Any, seed: int, scale: float = 1.0) -> Te
         scale: factor on ``mean`` (exposure).
 
     Returns:
-        Tensor of the shape and dtype of ``mean``. A negative or NaN expectation gives NaN.
+        Tensor of the shape and dtype of ``mean``. A negative, infinite or NaN expectation gives NaN. From 10¹² counts
+        on the numbers are normal ones, rounded.
 
     Raises:
-        TypeError, ValueError: a seed that is no whole number ≥ 0, indices that do not match ``mean``.
+        TypeError, ValueError: a seed that is no whole number ≥ 0, indices that do not match ``mean``, a mean of another
+            kind, a scale that is negative or not finite.
     """
-    return _drawn(_poisson_rows, (mean,), first_index, float(scale), seed_key(seed))
+    return _drawn(_poisson_rows, (mean,), first_index, number("scale", scale, low=0.0), seed_key(seed))
 
 
 def compound_poisson(
@@ -251,11 +294,10 @@ def compound_poisson(
     Raises:
         TypeError, ValueError: as :func:`poisson`; a ``quantum`` of another shape; ``electronic`` < 0.
     """
-    if quantum.shape != mean.shape:
-        raise ValueError(f"quantum has shape {tuple(quantum.shape)}, mean {tuple(mean.shape)}: they must be equal")
-    if not 0 <= electronic < math.inf:
-        raise ValueError(f"electronic must be a finite standard deviation ≥ 0, got {electronic}")
-    out = _drawn(_compound_rows, (mean, quantum), first_index, float(scale), seed_key(seed))
+    _like("quantum", quantum, "mean", mean)
+    number("electronic", electronic, low=0.0)
+    scale = number("scale", scale, low=0.0)
+    out = _drawn(_compound_rows, (mean, quantum), first_index, scale, seed_key(seed))
     if electronic:
         added = normal(tuple(mean.shape), first_index, seed, mean.dtype, purpose=_ELECTRONICS)
         out.add_(added, alpha=float(electronic))
@@ -281,10 +323,18 @@ def thinned(
         electronic: standard deviation of the electronic noise in ``counts``, which no dose changes.
 
     Returns:
-        Shape and dtype of ``counts``.
+        Shape and dtype of ``counts``; NaN where the counts are not finite.
+
+    Raises:
+        TypeError, ValueError: as :func:`poisson`; a fraction outside of (0, 1], a ``quantum`` of another shape or
+            dtype, ``electronic`` < 0.
     """
+    fraction = number("fraction", fraction, positive=True, high=1.0)
+    number("electronic", electronic, low=0.0)
+    if quantum is not None:
+        _like("quantum", quantum, "counts", counts)
     quanta = counts if quantum is None else counts / quantum
-    out = _drawn(_thinned_rows, (quanta,), first_index, float(fraction), seed_key(seed, _THINNING))
+    out = _drawn(_thinned_rows, (quanta,), first_index, fraction, seed_key(seed, _THINNING))
     if quantum is not None:
         out *= quantum
     if electronic:

@@ -24,6 +24,7 @@ __all__ = [
     "per_axis",
     "reals",
     "renamed",
+    "shaped",
     "whole",
 ]  # fmt: skip
 
@@ -188,6 +189,23 @@ def broadcast(**arrays: Any) -> list[Any]:
     except ValueError:
         listed = ", ".join(f"{name} {np.shape(value)}" for name, value in arrays.items())
         raise ValueError(f"shapes must be equal or broadcast to one, got {listed}") from None
+
+
+def shaped(name: str, value: Any, wanted: tuple[int | None, ...]) -> None:
+    """Refuse an array or tensor of another shape, before a compiled kernel that checks no index reads it.
+
+    Args:
+        name: what the message calls it.
+        value: anything with a ``shape``.
+        wanted: the shape; None: any length.
+
+    Raises:
+        ValueError: another number of axes, another length.
+    """
+    found = tuple(np.shape(value) if not hasattr(value, "shape") else value.shape)
+    if len(found) != len(wanted) or any(w not in (None, n) for n, w in zip(found, wanted, strict=True)):
+        text = ", ".join("any" if n is None else str(n) for n in wanted)
+        raise ValueError(f"{name} must have the shape ({text}{',' * (len(wanted) == 1)}), got {found}")
 
 
 F = TypeVar("F", bound=Callable[..., Any])

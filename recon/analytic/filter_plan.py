@@ -20,6 +20,7 @@ from recon.analytic.ramp import fast_length, ramp_kernel
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam
 from torchpcct.threads import run
+from torchpcct.validate import shaped
 
 __all__ = ["CHUNK_BYTES", "FilterPlan"]
 
@@ -54,6 +55,7 @@ class FilterPlan:
         g, a, b = self.geometry, self.window_in, self.window_out
         for name, w in (("window_in", a), ("window_out", b)):
             w.check(g, name)
+        shaped("angular", self.angular, (g.views, 1 if np.shape(self.angular)[-1:] == (1,) else g.columns))
         if b.first_row < a.first_row or b.first_row + b.rows > a.first_row + a.rows:
             raise ValueError(
                 f"the window to fill has rows {b.first_row}…{b.first_row + b.rows - 1}, but the data only rows "

@@ -53,6 +53,8 @@ def cholesky(kernel: Tensor) -> tuple[Tensor, NDArray[np.bool_]]:
     """Banded L with L Lᴴ = kernel, ``(reach + 1, nz, ...)``, and where the kernel is positive definite, ``(...)``."""
     from recon.gram.kernels import banded_cholesky  # numba loads with its first use
 
+    if kernel.ndim < 2 or kernel.shape[0] > max(kernel.shape[1], 1):
+        raise ValueError(f"kernel must be (reach + 1, nz, ...) with reach < nz, got the shape {tuple(kernel.shape)}")
     flat = kernel.cpu().reshape(*kernel.shape[:2], -1).to(torch.complex128).contiguous().numpy()
     lower = np.zeros_like(flat)
     definite = np.zeros(flat.shape[2], dtype=np.bool_)
@@ -70,7 +72,15 @@ def make_definite(spectra: Tensor) -> Tensor:
     Returns:
         Spectra of the same shape for which Σ_c b_c K_c is positive definite at the centre, the corners and the edge
         midpoints of the grid, b_c ∈ monomials of y, x ∈ {−1, 0, 1}.
+
+    Raises:
+        ValueError: another shape.
     """
+    if spectra.ndim != 5 or spectra.shape[0] not in (1, 3, 6) or spectra.shape[1] > spectra.shape[2]:
+        raise ValueError(
+            "spectra must be (terms, reach + 1, nz, fy, fx) of 1, 3 or 6 terms and reach < nz, got the shape "
+            f"{tuple(spectra.shape)}"
+        )
     terms, bands, nz = spectra.shape[:3]
     flat = spectra.reshape(terms, bands, nz, -1).to(torch.complex128).numpy().copy()
     level = np.abs(flat[0, 0].real).mean(axis=0)

@@ -194,9 +194,18 @@ class BoundPrior:
     def _volume(self) -> float:
         return math.prod(self.spacing)
 
-    def _check(self, x: Tensor) -> None:
+    def _check(self, x: Tensor, **others: Tensor) -> None:
+        """Refuse volumes of too few axes or of another kind than float, and others that are not like the first."""
+        if not isinstance(x, Tensor) or x.dtype not in (torch.float32, torch.float64):
+            raise TypeError(f"x must be a float32 or float64 tensor, got {getattr(x, 'dtype', type(x).__name__)}")
         if x.dim() < self.axes:
             raise ValueError(f"the prior needs a volume of {self.axes} axes, got shape {tuple(x.shape)}")
+        for name, other in others.items():
+            if not isinstance(other, Tensor) or (other.dtype, other.device) != (x.dtype, x.device):
+                kind = f"{other.dtype} on {other.device}" if isinstance(other, Tensor) else type(other).__name__
+                raise TypeError(f"{name} must be a tensor like x, {x.dtype} on {x.device}, got {kind}")
+            if other.shape != x.shape:
+                raise ValueError(f"{name} must have the shape of x, {tuple(x.shape)}, got {tuple(other.shape)}")
 
     def gradients(self, x: Tensor) -> Iterator[Tensor]:
         """Gradient of every pair in HU/mm, one tensor per entry of :attr:`offsets`; of channels its length,
@@ -231,15 +240,23 @@ class BoundPrior:
         """Curvature matrix of the parabola that touches R at x and lies above it, times ``direction``.
 
         ``majorizer(x, x)`` is the gradient. Not differentiable (both passes run in numba on the CPU).
+
+        Raises:
+            ValueError: a direction of another shape than x, fewer axes than a volume has.
+            TypeError: tensors that are not float32 or float64, or not alike.
         """
-        self._check(x)
+        self._check(x, direction=direction)
         if x.device.type == "cpu":
             return self._fused_majorizer(x, direction)
         return self._plain_majorizer(x, direction)
 
     def along(self, x: Tensor, direction: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
-        """⟨direction, ∇R(x)⟩ and ⟨direction, majorizer(x) other⟩ of each volume, ``(...)`` float64."""
-        self._check(x)
+        """⟨direction, ∇R(x)⟩ and ⟨direction, majorizer(x) other⟩ of each volume, ``(...)`` float64.
+
+        Raises:
+            ValueError, TypeError: as :meth:`majorizer`.
+        """
+        self._check(x, direction=direction, other=other)
         if x.device.type == "cpu":
             return self._fused_along(x, direction, other)
         axes = tuple(range(-self.axes, 0))

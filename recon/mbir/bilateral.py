@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchpcct.threads import run
+from torchpcct.validate import number, shaped, whole
 
 __all__ = ["joint_bilateral"]
 
@@ -146,6 +147,15 @@ def joint_bilateral(u: Tensor, guide: Tensor, threshold: Tensor, reach: float = 
         threshold: ``(batch,)`` differences of the guide that weigh about exp(−½) (t above).
         reach: standard deviation of s in voxels; it ends at twice that.
         step: only every so many voxels along each axis are neighbours: of smooth volumes the others add nothing.
+
+    Raises:
+        ValueError: volumes that have not four axes, a guide or thresholds that do not belong to them, a reach ≤ 0, a
+            step < 1.
     """
+    shaped("u", u, (None, None, None, None))
+    shaped("guide", guide, tuple(u.shape))
+    shaped("threshold", threshold, (u.shape[0],))
+    number("reach", reach, positive=True, unit="voxels")
+    whole("step", step)
     found: Tensor = _Bilateral.apply(u, guide, threshold, reach, step)
     return found

@@ -19,6 +19,7 @@ from recon.plaque.kernels import core_fractions, sharpened
 from recon.plaque.local_gram import LocalGram
 from recon.plaque.vessel import EXCESS, Fit, Vessel
 from torchpcct.threads import run
+from torchpcct.validate import shaped
 
 __all__ = ["CorePrior", "CoreSpace", "Evidence"]
 
@@ -191,7 +192,8 @@ class CoreSpace:
         return np.stack([c * across + s * around, c * around - s * across, frame[:, 2]], axis=1)
 
     def shares(self, shapes: Floats) -> NDArray[np.float32]:
-        """Share of each of the chosen voxels in every body, ``(m, n)``."""
+        """Share of each of the chosen voxels in every body, ``(m, n)``; ``ValueError`` for shapes not ``(m, 8)``."""
+        shaped("shapes", shapes, (None, 8))
         out = np.empty((len(shapes), len(self.chosen)), np.float32)
         run(
             core_fractions, len(shapes), np.ascontiguousarray(shapes[:, CENTRE]),

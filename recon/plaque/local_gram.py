@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from recon.plaque.kernels import gather_block, symmetric_step
 from torchpcct.threads import run
+from torchpcct.validate import shaped
 
 __all__ = ["LocalGram"]
 
@@ -44,11 +45,16 @@ class LocalGram:
             scale: factor on the operator.
 
         Raises:
-            ValueError: so many voxels that the blocks would take more than 1.5 GB.
+            ValueError: so many voxels that the blocks would take more than 1.5 GB; an index that is not ``(n, 3)``, or
+                beyond the grid.
         """
         ny, nx = gram.grid.shape[-2:]
+        shaped("index", index, (None, 3))
+        nz = gram.grid.shape[0] if gram.grid.ndim == 3 else 1
+        if len(index) and not ((index >= 0) & (index < (nz, ny, nx))).all():
+            raise ValueError(f"index must lie in the grid of {nz} × {ny} × {nx} voxels, z, y, x")
         kernels = (gram.lag_kernels() * scale).float()
-        _, lags, nz, py, px = kernels.shape
+        lags, (py, px) = kernels.shape[1], kernels.shape[-2:]
         # Lags from −(n − 1) to n − 1 in a row, mirrored along x: the lag falls with the x of the voxel read.
         kernels = kernels[..., torch.arange(1 - ny, ny) % py, :][..., torch.arange(nx - 1, -nx, -1) % px]
         near = np.ascontiguousarray(kernels.permute(1, 2, 0, 3, 4).numpy())

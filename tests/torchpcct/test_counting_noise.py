@@ -80,3 +80,29 @@ def test_a_window_is_thinned_as_the_whole():
     counts = poisson(torch.full((6, 50), 80.0), np.arange(6) * 50, seed=11)
     full = thinned(counts, np.arange(6) * 50, 4, 0.6)
     assert torch.equal(thinned(counts[2:5, 7:30], np.arange(2, 5) * 50 + 7, 4, 0.6), full[2:5, 7:30])
+
+
+@pytest.mark.parametrize("mean", [2.0**31, 9.9e11, 1e12, 2.0**53, 2.0**63, 2.0**64, 1e25])
+@pytest.mark.parametrize("fraction", [1e-12, 1e-9, 1e-3, 0.4, 0.97])
+def test_counts_beyond_every_integer_keep_mean_and_variance(mean, fraction):
+    """No whole number of 32, 53 or 63 bits ends them, and none is negative or more than there were."""
+    n = 20_000
+    full = torch.full((1, n), mean, dtype=torch.float64)
+    draws = poisson(full, [0], seed=3).numpy()
+    kept = thinned(full, [0], 3, fraction).numpy()
+    assert kept.min() >= 0
+    assert kept.max() <= mean
+    for values, centre, variance in (
+        (draws, mean, mean),
+        (kept, mean * fraction, mean * fraction * (1 - fraction)),
+    ):
+        assert abs((values - centre).mean()) < 4.5 * np.sqrt(variance / n) + 1e-9 * np.sqrt(variance)
+        # Fourth moment of few counts: variance · (1 + 3 variance).
+        assert abs(values.var() / variance - 1) < 4.5 * np.sqrt((2 + 1 / variance) / n)
+
+
+def test_infinite_expectations_are_no_numbers():
+    values = torch.tensor([[np.inf, np.nan, 0.0, 5.0]], dtype=torch.float64)
+    assert torch.isnan(poisson(values, [0], 0))[0].tolist() == [True, True, False, False]
+    assert torch.isnan(thinned(values, [0], 0, 0.5))[0].tolist() == [True, True, False, False]
+    assert torch.isnan(poisson(torch.full((1, 2), 1e300, dtype=torch.float64), [0], 0, scale=1e10)).all()

@@ -32,8 +32,9 @@ from torchpcct.acquisition.bodies import BodySet
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam
 from torchpcct.kernel_cache import forget_outdated
-from torchpcct.scene.chords import interval
+from torchpcct.scene.chords import PARAMETERS, interval
 from torchpcct.threads import run
+from torchpcct.validate import shaped
 
 __all__ = ["SUB_RAY_COUNTS", "Beam", "compress", "expected_readings", "sub_rays"]
 
@@ -263,7 +264,23 @@ def expected_readings(
 
     Returns:
         ``(bins, views, window.rows, window.columns)`` float64.
+
+    Raises:
+        ValueError: arrays that do not belong to the detector, the views or the bodies.
     """
+    window.check(geometry)
+    bins, energies = len(beam.spectra), bodies.contrast.shape[-1]
+    count = len(bodies.kinds)
+    shaped("spectra", beam.spectra, (None, geometry.columns, energies))
+    shaped("row_factor", beam.row_factor, (geometry.rows,))
+    shaped("points", beam.points, (None, 5))
+    shaped("view_step", view_step, (geometry.views,))
+    shaped("params", bodies.params, (count, PARAMETERS))
+    shaped("contrast", bodies.contrast, (count, energies))
+    for name, way in (("offsets", bodies.offsets), ("drift", bodies.drift)):
+        shaped(name, way, (count, geometry.views, 3))
+    if surround is not None:
+        shaped("surround", surround, (bins, geometry.rows, geometry.columns))
     coefficients, basis = compress(bodies.contrast)
     out = np.empty((len(beam.spectra), *window.shape))
     dv, du = geometry.pitch

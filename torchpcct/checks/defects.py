@@ -20,6 +20,7 @@ from torch import Tensor
 from torchpcct.readings import MEDIAN_TO_SD, MOST_DEAD, bridge, dispersion
 from torchpcct.scan import Scan
 from torchpcct.threads import run
+from torchpcct.validate import shaped
 
 __all__ = ["Cells", "Defects", "cell_sums", "dark_views", "dead_readings", "find_defects", "is_repaired",
            "photon_and_light", "repair_defects", "wrong_cells"]  # fmt: skip
@@ -181,7 +182,13 @@ def cell_sums(n: Any, air: Tensor, first: Any, lost: NDArray[np.bool_], light: f
     """
     from torchpcct.checks.defect_kernels import bends, levels  # numba loads with its first use
 
+    first = np.asarray(first)
     rows, alive = n.shape[1], np.flatnonzero(~lost)
+    shaped("air", air, (rows, None))
+    shaped("first", first, (len(n),))
+    shaped("lost", lost, (len(n),))
+    if first.size and (first.min() < 0 or first.max() + n.shape[2] > air.shape[1]):
+        raise ValueError(f"first must be columns of a detector of {air.shape[1]}, {n.shape[2]} of which are read")
     sums = np.zeros((5, *air.shape))
     seen, dark, bright, above, times = sums
     run(levels, rows, n, first, alive, seen, dark, bright, operations=3 * alive.size * n.shape[2])

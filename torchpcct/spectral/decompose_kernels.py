@@ -188,7 +188,7 @@ def solve(
             n[b] = counts[b, i]
             total += n[b]
         p = (math.log(air[c] * s) - math.log(total + 0.5)) / start_step[c]
-        p = min(max(p, 0.0), start.shape[1] - 1.0)
+        p = min(p, start.shape[1] - 1.0) if p > 0.0 else 0.0  # NaN, too, of spectra that nothing attenuates
         k = min(int(p), start.shape[1] - 2)
         t = start[c, k] + (p - k) * (start[c, k + 1] - start[c, k])
         a1 = min(max(t * direction[0], bounds[0, 0]), bounds[0, 1])

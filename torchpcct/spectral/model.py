@@ -24,7 +24,7 @@ from torchpcct.scene.materials import material
 from torchpcct.spectral.basis import Basis, pe_pvc
 from torchpcct.spectral.decompose_kernels import expected
 from torchpcct.threads import run
-from torchpcct.validate import reals
+from torchpcct.validate import reals, shaped
 
 __all__ = ["SpectralModel"]
 
@@ -91,7 +91,10 @@ class SpectralModel:
         set_ = object.__setattr__
         set_(self, "energies", energies[kept])
         set_(self, "spectra", np.ascontiguousarray(spectra[:, :, kept]))
-        set_(self, "row_factor", np.asarray(self.row_factor, np.float64))
+        set_(self, "row_factor", reals("row_factor", self.row_factor))
+        shaped("row_factor", self.row_factor, (None,))
+        if not (np.isfinite(self.row_factor).all() and (self.row_factor > 0).all()):
+            raise ValueError("row_factor must be finite and > 0: the intensity of each row relative to the central one")
 
     @classmethod
     def of(cls, scanner: Scanner, exposure_s: float, basis: Basis | None = None) -> SpectralModel:
