@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import functools
 import glob
@@ -26,8 +25,8 @@ __all__ = [
     "LEFTOVER",
     "VERSION",
     "WriteError",
+    "abandoned",
     "atomic_write",
-    "clear_folder",
     "fingerprint",
     "is_own_hdf5",
     "marker",
@@ -99,11 +98,11 @@ def _part(target: Path, process: int) -> Path:
     return target.with_name(f".{process}-{_machine()}-{secrets.token_hex(4)}.part.{target.name}")
 
 
-def _abandoned(part: Path, seconds: float = 0.0) -> bool:
+def abandoned(part: Path, seconds: float = 0.0) -> bool:
     """Whether the writer of a temporary file is dead, by all that can be known here: that of another machine is not.
 
     Args:
-        part: temporary file or folder.
+        part: temporary file or folder; of any other name it is none.
         seconds: for which nothing has been written to it.
     """
     owner = LEFTOVER.match(part.name)
@@ -127,16 +126,6 @@ def _remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def clear_folder(folder: str | os.PathLike[str]) -> None:
-    """Remove a folder and all in it, but what other processes or threads are writing at this moment."""
-    for place, _, names in os.walk(folder, topdown=False):
-        for name in names:
-            if not LEFTOVER.match(name) or _abandoned(Path(place, name)):
-                Path(place, name).unlink(missing_ok=True)
-        with contextlib.suppress(OSError):  # not empty: somebody writes
-            os.rmdir(place)
-
-
 @contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary name beside ``path``, for a file or a folder; flush what is there to the disk, rename it.
@@ -153,7 +142,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     target = Path(path)
     require_folder(target)
     for left in target.parent.glob(f".*.part.{glob.escape(target.name)}"):
-        if _abandoned(left, _ABANDONED_S):
+        if abandoned(left, _ABANDONED_S):
             _remove(left)
     part = _part(target, os.getpid())
     try:
@@ -178,7 +167,7 @@ def marker(folder: str | os.PathLike[str]) -> Iterator[Path]:
     What a killed process left is removed by the next one.
     """
     for left in Path(folder).glob(".*.part.marker"):
-        if _abandoned(left):
+        if abandoned(left):
             _remove(left)
     part = _part(Path(folder) / "marker", os.getpid())
     part.touch()

@@ -16,7 +16,7 @@ from torchpcct.files import LEFTOVER
 __all__ = ["CHECKPOINT_FORMAT", "Store", "start_from"]
 
 CHECKPOINT_FORMAT = "torchpcct training checkpoint 2"
-UNFINISHED = "checkpoint.next."
+UNFINISHED = "checkpoint.next.safetensors"
 
 
 class Store:
@@ -32,7 +32,7 @@ class Store:
 
     def save(self, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> None:
         """Write the checkpoint; the one in place becomes the previous one."""
-        fresh = self.current.with_name(UNFINISHED + "safetensors")
+        fresh = self.current.with_name(UNFINISHED)
         write_tensors(fresh, CHECKPOINT_FORMAT, tensors, metadata)
         # Killed between the two renames, the run goes on from the previous checkpoint, which is then the newest one
         # that had been completed. Renames that a power cut undoes lose a checkpoint, but never both.
@@ -59,7 +59,7 @@ class Store:
     def clean(self) -> None:
         """Remove temporary files that a killed process left behind."""
         for path in self.current.parent.iterdir():
-            if LEFTOVER.match(path.name) or path.name.startswith(UNFINISHED):
+            if LEFTOVER.match(path.name) or path.name == UNFINISHED:
                 path.unlink(missing_ok=True)
 
 

@@ -51,7 +51,6 @@ from torchpcct.checks.defects import (
 )
 from torchpcct.checks.readings import reading_warnings
 from torchpcct.detector_window import DetectorWindow
-from torchpcct.files import clear_folder
 from torchpcct.formats.scans import adapted, open_scan, own_options
 from torchpcct.formats.volume_slabs import CHUNK, SlabFile, check_slab_name
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
@@ -572,10 +571,10 @@ def _as_jobs(executor: Any, maker: _Maker, plan: SlabPlan, key: str, folder: Pat
             first, stop = waiting.popleft()
             piece = _slab_piece(folder, maker, key, first, stop)
             keep(stop, piece["values"], dict(zip(piece["texts"].tolist(), piece["peaks"].tolist(), strict=True)))
-            (folder / f"{first}-{stop}.npz").unlink(missing_ok=True)
+            Store(folder).remove(folder / f"{first}-{stop}.npz")
 
     execute.run(jobs, folder, executor, finished=finished)
-    clear_folder(folder)
+    Store(folder).clear()
 
 
 def _slab(folder: Path, packed: bytes, key: str, first: int, stop: int) -> None:

@@ -300,7 +300,8 @@ def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
             progress("scans", k / len(jobs))
             tell_of(job.name, *(found[job.name] if found else job.function(folder, *job.args)))
     for out in outs:
-        (folder / f"{out}{_DONE}").unlink(missing_ok=True)
+        if _note(folder / f"{out}{_DONE}"):
+            (folder / f"{out}{_DONE}").unlink(missing_ok=True)
     if refused:
         raise ValueError(f"{len(refused)} of {len(jobs)} scans are not reconstructed: {'; '.join(refused)}")
 
@@ -320,9 +321,9 @@ def reconstruct_one(folder: Path, options: dict[str, Any], out: str) -> tuple[li
     def state() -> dict[str, Any]:
         return {"torchpcct": VERSION, "asked": asked, "scan": fingerprint(scan), "volume": fingerprint(folder / out)}
 
-    with contextlib.suppress(OSError, ValueError):
-        note = json.loads(noted.read_text(encoding="utf-8"))
-        if note["state"] == state():
+    note = _note(noted)
+    with contextlib.suppress(OSError):
+        if note and note["state"] == state():
             return note["messages"], f"{note['text']}, already there", ""
     messages: list[str] = []
     arguments = argparse.Namespace(**options, out=folder / out, warn=messages.append)
@@ -334,10 +335,19 @@ def reconstruct_one(folder: Path, options: dict[str, Any], out: str) -> tuple[li
         except (ValueError, TypeError, OSError, ImportError, OverflowError) as error:
             return messages, "", str(error)
     text = printed.getvalue().rstrip()
-    if not options["dry_run"]:
+    if not options["dry_run"] and (note or not noted.exists()):
         with atomic_write(noted) as part:
             part.write_text(json.dumps({"state": state(), "messages": messages, "text": text}), encoding="utf-8")
     return messages, text, ""
+
+
+def _note(path: Path) -> dict[str, Any]:
+    """What :func:`reconstruct_one` noted beside a volume; empty: nothing, or the file is somebody else's."""
+    try:
+        note = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return note if isinstance(note, dict) and {"state", "messages", "text"} <= note.keys() else {}
 
 
 def _reconstruct_scan(arguments: argparse.Namespace, progress: ProgressBars) -> None:

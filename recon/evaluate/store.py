@@ -2,30 +2,45 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import hashlib
 import importlib
 import json
 import logging
+import os
+import re
+import zipfile
 from collections.abc import Callable, Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 import torch
 
 from recon.evaluate import execute
 from recon.evaluate.sources import source_digest
-from torchpcct.files import atomic_write, clear_folder
+from torchpcct.files import LEFTOVER, abandoned, atomic_write, read_hdf5
 
-__all__ = ["Pieces", "Store", "packed", "unpacked"]
+if TYPE_CHECKING:
+    from torchpcct.scan import Scan
+
+__all__ = ["Pieces", "Store", "packed", "unpacked", "was_kept"]
 
 log = logging.getLogger(__name__)
 
 
 _TRIES = 100
 """To write a piece, where others clear its folder; it is only kept for later, and a study goes on without."""
+
+_MARK = "piece"
+"""What the store wrote carries its own file name under this name: a file is removed, or replaced by another piece, only
+if it says so itself. A folder of pieces may be the user's, or a link to one."""
+_FIRST_MEMBER = (30, b"key.npy")
+"""Where the name of a ZIP archive's first file stands, and which it is in a piece: by it a damaged one is known."""
+_SCAN = re.compile(r"-[0-9a-f]{16}\.h5$")
+"""Names of kept scans end so, with a task's fingerprint."""
 
 
 def _digest(key: str, arrays: Mapping[str, Any]) -> str:
@@ -39,6 +54,8 @@ def _digest(key: str, arrays: Mapping[str, Any]) -> str:
 
 class Store:
     """A folder of ``.npz`` files, each with the key (settings, parameters) that it was made with, and its checksum.
+
+    The folder may hold files of others, and be a link: :meth:`clear` and :meth:`remove` touch only what a store wrote.
 
     Args:
         folder: made if need be.
@@ -65,16 +82,21 @@ class Store:
     def piece(self, name: str, key: str, compute: Callable[[], Any]) -> Any:
         """What a piece holds: read if it was finished with the same key, else computed and written.
 
+        A file of that name that no store wrote stays, and the piece is not kept.
+
         Args:
             name: path in the folder, without ending.
             key: everything that the piece depends on.
             compute: gives it, anything that :func:`packed` takes.
         """
         path = self.folder / (name + ".npz")
-        if path.exists():
+        foreign = _is_foreign(path)
+        if foreign:
+            log.warning("%s is no piece of a study: it is left as it is, and the piece of that name is not kept", path)
+        elif path.exists():
             try:
                 with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
-                    arrays = {k: file[k] for k in file.files}
+                    arrays = {k: file[k] for k in file.files if k != _MARK}
                 found, digest = (str(arrays.pop(k, "")) for k in ("key", "sum"))
                 if digest != _digest(found, arrays):
                     raise ValueError("its content does not have its checksum")
@@ -84,7 +106,10 @@ class Store:
             except Exception as error:  # a damaged archive can fail in any way
                 log.warning("%s cannot be read (%s): computed again", path, error)
         arrays = packed(compute())
-        sealed = {"key": np.array(key), "sum": np.array(_digest(key, arrays)), **arrays}
+        if foreign:
+            return unpacked(arrays)
+        digest = _digest(key, arrays)
+        sealed = {"key": np.array(key), "sum": np.array(digest), _MARK: np.array(path.name), **arrays}
         for _ in range(_TRIES):
             try:
                 with atomic_write(self.path(name + ".npz")) as part:  # its folder again, which others may clear
@@ -93,6 +118,68 @@ class Store:
             except (FileNotFoundError, FileExistsError) as error:  # of its folder
                 log.info("cleared while it was written: %s", error)
         return unpacked(arrays)
+
+    def keep_scan(self, scan: Scan, path: Path) -> None:
+        """Write a scan to a path of this folder, marked as the store's."""
+        replace(scan, info={**scan.info, _MARK: path.name}).save(path)
+
+    def remove(self, path: Path) -> bool:
+        """Remove a file if a store wrote it under this name, or what a store that is dead was writing.
+
+        Returns:
+            Whether it is gone.
+        """
+        if not (abandoned(path) if LEFTOVER.match(path.name) else was_kept(path)):
+            return False
+        path.unlink(missing_ok=True)
+        return True
+
+    def clear(self) -> None:
+        """Remove what stores wrote into the folder and below, and the folders that this leaves empty.
+
+        All else stays: files of others, links, folders that were empty, and what is being written at this moment.
+        """
+        emptied = {str(self.folder)}
+        for place, _, names in os.walk(self.folder, topdown=False):
+            removed = [name for name in names if self.remove(Path(place, name))]
+            if removed or place in emptied:
+                with contextlib.suppress(OSError):  # not empty: somebody writes, or it is the user's; or it is a link
+                    os.rmdir(place)
+                    emptied.add(os.path.dirname(place))
+
+
+def was_kept(path: Path) -> bool:
+    """Whether a store wrote this file, under this name: the file says so."""
+    if path.is_symlink():
+        return False
+    try:
+        if path.suffix == ".npz":
+            with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
+                return str(file[_MARK]) == path.name
+        if path.suffix == ".h5" and _SCAN.search(path.name):
+            with read_hdf5(path, "scan") as file:
+                return bool(json.loads(file.attrs["info"])[_MARK] == path.name)
+    except Exception:  # damaged, or of others
+        return False
+    return False
+
+
+def _is_foreign(path: Path) -> bool:
+    """Whether something is there that is no piece, not even a damaged one or one of an earlier version."""
+    try:
+        if path.is_symlink() or not path.is_file():
+            return path.is_symlink() or path.exists()
+        with path.open("rb") as raw:
+            try:
+                with zipfile.ZipFile(raw) as file:
+                    return not {"key.npy", "sum.npy", "tree.npy"} <= set(file.namelist())
+            except Exception:  # a damaged archive can fail in any way
+                at, name = _FIRST_MEMBER
+                raw.seek(0)
+                head = raw.read(at + len(name))
+                return not (head.startswith(b"PK") and head[at:] == name)
+    except FileNotFoundError:  # cleared by others meanwhile
+        return False
 
 
 T = TypeVar("T")
@@ -169,8 +256,9 @@ class Pieces:
 
     @classmethod
     def clear(cls, folder: str | Path) -> None:
-        """Remove the pieces of a finished study."""
-        clear_folder(Path(folder) / cls.FOLDER)
+        """Remove the pieces of a finished study, and nothing else that lies there."""
+        if (Path(folder) / cls.FOLDER).is_dir():
+            Store(Path(folder) / cls.FOLDER).clear()
 
 
 def _ahead(root: Path, settings: Any, prefix: str, function: Callable[..., Any], call: tuple[Any, ...]) -> None:

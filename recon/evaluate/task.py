@@ -173,7 +173,7 @@ class Task:
                 raise ValueError(
                     f"task {self.name}: {error} (outside of the inset a task's scene must be round about the axis)"
                 ) from error
-            made.save(path)
+            store.keep_scan(made, path)
         return Scan.load(path)
 
     def scan_file(self, store: Store, name: str) -> Path:
@@ -181,7 +181,7 @@ class Task:
         path = store.path(f"{name}-{self.fingerprint}.h5")
         for old in path.parent.glob(f"{name}-*.h5"):
             if old != path:
-                old.unlink()
+                store.remove(old)
         return path
 
     def facts(self, store: Store) -> Facts:

@@ -193,7 +193,8 @@ class VesselTask(Task):
             values = {("core" if t == "signal" else t): v for t, v in zip(facts.tissues, facts.values_hu, strict=True)}
             for path, core in zip(paths, (values["core"], values["fibrous"]), strict=True):
                 hu = {n: v - values[self.scene.names[0]] for n, v in {**values, "core": core}.items()}
-                _with(_without_inset(straight[1]), self.grid, partial(self._vessel.painted, values=hu)).save(path)
+                made = _with(_without_inset(straight[1]), self.grid, partial(self._vessel.painted, values=hu))
+                store.keep_scan(made, path)
         present, absent = (Scan.load(p) for p in paths)
         return present, absent
 
@@ -282,7 +283,7 @@ class VoxelTask(Task):
             def painted(grid: VolumeGrid) -> Floats:
                 return np.sum([share * hu[t] for t, share in self._painted(grid).items()], axis=0)
 
-            _with(plain, self.grid, painted).save(path)
+            store.keep_scan(_with(plain, self.grid, painted), path)
         return Scan.load(path)
 
     def _alone(self, store: Store) -> Scan:

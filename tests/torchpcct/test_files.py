@@ -11,7 +11,7 @@ import pytest
 from fresh_python import run_python
 
 from recon.evaluate.store import Store
-from torchpcct.files import WriteError, atomic_write, clear_folder, write_hdf5
+from torchpcct.files import WriteError, atomic_write, write_hdf5
 
 FULL = """
 import os, resource, sys
@@ -75,8 +75,8 @@ def test_a_study_outlives_another_one_that_clears_the_same_folder(tmp_path, monk
     done = threading.Event()
 
     def clear():
-        while not done.is_set():
-            clear_folder(tmp_path / "pieces")
+        while not done.wait(0.001):
+            Store(tmp_path / "pieces").clear()
 
     other = threading.Thread(target=clear)
     other.start()
@@ -87,7 +87,7 @@ def test_a_study_outlives_another_one_that_clears_the_same_folder(tmp_path, monk
         done.set()
         other.join()
     assert found == list(range(150))
-    clear_folder(tmp_path / "pieces")
+    Store(tmp_path / "pieces").clear()
     assert list(tmp_path.iterdir()) == []
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -56,6 +57,8 @@ class SlabFile:
 
     Raises:
         ValueError: another ending.
+        FileExistsError: a folder of that name that holds anything else than such a volume, or files of others that
+            have the names of an unfinished one.
         FileNotFoundError: the folder does not exist.
         WriteError: the system refuses to write.
         ImportError: ``zarr`` is not installed.
@@ -67,16 +70,21 @@ class SlabFile:
         self.path, self.grid, self.unit, self.key = Path(path), grid, unit, key
         self.part = self.path.with_name(self.path.name + ".unfinished")
         self.journal = self.part.with_name(self.part.name + ".json")
-        try:
-            kept = json.loads(self.journal.read_text(encoding="utf-8"))
-        except (OSError, ValueError):
-            kept = {}
+        kept = self._kept()
+        for there in (self.part, self.journal):
+            if not kept and (there.exists() or there.is_symlink()):
+                raise FileExistsError(
+                    f"{there} is there and is no unfinished volume of torchpcct: move it, or name another file than "
+                    f"{path}"
+                )
+        _require_own(self.path)
         resumed = self.part.exists() and kept.get("key") == key
         self.done: int = kept["done"] if resumed else 0
         self.notes: dict[str, Any] = kept["notes"] if resumed else {}
         if not resumed:
             with self._writing():
                 self.discard()
+                self._note(begun=False)  # before anything else, so that whatever is left says whose it is
                 if self.path.suffix == ".zarr":
                     _create(self.part, grid, unit, chunk)
                 else:
@@ -108,21 +116,30 @@ class SlabFile:
                 group = needed("zarr").open_group(self.part, mode="r+")
                 text = json.dumps(dict(report), default=str)
                 group.attrs["torchpcct"] = {"unit": self.unit, "report": json.loads(text)}
-            if self.path.is_dir():
-                shutil.rmtree(self.path)
+            _remove_ome_zarr(self.path)
             os.replace(self.part, self.path)
             self.journal.unlink(missing_ok=True)
 
-    def _note(self) -> None:
+    def _kept(self) -> dict[str, Any]:
+        """What the journal says; empty if there is none, or that is a file of somebody else."""
+        try:
+            kept = json.loads(self.journal.read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return {}
+        ours = isinstance(kept, dict) and {"key", "done", "notes"} <= kept.keys()
+        return kept if ours and not self.part.is_symlink() else {}
+
+    def _note(self, begun: bool = True) -> None:
+        kept = {"key": self.key if begun else "", "done": self.done, "notes": self.notes}
         with atomic_write(self.journal) as part:
-            part.write_text(json.dumps({"key": self.key, "done": self.done, "notes": self.notes}))
+            part.write_text(json.dumps(kept))
 
     def discard(self) -> None:
         """Take back what has been begun."""
-        self.journal.unlink(missing_ok=True)
         if self.part.is_dir():
             shutil.rmtree(self.part)
         self.part.unlink(missing_ok=True)
+        self.journal.unlink(missing_ok=True)
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
@@ -165,11 +182,50 @@ def _create(path: Path, grid: VolumeGrid, unit: str, chunk: int) -> Any:
 
 
 def write_ome_zarr(path: str | os.PathLike[str], data: Any, grid: VolumeGrid, unit: str) -> None:
-    """Write a whole volume ``(z, y, x)`` as OME-Zarr 0.5: a folder, float32, mm."""
+    """Write a whole volume ``(z, y, x)`` as OME-Zarr 0.5: a folder, float32, mm.
+
+    Raises:
+        FileExistsError: a folder of that name holds anything else than such a volume.
+    """
+    _require_own(path)
     with atomic_write(path) as part:
         _create(part, grid, unit, CHUNK)["0"][...] = np.asarray(data, dtype=np.float32)
-        if Path(path).is_dir():
-            shutil.rmtree(path)
+        _remove_ome_zarr(Path(path))
+
+
+_OWN_FILES = re.compile(r"zarr\.json|0/zarr\.json|0/c(/\d+)+")
+
+
+def _require_own(path: str | os.PathLike[str]) -> None:
+    """Raise ``FileExistsError`` for a folder that a volume of this name would replace, and that holds anything else
+    than an OME-Zarr as it is written here."""
+    folder = Path(path)
+    if not folder.is_dir():
+        return
+    if folder.is_symlink():
+        raise FileExistsError(f"{folder} is a link to a folder: name another file, or remove the link")
+    files = {
+        file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_symlink() or not file.is_dir()
+    }
+    foreign = sorted(name for name in files if not _OWN_FILES.fullmatch(name))
+    if files and not foreign:
+        try:
+            attributes = json.loads((folder / "zarr.json").read_text(encoding="utf-8"))["attributes"]
+            foreign = [] if "torchpcct" in attributes else ["zarr.json"]
+        except (OSError, ValueError, TypeError, KeyError):
+            foreign = ["zarr.json"]
+    if foreign:
+        raise FileExistsError(
+            f"{folder} is a folder that holds {foreign[0]}, which torchpcct did not write there: name another file, or "
+            "move the folder"
+        )
+
+
+def _remove_ome_zarr(folder: Path) -> None:
+    """Make room for another volume of the name."""
+    _require_own(folder)
+    if folder.is_dir():
+        shutil.rmtree(folder)
 
 
 def read_ome_zarr(path: str | os.PathLike[str]) -> tuple[Any, VolumeGrid, str]:

@@ -268,6 +268,35 @@ def test_ome_zarr_says_where_it_lies(tmp_path):
         Volume.load(tmp_path / "v.zarr")
 
 
+@pytest.mark.parametrize("name", ["notes.txt", "0/c/0/0/0.txt", "labels/zarr.json", "link"])
+def test_a_folder_with_files_of_others_is_not_replaced(tmp_path, name):
+    folder, grid = tmp_path / "v.zarr", VolumeGrid((3, 4, 5), 1.0)
+    volume = Volume(torch.zeros(grid.shape), grid, {})
+    volume.save(folder)
+    if name == "link":
+        folder.rename(tmp_path / "far.zarr")
+        folder.symlink_to(tmp_path / "far.zarr", target_is_directory=True)
+    else:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text("mine")
+    before = {path: path.is_file() and path.read_bytes() for path in tmp_path.rglob("*")}
+    for write in (volume.save, lambda path: SlabFile(path, grid, "HU", "key", 1)):
+        with pytest.raises(FileExistsError, match="link to a folder" if name == "link" else "did not write there"):
+            write(folder)
+    assert {path: path.is_file() and path.read_bytes() for path in tmp_path.rglob("*")} == before
+
+
+@pytest.mark.parametrize("name", ["v.nii.unfinished", "v.nii.unfinished.json", "v.zarr.unfinished/notes.txt"])
+def test_files_of_others_with_the_names_of_an_unfinished_volume_stay(tmp_path, name):
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_text('{"key": "mine"}')
+    with pytest.raises(FileExistsError, match="is no unfinished volume of torchpcct: move it"):
+        SlabFile(tmp_path / name.partition(".unfinished")[0], VolumeGrid((3, 4, 5), 1.0), "HU", "key", 1)
+    assert [p.name for p in tmp_path.rglob("*") if p.is_file()] == [path.name]
+    assert path.read_text() == '{"key": "mine"}'
+
+
 def test_nifti_is_that_of_a_whole_volume(tmp_path):
     scan = made(PARALLEL, slices=6)
     reconstruct_to(scan, STACK, tmp_path / "slabs.nii", memory=250_000)

@@ -155,6 +155,8 @@ def test_many_scans_go_on_after_an_interruption(tmp_path, monkeypatch, capsys):
         save(volume, path)
         saved.append(Path(path).name)
 
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "s2_fbp.nii.gz.done").write_text("mine")  # not the command's note
     monkeypatch.setattr(Volume, "save", interrupted)
     with pytest.raises((KeyboardInterrupt, SystemExit)):
         raise SystemExit(main(command))
@@ -165,7 +167,7 @@ def test_many_scans_go_on_after_an_interruption(tmp_path, monkeypatch, capsys):
     assert main(command) == 0
     assert saved == [f"s{k}_fbp.nii.gz" for k in (0, 1, 1, 2)]
     assert capsys.readouterr().out.count("already there") == 1
-    assert not list((tmp_path / "out").glob("*.done"))
+    assert [path.read_text() for path in (tmp_path / "out").glob("*.done")] == ["mine"]
 
 
 @pytest.mark.parametrize("where", ["processes", pytest.param("cluster", marks=pytest.mark.cluster)])

@@ -15,7 +15,7 @@ from fresh_python import run_python
 from tiny_studies import run_tiny
 
 import recon.evaluate.store as store_module
-from recon.evaluate.store import Pieces, packed, unpacked
+from recon.evaluate.store import Pieces, Store, packed, unpacked
 from recon.study.noise import Table
 from recon.study.results import differences
 from torchpcct import ConeBeam, VolumeGrid, full_turn
@@ -89,6 +89,59 @@ def test_finished_pieces_are_used_again_by_the_same_settings_and_source_only(tmp
     Pieces.clear(tmp_path)
     assert list(tmp_path.iterdir()) == []
     Pieces.clear(tmp_path)  # nothing there: nothing to do
+
+
+def _content(folder):
+    return {
+        path.relative_to(folder).as_posix(): None if path.is_dir() else path.read_bytes() for path in folder.rglob("*")
+    }
+
+
+@pytest.mark.parametrize("linked", [False, True])
+def test_only_what_a_study_wrote_is_ever_removed(tmp_path, linked):
+    """Files of the user in ``OUT/pieces``, also of a kept piece's name and kind, also where it is a link."""
+    out, pieces = tmp_path / "out", tmp_path / "out" / "pieces"
+    out.mkdir()
+    if linked:
+        (tmp_path / "mine").mkdir()
+        pieces.symlink_to(tmp_path / "mine", target_is_directory=True)
+    for name in ("deep/notes.txt", "deep/.part", "empty/nothing/", "other.d/data.npz", "deep/x.npz"):
+        path = pieces / name
+        (path if name.endswith("/") else path.parent).mkdir(parents=True, exist_ok=True)
+        if path.suffix == ".npz":
+            np.savez(path, key=np.ones(3), measured=np.arange(5))
+        elif not name.endswith("/"):
+            path.write_text("mine")
+    g = ConeBeam(full_turn(3), 500.0, 900.0, 4, 2, 1.0)
+    scan = Scan.from_counts(torch.full(g.shape, 7.0), g, air=9.0)
+    for name in ("present.h5", "present-0123456789abcdef.h5"):
+        scan.save(pieces / name)
+    (tmp_path / "elsewhere.txt").write_text("mine")
+    (pieces / "link.txt").symlink_to(tmp_path / "elsewhere.txt")
+    Path(pieces / "link.npz").symlink_to(tmp_path / "elsewhere.txt")
+    mine = _content(tmp_path)
+    study = Pieces(out, _Settings())
+    for name in ("a", "deep/x", "deep/deeper/y", "link"):
+        assert study(name, lambda name=name: name) == name
+    store = Store(study.folder("evaluate"))
+    store.keep_scan(scan, store.path("task/present-fedcba9876543210.h5"))
+    assert Scan.load(store.path("task/present-fedcba9876543210.h5")).geometry == g
+    own = {"a.npz", "deep/deeper/y.npz", "evaluate/task/present-fedcba9876543210.h5"}
+    assert own <= {name.removeprefix("out/pieces/").removeprefix("mine/") for name in _content(tmp_path)}
+    (pieces / "copy of a.npz").write_bytes((pieces / "a.npz").read_bytes())
+    mine = {**mine, **{k: v for k, v in _content(tmp_path).items() if "copy" in k}}
+    Pieces.clear(out)
+    assert _content(tmp_path) == mine
+    assert (pieces / "link.npz").is_symlink()
+
+
+def test_a_piece_does_not_replace_a_file_of_the_user(tmp_path, caplog):
+    np.savez(tmp_path / "x.npz", measured=np.arange(5))
+    mine = (tmp_path / "x.npz").read_bytes()
+    store = Store(tmp_path)
+    assert [store.piece("x", "key", lambda: 7) for _ in range(2)] == [7, 7]
+    assert (tmp_path / "x.npz").read_bytes() == mine
+    assert "x.npz is no piece of a study: it is left as it is" in caplog.text
 
 
 def test_one_name_is_one_piece(tmp_path):
