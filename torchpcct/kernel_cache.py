@@ -7,15 +7,20 @@ go on giving the old code, silently.
 
 from __future__ import annotations
 
+import hashlib
 import logging
+import os
+import platform
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-__all__ = ["OURS", "announce_compilation", "folders", "forget_outdated", "sources"]
+__all__ = ["OURS", "announce_compilation", "compiled_once", "folders", "forget_outdated", "sources"]
 
 OURS = ("torchpcct.", "recon.", "train.")
 """What the names of our modules begin with."""
@@ -101,3 +106,91 @@ def announce_compilation() -> None:
             pass
 
     event.register("numba:compile", Announce())
+
+
+# --- processes that need the same kernel ------------------------------------------------------------------------------
+
+
+@contextmanager
+def compiled_once(patience_s: float = 60.0) -> Iterator[None]:
+    """Of the processes of a machine that are in such a block one compiles a kernel; the others read it from the cache.
+
+    Each kernel has a lock of its own, so that nobody waits for a kernel that he does not need. All waits of a block
+    together last ``patience_s`` at most; then, and where no lock can be had (no folder of one's own, a disk without
+    locks), a process compiles for itself: that takes time, and the result is the same.
+    """
+    from filelock import BaseFileLock, FileLock, Timeout
+    from numba.core import caching, event
+
+    held: dict[str, BaseFileLock] = {}
+    load, save, left = caching.Cache.load_overload, caching.Cache.save_overload, patience_s
+
+    def name_of(kernel: Any) -> str:
+        where = f"{platform.node()} {kernel.cache_path} {kernel._impl.filename_base}"
+        return hashlib.sha256(where.encode()).hexdigest()[:32]
+
+    def loaded(kernel: Any, *given: Any) -> Any:
+        nonlocal left
+        found, name = load(kernel, *given), name_of(kernel)
+        folder = None if found is not None or name in held else _lock_folder()
+        if folder is None:
+            return found
+        lock, start = FileLock(folder / f"{name}.lock"), time.monotonic()
+        try:
+            lock.acquire(timeout=max(left, 0.0))
+        except (Timeout, OSError, NotImplementedError):
+            return None
+        finally:
+            left -= time.monotonic() - start
+        found = load(kernel, *given)  # who had the lock may have compiled it
+        if found is None:
+            held[name] = lock
+        else:
+            lock.release()
+        return found
+
+    def saved(kernel: Any, *given: Any) -> None:
+        try:
+            save(kernel, *given)
+        finally:
+            if name_of(kernel) in held:
+                held.pop(name_of(kernel)).release()
+
+    def release_all() -> None:
+        while held:
+            held.popitem()[1].release()
+
+    class Ended(event.Listener):  # also a compilation that fails, and saves nothing
+        depth = 0
+
+        def on_start(self, event: Any) -> None:
+            self.depth += 1
+
+        def on_end(self, event: Any) -> None:
+            self.depth -= 1
+            if self.depth == 0:
+                release_all()
+
+    caching.Cache.load_overload, caching.Cache.save_overload = loaded, saved
+    try:
+        with event.install_listener("numba:compiler_lock", Ended()):
+            yield
+    finally:
+        caching.Cache.load_overload, caching.Cache.save_overload = load, save
+        release_all()
+
+
+def _lock_folder() -> Path | None:
+    """In the user's own cache, made if need be, where nobody else can put a file or a link; None: there is none."""
+    local = os.environ.get("LOCALAPPDATA" if sys.platform == "win32" else "XDG_CACHE_HOME", "")
+    with suppress(OSError, RuntimeError):  # not writable; no home
+        folder = (Path(local) if os.path.isabs(local) else Path.home() / ".cache") / "torchpcct" / "locks"
+        for part in (folder.parent, folder):
+            part.mkdir(mode=0o700, parents=True, exist_ok=True)
+            found = part.lstat()
+            # On Windows the profile's own rights keep others out, and these numbers say nothing.
+            mine = not hasattr(os, "getuid") or (found.st_uid == os.getuid() and not found.st_mode & 0o022)
+            if part.is_symlink() or not mine:
+                return None
+        return folder
+    return None

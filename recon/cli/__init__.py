@@ -27,7 +27,7 @@ from recon.cli.measuring import (
     add_study,
     add_verify,
 )
-from recon.cli.parsing import Commands, Parser, as_options, check_limits, saying
+from recon.cli.parsing import Commands, Ended, Parser, as_options, check_limits, ending_by_signals, saying
 
 # What loads torch or numba is imported by the commands: help and refusals come at once.
 from recon.cli.plaque import add_plaque
@@ -108,7 +108,8 @@ class _Completion(argparse.Action):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit status: 0 done, 1 not written (a full disk) or, of ``doctor``, something is
-    broken, 2 refused input, 130 interrupted. Without a command it says where to begin, which is no error."""
+    broken, 2 refused input, 130 interrupted, 128 + N ended by signal N. Without a command it says where to begin,
+    which is no error."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     if words[:1] == ["train"]:
         return train(words[1:])
@@ -123,7 +124,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return demo_steps(options, main)
     options.command_line = words
     chosen = commands.choices[options.command]
-    with saying(chosen._actions, options.verbose) as options.warn:
+    with saying(chosen._actions, options.verbose) as options.warn, ending_by_signals():
         return _run(options, chosen)
 
 
@@ -149,6 +150,8 @@ def _run(options: argparse.Namespace, parser: Parser) -> int:
             raise
         text = "numba cannot keep compiled kernels: set NUMBA_CACHE_DIR to a folder that you can write"
         return _failed(options.command, progress, text, 2)
+    except Ended as error:
+        return _failed(options.command, progress, f"{error}, nothing half written", 128 + error.number)
     except KeyboardInterrupt:
         return _failed(options.command, progress, "interrupted, nothing half written", 130)
 

@@ -46,6 +46,7 @@ _MEASURED = ("noise", "noise_reference", "dose_factor", "f50", "resolution")
 
 def _evaluate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     from recon.evaluate.experiment import evaluate, export_scans
+    from recon.evaluate.methods import names_module
     from recon.evaluate.report import save, text_of
 
     out = arguments.out or Path(f"out/{arguments.command}")
@@ -55,9 +56,9 @@ def _evaluate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     if getattr(arguments, "volumes", None):
         _volumes(arguments.volumes[0], arguments.volumes[1], arguments.reference)
         return
-    # The user's own modules lie where the command is run.
-    sys.path.insert(0, os.getcwd())
     methods = [*(arguments.method or []), *map(_denoiser, arguments.denoiser or [])]
+    if any(map(names_module, methods)):
+        sys.path.append(os.getcwd())  # the user's own modules lie where the command is run; none hides another one
     if not methods:
         methods = list(arguments.methods)
     tasks = arguments.task or list(arguments.tasks)

@@ -7,11 +7,13 @@ import json
 import logging
 import os
 import re
+import signal
 import sys
+import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -22,6 +24,7 @@ __all__ = [
     "FORCE",
     "SCAN_ENDINGS",
     "Commands",
+    "Ended",
     "Parser",
     "add_execution",
     "add_options",
@@ -32,6 +35,7 @@ __all__ = [
     "check_output",
     "check_results",
     "command",
+    "ending_by_signals",
     "examples",
     "executing",
     "is_picture",
@@ -328,13 +332,43 @@ def executing(arguments: argparse.Namespace, out: Path) -> Iterator[Any]:
     if executor is not None:
         executor.log = out / f"jobs-{time.strftime('%Y%m%d-%H%M%S')}.log"
     try:
-        with execute.using(executor):
+        with nullcontext() if executor is None else executor, execute.using(executor):
             yield executor
     except execute.Planned as plan:
         print(plan)
+
+
+class Ended(KeyboardInterrupt):
+    """A signal of the system has told the command to end, as Ctrl-C does; ``number`` is the signal's."""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+        super().__init__(f"ended by {signal.Signals(number).name}")
+
+
+@contextmanager
+def ending_by_signals() -> Iterator[None]:
+    """SIGTERM (a batch system's time is up) and SIGHUP (the terminal is closed) raise :class:`Ended` in a block.
+
+    Processes are then ended and files taken back that are half written. What is ignored (``nohup``) stays so, and what
+    comes on the way out is.
+    """
+    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    main = threading.current_thread() is threading.main_thread()
+    mine = [n for n in numbers if main and signal.getsignal(n) is signal.SIG_DFL]
+
+    def told(number: int, frame: Any) -> None:
+        for n in mine:
+            signal.signal(n, signal.SIG_IGN)
+        raise Ended(number)
+
+    try:
+        for n in mine:
+            signal.signal(n, told)
+        yield
     finally:
-        if executor is not None:
-            executor.shutdown(cancel_futures=True)
+        for n in mine:
+            signal.signal(n, signal.SIG_DFL)
 
 
 def check_output(

@@ -22,6 +22,8 @@ import multiprocessing
 import os
 import pickle
 import platform
+import secrets
+import signal
 import socket
 import sys
 import threading
@@ -40,6 +42,7 @@ from typing import Any
 
 from recon.evaluate.sources import source_digest
 from torchpcct.files import VERSION, WriteError, atomic_write, marker
+from torchpcct.kernel_cache import compiled_once
 from torchpcct.validate import whole
 
 __all__ = [
@@ -64,6 +67,12 @@ DEATHS = 3
 """Of processes until a job is left out; a Dask scheduler counts by itself."""
 _ANSWER_S = 8.0
 """That a scheduler may take."""
+_AGAIN_S = 0.5
+"""Until a scheduler is asked a second time for a job that it does not know."""
+_NO_WORKER_S = 30.0
+"""Until it is said that a cluster has no worker."""
+_LAST_S = 5.0
+"""For processes that are told to end."""
 
 _DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)
 
@@ -121,7 +130,7 @@ class Job:
 
 @dataclass(frozen=True)
 class _Run:
-    """What the jobs of a run share."""
+    """What the jobs of a run share; ``path``: a folder of modules, looked into after all others."""
 
     folder: str
     marker: str
@@ -176,7 +185,8 @@ class Processes(ThreadPoolExecutor):
         self.workers = whole("workers", workers)
         self.threads = whole("threads", threads or max(1, (os.cpu_count() or 1) // workers))
         super().__init__(workers)
-        self._own, self._pools = threading.local(), list[Pool]()
+        self._own, self._pools, self._starting = threading.local(), list[Pool](), threading.Lock()
+        self._ended = False
         for _ in range(workers):  # all of them load what is slow to load, while the first jobs are thought of
             self.submit(_load)
 
@@ -187,14 +197,38 @@ class Processes(ThreadPoolExecutor):
     def _in_process(self, fn: Callable[..., Any], *args: Any) -> Any:
         pool: Pool | None = getattr(self._own, "pool", None)
         if pool is None:
-            pool = Pool(1, multiprocessing.get_context("spawn"), initializer=_end_with_parent)
+            pool = Pool(1, multiprocessing.get_context("spawn"), initializer=_begin_process)
             self._own.pool = pool
             self._pools.append(pool)
         try:
-            return pool.submit(fn, *args).result()
+            with self._starting, _without_current_folder():  # a process starts when it is first given something
+                if self._ended:
+                    raise BrokenExecutor("ended")
+                job = pool.submit(fn, *args)
+            return job.result()
         except BrokenExecutor:
             self._own.pool = None
             raise
+
+    def __exit__(self, kind: Any, value: Any, trace: Any) -> None:
+        """What is running is finished, but for an interruption (Ctrl-C, a signal of the system)."""
+        if kind is not None and issubclass(kind, KeyboardInterrupt):
+            self.end()
+        self.shutdown(cancel_futures=kind is not None)
+
+    def end(self) -> None:
+        """End the processes now: each is told, and has a few seconds to take back what it is writing."""
+        with self._starting:
+            self._ended = True
+        super().shutdown(wait=False, cancel_futures=True)
+        children = [p for pool in self._pools for p in list((getattr(pool, "_processes", None) or {}).values())]
+        for child in children:
+            child.terminate()
+        until = time.monotonic() + _LAST_S
+        for child in children:
+            child.join(max(0.0, until - time.monotonic()))
+            if child.is_alive():
+                child.kill()
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """See :class:`concurrent.futures.Executor`."""
@@ -208,8 +242,41 @@ def _load() -> None:
     source_digest()  # of all files as they are loaded: what is installed while a worker runs, it does not have
 
 
-def _end_with_parent() -> None:
-    """A process whose parent was killed would wait for its next job forever."""
+@contextlib.contextmanager
+def _without_current_folder() -> Iterator[None]:
+    """A process that is started meanwhile imports nothing from the current folder but what this process would.
+
+    Python looks there first for the modules that it needs to start (https://docs.python.org/3/using/cmdline.html).
+    """
+    before = os.environ.get("PYTHONSAFEPATH")
+    os.environ["PYTHONSAFEPATH"] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["PYTHONSAFEPATH"]
+        else:
+            os.environ["PYTHONSAFEPATH"] = before
+
+
+class _Told(BaseException):
+    """A signal has told a process to end: what its job is writing is taken back on the way out."""
+
+
+_working = False
+"""Whether this process, one of :class:`Processes`, is at a job."""
+
+
+def _begin_process() -> None:
+    def told(number: int, frame: Any) -> None:
+        if not _working:
+            os._exit(128 + number)
+        raise _Told(number)
+
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), told)
+    # A process whose parent was killed would wait for its next job forever.
     parent: Any = multiprocessing.parent_process()
 
     def end() -> None:
@@ -252,6 +319,9 @@ class Cluster(Executor):
             quiet.setLevel(level)
         self.avoid: dict[str, str] = {}  # machine → why
         self._asked: tuple[float, list[str]] = -9.0, []
+        self._given = dict[str, Future[Any]]()
+        self._doubted: tuple[float, set[str]] = -9.0, set()
+        self._without: tuple[float | None, float] = None, _NO_WORKER_S
         from cloudpickle import dumps
 
         self.dumps = dumps
@@ -280,7 +350,9 @@ class Cluster(Executor):
         """See :class:`concurrent.futures.Executor`."""
         # Machines, not workers: one that dies is started again under another address.
         only = {"workers": sorted(set(map(_machine, self._addresses)))} if self.avoid else {}
+        kwargs["key"] = f"torchpcct-{secrets.token_hex(16)}"
         found: Future[Any] = self.client.get_executor(pure=False, **only).submit(fn, *args, **kwargs)
+        self._given[kwargs["key"]] = found
         return found
 
     def refuse(self, error: Unfit) -> None:
@@ -289,16 +361,46 @@ class Cluster(Executor):
             log.warning("%s; jobs go to other machines", error)
 
     def check(self) -> None:
-        """Raise ``ConnectionError`` if the scheduler is gone, or was: it has forgotten what it was given."""
-        # What only a dead worker held is lost as well, but the scheduler knows it and has it computed again.
-        lost = [key for key, state in list(self.client.futures.items()) if state.status == "lost"]
-        if self.client.status in ("closing", "closed") or (
-            lost
-            and self.client.run_on_scheduler(
-                lambda keys, dask_scheduler: any(key not in dask_scheduler.tasks for key in keys), lost
+        """Raise ``ConnectionError`` if the scheduler is gone, or was: it has forgotten what it was given.
+
+        A warning says that there is no worker, and for how long.
+        """
+        now = time.monotonic()
+        if self.workers:
+            self._without = None, _NO_WORKER_S
+        since, tell_at = self._without
+        since = now if since is None and not self.workers else since
+        if since is not None and now - since >= tell_at:
+            log.warning(
+                "no worker since %.0f s: jobs wait until one comes to the scheduler %s (dask worker --nthreads 1); "
+                "what is done is kept, Ctrl-C ends",
+                now - since,
+                self.address,
             )
-        ):
+            tell_at *= 10
+        self._without = since, tell_at
+        if self.client.status in ("closing", "closed"):
             raise _gone(self)
+        # What only a dead worker held is lost as well, but the scheduler knows it and has it computed again. A job that
+        # is done while the scheduler answers is forgotten rightly: so only what runs on counts, and that twice.
+        self._given = {key: future for key, future in self._given.items() if not future.done()}
+        if not self._lost() or now - self._doubted[0] < _AGAIN_S:
+            return
+        try:
+            unknown = self.client.run_on_scheduler(  # a lambda is sent whole: the scheduler need not have torchpcct
+                lambda keys, dask_scheduler: [key for key in keys if key not in dask_scheduler.tasks], self._lost()
+            )
+        except (OSError, TimeoutError):
+            return  # the client's status says so soon
+        unknown = set(unknown).intersection(self._lost())
+        if unknown & self._doubted[1]:
+            raise _gone(self)
+        self._doubted = time.monotonic(), unknown
+
+    def _lost(self) -> list[str]:
+        """Keys of jobs that are not done, and whose worker or scheduler is gone."""
+        states = self.client.futures
+        return [k for k, f in self._given.items() if not f.done() and getattr(states.get(k), "status", "") == "lost"]
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Part from the scheduler, which goes on; what was submitted and is not done is dropped."""
@@ -338,42 +440,14 @@ def _use_threads(threads: int) -> None:
 
 
 @contextlib.contextmanager
-def _compiling(own: bool) -> Iterator[list[float]]:
-    """Seconds in which numba compiled kernels, one number for each.
-
-    Of the workers of a machine one at a time compiles, or looks into the cache for what another has compiled: every
-    kernel is compiled once on each machine, however many workers begin with it together.
-    """
-    import fcntl
-
+def _compiling(own: bool) -> Iterator[Callable[[], float]]:
+    """Gives the seconds in which numba has compiled kernels. Of the workers of a machine each compiles others."""
     from numba.core import event
 
-    found: list[float] = []
-    depths: dict[int, int] = defaultdict(int)
-    path = Path(gettempdir()) / f"torchpcct-{os.getuid()}.compiling"
-
-    class Timer(event.TimingListener):
-        def on_end(self, event: Any) -> None:
-            super().on_end(event)
-            if self.done:
-                found.append(self.duration)
-
-    class Alone(event.Listener):  # numba takes its lock before it looks into the cache, also for what a kernel calls
-        def on_start(self, event: Any) -> None:
-            me = threading.get_ident()
-            if not depths[me]:
-                fcntl.flock(file, fcntl.LOCK_EX)
-            depths[me] += 1
-
-        def on_end(self, event: Any) -> None:
-            me = threading.get_ident()
-            depths[me] -= 1
-            if not depths[me]:
-                fcntl.flock(file, fcntl.LOCK_UN)
-
-    alone = contextlib.nullcontext() if own else event.install_listener("numba:compiler_lock", Alone())
-    with path.open("w") as file, event.install_listener("numba:compile", Timer()), alone:
-        yield found
+    timer = event.TimingListener()
+    alone = contextlib.nullcontext() if own else compiled_once()
+    with event.install_listener("numba:compile", timer), alone:
+        yield lambda: timer.duration if timer.done else 0.0
 
 
 @contextlib.contextmanager
@@ -400,14 +474,25 @@ def heard(*loggers: str, alone: bool = False) -> Iterator[list[str]]:
 
 def _work(call: bytes, module: str, digest: str, makes: tuple[str, ...], of: _Run) -> _Done:
     """Run a job where this is called."""
+    global _working
+    try:
+        _working = True
+        return _do_job(call, module, digest, makes, of)
+    except _Told as told:
+        os._exit(128 + told.args[0])
+    finally:
+        _working = False
+
+
+def _do_job(call: bytes, module: str, digest: str, makes: tuple[str, ...], of: _Run) -> _Done:
     own = of.client == (platform.node(), os.getpid())
     where, scratch, at_once = _where()
     if not own:
         if at_once > 1:
             raise Unfit(where, f"takes {at_once} jobs at once: start it with --nthreads 1 (more workers of a machine: "
                         "--nworkers)")  # fmt: skip
-        if of.path not in sys.path and os.path.isdir(of.path):
-            sys.path.insert(0, of.path)
+        if of.path and of.path not in sys.path and os.path.isdir(of.path):
+            sys.path.append(of.path)
         source_digest()  # as in _load, for a worker that came later
         if (VERSION, source_digest(module)) != (of.version, digest):
             raise Unfit(where, f"has another torchpcct (its version {VERSION}, here {of.version}; the sources of "
@@ -430,7 +515,7 @@ def _work(call: bytes, module: str, digest: str, makes: tuple[str, ...], of: _Ru
     made = {} if shared else {
         p.relative_to(folder).as_posix(): p.read_bytes() for pattern in makes for p in folder.glob(pattern)
     }  # fmt: skip
-    return _Done(where, value, made, time.perf_counter() - start, sum(compiled), said)
+    return _Done(where, value, made, time.perf_counter() - start, compiled(), said)
 
 
 # --- the client ---------------------------------------------------------------------------------------------------
@@ -480,9 +565,15 @@ def run(
     with marker(folder) as here:
         of = _Run(
             str(folder.resolve()), str(here.resolve()), (platform.node(), os.getpid()),
-            getattr(executor, "threads", None), VERSION, os.getcwd(),
+            getattr(executor, "threads", None), VERSION, _current_folder(),
         )  # fmt: skip
         return _run(jobs, folder, executor, of, _Log(executor, jobs), progress, finished)
+
+
+def _current_folder() -> str:
+    """If this process finds modules there, so must those that work for it; else empty."""
+    here = os.getcwd()
+    return here if any(os.path.abspath(path) == here for path in sys.path) else ""
 
 
 def _run(
@@ -556,6 +647,9 @@ def _run(
                 executor.check()
             if progress is not None:
                 progress(book.text(len(values), len(running), len(lost)), len(values) / len(jobs))
+    except KeyboardInterrupt as error:
+        book.note(f"ended    {error or 'interrupted'}: {len(values)} of {len(jobs)} jobs are done, and kept")
+        raise
     finally:
         for future in running:
             future.cancel()

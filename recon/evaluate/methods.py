@@ -38,7 +38,7 @@ from torchpcct.scan import Scan
 from torchpcct.validate import checked, choice, meant, number, renamed
 from torchpcct.volume import Volume
 
-__all__ = ["Draw", "Method", "deepinv_denoiser", "denoiser", "method_of"]
+__all__ = ["Draw", "Method", "deepinv_denoiser", "denoiser", "method_of", "names_module"]
 
 
 class Draw(Protocol):
@@ -123,6 +123,15 @@ def method_of(spec: Any) -> Method:
     if isinstance(spec, str):
         return replace(_named(spec), made=(method_of, (spec,)))
     raise TypeError(f"a method must be a name or a function of (scan, grid), got {type(spec).__name__}")
+
+
+def names_module(spec: str) -> bool:
+    """Whether a method's name is that of a function of a module, which is imported."""
+    head, _, base = spec.partition("@")
+    if base:
+        return head not in FILTERS
+    name, _, rest = spec.partition(":")
+    return bool(rest) and name not in ("fbp", "mbir", "files")
 
 
 def _named(spec: str) -> Method:

@@ -1,14 +1,17 @@
 """Jobs for tests of recon.evaluate.execute, which other processes import."""
 
 import errno
+import importlib
 import logging
 import os
 import signal
+import sys
 import time
 
 from numba import njit
 
 from recon.evaluate import execute
+from torchpcct.files import atomic_write
 
 
 def noted(folder, name, value):
@@ -50,6 +53,19 @@ def kills(folder, process):
 def waits(folder, seconds):
     """Take so long, and no processor."""
     time.sleep(seconds)
+
+
+def holds(folder, seconds):
+    """A file that it has begun to write; it says so by another, and which process it is."""
+    with atomic_write(folder / "result.txt") as part:
+        part.write_text("half")
+        (folder / "begun").write_text(str(os.getpid()))
+        time.sleep(seconds)
+
+
+def found_in(folder, module):
+    """Where a module is found, and what of the current folder was loaded before."""
+    return importlib.import_module(module).__file__, sys.modules["queue"].__file__
 
 
 @njit(cache=True)

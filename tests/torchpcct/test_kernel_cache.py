@@ -3,17 +3,22 @@
 import importlib
 import os
 import pkgutil
+import sys
 import textwrap
 import time
 from pathlib import Path
 
+import filelock
 import pytest
 from fresh_python import run_python
+from numba import TypingError
+from numba.core import caching
 
 import recon
 import torchpcct
 import train
-from torchpcct.kernel_cache import sources
+from torchpcct import kernel_cache
+from torchpcct.kernel_cache import compiled_once, sources
 
 HELPER = """
     from numba import njit
@@ -106,3 +111,108 @@ def test_a_fresh_process_and_later_ones(tmp_path):
     assert (theirs.count("compiling kernels"), ours.count("compiling kernels")) == (0, 1)
     assert "compiling kernels" not in found[1].stderr
     assert found[0].stdout == found[1].stdout
+
+
+@pytest.fixture
+def kernels(tmp_path, monkeypatch):
+    """Two new kernels, kept in a cache of their own; locks in a cache folder of a user of their own."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "user"))
+    (tmp_path / "made_up_kernels.py").write_text(
+        "from numba import njit\n"
+        "@njit(cache=True)\ndef inner(x):\n    return x + 1\n"
+        "@njit(cache=True)\ndef outer(x):\n    return 2 * inner(x)\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    sys.modules.pop("made_up_kernels", None)
+    yield importlib.import_module("made_up_kernels")
+    sys.modules.pop("made_up_kernels", None)
+
+
+def locks(tmp_path):
+    return sorted((tmp_path / "user" / "torchpcct" / "locks").glob("*.lock"))
+
+
+def held(path):
+    """Whether somebody has this lock."""
+    lock = filelock.FileLock(path)
+    try:
+        lock.acquire(timeout=0)
+    except filelock.Timeout:
+        return True
+    lock.release()
+    return False
+
+
+def test_each_kernel_has_a_lock_of_its_own_until_it_is_kept(kernels, tmp_path, monkeypatch):
+    states, save = [], caching.Cache.save_overload
+
+    def saved(kernel, *given):
+        states.append([*map(held, locks(tmp_path))])
+        save(kernel, *given)
+
+    monkeypatch.setattr(caching.Cache, "save_overload", saved)
+    with compiled_once():
+        assert kernels.outer(1) == 4
+        assert not any(map(held, locks(tmp_path)))
+    assert [len(state) for state in states] == [2, 2]  # of inner, then of outer
+    assert [sum(state) for state in states] == [2, 1]
+    assert caching.Cache.load_overload.__qualname__ == "Cache.load_overload"
+
+
+def test_nobody_waits_longer_than_he_has_patience_and_only_for_the_same_kernel(kernels, tmp_path):
+    with compiled_once():
+        kernels.outer(1)
+    everything = [filelock.FileLock(path) for path in locks(tmp_path)]
+    for lock in everything:
+        lock.acquire()
+    try:
+        start = time.monotonic()
+        with compiled_once(patience_s=0.3):
+            assert kernels.outer(1.5) == 5.0  # another signature: not in the cache, and both locks are taken
+        assert 0.3 <= time.monotonic() - start < 20.0
+        fresh = importlib.reload(kernels)
+        with compiled_once(patience_s=300.0):
+            assert fresh.outer(2.5) == 7.0  # in the cache: no lock is asked for
+    finally:
+        for lock in everything:
+            lock.release()
+
+
+def test_a_compilation_that_fails_holds_no_lock(kernels, tmp_path):
+    with compiled_once():
+        with pytest.raises(TypingError):
+            kernels.outer("text")
+        assert locks(tmp_path)
+        assert not any(map(held, locks(tmp_path)))
+
+
+@pytest.mark.parametrize("case", ["link", "others may write", "no home", "a file"])
+def test_without_a_folder_of_ones_own_there_is_no_lock(kernels, tmp_path, monkeypatch, case):
+    user, target = tmp_path / "user", tmp_path / "victim"
+    target.mkdir()
+    if case == "link":
+        user.mkdir()
+        (user / "torchpcct").symlink_to(target, target_is_directory=True)
+    elif case == "others may write":
+        (user / "torchpcct").mkdir(parents=True)
+        (user / "torchpcct").chmod(0o777)
+    elif case == "a file":
+        user.write_text("mine")
+    else:
+        monkeypatch.setenv("XDG_CACHE_HOME", "relative")
+        monkeypatch.setattr(Path, "home", lambda: (_ for _ in ()).throw(RuntimeError("no home")))
+    with compiled_once():
+        assert kernels.outer(1) == 4
+    assert kernel_cache._lock_folder() is None
+    assert list(target.iterdir()) == []
+    if case == "a file":
+        assert user.read_text() == "mine"
+
+
+def test_locks_need_nothing_that_windows_lacks(kernels, tmp_path, monkeypatch):
+    """``os.getuid`` and ``fcntl`` are of Unix alone."""
+    monkeypatch.delattr(os, "getuid", raising=False)
+    monkeypatch.setitem(sys.modules, "fcntl", None)
+    with compiled_once():
+        assert kernels.outer(1) == 4
+    assert len(locks(tmp_path)) == 2

@@ -9,18 +9,24 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 import warnings
+from concurrent.futures import Future
 from pathlib import Path
+from types import SimpleNamespace
 
+import psutil
 import pytest
 import torch
 from fresh_python import run_python
-from some_jobs import compiles, dies, full, kills, noted, refuses, set_version, threads, waits
+from some_jobs import compiles, dies, found_in, full, holds, kills, noted, refuses, set_version, waits
+from some_jobs import threads as threads_of
 from tiny_studies import INSERT, TINY
 
 from recon.analytic.slabs import reconstruct_to
 from recon.cli import main
+from recon.cli.parsing import Ended, ending_by_signals
 from recon.evaluate import execute
 from recon.evaluate.execute import Cluster, Job, LeftOut, Processes, run
 from recon.evaluate.experiment import evaluate
@@ -251,13 +257,13 @@ def test_what_a_job_itself_refuses_ends_the_run(processes, tmp_path):
 
 
 def test_threads_of_all_libraries_are_the_workers(processes, tmp_path):
-    assert run([Job("t", threads, ())], tmp_path, processes)["t"] == (1, 1, 1)
+    assert run([Job("t", threads_of, ())], tmp_path, processes)["t"] == (1, 1, 1)
 
 
 @pytest.mark.cluster
 def test_threads_on_a_cluster(cluster, tmp_path):
     """Of each job what its command asks for, whatever another command asked of the same worker."""
-    one = [Job("t", threads, ())]
+    one = [Job("t", threads_of, ())]
     found = []
     for number in (1, 2, 1):
         cluster.threads = number
@@ -273,6 +279,129 @@ def test_workers_of_a_machine_compile_a_kernel_once(tmp_path, monkeypatch):
         executor.log = tmp_path / "run.log"
         run([Job(f"{k}", compiles, (f"{k}", 2)) for k in range(2)], tmp_path, executor)
     assert executor.log.read_text().count("s of it compiling") == 1
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+def test_a_signal_ends_the_processes_and_takes_back_what_is_half_written(tmp_path):
+    """SIGTERM to the command alone, as ``kill`` sends it; a batch system sends it to its processes, too."""
+    log, jobs = tmp_path / "log", [Job("quick", noted, ("q", 1)), Job("holds", holds, (600.0,), after=("quick",))]
+    log.mkdir()
+
+    def signalled():
+        wait_until((tmp_path / "begun").exists)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    def command():
+        with ending_by_signals(), Processes(1, 1) as executor:
+            executor.log = log / "run.log"
+            run(jobs, tmp_path, executor)
+
+    sender = threading.Thread(target=signalled)
+    sender.start()
+    with pytest.raises(Ended, match="ended by SIGTERM") as ended:
+        command()
+    sender.join()
+    assert ended.value.number == signal.SIGTERM
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    with pytest.raises(ProcessLookupError):
+        os.kill(int((tmp_path / "begun").read_text()), 0)
+    assert {p.name for p in tmp_path.iterdir()} == {"q.txt", "begun", "log"}
+    assert "ended    ended by SIGTERM: 1 of 2 jobs are done, and kept" in (log / "run.log").read_text()
+
+
+def wait_until(condition, seconds=120.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+@pytest.mark.extended
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_a_signal_ends_evaluate(tmp_path, name):
+    number = getattr(signal, name)
+    command = [sys.executable, "-c", "import sys; from recon.cli import main; sys.exit(main())", "evaluate", "--task",
+               "nodule", "--method", "fbp:soft", "--n", "400", "--workers", "1", "--out", "out"]  # fmt: skip
+    path = os.pathsep.join(p for p in sys.path if p)
+    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True,
+                          env={**os.environ, "PYTHONPATH": path}) as process:  # fmt: skip
+        wait_until(lambda: list(tmp_path.glob("out/pieces/**/*.h5")), 300.0)
+        children = psutil.Process(process.pid).children(recursive=True)
+        process.send_signal(number)
+        said = process.communicate(timeout=60)[1]
+    assert process.returncode == 128 + number
+    assert said.splitlines()[-1] == f"torchpcct evaluate: ended by {name}, nothing half written"
+    assert "Traceback" not in said
+    assert children
+    assert not psutil.wait_procs(children, 10.0)[1]
+    assert not [p for p in tmp_path.rglob("*.part.*")]
+
+
+def test_what_lies_in_the_current_folder_hides_no_module(tmp_path, monkeypatch):
+    """Neither in a process when it starts, nor later; a module of the user's own is found there, after all others."""
+    for name in ("queue", "spekpy", "mine"):
+        (tmp_path / f"{name}.py").write_text("")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [p for p in sys.path if p not in ("", str(tmp_path))])
+    with Processes(1, 1) as executor:
+        (found,) = run([Job("a", found_in, ("spekpy",))], tmp_path, executor).values()
+        assert str(tmp_path) not in " ".join(found)
+        with pytest.raises(ModuleNotFoundError):
+            run([Job("b", found_in, ("mine",))], tmp_path, executor)
+        monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])
+        (found,) = run([Job("c", found_in, ("mine",))], tmp_path, executor).values()
+        assert found[0] == str(tmp_path / "mine.py")
+        (found,) = run([Job("d", found_in, ("xraydb",))], tmp_path, executor).values()
+        assert str(tmp_path) not in " ".join(found)
+
+
+@pytest.mark.cluster
+def test_a_job_that_is_done_while_the_scheduler_answers_is_no_loss(cluster, tmp_path, monkeypatch):
+    """Keys of jobs that are lost, asked for, and forgotten when the answer comes: the scheduler is not gone."""
+    asked = []
+
+    class Client:
+        status, futures = "running", {}
+
+        def run_on_scheduler(self, function, keys):
+            asked.append(keys)
+            if len(asked) == 1:
+                given["a"].set_result(1)
+            return keys
+
+    given = {"a": Future(), "b": Future()}
+    monkeypatch.setattr(cluster, "client", Client())
+    monkeypatch.setattr(Cluster, "workers", 2)
+    monkeypatch.setattr(cluster, "_given", given)
+    monkeypatch.setattr(cluster, "_doubted", (-9.0, set()))
+    Client.futures = {k: SimpleNamespace(status="lost") for k in given}
+    cluster.check()
+    assert asked == [["a", "b"]]
+    cluster.check()  # too soon to ask again
+    Client.futures["b"].status = "pending"
+    monkeypatch.setattr(execute, "_AGAIN_S", 0.0)
+    cluster.check()
+    assert len(asked) == 1
+    Client.futures["b"].status = "lost"
+    with pytest.raises(ConnectionError, match="is gone"):
+        cluster.check()
+
+
+@pytest.mark.cluster
+def test_a_cluster_without_workers_says_so(cluster, monkeypatch, caplog):
+    monkeypatch.setattr(cluster, "_asked", (time.monotonic() + 900.0, []))
+    monkeypatch.setattr(cluster, "_without", (None, 0.05))
+    cluster.check()
+    assert not caplog.messages
+    time.sleep(0.06)
+    for _ in range(2):
+        cluster.check()
+    (said,) = caplog.messages
+    assert said.startswith("no worker since 0 s: jobs wait until one comes to the scheduler")
+    monkeypatch.setattr(cluster, "_asked", (-9.0, []))
+    cluster.check()
+    assert cluster._without == (None, execute._NO_WORKER_S)
 
 
 @pytest.mark.cluster
