@@ -1,6 +1,8 @@
 """Operators as other libraries call them, narrow dtypes, forks and the notice of compilation."""
 
 import copy
+import importlib.metadata
+import importlib.util
 import os
 
 import numpy as np
@@ -71,9 +73,21 @@ def test_pylops_takes_it(A):
     np.testing.assert_allclose(P @ x, A(torch.from_numpy(x).reshape(A.domain_shape)).numpy().ravel(), rtol=1e-12)
 
 
-def test_deepinv_takes_it(A):
-    pytest.importorskip("deepinv")
+@pytest.fixture(scope="module")
+def deepinv():
+    """It imports torchvision, whose compiled operators (no one is used here) lack beside a PyTorch for CPUs alone,
+    unless torchvision is of https://download.pytorch.org/whl/cpu, too; it then looks for two of them in vain."""
+    if importlib.util.find_spec("deepinv") is None:
+        pytest.skip("deepinv is not installed")
+    if torch.version.cuda is None and "+cpu" not in importlib.metadata.version("torchvision"):
+        for name in ("nms", "qnms"):
+            torch.library.define(f"torchvision::{name}", "(Tensor boxes, Tensor scores, float threshold) -> Tensor")
+    return importlib.import_module("deepinv")
+
+
+def test_deepinv_takes_it(A, deepinv):
     physics = A.as_deepinv()
+    assert isinstance(physics, deepinv.physics.LinearPhysics)
     x = torch.randn(2, 1, *A.domain_shape)
     assert torch.equal(physics.A(x), A(x))
     assert float(physics.adjointness_test(x)) == pytest.approx(0.0, abs=1e-3 * float(A(x).square().sum()))
