@@ -167,6 +167,7 @@ def test_train_your_own_prior_runs(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["train_your_own_prior.ipynb"]
 
 
+@pytest.mark.extended
 def test_a_full_run_is_a_full_run(tmp_path):
     """The switch is found in the cell itself: a tag once was lost, and ``--full`` ran the quick version."""
     path = tmp_path / "small.ipynb"

@@ -171,12 +171,13 @@ def compiled_once(patience_s: float = 60.0) -> Iterator[None]:
             if self.depth == 0:
                 release_all()
 
-    caching.Cache.load_overload, caching.Cache.save_overload = loaded, saved
+    caches: Any = caching.Cache
+    caches.load_overload, caches.save_overload = loaded, saved
     try:
         with event.install_listener("numba:compiler_lock", Ended()):
             yield
     finally:
-        caching.Cache.load_overload, caching.Cache.save_overload = load, save
+        caches.load_overload, caches.save_overload = load, save
         release_all()
 
 

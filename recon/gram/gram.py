@@ -12,7 +12,7 @@ shapes. It is a model: who needs the exact operator removes its error with exact
 
 Exact impulse responses carry that beat: the fitted spectrum is indefinite at some frequencies, which would let a weakly
 regularised solution escape there, so :func:`make_definite` changes it. Low frequencies are left as they are
-(:data:`LOW`): what makes them indefinite is that the square of lags is cut off, and that harms nobody on the grid
+(``LOW``): what makes them indefinite is that the square of lags is cut off, and that harms nobody on the grid
 itself, whereas tissues have most of their energy there.
 """
 

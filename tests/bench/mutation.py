@@ -34,6 +34,10 @@ class Fault(NamedTuple):
     then: str = ""
 
 
+TIER = "not slow and not peers"
+"""Also the tests that are too long for the default tier."""
+
+
 def read_faults() -> list[Fault]:
     """The table."""
     return [Fault(**row) for row in yaml.safe_load(TABLE.read_text(encoding="utf-8"))]
@@ -55,7 +59,7 @@ def _run(copy: Path, tests: list[str]) -> int:
         sys.path.insert(0, str(copy))
         import pytest
 
-        os._exit(int(pytest.main(["-n", "0", "-x", "-q", "-p", "no:cacheprovider", *tests])))
+        os._exit(int(pytest.main(["-n", "0", "-x", "-q", "-p", "no:cacheprovider", "-m", TIER, *tests])))
     end = time.monotonic() + LIMIT_S * len(tests)
     while time.monotonic() < end:
         done, status = os.waitpid(child, os.WNOHANG)

@@ -79,7 +79,7 @@ def run_tiny(name: str, folder: Path) -> TinyStudy:
 def assert_report_is_whole(tiny: TinyStudy, folder: Path, figures: set[str], sections: tuple[str, ...]) -> dict:
     """The contract of every report; returns its JSON values as they were written.
 
-    Each study's own test file calls it once: so each study is measured once a session, by the process of that file.
+    Each study's own test file calls it once.
     """
     files = tiny.report.save(folder / "new")
     assert {f.name for f in files} == {"report.json", "report.md", "report.html", *figures}

@@ -35,6 +35,7 @@ def test_fbp_of_line_integrals(clean):
     assert float((one - two).abs().max()) <= 1e-5 * float(one.abs().max())
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("method", TOLERANCE_HU)
 def test_reconstructions(clean, method):
     noisy = clean.with_noise(2.0, 0)

@@ -105,6 +105,7 @@ print([hashlib.sha256(v.numpy().tobytes()).hexdigest() for v in (y, A.T(y))])
 """
 
 
+@pytest.mark.extended
 def test_a_fresh_process_and_later_ones(tmp_path):
     found = [run_python(SCRIPT, NUMBA_CACHE_DIR=str(tmp_path)) for _ in range(2)]
     theirs, _, ours = found[0].stderr.partition("theirs")

@@ -97,6 +97,7 @@ def test_exposures_lie_in_their_range(data):
     assert 1.1 < ratio < 1.3 * math.sqrt(4.0)  # two situations: their information differs
 
 
+@pytest.mark.extended
 def test_scenes_are_painted_beforehand_as_when_they_are_used():
     made = Data(CONFIG)
     ahead = Data(replace(CONFIG, pool=3))
@@ -105,6 +106,7 @@ def test_scenes_are_painted_beforehand_as_when_they_are_used():
         assert torch.equal(ahead._pool[4, number], made._scene(4, number))
 
 
+@pytest.mark.extended
 def test_draws_are_used_several_times():
     """About as often as asked for, and a resumed run finds the same."""
     config = replace(CONFIG, reuse=3, situations=CONFIG.situations[:1])

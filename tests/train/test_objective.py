@@ -90,6 +90,7 @@ class Linear(nn.Module):
         return self.gain * start(problem, problem.spectrum())
 
 
+@pytest.mark.extended
 def test_validation_of_the_linear_start():
     """The start against itself: a lesion factor of 1 (but for slopes that differ from scene to scene), at any gain."""
     data = Data(replace(CONFIG, shape=(28, 24, 24), voxel_mm=0.3))

@@ -60,6 +60,7 @@ def launch(out, launcher):
             process.kill()
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("launcher", ["plain", pytest.param("torchrun", marks=pytest.mark.slow)])
 def test_two_processes_give_the_gradients_of_one(tmp_path, launcher):
     launch(tmp_path, launcher)

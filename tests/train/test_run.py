@@ -54,6 +54,7 @@ def test_finished_run_resumed_changes_nothing(tmp_path, uninterrupted):
     assert_same_run(tmp_path / "x", uninterrupted)
 
 
+@pytest.mark.extended
 def test_killed_run_resumed(tmp_path, uninterrupted):
     """SIGKILL at an arbitrary moment: the log ran ahead of the checkpoint, and is cut back."""
     out = tmp_path / "x"

@@ -37,7 +37,7 @@ def edge_profile(
     Args:
         image: ensemble mean in HU, any shape.
         distance: signed distance of every voxel from the surface in mm, negative inside, same shape; of drawn masks
-            :func:`scipy.ndimage.distance_transform_edt` gives it.
+            ``scipy.ndimage.distance_transform_edt`` gives it.
         reach: how far inside and outside the surface, mm, both positive: not beyond the next edge.
         bin_mm: width of a bin of distances; a fifth of a voxel or more, so that most bins are filled.
 

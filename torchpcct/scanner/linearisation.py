@@ -96,7 +96,7 @@ class WaterLinearisation:
         order: int = 7,
         shift: Callable[[Floats], Floats] | None = None,
     ) -> WaterLinearisation:
-        """Fit from the spectra of the columns, behind up to :data:`THICKEST_MM` of water.
+        """Fit from the spectra of the columns, behind up to ``THICKEST_MM`` of water.
 
         Args:
             weights: ``(columns, E)`` expected signal per energy without an object.

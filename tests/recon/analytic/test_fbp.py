@@ -285,6 +285,7 @@ print(peak() - before, kept, CHUNK_BYTES)
 """
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("inset", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_memory_is_bounded(inset):
     """Filtered data and volumes, and one chunk of views: never a second sinogram."""

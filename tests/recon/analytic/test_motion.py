@@ -145,6 +145,7 @@ def test_compensated_fbp_shows_the_inset_at_rest(scans, path):
     assert corner < 3.0
 
 
+@pytest.mark.extended
 def test_compensated_pwls_shows_the_inset_at_rest(scans, path):
     prior = QGGMRF(strength=0.3, threshold=300.0)
     problem = InsetProblem(scans[0.0], GRID)

@@ -126,6 +126,7 @@ def test_a_second_call_computes_nothing_again(task, folder, found):
     assert value(again, "error", "mine", "near the bodies") == value(found, "error", "mine", "near the bodies")
 
 
+@pytest.mark.extended
 def test_a_changed_task_takes_no_old_results(tmp_path):
     """The same name in the same folder, another scene: other scans, other figures."""
     texts = INSERT, INSERT.replace("material: soft_tissue", "material: adipose")
@@ -208,6 +209,7 @@ def test_bad_methods_are_named(spec, expected_text):
         method_of(spec)
 
 
+@pytest.mark.extended
 def test_volumes_of_another_program(task, folder, tmp_path, found):
     files = export_scans(task, tmp_path / "scans", n=8)
     assert len(files) == 2 * (8 + 1)
@@ -327,6 +329,7 @@ def voxel_task(tmp_path_factory):
     return path
 
 
+@pytest.mark.extended
 def test_a_segmented_lesion_is_a_task(voxel_task, task, folder, tmp_path):
     """The same figures as the analytic scene, whose insert reads so many HU, within the staircase of the voxels."""
     mine, store, there = read_task(voxel_task), Store(tmp_path / "pieces"), Store(tmp_path / "analytic")

@@ -108,6 +108,7 @@ def test_a_cluster_gives_the_same_figures(task, serial, cluster, tmp_path, monke
     assert bool(list(tmp_path.rglob("*.h5"))) is shared  # scans stay where they were made
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     "name",
     ["detector", *(pytest.param(n, marks=pytest.mark.slow) for n in ("bowtie", "motion", "resolution", "spectral",
@@ -222,6 +223,7 @@ def test_a_lambda_is_computed_here(task, processes, tmp_path, caplog):
     assert "mine is computed here, not by other processes" in caplog.text
 
 
+@pytest.mark.extended
 def test_a_job_whose_process_dies_is_repeated_and_left_out_after_three(processes, tmp_path, caplog, capfd):
     jobs = [Job("once", dies, ("once", 1)), Job("always", dies, ("always", 9)),
             Job("needs it", noted, ("n", 1), after=("always",)),
@@ -239,6 +241,7 @@ def test_a_job_whose_process_dies_is_repeated_and_left_out_after_three(processes
     assert "noted" not in capfd.readouterr().err
 
 
+@pytest.mark.extended
 @pytest.mark.cluster
 def test_a_job_that_kills_workers_of_a_cluster_is_left_out_alone(cluster, tmp_path):
     """Dask counts every job that a dead worker had been given: the others must not be among them."""
@@ -273,6 +276,7 @@ def test_threads_on_a_cluster(cluster, tmp_path):
     assert found == [(1, 1, 1), (2, 2, 2), (1, 1, 1)]
 
 
+@pytest.mark.extended
 def test_workers_of_a_machine_compile_a_kernel_once(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
     with Processes(2, 1) as executor:
@@ -579,6 +583,7 @@ print(*called)
 """
 
 
+@pytest.mark.extended
 def test_a_digest_covers_all_that_a_piece_runs(task, tmp_path):
     """Every function that is called while a piece is computed stands in a module that the digest has read, and the
     digest reads neither studies nor the command line."""

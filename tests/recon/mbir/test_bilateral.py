@@ -133,6 +133,7 @@ def test_overshoot_of_strong_edges_is_cut_off_and_weak_structures_stay(level, no
     torch.testing.assert_close(kept[inner], beside[inner])
 
 
+@pytest.mark.extended
 def test_noise_of_the_guide_is_that_of_draws(normalised):
     """White spectra of two sizes: the formula against drawn noise through the same steps."""
     problem, towards = normalised
@@ -158,6 +159,7 @@ def normalised():
     return problem, v + filtered(problem.beta - problem.apply(v), 1.0 / (spectrum + 0.1))
 
 
+@pytest.mark.extended
 def test_unrolled_with_the_filter_is_differentiable_in_the_data(normalised):
     problem, _ = normalised
     model = Unrolled(replace(CONFIG, voxel_mm=0.2), steps=1).eval()

@@ -49,6 +49,7 @@ def test_noise_free_values_in_hu(clean, problem):
         assert float(found[place].mean()) == pytest.approx(float(fbp[place].mean()), abs=6)
 
 
+@pytest.mark.extended
 def test_noise_map_is_the_noise(clean, problem, network):
     """Against the standard deviation over realisations."""
     scans = [clean.with_noise(2.0, s) for s in range(24)]

@@ -67,6 +67,7 @@ def test_a_vessel_without_a_layer_holds_nothing(fit):
     assert np.isfinite(field.of(np.ones(field.size))).all()
 
 
+@pytest.mark.extended
 def test_contents_and_step_are_those_of_the_joint_mode(fit, dense):
     joint, right, B = dense
     exact = np.linalg.solve(joint, right)
@@ -79,6 +80,7 @@ def test_contents_and_step_are_those_of_the_joint_mode(fit, dense):
     assert np.abs(found.fit.drawing.soft - fit.vessel.draw(fit.parameters + exact[:p], fit.bodies).soft).max() < 2.0
 
 
+@pytest.mark.extended
 def test_a_step_that_leads_up_is_not_taken(fit, dense, monkeypatch):
     joint, right, B = dense
     p = len(fit.parameters)

@@ -100,6 +100,7 @@ def test_a_second_vessel_apart_is_taken_off_the_data(both):
     assert both.figures["lumen"].value == pytest.approx(drawn_vessel.VALUES["lumen"], abs=10)
 
 
+@pytest.mark.extended
 def test_beside_a_second_vessel_that_is_not_known_nothing_of_a_plaque_is_claimed(gram, monkeypatch):
     """The fit takes what it sees of it for plaque bodies."""
     monkeypatch.setattr(reading, "_ROUNDS", 0)
@@ -145,6 +146,7 @@ def test_what_is_no_enhanced_vessel_is_refused_in_words(gram, change, why):
         read_plaque(drawn_vessel.data(gram, volume, 8), particles=60)
 
 
+@pytest.mark.extended
 def test_a_second_core_is_read_beside_the_first(gram, tmp_path):
     point = (gram.grid.center[0] - 1.5, gram.grid.center[1] - 1.5 * drawn_vessel.TILT, gram.grid.center[2] + 1.15)
     two, one = (

@@ -31,6 +31,7 @@ def test_verdicts():
     assert verdict(4.0, 10.0, True, [], worse=1.04) == "right"
 
 
+@pytest.mark.extended
 def test_a_mended_case_is_right_and_a_refused_one_said(tiny):
     rows = {r["case"]: r for r in tiny.measured.data["rows"]}
     assert len(CASES) >= 100
@@ -42,6 +43,7 @@ def test_a_mended_case_is_right_and_a_refused_one_said(tiny):
     assert any("opposite rays disagree" in text for text in rows["centre-2"]["messages"])
 
 
+@pytest.mark.extended
 def test_a_whole_body(tiny):
     rows = {r["case"]: r for r in tiny.measured.data["rows"]}
     assert rows["body-sod"]["verdict"] == "unseen"
@@ -52,6 +54,7 @@ def test_a_whole_body(tiny):
     assert "unseen 1" in tiny.report.text
 
 
+@pytest.mark.extended
 def test_metal_is_named_and_its_own_voxels_do_not_count(tiny):
     rows = {r["case"]: r for r in tiny.measured.data["rows"]}
     assert any("metal" in text for text in rows["metal"]["messages"])
@@ -75,12 +78,14 @@ def test_only_what_a_case_adds_is_left_out():
     assert untouched(CASES["large-body"].scene(plaque), scene, grid).all()
 
 
+@pytest.mark.extended
 def test_the_report_counts_silent_errors(tiny):
     assert tiny.report.data["silent"] == 0 == sum(r["verdict"] == "SILENT" for r in tiny.measured.data["rows"])
     assert f"**Silent errors: {tiny.report.data['silent']}** of 8" in tiny.report.text
     assert "a dead column" in tiny.report.text
 
 
+@pytest.mark.extended
 def test_listening_ends_with_the_study(tiny):
     assert all(logging.getLogger(name).propagate for name in ("recon", "torchpcct"))
     assert not any(type(h).__name__ == "Listener" for h in logging.getLogger("recon").handlers)

@@ -36,6 +36,7 @@ def test_measures_of_a_known_volume(drawn):
     assert away["lumen_mm2"] == pytest.approx(found["lumen_mm2"], rel=0.02)
 
 
+@pytest.mark.extended
 def test_motion_spoils_and_its_knowledge_repairs(tiny):
     measured = tiny("motion").measured
     m = measured.seen

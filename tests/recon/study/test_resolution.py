@@ -111,6 +111,7 @@ def test_a_thicker_blur_before_is_a_thinner_blur_after(plaque, series):
     assert twice["lumen_mm2"] == pytest.approx(direct["lumen_mm2"], rel=2e-3)
 
 
+@pytest.mark.extended
 def test_the_scanners(tiny):
     """The EID-CT is the blunter one; the core's part of the contrast goes first."""
     measured = tiny("resolution").measured

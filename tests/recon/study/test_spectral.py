@@ -25,6 +25,7 @@ from torchpcct.scene.plaque import plaque_scene
 from torchpcct.spectral import MMD_TISSUES, vmi
 
 
+@pytest.mark.extended
 def test_report(tiny, tmp_path):
     study = tiny("spectral")
     sections = ("## Agreement with the paper", "## What was modelled", "seed 0", "## Tissue maps")
@@ -33,6 +34,7 @@ def test_report(tiny, tmp_path):
     assert done >= {"simulate", "decompose noisy scans", "tissue maps", "joint MBIR"}
 
 
+@pytest.mark.extended
 def test_physics_that_holds_at_any_scale(tiny):
     data = tiny("spectral").measured.data
     standard, low = data["rays"][0], data["rays"][-1]
@@ -50,6 +52,7 @@ def test_physics_that_holds_at_any_scale(tiny):
     assert data["mbir"]["anisotropy"] < 0.05
 
 
+@pytest.mark.extended
 def test_mbir_is_less_noisy_than_fbp(tiny):
     """The gantry turns 6° in each of so few views and smears the vessel: only the fat can be judged."""
     data = tiny("spectral").measured.data
@@ -62,6 +65,7 @@ def test_mbir_is_less_noisy_than_fbp(tiny):
         assert data["dice"][method][0]["pericoronary_fat"]["mean"] > 0.9
 
 
+@pytest.mark.extended
 def test_checks_name_what_fails(tiny):
     data = copy.deepcopy(tiny("spectral").measured.data)
     data["rays"][0]["whitened_ratio"] = 1.2
@@ -71,6 +75,7 @@ def test_checks_name_what_fails(tiny):
         assert any(part in name for name in failed)
 
 
+@pytest.mark.extended
 def test_no_error_costs_nothing(tiny, monkeypatch):
     """Wrong calibrations of zero size, through the whole chain: every cost is 0 in HU and in Dice."""
     # One bin stands for all of them.
@@ -88,6 +93,7 @@ def test_no_error_costs_nothing(tiny, monkeypatch):
         assert set(case["cost_dice"].values()) == {0.0}
 
 
+@pytest.mark.extended
 def test_wrong_calibrations_cost(tiny):
     """Signs and sizes that follow without the study's own code."""
     found = {c["name"]: c for c in tiny("spectral").measured.data["calibration"]["cases"]}
@@ -109,6 +115,7 @@ def test_wrong_calibrations_cost(tiny):
     assert found["none"]["hu"]["52"]["contrast"] > 20.0
 
 
+@pytest.mark.extended
 def test_twice_the_error_costs_more(tiny):
     """Small errors cost in proportion."""
     scan = tiny("spectral").measured.seen.scan
@@ -132,6 +139,7 @@ def test_truth_is_the_tissue_that_fills_the_voxel():
     assert 0 < float((labels < 0).float().mean()) < 0.1
 
 
+@pytest.mark.extended
 def test_what_joint_mbir_does_to_the_contrast_is_said_by_its_sign(tiny):
     data = json.loads(tiny("spectral").report.json)
     clean = data["mbir"]["at_best_energy"][0]

@@ -166,6 +166,7 @@ def test_steps_between_views_of_a_wrong_size_are_found_and_measured(kind, part):
     assert len(found.findings) == 1
 
 
+@pytest.mark.extended
 def test_a_rolled_detector_is_found_and_measured():
     """Was silent by every method: 2°, which is 0.3 columns of 1 mm at the outer of 17 rows."""
     g = replace(GEOMETRIES["cone"], rows=17, offset=(0.0, 0.0))

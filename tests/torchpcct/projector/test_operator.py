@@ -183,6 +183,7 @@ for _ in range(5):
 """
 
 
+@pytest.mark.extended
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this platform")
 @pytest.mark.parametrize("used", ["before", "meanwhile", pytest.param("never", marks=pytest.mark.slow)])
 def test_a_forked_process_computes_on_threads_of_its_own(used):
