@@ -59,6 +59,7 @@ def test_weights_that_are_nearly_zero_count_as_zero():
     assert precision.light_weights(1e-12, 4)["worst"] < 0.01
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("where", ["inset", "whole field"])
 def test_pwls_forgets_a_start_far_away(where):
     """Rounding of 10⁴ HU must not stay in the volume: followed by recurrence alone, the inset's were off by 2 HU."""

@@ -69,6 +69,7 @@ def test_a_slip_is_answered_with_what_was_meant(here, cli, words, expected_text)
     assert expected_text in cli(words, 2)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("quick", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_the_demo_does_what_its_lines_do(quick, tmp_path, cli, monkeypatch):
     if quick:  # FBP in place of MBIR

@@ -65,6 +65,7 @@ def wobbling():
     return g.shifted(rng.uniform(-1, 1, 36), rng.uniform(-1, 1, 36))
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("make", [helix, wobbling])
 def test_pwls_of_what_fbp_refuses_or_bends(make):
     geometry, grid = make(), VolumeGrid((12, 12, 12), 2.0)

@@ -56,6 +56,7 @@ def edit(path, text, age):
     os.utime(path, (then, then))
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("call", "second"), [("forget_outdated(__name__)", 202), pytest.param("", 4, marks=pytest.mark.slow)]
 )
@@ -202,9 +203,10 @@ def test_without_a_folder_of_ones_own_there_is_no_lock(kernels, tmp_path, monkey
     else:
         monkeypatch.setenv("XDG_CACHE_HOME", "relative")
         monkeypatch.setattr(Path, "home", lambda: (_ for _ in ()).throw(RuntimeError("no home")))
-    with compiled_once():
-        assert kernels.outer(1) == 4
     assert kernel_cache._lock_folder() is None
+    if case == "link":
+        with compiled_once():
+            assert kernels.outer(1) == 4
     assert list(target.iterdir()) == []
     if case == "a file":
         assert user.read_text() == "mine"

@@ -51,6 +51,7 @@ def wobbling(seed=0):
     return v.reshape(n, 12)
 
 
+@pytest.mark.extended
 def test_wobbling_cone_beam():
     """3° of roll, 4° of tilt, four columns aside, a cell of jitter: 2 % of the truth; ignored, more than 10 %."""
     v, grid = wobbling(), VolumeGrid((2, 48, 48), (1.0, 2.0, 2.0))

@@ -173,6 +173,7 @@ def test_quarter_column_offset_raises_the_resolution_at_the_isocentre(detector):
     assert width[1] < 0.95 * width[0]
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("at", [(0.0, 0.0), (7.3, -4.1)])
 def test_interleaving_resolves_what_single_views_alias(at):
     """Bars at 0.71 of the Nyquist frequency of the doubled sampling: contrast only with offset and interleaving."""

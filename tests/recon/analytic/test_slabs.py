@@ -79,7 +79,13 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case",
+    [
+        c if c in ("cone with broken cells", "parallel stack") else pytest.param(c, marks=pytest.mark.extended)
+        for c in CASES
+    ],
+)
 def test_slabs_are_the_whole_volume(case, tmp_path):
     geometry, grid, options, memory = CASES[case]
     report, volume, whole = slabs_and_whole(made(geometry, **options), grid, tmp_path / "v.nii", memory)
@@ -91,6 +97,7 @@ def test_slabs_are_the_whole_volume(case, tmp_path):
     assert report["mean"] == pytest.approx(float(whole.data.mean()), abs=1e-3)
 
 
+@pytest.mark.extended
 def test_pwls_of_a_stack(tmp_path):
     scan = made(PARALLEL, slices=4)
     grid = VolumeGrid((4, 24, 24), 1.6)
@@ -177,6 +184,7 @@ def test_a_limit_that_is_too_small_names_the_smallest_that_works(tmp_path):
             plan_slabs(CONE, GRID, bad)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("name", ["v.nii", "v.zarr"])
 def test_killed_between_slabs(name, tmp_path, monkeypatch):
     """The finished slabs stay under a name that is not the volume's, and the next call goes on with them."""

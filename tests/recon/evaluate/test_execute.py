@@ -98,6 +98,7 @@ def test_processes_give_the_same_figures(task, serial, processes, tmp_path, monk
     assert figures(evaluate(task, METHODS, n=8, folder=tmp_path, executor=processes)) == serial
 
 
+@pytest.mark.extended
 @pytest.mark.cluster
 @pytest.mark.parametrize("shared", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_a_cluster_gives_the_same_figures(task, serial, cluster, tmp_path, monkeypatch, shared):
@@ -137,7 +138,7 @@ def test_many_scans_are_reconstructed_as_if_each_were_alone(processes, here, cap
         Scan.from_counts(torch.full(g.shape, 900.0 + k), g, air=1000.0).save(f"s{k}.h5")
     (here / "bad.h5").write_bytes(b"no scan")
     command = "reconstruct s0.h5 bad.h5 s1.h5 s2.h5"
-    assert main([*command.split(), "--out", "out", "--workers", "2"]) == 2
+    assert main([*command.split(), "--out", "out", "--workers", "1"]) == 2
     text = capsys.readouterr()
     assert "1 of 4 scans are not reconstructed" in text.err
     assert text.out.count("voxels of") == 3
@@ -520,6 +521,7 @@ run([Job("x", noted, ("x", 1))], Path({folder!r}), cluster)
 """
 
 
+@pytest.mark.extended
 @pytest.mark.cluster
 def test_the_recipe_of_srun(tmp_path):
     """The page's script as it stands, with an ``srun`` that starts one process of each step here."""

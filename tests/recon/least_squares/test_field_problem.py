@@ -33,7 +33,9 @@ def hu_error(volume, truth, where):
     return float((volume.data - 1000 * (truth / MU - 1))[where].square().mean().sqrt())
 
 
-@pytest.mark.parametrize("name", list(GEOMETRIES))
+@pytest.mark.parametrize(
+    "name", [name if name == "parallel" else pytest.param(name, marks=pytest.mark.extended) for name in GEOMETRIES]
+)
 def test_counts_and_line_integrals_of_any_geometry(name):
     geometry, grid = GEOMETRIES[name]
     truth = body(grid)

@@ -99,6 +99,7 @@ def test_every_pair_lowers_the_objective(scan):
         assert all(b <= a + slack for a, b in itertools.pairwise(values)), values
 
 
+@pytest.mark.extended
 def test_batch_is_each_alone(scan):
     A, y, w, _ = scan
     both = pwls(A, torch.stack([y, 0.5 * y]), w, EDGE, mu_per_hu=HU, tolerance=0.3)

@@ -88,6 +88,7 @@ def test_without_a_vessel_it_is_the_plain_reconstruction(drawn, network):
     assert "no tissues were fitted" in found.notes[0]["warnings"][0]
 
 
+@pytest.mark.extended
 def test_tissues_that_do_not_explain_the_data_are_not_used(drawn, network, fine, monkeypatch):
     reading = tissues.read_plaque
     monkeypatch.setattr(tissues, "read_plaque", lambda *a, **k: replace(reading(*a, **k), chi2=2.0))
@@ -111,6 +112,7 @@ def test_what_is_believed_of_the_vessel_reaches_the_reading(drawn, network, fine
     assert seen == [None, VesselPrior(wall=(20.0, 5.0))]
 
 
+@pytest.mark.extended
 def test_a_core_is_drawn_as_far_as_it_is_probable(drawn, network, fine, monkeypatch):
     b = statistic(drawn, fine, 1)[0]
     reading = read_plaque(TissueData.of_statistic(b, drawn, 1.0))

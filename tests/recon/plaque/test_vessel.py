@@ -56,6 +56,7 @@ def test_fit_finds_tissues_and_outlines(vessel, fit):
     assert np.exp(p[THICKNESS]) == pytest.approx(WALL_MM, abs=0.08)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("seed", [2, 3, 5])
 def test_fit_goes_to_the_mode_from_afar(gram, seed):
     """It stopped where a shortened step gained little: for seed 5 at 63 in the log posterior short of the mode."""

@@ -24,6 +24,7 @@ def materials(setup, *names):
     return {name: setup[0][name].material for name in names or setup[0].names}
 
 
+@pytest.mark.extended
 def test_ct_numbers_behind_the_patient(setup, found):
     """Material.hu behind the cylinder refers to water behind fat, FBP to water alone: a shift of a few HU."""
     scene, scanner, _ = setup
@@ -38,6 +39,7 @@ def test_ct_numbers_behind_the_patient(setup, found):
     assert found["fibrous"] - found["core"] == pytest.approx(fibrous - core, abs=1.5)
 
 
+@pytest.mark.extended
 def test_neither_diameter_nor_views_matter(setup, found, monkeypatch):
     tissues = materials(setup, "core", "fibrous")
     monkeypatch.setattr(plaque_scan, "_ROD_VIEWS", 30)

@@ -171,6 +171,7 @@ def test_narrow_fans_shade_the_outside(scanners):
 # -- Monte Carlo ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.extended
 def test_monte_carlo_primary_is_the_exact_primary(scanners):
     grid, scene = VolumeGrid((110, 110), 2.0), water_cylinder(200.0)
     for scanner in scanners.values():

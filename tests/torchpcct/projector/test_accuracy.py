@@ -124,6 +124,7 @@ def _moving_lines(geometry, body, motion):
     return np.stack(views)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("name", sorted(SCANS))
 @pytest.mark.parametrize("kind", [Gaussian, Ellipsoid])
 def test_moving_body(name, kind):

@@ -27,6 +27,7 @@ CASES = {
 }
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("name", sorted(CASES))
 def test_same_weights_as_the_cpu(name):
     A = Projector(*CASES[name])
@@ -38,6 +39,7 @@ def test_same_weights_as_the_cpu(name):
     torch.testing.assert_close(passes.adjoint(y), A.T(y), rtol=1e-10, atol=1e-10)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("name", ["fan", "cone"])
 def test_slices_that_fit_the_memory_give_the_same_bits(name, monkeypatch):
     geometry, grid, window = CASES[name]
