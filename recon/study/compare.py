@@ -5,7 +5,6 @@ One task of the instrument (:mod:`recon.evaluate`): every method on the same noi
 
 from __future__ import annotations
 
-import resource
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -127,5 +126,10 @@ def figures(measured: Measured) -> dict[str, Any]:
 
 
 def _peak_memory_gib() -> float:
+    """Of this process; 0 where the system does not say (Windows)."""
+    try:
+        import resource
+    except ImportError:
+        return 0.0
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / 2**30 if sys.platform == "darwin" else peak / 2**20

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from fresh_python import run_python
 
 import recon.api
 from recon.cli import _parser as make_parser
@@ -135,3 +136,25 @@ def test_the_completion_knows_commands_and_options(cli, monkeypatch):
     assert all(name in script for name in _commands())
     monkeypatch.setitem(sys.modules, "shtab", None)
     assert "pip install 'torchpcct[completion]'" in cli("--print-completion bash", 2)
+
+
+WITHOUT_UNIX = """
+import os, sys
+for name in ("fcntl", "resource", "pwd", "grp", "termios"):
+    sys.modules[name] = None
+for name in ("getuid", "fork", "sysconf", "sync", "sched_getaffinity"):
+    delattr(os, name)
+import recon.cli, recon.study.registry as registry
+from recon.evaluate import execute
+from recon.evaluate.execute import _compiling
+for name in registry.STUDIES:
+    registry.part(name)
+with _compiling(False) as seconds:
+    print(seconds())
+from recon.study.compare import _peak_memory_gib
+print(_peak_memory_gib())
+"""
+
+
+def test_studies_need_no_module_that_only_unix_has():
+    assert run_python(WITHOUT_UNIX).stdout.split() == ["0.0", "0.0"]

@@ -59,11 +59,20 @@ def processes():
 
 @pytest.fixture(scope="module")
 def cluster():
-    """Of two machines: addresses of this one that look like two."""
-    distributed = pytest.importorskip("distributed")
+    """Of two machines: addresses of this one that look like two.
+
+    On a busy machine a killed worker takes longer to come back than Dask's test cluster waits by default (15 s), which
+    then gives it up for good: a job that waits for it would wait for ever.
+    """
+    distributed, dask = pytest.importorskip("distributed"), pytest.importorskip("dask")
+    patient = {
+        "distributed.deploy.lost-worker-timeout": "600s",
+        "distributed.comm.timeouts.connect": "300s",
+        "distributed.scheduler.allowed-failures": 1,  # fewer workers to start again
+    }
     nodes = {k: {"cls": distributed.Nanny, "options": {"host": f"127.0.0.{k}", "nthreads": 1}} for k in (1, 2)}
     scheduler = {"cls": distributed.Scheduler, "options": {"host": "127.0.0.1", "dashboard_address": ":0"}}
-    with distributed.SpecCluster(nodes, scheduler) as workers:
+    with dask.config.set(patient), distributed.SpecCluster(nodes, scheduler) as workers:
         executor = Cluster(workers.scheduler_address)
         yield executor
         executor.shutdown()
@@ -359,6 +368,23 @@ def test_what_lies_in_the_current_folder_hides_no_module(tmp_path, monkeypatch):
         assert found[0] == str(tmp_path / "mine.py")
         (found,) = run([Job("d", found_in, ("xraydb",))], tmp_path, executor).values()
         assert str(tmp_path) not in " ".join(found)
+
+
+@pytest.mark.parametrize(
+    ("method", "is_of_a_module"),
+    [
+        ("fbp:soft", False), ("pwls", False), ("mbir:tissues", False), ("files:a/b", False), ("tv@fbp:soft", False),
+        ("mylab.nets:reconstruct", True), ("mylab.nets:denoise@fbp:detail", True),
+    ],
+)  # fmt: skip
+def test_modules_are_looked_for_in_the_current_folder_only_for_a_method_of_one(
+    method, is_of_a_module, here, monkeypatch
+):
+    monkeypatch.setattr(sys, "path", [p for p in sys.path if p not in ("", str(here))])
+    before, seen = list(sys.path), []
+    monkeypatch.setattr("recon.evaluate.experiment.evaluate", lambda *_, **__: seen.append(list(sys.path)))
+    assert main(["evaluate", "--task", "nodule", "--method", method, "--out", "out"]) == 0
+    assert seen == [[*before, os.getcwd()] if is_of_a_module else before]
 
 
 @pytest.mark.cluster
