@@ -198,7 +198,7 @@ def test_a_script_of_the_gallery_runs(path, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_the_site_builds_without_a_warning_and_without_a_network(tmp_path):
     """No reference leads nowhere, and no page loads anything from elsewhere."""
     pytest.importorskip("sphinx_gallery")

@@ -121,12 +121,12 @@ def test_first_scan_is_short():
     assert len(code_lines(nbformat.read(FOLDER / "first_scan.ipynb", as_version=4))) < 15
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_first_scan_runs(tmp_path):
     assert len(pictures(run("first_scan.ipynb", tmp_path, 600))) == 1
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_your_own_data_runs(tmp_path):
     pytest.importorskip("algotom")
     (tmp_path / "tooth.h5").write_bytes(b"the user's own")
@@ -141,7 +141,7 @@ def test_your_own_data_runs(tmp_path):
     assert quieter["| PWLS, 0.03"] > 1.5
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_benchmark_runs(tmp_path):
     notebook = run("fbp_vs_mbir.ipynb", tmp_path, 3600)
     assert len(pictures(notebook)) == 3
@@ -149,14 +149,14 @@ def test_benchmark_runs(tmp_path):
     assert "The limit of the data" in text
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_reading_a_plaque_runs(tmp_path):
     notebook = run("reading_a_plaque.ipynb", tmp_path, 1800)
     (text,) = (o.data["text/markdown"] for o in outputs(notebook) if "text/markdown" in o.get("data", {}))
     assert float(text.split("core: ")[1].split(".\n")[0]) > 0.9  # the scan holds a core
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_train_your_own_prior_runs(tmp_path):
     notebook = run("train_your_own_prior.ipynb", tmp_path, 3600)
     texts = [o.data["text/markdown"] for o in outputs(notebook) if "text/markdown" in o.get("data", {})]
