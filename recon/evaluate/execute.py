@@ -663,9 +663,13 @@ def _run(
 
 
 def _keep(folder: Path, files: dict[str, bytes]) -> None:
-    """Write what came back from another disk."""
+    """Write what came back from another disk; a file that is no piece is not replaced by one."""
+    from recon.evaluate.store import is_foreign  # which imports this module
+
     for name, data in files.items():
         path = folder / name
+        if path.suffix == ".npz" and is_foreign(path):
+            continue
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(path) as part:
             part.write_bytes(data)

@@ -26,7 +26,7 @@ from torchpcct.files import LEFTOVER, abandoned, atomic_write, read_hdf5
 if TYPE_CHECKING:
     from torchpcct.scan import Scan
 
-__all__ = ["Pieces", "Store", "packed", "unpacked", "was_kept"]
+__all__ = ["Pieces", "Store", "is_foreign", "packed", "unpacked", "was_kept"]
 
 log = logging.getLogger(__name__)
 
@@ -90,7 +90,7 @@ class Store:
             compute: gives it, anything that :func:`packed` takes.
         """
         path = self.folder / (name + ".npz")
-        foreign = _is_foreign(path)
+        foreign = is_foreign(path)
         if foreign:
             log.warning("%s is no piece of a study: it is left as it is, and the piece of that name is not kept", path)
         elif path.exists():
@@ -164,7 +164,7 @@ def was_kept(path: Path) -> bool:
     return False
 
 
-def _is_foreign(path: Path) -> bool:
+def is_foreign(path: Path) -> bool:
     """Whether something is there that is no piece, not even a damaged one or one of an earlier version."""
     try:
         if path.is_symlink() or not path.is_file():

@@ -15,6 +15,7 @@ from fresh_python import run_python
 from tiny_studies import run_tiny
 
 import recon.evaluate.store as store_module
+from recon.evaluate import execute
 from recon.evaluate.store import Pieces, Store, packed, unpacked
 from recon.study.noise import Table
 from recon.study.results import differences
@@ -140,7 +141,10 @@ def test_a_piece_does_not_replace_a_file_of_the_user(tmp_path, caplog):
     mine = (tmp_path / "x.npz").read_bytes()
     store = Store(tmp_path)
     assert [store.piece("x", "key", lambda: 7) for _ in range(2)] == [7, 7]
+    Store(tmp_path / "far").piece("x", "key", lambda: 7)
+    execute._keep(tmp_path, {name: (tmp_path / "far/x.npz").read_bytes() for name in ("x.npz", "y.npz")})
     assert (tmp_path / "x.npz").read_bytes() == mine
+    assert store.piece("y", "key", lambda: 8) == 7
     assert "x.npz is no piece of a study: it is left as it is" in caplog.text
 
 
