@@ -58,10 +58,10 @@ assert main([*start, "--out", out]) == 0
 TRAIN = """
 import sys
 from pathlib import Path
-from tiny_training import StubData, StubObjective, stub_model
+from tiny_training import StubObjective, stub_build
 from train import __main__ as command_line
 out = sys.argv[1]
-command_line.build = lambda config: (stub_model(config.seed), StubData(), StubObjective(pause=0.03))
+command_line.build = stub_build(StubObjective(pause=0.03))
 Path(out + ".begun").touch()
 more = ["--resume"] if any((Path(out) / f"checkpoint{x}.safetensors").exists() for x in ("", ".previous")) else []
 assert command_line.main(["--config", out + ".yaml", "--out", out, "--threads", "1", "--no-tensorboard", *more]) == 0

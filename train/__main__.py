@@ -53,19 +53,31 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--threads", type=int, metavar="N", help="threads per process (default: torch's choice)")
     parser.add_argument("--device", default="cpu", metavar="NAME", help="where it trains: cpu (default) or cuda")
     parser.add_argument(
+        "--views",
+        type=Path,
+        metavar="PATH",
+        help="folder of what the network sees of the scenes, several GB; runs of one seed and the same data share it "
+        "(default: the folder views in --out)",
+    )
+    parser.add_argument(
         "--painters",
         type=int,
         metavar="N",
-        help="processes that paint all scenes beforehand (default: each scene is painted when it is first used; needed "
-        "for the speed of a GPU)",
+        help="processes that make all views beforehand (default: each is made when it is first used; needed for the "
+        "speed of a GPU)",
     )
     parser.add_argument("--no-progress", action="store_true", help="no progress line")
     parser.add_argument("--no-tensorboard", action="store_true", help="no TensorBoard events")
     return parser
 
 
-def build(config: TrainConfig, device: str = "cpu") -> tuple[Unrolled, Data, Objective]:
-    """Model with its starting weights, data, and objective.
+def build(config: TrainConfig, views: Path, device: str = "cpu") -> tuple[Unrolled, Data, Data, Objective]:
+    """Model with its starting weights, data of the training and of the validation, and objective.
+
+    Args:
+        config: of the run.
+        views: folder of the views.
+        device: where it trains.
 
     Raises:
         ValueError: a device that torch does not have here.
@@ -74,7 +86,7 @@ def build(config: TrainConfig, device: str = "cpu") -> tuple[Unrolled, Data, Obj
 
     from recon.mbir.network import NetworkConfig
     from recon.mbir.unrolled import Unrolled
-    from train.data import Data
+    from train.data import Data, seed_of
     from train.objective import Objective
 
     try:
@@ -85,7 +97,10 @@ def build(config: TrainConfig, device: str = "cpu") -> tuple[Unrolled, Data, Obj
     model = Unrolled(NetworkConfig(**config.network), steps=config.unroll).to(where)
     fast = where.type == "cuda" or torch.ops.mkldnn._is_mkldnn_bf16_supported()
     model.network.half_precision = config.bfloat16 and fast
-    return model, Data(config.data, where), Objective(config.objective, config.single)
+    data = Data(config.data, config.seed, views, where)
+    few = replace(config.data, scenes_kept=config.objective.held_out)
+    held_out = Data(few, seed_of("held out", config.seed), views, where)
+    return model, data, held_out, Objective(config.objective, config.single)
 
 
 @contextmanager
@@ -126,15 +141,17 @@ def _run(arguments: argparse.Namespace, command: str) -> int:
         changes = {k: v for k, v in (("steps", arguments.steps), ("seed", arguments.seed)) if v is not None}
         config = replace(config, **changes)
         with _processes():
-            model, data, objective = build(config, arguments.device)
+            views = arguments.views or arguments.out / "views"
+            model, data, held_out, objective = build(config, views, arguments.device)
             if arguments.weights is not None:
                 start_from(model, read_tensors(arguments.weights, WEIGHTS_FORMAT)[0])
             if arguments.painters is not None:
-                data.paint(config.seed, arguments.painters)
+                data.prepare(arguments.painters)
             state, number = train(
                 config,
                 model,
                 data,
+                held_out,
                 objective,
                 arguments.out,
                 resume=arguments.resume,

@@ -93,12 +93,10 @@ class DataConfig:
         views: views of the scans whose Gram operators are taken (their exposure is that of the whole scan).
         situations: one Gram operator each; one is drawn per step.
         scenes: changes of :class:`train.scenes.scene.SceneConfig`.
-        pool: different scenes; each comes again with other noise, exposure and mirroring.
-        along_z: share of the scenes whose vessels run about z; the others run about y or x.
+        scenes_kept: different scenes, each with an exposure, two noise draws and a volume without noise; what the
+            network sees of them is computed once and kept in a file, 1.1 MB a scene of the usual shape.
         core_roi, tissue_roi: ranges of the radii of the random ROIs, mm.
         flat_roi: share of ROIs that are discs of one slice, as in an axial image, instead of balls.
-        reuse: steps that use a scene with its noise, about: what the network sees of it is made once, which takes
-            longer than a step.
 
     Raises:
         TypeError, ValueError: a value is out of its range, or ``scenes`` or a situation has an unknown key.
@@ -110,12 +108,10 @@ class DataConfig:
     views: int = 984
     situations: tuple[Situation, ...] = _SITUATIONS
     scenes: dict[str, Any] = field(default_factory=dict)
-    pool: int = 4000
-    along_z: float = 0.5
+    scenes_kept: int = 4000
     core_roi: tuple[float, float] = (0.25, 0.8)
     tissue_roi: tuple[float, float] = (0.15, 0.45)
     flat_roi: float = 0.6
-    reuse: int = 1
 
     def __post_init__(self) -> None:
         if len(self.shape) != 3:
@@ -129,9 +125,7 @@ class DataConfig:
             voxel_mm=number("voxel_mm", self.voxel_mm, positive=True),
             views=whole("views", self.views),
             situations=tuple(_section(Situation, s, f"situations[{i}]") for i, s in enumerate(self.situations)),
-            pool=whole("pool", self.pool),
-            reuse=whole("reuse", self.reuse),
-            along_z=number("along_z", self.along_z, low=0.0, high=1.0),
+            scenes_kept=whole("scenes_kept", self.scenes_kept),
             flat_roi=number("flat_roi", self.flat_roi, low=0.0, high=1.0),
         )
         for name in ("exposure_s", "core_roi", "tissue_roi"):
@@ -156,8 +150,7 @@ class ObjectiveConfig:
         bias: κ at fidelity 0 and at fidelity 1, linear between.
         contrast_sd: an ROI contrast error, in noise units, that counts as 1.
         fidelities: range of the fidelity, uniform.
-        validation_exposures_s: exposures of the validation scans.
-        validation_draws: noise draws of each validation scene, contrast and exposure; 2 give a variance.
+        held_out: scenes of the validation, of another seed than those of the training.
 
     Raises:
         TypeError, ValueError: a value is out of its range.
@@ -173,8 +166,7 @@ class ObjectiveConfig:
     bias: tuple[float, float] = (1.0, 1.0)
     contrast_sd: float = 0.15
     fidelities: tuple[float, float] = (0.0, 1.0)
-    validation_exposures_s: tuple[float, ...] = (0.35, 2.0)
-    validation_draws: int = 6
+    held_out: int = 64
 
     def __post_init__(self) -> None:
         for name in ("data", "white", "edge", "body", "noise_free", "contrast"):
@@ -189,10 +181,7 @@ class ObjectiveConfig:
         if not 0 <= low <= high <= 1:
             raise ValueError(f"fidelities must be a range within 0 … 1, got {self.fidelities}")
         _set(self, fidelities=(low, high))
-        exposures = numbers("validation_exposures_s", self.validation_exposures_s, positive=True)
-        _set(
-            self, validation_exposures_s=exposures, validation_draws=whole("validation_draws", self.validation_draws, 2)
-        )
+        _set(self, held_out=whole("held_out", self.held_out, 2))
 
 
 @dataclass(frozen=True)
@@ -205,6 +194,8 @@ class TrainConfig:
         batch: scenes of a step, over all processes.
         learning_rate: of Adam, at the end of the warm-up.
         warmup: steps over which it rises linearly; it counts only steps that change the weights, as the average does.
+        decay: share of the steps, at the end, over which the learning rate falls along a cosine; before, it is
+            constant, and a run may be resumed with other ``steps``.
         final_fraction: of ``learning_rate`` that the cosine ends with, 0 to 1.
         clip: largest norm of the gradient of the mean loss; longer ones are shortened to it. ``inf`` for none.
         ema: decay per step of the exponential moving average of the weights, in [0, 1); the average is what is
@@ -228,6 +219,7 @@ class TrainConfig:
     batch: int = 4
     learning_rate: float = 2e-3
     warmup: int = 50
+    decay: float = 1.0
     final_fraction: float = 0.02
     clip: float = 1.0
     ema: float = 0.995
@@ -248,6 +240,7 @@ class TrainConfig:
         _set(
             self,
             learning_rate=number("learning_rate", self.learning_rate, positive=True),
+            decay=number("decay", self.decay, low=0.0, high=1.0),
             final_fraction=number("final_fraction", self.final_fraction, low=0.0, high=1.0),
             clip=number("clip", self.clip, positive=True, finite=False),
             ema=number("ema", self.ema, low=0.0),
@@ -263,6 +256,11 @@ class TrainConfig:
         if not isinstance(self.bfloat16, bool):
             raise TypeError(f"bfloat16 must be true or false, got {self.bfloat16!r}")
         _section(NetworkConfig, self.network, "network")
+
+    @property
+    def decay_begins(self) -> int:
+        """Updates after which the learning rate falls."""
+        return round(self.steps * (1.0 - self.decay))
 
     @classmethod
     def from_yaml(cls, text: str) -> Self:

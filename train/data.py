@@ -4,29 +4,39 @@ For a scene x and an exposure, β = H x + noise of covariance H is distributed a
 of the Gram operator, see :mod:`recon.gram.gram`), so thousands of scans a minute cost a few FFTs. The Gram operators
 are those of real scanners: several inset positions, patient sizes and pitches, each made when it is first asked for.
 
-Scenes are painted on the CPU. All that follows is done for a whole batch on the device of the training.
+What the network sees of a scan, its *views*, does not depend on any weight. It is computed when a scene is first used,
+kept in a file (:class:`Views`) in half precision, and read from there in every later epoch, mirrored and turned at
+random. A scene has one exposure, two independent noise draws and one volume without noise.
 """
 
 from __future__ import annotations
 
+import errno
 import hashlib
+import json
 import math
-from collections.abc import Sequence
+import os
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from multiprocessing import get_context
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.lib.format import open_memmap
 from torch import Tensor
+from torch.nn import functional as F
 
 from recon.gram.gram import Gram
 from recon.least_squares.inset_problem import InsetProblem
 from recon.mbir.problem import NormalisedProblem
+from recon.mbir.unrolled import Views as NetworkViews
+from recon.mbir.unrolled import first_views
 from torchpcct.acquisition.acquire import acquire
+from torchpcct.files import atomic_write
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scanner import presets
 from torchpcct.scene import Body, EllipticCylinder, Scene
@@ -35,7 +45,7 @@ from train.scenes.drawing import draw_scene
 from train.scenes.rasterise import rasterise
 from train.scenes.scene import SceneConfig
 
-__all__ = ["Batch", "Data", "painted", "seed_of", "situation_gram"]
+__all__ = ["Batch", "Data", "Sample", "Views", "seed_of", "situation_gram"]
 
 
 def seed_of(*key: int | str) -> int:
@@ -46,11 +56,35 @@ def seed_of(*key: int | str) -> int:
 
 ROIS = 3
 """Contrasts of each scene: two of small ROIs, one of a whole core."""
-_DRAWS_OF_ROI, _OWN_DRAWS = 6, 7
-"""Random numbers that a small ROI takes; those of a scene: three mirrors, an exchange, the exposure, two lots."""
-_CORE, _AROUND = 1, 2
-_WINDOW = 64
-"""Draws of each scene of a batch that are at hand where they are used several times."""
+VOLUMES = 3
+"""Of each scene: two noise draws and one volume without noise."""
+BODY_HU = 15.0
+"""What differs by more from the background is a body; where values differ by more there is an edge."""
+FORMAT = "torchpcct training views 1"
+_DRAWS_OF_ROI = 6
+"""Random numbers that a small ROI takes."""
+_SIGNAL, _AROUND, _EDGE, _BODY = 1, 2, 4, 8
+"""Bits of a scene's labels: wholly in the signal, wholly in the tissue around it, near an edge, in or near a body."""
+_TURNS = 16
+"""Mirror images along three axes, with y and x exchanged or not."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One scene as it is kept.
+
+    Args:
+        views: ``(3, 4, z, y, x)`` float16: of every volume start, step towards the data, its filtered view, and β, all
+            in noise units.
+        truth: ``(z, y, x)`` float16, HU above the background.
+        labels: ``(z, y, x)`` uint8.
+        exposure: s.
+    """
+
+    views: Tensor
+    truth: Tensor
+    labels: Tensor
+    exposure: float
 
 
 @dataclass(frozen=True)
@@ -58,50 +92,128 @@ class Batch:
     """Scenes with two independent noise draws each.
 
     Args:
-        with_noise_free: problem of ``3 · size`` volumes: the first draws of all scenes, the second ones, no noise.
+        problem: of ``3 · size`` volumes: the first draws of all scenes, the second ones, no noise.
+        views: of the problem, :func:`recon.mbir.unrolled.first_views`.
         truth: ``(size, z, y, x)`` HU above the background.
+        edges, bodies: ``(size, z, y, x)``, 1 near edges of the truth, and in bodies and one voxel about them, else 0.
         contrast: ``(size, rois, z, y, x)`` weights of ROI contrasts: mean over a core (or of plain tissue) less mean
             over the tissue around it, random small parts of both, last all of both; 0 where the scene offers none.
         voxels: ``(size, rois)`` voxels of the smaller ROI, 0 if none.
         lots: ``(size, 2)`` random numbers in 0 … 1 of each scene, for its fidelity and whether it is also seen without
             noise.
-        kept: what has been made of the batch and does not change, as long as it is used.
+        turned: a volume as the network shall see it, mirrored; unturned: the inverse.
     """
 
-    with_noise_free: NormalisedProblem
+    problem: NormalisedProblem
+    views: NetworkViews
     truth: Tensor
+    edges: Tensor
+    bodies: Tensor
     contrast: Tensor
     voxels: Tensor
     lots: Tensor
-    kept: dict[str, Any] = field(default_factory=dict)
+    turned: Callable[[Tensor], Tensor]
+    unturned: Callable[[Tensor], Tensor]
 
     @property
     def size(self) -> int:
         """Number of scenes."""
         return self.truth.shape[0]
 
-    @property
-    def problem(self) -> NormalisedProblem:
-        """Of the noisy volumes alone."""
-        return self.with_noise_free.part(torch.arange(2 * self.size))
+
+class Views:
+    """A file of samples: each is written when it has been computed, and says so.
+
+    Several processes may use one folder. Files are made at their full length, so that a disk that is too small is
+    noticed at the start. They are found by a digest of all that the samples depend on.
+
+    Args:
+        folder: of the files, made if missing.
+        config: of the samples; seed: of the run.
+
+    Raises:
+        OSError: the folder cannot be written, or the disk has no room; the message says how much is needed.
+    """
+
+    def __init__(self, folder: Path, config: DataConfig, seed: int) -> None:
+        key = json.dumps({"format": FORMAT, "seed": seed, "data": asdict(config)}, sort_keys=True)
+        digest = hashlib.sha256(key.encode()).hexdigest()[:16]
+        self.folder = folder / digest
+        self.folder.mkdir(parents=True, exist_ok=True)
+        shape = tuple(config.shape)
+        n = config.scenes_kept
+        kinds = {
+            "views": ((n, VOLUMES, 4, *shape), np.float16),
+            "truth": ((n, *shape), np.float16),
+            "labels": ((n, *shape), np.uint8),
+            "exposure": ((n,), np.float32),
+            "done": ((n,), np.uint8),
+        }
+        self._arrays = {name: self._open(name, *kind) for name, kind in kinds.items()}
+        if not (self.folder / "config.json").exists():
+            with atomic_write(self.folder / "config.json") as part:
+                part.write_text(key, encoding="utf-8")
+
+    def _open(self, name: str, shape: tuple[int, ...], kind: type) -> Any:
+        path = self.folder / f"{name}.npy"
+        if not path.exists():
+            size = math.prod(shape) * np.dtype(kind).itemsize
+            part = path.with_name(f"{name}.{os.getpid()}.part")
+            try:
+                open_memmap(part, mode="w+", dtype=kind, shape=shape).flush()
+                with part.open("r+b") as file:
+                    os.posix_fallocate(file.fileno(), 0, part.stat().st_size)
+                # Another process may have been faster: its file is the one that counts.
+                os.link(part, path)
+            except FileExistsError:
+                pass
+            except OSError as error:
+                if error.errno != errno.ENOSPC:
+                    raise
+                text = f"no room for {size / 1e9:.1f} GB of views in {self.folder}: name another folder with --views"
+                raise OSError(errno.ENOSPC, text + ", or a smaller data.scenes_kept") from error
+            finally:
+                part.unlink(missing_ok=True)
+        found = np.load(path, mmap_mode="r+", allow_pickle=False)
+        if found.shape != shape or found.dtype != kind:
+            raise ValueError(f"{path} is damaged: it holds {found.dtype} of shape {found.shape}; remove the folder")
+        return found
+
+    def __len__(self) -> int:
+        return len(self._arrays["done"])
+
+    def __contains__(self, number: int) -> bool:
+        return bool(self._arrays["done"][number])
+
+    def __getitem__(self, number: int) -> Sample:
+        views, truth, labels = (torch.from_numpy(self._arrays[k][number]) for k in ("views", "truth", "labels"))
+        return Sample(views, truth, labels, float(self._arrays["exposure"][number]))
+
+    def __setitem__(self, number: int, sample: Sample) -> None:
+        arrays = self._arrays
+        arrays["views"][number] = sample.views.numpy()
+        arrays["truth"][number] = sample.truth.numpy()
+        arrays["labels"][number] = sample.labels.numpy()
+        arrays["exposure"][number] = sample.exposure
+        arrays["done"][number] = 1
 
 
 class Data:
-    """Draws batches; a pure function of seed, step and scene index once the Gram operators are made.
-
-    Scenes come from a pool and are kept once they are painted.
+    """Batches of scenes; a pure function of seed, step and scene index.
 
     Args:
         config: what is drawn.
+        seed: of the run.
         device: of the batches.
+        folder: of the views.
     """
 
-    def __init__(self, config: DataConfig | None = None, device: torch.device | str = "cpu") -> None:
-        self.config = config or DataConfig()
+    def __init__(self, config: DataConfig, seed: int, folder: Path, device: torch.device | str = "cpu") -> None:
+        self.config = config
+        self.seed = seed
         self.device = torch.device(device)
+        self.views = Views(folder, config, seed)
         self._grams: dict[int, tuple[Gram, float]] = {}
-        self._pool: dict[tuple[int, int], Tensor] = {}
-        self._kept: dict[tuple[int, int, int], Batch] = {}
 
     def gram(self, situation: int) -> tuple[Gram, float]:
         """Gram operator per second of exposure, and 1 HU in mm⁻¹."""
@@ -110,93 +222,139 @@ class Data:
             self._grams[situation] = gram.to(self.device), hu
         return self._grams[situation]
 
-    def paint(self, seed: int, processes: int) -> None:
-        """Paint the whole pool beforehand, by so many processes; else scenes are painted when they are first used."""
-        make = partial(_as_array, self.config, seed)
-        numbers = range(self.config.pool)
-        make(0)  # compiles the kernels for all
+    def prepare(self, processes: int) -> None:
+        """Compute all views beforehand, by so many processes; else they are computed when a scene is first used."""
+        numbers = [n for n in range(len(self.views)) if n not in self.views]
+        # All scenes of a situation in one process: each makes its Gram operator once.
+        numbers.sort(key=self._situation)
+        make = partial(_keep, self.config, self.seed, self.views.folder.parent)
         with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as workers:
-            for number, maps in zip(numbers, workers.map(make, numbers, chunksize=16), strict=True):
-                self._pool[seed, number] = torch.from_numpy(maps).to(self.device)
+            for _ in workers.map(make, [numbers[k : k + 64] for k in range(0, len(numbers), 64)]):
+                pass
 
-    def batches(self, seed: int, step: int, indices: Sequence[int]) -> list[Batch]:
-        """Scenes ``indices`` of a step, all at once; one by one where draws are used several times.
+    def _situation(self, number: int) -> int:
+        return number % len(self.config.situations)
 
-        Then a scene is drawn out of :data:`_WINDOW` that move on by one in ``reuse`` steps.
-        """
-        reuse = self.config.reuse
-        if reuse == 1:
-            return [self.batch(seed, step, indices)]
-        first = step // reuse
-        self._kept = {key: batch for key, batch in self._kept.items() if key[1] >= first}
+    def sample(self, number: int) -> Sample:
+        """A scene of the pool, from the file or computed and kept there."""
+        if number not in self.views:
+            self.views[number] = self._computed(number)
+        return self.views[number]
+
+    @torch.no_grad()
+    def _computed(self, number: int) -> Sample:
+        c = self.config
+        gram, hu = self.gram(self._situation(number))
+        generator = torch.Generator().manual_seed(seed_of("sample", self.seed, number))
+        low, high = (math.log(v) for v in c.exposure_s)
+        exposure = math.exp(low + (high - low) * float(torch.rand((), generator=generator)))
+        data, truth, labels = painted(c, seed_of("scene", self.seed, number))
+        noise = gram.noise((2,), generator=generator) * math.sqrt(exposure)
+        signal = gram.apply(data)[None] * (hu * exposure)
+        b = torch.cat([signal + noise, signal])
+        problem = NormalisedProblem.from_statistic(gram, b, torch.full((VOLUMES,), exposure), hu, c.voxel_mm)
+        found = first_views(problem, bilateral=True)
+        views = torch.stack([*(v for v in found if v is not None), problem.beta], 1)
+        return Sample(views.to(torch.float16), truth.to(torch.float16), labels, exposure)
+
+    def batches_in_epoch(self, batch: int) -> int:
+        """Batches of an epoch; scenes that fill none are left out of it."""
+        kinds = len(self.config.situations)
+        return sum(len(range(k, len(self.views), kinds)) // batch for k in range(kinds))
+
+    def numbers(self, step: int, batch: int) -> list[int]:
+        """The scenes of a step, all of one situation; an epoch takes every scene once, in an order of its own."""
+        epoch, index = divmod(step, self.batches_in_epoch(batch))
+        rng = np.random.default_rng(seed_of("epoch", self.seed, epoch))
+        kinds = len(self.config.situations)
         found = []
-        for index in indices:
-            number = first + seed_of("window", seed, step, index) % _WINDOW
-            if (seed, number, index) not in self._kept:
-                self._kept[seed, number, index] = self.batch(seed, number, [index])
-            found.append(self._kept[seed, number, index])
-        return found
+        for kind in range(kinds):
+            order = rng.permutation(np.arange(kind, len(self.views), kinds))
+            found += [order[k : k + batch] for k in range(0, len(order) - batch + 1, batch)]
+        return [int(n) for n in found[rng.permutation(len(found))[index]]]
 
-    def batch(self, seed: int, step: int, indices: Sequence[int]) -> Batch:
+    def batch(self, step: int, batch: int, indices: Sequence[int]) -> Batch:
         """Scenes ``indices`` of a step.
 
         Args:
-            seed: of the run.
-            step: all scenes of a step share one Gram operator.
-            indices: scenes of the step, any subset in any order.
+            step: all scenes of a step share one Gram operator, and one orientation.
+            batch: scenes of the whole step.
+            indices: of it, any subset in any order.
         """
         c = self.config
-        gram, hu = self.gram(seed_of(seed, step) % len(c.situations))
-        own = [seed_of(seed, step, i) for i in indices]
-        numbers = [o % c.pool for o in own]
-        generators = [torch.Generator().manual_seed(o) for o in own]
-        count = _OWN_DRAWS + (ROIS - 1) * _DRAWS_OF_ROI
-        random = torch.stack([torch.rand(count, generator=g) for g in generators]).to(self.device)
-        if self.device.type != "cpu":
-            generators = [torch.Generator(self.device).manual_seed(o) for o in own]
-        noise = gram.coloured(torch.stack([gram.white((2,), generator=g) for g in generators]))
-        maps = _mirrored(torch.stack([self._scene(seed, n) for n in numbers]).float(), random[:, :4])
-        truth, core, tissue = maps[:, 0], maps[:, 1] == _CORE, maps[:, 1] == _AROUND
-        low, high = (math.log(v) for v in c.exposure_s)
-        exposure = torch.exp(low + (high - low) * random[:, 4])
-        found = [_random_contrasts(core, tissue, c, part) for part in random[:, _OWN_DRAWS:].split(_DRAWS_OF_ROI, 1)]
-        found.append(_whole_contrasts(core, tissue))
+        numbers = self.numbers(step, batch)
+        gram, hu = self.gram(self._situation(numbers[0]))
+        samples = [self.sample(numbers[i]) for i in indices]
+        generators = [torch.Generator().manual_seed(seed_of("step", self.seed, step, i)) for i in indices]
+        random = torch.stack([torch.rand(2 + (ROIS - 1) * _DRAWS_OF_ROI, generator=g) for g in generators])
+        random = random.to(self.device)
+        # ``(volume, scene)`` is the order of a batch: the first draws of all scenes, the second ones, no noise.
+        views = torch.stack([s.views for s in samples], 1).to(self.device).float().flatten(0, 1)
+        truth = torch.stack([s.truth for s in samples]).to(self.device).float()
+        labels = torch.stack([s.labels for s in samples]).to(self.device)
+        exposure = torch.tensor([s.exposure for s in samples], device=self.device).repeat(VOLUMES)
+        problem = NormalisedProblem.with_beta(gram, views[:, 3], exposure, hu, c.voxel_mm)
+        signal, around = labels & _SIGNAL > 0, labels & _AROUND > 0
+        found = [_random_contrasts(signal, around, c, part) for part in random[:, 2:].split(_DRAWS_OF_ROI, 1)]
+        found.append(_whole_contrasts(signal, around))
         contrast, voxels = (torch.stack(v, 1) for v in zip(*found, strict=True))
-        noise = noise * exposure.sqrt().reshape(-1, 1, 1, 1, 1)
-        signal = gram.apply(truth) * (hu * exposure).reshape(-1, 1, 1, 1)
-        b = torch.cat([signal + noise[:, 0], signal + noise[:, 1], signal])
-        problem = NormalisedProblem.from_statistic(gram, b, exposure.repeat(3), hu, c.voxel_mm)
-        return Batch(problem, truth, contrast, voxels, random[:, 5:7])
-
-    def _scene(self, seed: int, number: int) -> Tensor:
-        if (seed, number) not in self._pool:
-            self._pool[seed, number] = painted(self.config, seed, number).to(self.device)
-        return self._pool[seed, number]
-
-
-def painted(config: DataConfig, seed: int, number: int) -> Tensor:
-    """A scene of the pool, ``(2, z, y, x)`` float16: image in HU above the background, and a label.
-
-    The label is 1 in voxels wholly in a core, 2 in those wholly in the tissue around, else 0.
-    """
-    generator = torch.Generator().manual_seed(seed_of("scene", seed, number))
-    draw = float(torch.rand((), generator=generator))
-    axis = 0 if draw < config.along_z else 1 if draw < 0.5 * (1 + config.along_z) else 2
-    across, along = config.shape[axis], config.shape[0]
-    shape = (across, *(along if k == axis else n for k, n in enumerate(config.shape) if k))
-    # The extents of equal insets differ by rounding; without this so would positions drawn in them, in the last digit.
-    z, y, x = (round(n * config.voxel_mm, 6) for n in shape)
-    drawn = int(torch.randint(2**62, (), generator=generator))
-    scene = draw_scene(drawn, (z, y, x), SceneConfig(**config.scenes))
-    found = rasterise(scene, (shape[0], shape[1], shape[2]), (config.voxel_mm,) * 3)
-    image, core, around = torch.from_numpy(found)
-    maps = (image - scene.background, _CORE * (core > 0.97) + _AROUND * (around > 0.97))
-    return torch.stack([m.transpose(0, axis).to(torch.float16) for m in maps])
+        return Batch(
+            problem,
+            (views[:, 0], views[:, 1], views[:, 2]),
+            truth,
+            (labels & _EDGE > 0).float(),
+            (labels & _BODY > 0).float(),
+            contrast,
+            voxels,
+            random[:, :2],
+            *turn(seed_of("turn", self.seed, step) % _TURNS, truth.shape[-1] == truth.shape[-2]),
+        )
 
 
-def _as_array(config: DataConfig, seed: int, number: int) -> NDArray[np.float16]:
-    # Tensors sent from another process would each hold a file open.
-    return np.asarray(painted(config, seed, number).numpy())
+def _keep(config: DataConfig, seed: int, folder: Path, numbers: Sequence[int]) -> None:
+    data = Data(config, seed, folder)
+    for number in numbers:
+        data.sample(number)
+
+
+def turn(number: int, square: bool) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]:
+    """One of the mirror images along three axes, y and x exchanged or not (``square``), and its inverse."""
+    axes = [axis for k, axis in enumerate((-3, -2, -1)) if number >> k & 1]
+    exchanged = square and bool(number >> 3)
+
+    def there(v: Tensor) -> Tensor:
+        v = v.flip(axes)
+        return v.transpose(-1, -2) if exchanged else v
+
+    def back(v: Tensor) -> Tensor:
+        return (v.transpose(-1, -2) if exchanged else v).flip(axes)
+
+    return there, back
+
+
+def painted(config: DataConfig, seed: int) -> tuple[Tensor, Tensor, Tensor]:
+    """A random scene, ``(z, y, x)`` each: what a scan holds of it and the truth, HU above the background; labels."""
+    nz, ny, nx = config.shape
+    z, y, x = (round(n * config.voxel_mm, 6) for n in (nz, ny, nx))
+    scene = draw_scene(seed, (z, y, x), SceneConfig(**config.scenes))
+    found = rasterise(scene, (nz, ny, nx), config.voxel_mm)
+    truth = torch.from_numpy(found.image) - scene.background
+    signal, around = torch.from_numpy(found.signal) > 0.97, torch.from_numpy(found.around) > 0.97
+    labels = _SIGNAL * signal + _AROUND * around + _EDGE * _edges(truth) + _BODY * _bodies(truth)
+    return torch.from_numpy(found.data) - scene.background, truth, labels.to(torch.uint8)
+
+
+def _bodies(truth: Tensor) -> Tensor:
+    """Bodies and one voxel about them, of ``(z, y, x)``."""
+    return F.max_pool3d((truth.abs() > BODY_HU).float()[None, None], 3, 1, 1)[0, 0] > 0
+
+
+def _edges(truth: Tensor) -> Tensor:
+    """Where values of the cube of five voxels about a voxel differ by more than that of a body."""
+    both = torch.stack([truth, -truth])[None]
+    for size in ((1, 1, 5), (1, 5, 1), (5, 1, 1)):
+        both = F.max_pool3d(both, size, 1, [n // 2 for n in size])
+    return both[0].sum(0) > BODY_HU
 
 
 def situation_gram(situation: Situation, config: DataConfig) -> tuple[Gram, float]:
@@ -217,15 +375,6 @@ def situation_gram(situation: Situation, config: DataConfig) -> tuple[Gram, floa
 def _chosen(which: Tensor, yes: Tensor, no: Tensor) -> Tensor:
     """``yes`` of the scenes ``(n,)`` that ``which`` names, ``no`` of the others."""
     return torch.where(which.reshape(-1, *[1] * (yes.dim() - 1)), yes, no)
-
-
-def _mirrored(maps: Tensor, random: Tensor) -> Tensor:
-    """Maps ``(n, k, z, y, x)`` along every axis mirrored or not, with y and x exchanged or not."""
-    for k, axis in enumerate((-3, -2, -1)):
-        maps = _chosen(random[:, k] < 0.5, maps.flip(axis), maps)
-    if maps.shape[-1] == maps.shape[-2]:
-        maps = _chosen(random[:, 3] < 0.5, maps.transpose(-1, -2), maps)
-    return maps
 
 
 def _size(mask: Tensor) -> Tensor:

@@ -33,6 +33,7 @@ def train(
     config: TrainConfig,
     model: nn.Module,
     data: Data,
+    held_out: Data,
     objective: Objective,
     out: Path,
     *,
@@ -47,6 +48,7 @@ def train(
         config: of the run; a resumed one must have the same, but for ``checkpoint_seconds``.
         model: with its starting weights; it ends with the last ones, not the averaged ones.
         data: source of the scenes; ``batch`` must be a pure function of its arguments.
+        held_out: scenes of the validation.
         objective: what is minimised, and what the weights are chosen by.
         out: folder of the run, made if missing. It gets ``checkpoint*.safetensors``, ``config.yaml``, ``log.csv``,
             ``validation.csv``, ``pictures``, ``tensorboard``, and the best weights with their card as
@@ -78,7 +80,7 @@ def train(
         while True:
             last = state.step == config.steps
             if not stop and state.step and (last or state.step % config.validate_every == 0):
-                run.validate(data, objective)
+                run.validate(held_out, objective)
             if last or stop:
                 break
             values, stop = gradient(config, model, data, objective, state.step, group, bool(caught))

@@ -66,11 +66,12 @@ def gradient(
     model.zero_grad()
     parameters = list(model.parameters())
     total, parts = parameters[0].new_zeros(1), Counter[str]()
-    for batch in data.batches(config.seed, step, range(group.rank, config.batch, group.size)):
-        loss = objective(model, batch, step / config.steps)
-        loss.total.backward()
-        total += loss.total.detach()
-        parts.update(loss.parts)
+    loss = objective(
+        model, data.batch(step, config.batch, range(group.rank, config.batch, group.size)), step / config.steps
+    )
+    loss.total.backward()
+    total += loss.total.detach()
+    parts.update(loss.parts)
     pieces = [(torch.zeros_like(p) if p.grad is None else p.grad).reshape(-1) for p in parameters]
     # One message: the gradient, the loss (for whether it is finite), and the wish to stop, on which all must agree.
     flat = group.sum(torch.cat([*pieces, total, total.new_tensor([float(stop)])]))

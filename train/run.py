@@ -18,7 +18,6 @@ from typing import Any
 
 import safetensors
 import torch
-import yaml
 from torch import Tensor, nn
 from torch.optim import Adam
 from torch.optim.lr_scheduler import LambdaLR
@@ -74,10 +73,14 @@ class State:
 
 
 def rate_factor(config: TrainConfig, update: int) -> float:
-    """Share of the learning rate at an update, counted from 0: linear warm-up, then a cosine to ``final_fraction``."""
+    """Share of the learning rate at an update, counted from 0: linear warm-up, constant, at last a cosine.
+
+    It ends with ``final_fraction``.
+    """
     if update < config.warmup:
         return (update + 1) / config.warmup
-    phase = (update - config.warmup) / max(1, config.steps - config.warmup)
+    first = max(config.decay_begins, config.warmup)
+    phase = max(update - first, 0) / max(1, config.steps - first)
     return config.final_fraction + (1 - config.final_fraction) * 0.5 * (1 + math.cos(math.pi * phase))
 
 
@@ -137,7 +140,7 @@ class Run:
                 self.notes.append(f"the result will differ in its last digits from an uninterrupted run: {was}")
         elif self.writes:
             self.out.mkdir(parents=True, exist_ok=True)
-            if any(self.out.iterdir()):
+            if any(path.name != "views" for path in self.out.iterdir()):
                 raise FileExistsError(f"{self.out} is not empty: continue the run in it with --resume, or use another")
         if self.writes:
             self.store.clean()
@@ -152,7 +155,11 @@ class Run:
         tensors, metadata, warning = self.store.load()
         if warning:
             self.notes.append(warning)
-        other = set(differences(self.config.as_dict(), yaml.safe_load(metadata["config"]))) - FREE_TO_CHANGE
+        before = TrainConfig.from_yaml(metadata["config"])
+        other = set(differences(self.config.as_dict(), before.as_dict())) - FREE_TO_CHANGE
+        alike = self.config.unroll == 1 or self.config.single == 0.0
+        if alike and metadata["state"]["step"] <= min(self.config.decay_begins, before.decay_begins):
+            other -= {"steps"}  # nothing has depended on it yet
         if other:
             raise ValueError(
                 f"the run in {self.out} has another configuration ({', '.join(sorted(other))}): resume it unchanged, "
@@ -200,7 +207,7 @@ class Run:
                 f"{config.learning_rate:g}"
             )
 
-    def validate(self, data: Data, objective: Objective) -> None:
+    def validate(self, held_out: Data, objective: Objective) -> None:
         """Validate the averaged weights, keep them if they are the best, unless that has been done at this step."""
         state = self.state
         if state.validated == state.step:
@@ -213,7 +220,7 @@ class Run:
             self.save()
         torch.manual_seed(seed_of("validation", self.config.seed))
         with torch.no_grad():
-            result = objective.validate(self.average.module, data, self.config.seed)
+            result = objective.validate(self.average.module, held_out)
         score = float(result.score)
         figures = {k: float(v) for k, v in result.figures.items() if k != "score"}
         self._tick()

@@ -40,6 +40,8 @@ _FIRST, _SECOND = (2.8, 2.5, 1), (1.4, 4.0, 2)
 """The filter is run twice, the second time guided by what the first has left: difference of the guide, in noise, that
 counts as an edge, reach and step in voxels."""
 _SLOPE = 0.1
+_LEAST = 1e-3
+"""In noise units: what the gate takes for 0."""
 _BLOCK = 2
 _DEPTH = 3
 
@@ -54,6 +56,8 @@ class NetworkConfig:
         local_mm: standard deviation of the Gaussian mean that it works relative to, mm; 0: relative to the surround.
         bilateral: a third view of the data: the step towards them through a joint bilateral filter, twice
             (:mod:`recon.mbir.bilateral`), to which the network adds what the filter has taken away.
+        gate: how much of the filtered view is in the result is decided voxel by voxel, else by one number. Where tissue
+            is wide and constant the filter is close to ideal, and nothing that is added to it would be better.
         turns: once trained, average over the eight turns and mirror images about z.
     """
 
@@ -62,6 +66,7 @@ class NetworkConfig:
     local_mm: float = 0.0
     turns: bool = False
     bilateral: bool = False
+    gate: bool = False
 
     def __post_init__(self) -> None:
         if len(self.channels) != _DEPTH:
@@ -69,9 +74,11 @@ class NetworkConfig:
         object.__setattr__(self, "channels", tuple(whole("channels", c, 1) for c in self.channels))
         object.__setattr__(self, "voxel_mm", number("voxel_mm", self.voxel_mm, positive=True))
         object.__setattr__(self, "local_mm", number("local_mm", self.local_mm, low=0.0, unit="mm"))
-        for name in ("turns", "bilateral"):
+        for name in ("turns", "bilateral", "gate"):
             if not isinstance(getattr(self, name), bool):
                 raise TypeError(f"{name} must be true or false, got {getattr(self, name)!r}")
+        if self.gate and not self.bilateral:
+            raise ValueError("gate needs the filtered view: set bilateral, too")
 
 
 class Network(nn.Module):
@@ -94,11 +101,11 @@ class Network(nn.Module):
         self.narrow = nn.ModuleList([_convolution(first, middle), _convolution(middle, last)])
         self.widen = nn.ModuleList([_convolution(last, middle, 1), _convolution(middle, first, 1)])
         self.up = nn.ModuleList([_Block(middle), _Block(first)])
-        self.leave = _convolution(first, _BLOCK**3)
+        self.leave = _convolution(first, (3 if c.gate else 1) * _BLOCK**3)
         # Small at the start: volumes are smooth, their blocks' channels nearly equal.
         with torch.no_grad():
             self.leave.weight.mul_(0.2)
-        if c.bilateral:
+        if c.bilateral and not c.gate:
             self.share = nn.Parameter(torch.tensor(0.5))
         # The layout that processors convolve fastest in (the overload is missing in torch's types).
         self.to(memory_format=torch.channels_last_3d)  # type: ignore[call-overload]
@@ -155,8 +162,18 @@ class Network(nn.Module):
             middle = self.up[0](middle + _doubled(self.widen[0](coarse)), condition)
             fine = self.up[1](fine + _doubled(self.widen[1](middle)), condition)
             out = self.leave(fine)
-        made: Tensor = from_blocks(out.float())[..., : shape[0], : shape[1], : shape[2]]
-        return made + self.share * views[2] if self.config.bilateral else made
+        volumes = [
+            from_blocks(part)[..., : shape[0], : shape[1], : shape[2]] for part in out.float().split(_BLOCK**3, dim=1)
+        ]
+        if not self.config.bilateral:
+            return volumes[0]
+        return volumes[0] + (_part(volumes[1], volumes[2]) if self.config.gate else self.share) * views[2]
+
+
+def _part(one: Tensor, other: Tensor) -> Tensor:
+    """|one| of |one| + |other|, half of it where both are 0: a number that does not change with the unit."""
+    a, b = one.abs() + _LEAST, other.abs() + _LEAST
+    return a / (a + b)
 
 
 def edge_preserved(towards: Tensor, guide_noise: Tensor) -> Tensor:

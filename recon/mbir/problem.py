@@ -52,10 +52,17 @@ class NormalisedProblem:
             mu_per_hu: 1 HU in mm⁻¹.
             voxel_mm: size of the cubic voxels.
         """
+        unit = cls.with_beta(gram, b, exposure, mu_per_hu, voxel_mm)
+        return replace(unit, beta=b * (unit.scale_hu * mu_per_hu).reshape(-1, 1, 1, 1))
+
+    @classmethod
+    def with_beta(
+        cls, gram: NormalOperator, beta: Tensor, exposure: Tensor, mu_per_hu: float, voxel_mm: float
+    ) -> NormalisedProblem:
+        """From β, which is in noise units already; the other arguments are those of :meth:`from_statistic`."""
         unit = gram.information(mu_per_hu)
-        scale = (unit * exposure.to(b) * voxel_mm**3).rsqrt()
-        factor = exposure.to(b) * (scale * mu_per_hu) ** 2
-        return cls(gram, b * (scale * mu_per_hu).reshape(-1, 1, 1, 1), scale, factor, voxel_mm)
+        scale = (unit * exposure.to(beta) * voxel_mm**3).rsqrt()
+        return cls(gram, beta, scale, exposure.to(beta) * (scale * mu_per_hu) ** 2, voxel_mm)
 
     def part(self, which: Sequence[int] | Tensor) -> NormalisedProblem:
         """Those of the batch."""

@@ -36,8 +36,11 @@ from torchpcct.validate import number, whole
 __all__ = [
     "DEFAULT_FIDELITY",
     "REFERENCE_SCALE_HU",
+    "Prior",
     "Unrolled",
+    "Views",
     "fidelity_frequency",
+    "first_views",
     "guide_noise",
     "limited",
     "low_residual",
@@ -118,7 +121,7 @@ class Unrolled(nn.Module):
             fidelity: 0 … 1, one for all or ``(batch,)``.
             callback: called with the number of each step and the volume after it.
             steps: fewer than K; None: K. With 0 the reconstruction is linear, and the solves go on until it is.
-            views: :meth:`first_views` of the problem, where they are known already.
+            views: :func:`first_views` of the problem, where they are known already.
             final_data_consistency: whether that step is taken; without it the network's last volume is the result.
             prior: in the place of the network: block by block (:mod:`recon.mbir.field`), or for comparisons
                 (:func:`recon.mbir.network.bilateral_prior`).
@@ -142,7 +145,7 @@ class Unrolled(nn.Module):
             callback(0, v)
         smoothed = None
         for k in range(self.steps if steps is None else steps):
-            _, towards, smoothed = views if views and k == 0 else self._views(problem, spectrum, v, noise)
+            _, towards, smoothed = views if views and k == 0 else _views(problem, spectrum, v, noise, self.bilateral)
             condition = torch.stack([level, fidelities - 0.5, torch.full_like(level, float(k))], 1)
             v = (prior or self.network)(v, towards, condition, smoothed)
             if callback is not None:
@@ -154,18 +157,20 @@ class Unrolled(nn.Module):
             return u
         return u + significant_residual(problem, spectrum, u, _TOWARDS)
 
-    def first_views(self, problem: NormalisedProblem) -> Views:
-        """What the network sees in its first step: start, step towards the data, and its filtered view, if it has one.
 
-        No weight takes part in it, so a training may keep it.
-        """
-        spectrum = problem.spectrum()
-        noise = guide_noise(spectrum, problem.beta.shape[-3:], problem.voxel_mm)
-        return self._views(problem, spectrum, start(problem, spectrum), noise)
+def first_views(problem: NormalisedProblem, bilateral: bool) -> Views:
+    """What a network sees in its first step: start, step towards the data, and its filtered view, if it has one.
 
-    def _views(self, problem: NormalisedProblem, spectrum: Tensor, v: Tensor, noise: Tensor) -> Views:
-        towards = v + filtered(problem.beta - problem.apply(v), 1.0 / (spectrum + _TOWARDS))
-        return v, towards, edge_preserved(towards, noise) if self.bilateral else None
+    No weight takes part in it, so a training may keep it.
+    """
+    spectrum = problem.spectrum()
+    noise = guide_noise(spectrum, problem.beta.shape[-3:], problem.voxel_mm)
+    return _views(problem, spectrum, start(problem, spectrum), noise, bilateral)
+
+
+def _views(problem: NormalisedProblem, spectrum: Tensor, v: Tensor, noise: Tensor, bilateral: bool) -> Views:
+    towards = v + filtered(problem.beta - problem.apply(v), 1.0 / (spectrum + _TOWARDS))
+    return v, towards, edge_preserved(towards, noise) if bilateral else None
 
 
 def start(problem: NormalisedProblem, spectrum: Tensor, iterations: int = _SOLVES[0]) -> Tensor:

@@ -42,7 +42,7 @@ from torchpcct.scanner import presets
 from torchpcct.scene import Body, Scene
 from torchpcct.scene.bodies import Ellipsoid
 from torchpcct.scene.plaque import Plaque, plaque_scene, plaque_variant
-from train.scenes.held_out import validation_scenes
+from train.scenes.held_out import held_out_plaques
 
 
 @dataclass(frozen=True)
@@ -230,14 +230,14 @@ class Draws:
 
     def _held_out(self, k: int) -> tuple[torch.Tensor, Any, dict[str, float]]:
         """The k-th plaque of the family, its core's centre and true values."""
-        scenes = validation_scenes(self.fine.shape, self.fine.spacing, seed=k // 8, contrasts=(-60.0,))
+        scenes = held_out_plaques(self.fine.shape, self.fine.spacing[0], seed=k // 8, contrasts=(-60.0,))
         image, core, vessel = scenes.image[k % 8, 0], scenes.core[k % 8].double(), scenes.scenes[k % 8].vessels[0]
         axes = [torch.from_numpy(a) for a in self.fine.axes]
         total = float(core.sum())
         centre = [float((core.sum([i for i in range(3) if i != d]) * axes[d]).sum()) / total for d in range(3)]
         true = {"fat": scenes.scenes[k % 8].background, "wall": vessel.wall_hu, "fibrous": vessel.fibrous_hu,
                 "lumen": vessel.lumen_hu, "core": vessel.fibrous_hu - 60.0, "contrast": 60.0,
-                "wall thickness": vessel.wall, "lumen area": np.pi * vessel.lumen_radius**2 * vessel.lumen_aspect,
+                "wall thickness": vessel.wall, "lumen area": np.pi * vessel.at(0.0)[-2:].prod(),
                 "core volume": total * float(np.prod(self.fine.spacing))}  # fmt: skip
         return image, np.array(centre), true
 

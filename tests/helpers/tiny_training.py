@@ -43,12 +43,12 @@ class StubValidation:
 
 
 class StubData:
-    def batch(self, seed, step, indices):
-        drawn = [torch.randn(7, generator=torch.Generator().manual_seed(seed + 1000 * step + i)) for i in indices]
-        return torch.stack(drawn)
+    def __init__(self, seed=0):
+        self.seed = seed
 
-    def batches(self, seed, step, indices):
-        return [self.batch(seed, step, indices)]
+    def batch(self, step, batch, indices):
+        seeds = [self.seed + 1000 * step + i for i in indices]
+        return torch.stack([torch.randn(7, generator=torch.Generator().manual_seed(seed)) for seed in seeds])
 
 
 class StubObjective:
@@ -68,10 +68,10 @@ class StubObjective:
         return StubLoss(total, {"square": float(error.detach().sum()), "scenes": float(len(batch))})
 
     @torch.no_grad()
-    def validate(self, model, data, seed):
+    def validate(self, model, held_out):
         assert not model.training
         self.validations += 1
-        batch = data.batch(seed, 10**6, range(16))
+        batch = held_out.batch(10**6, 16, range(16))
         error = (model(batch[:, :6]).squeeze(1) - batch[:, :6].square().sum(1)).square().mean()
         picture = np.linspace(-200, 500, 12, dtype=np.float32).reshape(3, 4) + float(error)
         return StubValidation(-float(error), {"rms": float(error.sqrt()), "bias": float("nan")}, {"a b": picture})
@@ -91,7 +91,18 @@ def run(out, config=None, objective=None, **options):
     """:func:`train.loop.train` on the stubs: the last state, and the signal that ended it."""
     options = {"tensorboard": False, **options}
     config = config or stub_config()
-    return train(config, stub_model(config.seed), StubData(), objective or StubObjective(), out, **options)
+    data, objective = StubData(config.seed), objective or StubObjective()
+    return train(config, stub_model(config.seed), data, data, objective, out, **options)
+
+
+def stub_build(objective):
+    """In the place of :func:`train.__main__.build`."""
+    return lambda config, views, device: (
+        stub_model(config.seed),
+        StubData(config.seed),
+        StubData(config.seed),
+        objective,
+    )
 
 
 def send(*numbers):
@@ -176,7 +187,7 @@ def _gradients(out):
 
 
 def _command(out):
-    command_line.build = lambda config, device: (stub_model(config.seed), StubData(), StubObjective())
+    command_line.build = stub_build(StubObjective())
     assert command_line.main(["--quick", "--out", out, "--threads", "1", "--no-tensorboard"]) == 0
 
 

@@ -19,11 +19,11 @@ def test_round_trip(tmp_path):
 
 
 def test_sections_from_plain_values():
-    text = "data: {shape: [8, 9, 10], situations: [{x: 1, y: 2}]}\nobjective: {validation_exposures_s: [1]}"
+    text = "data: {shape: [8, 9, 10], situations: [{x: 1, y: 2}]}\nobjective: {held_out: 5}"
     config = TrainConfig.from_yaml(text)
     assert config.data.shape == (8, 9, 10)
     assert config.data.situations[0].patient_mm == 240.0
-    assert config.objective.validation_exposures_s == (1.0,)
+    assert config.objective.held_out == 5
 
 
 @pytest.mark.parametrize(
@@ -41,7 +41,7 @@ def test_sections_from_plain_values():
         ("objective: {nonsense: 1}", r"unknown key 'objective\.nonsense'"),
         ("objective: {bias: [-1, 0]}", "objective: bias must be two weights of at least 0"),
         ("objective: {fidelities: [0.5, 1.5]}", "objective: fidelities must be a range within"),
-        ("objective: {validation_draws: 1}", "objective: validation_draws must be at least 2"),
+        ("objective: {held_out: 1}", "objective: held_out must be at least 2"),
         ("network: {channels: [8, 8]}", "network: channels must name 3 levels"),
         ("steps: 3.5", "steps must be a whole number"),
         ("steps: true", "steps must be a whole number"),
@@ -54,7 +54,9 @@ def test_sections_from_plain_values():
         ("network: 3", "network must be a mapping"),
         ("single: 1.5", "single must lie in"),
         ("bfloat16: 1", "bfloat16 must be true or false"),
-        ("data: {pool: 0}", "data: pool must be at least 1"),
+        ("data: {scenes_kept: 0}", "data: scenes_kept must be at least 1"),
+        ("decay: 1.5", "decay must lie in"),
+        ("network: {gate: true}", "network: gate needs the filtered view"),
         ("- 3", "mapping"),
         ("a: [", "no YAML"),
     ],

@@ -1,69 +1,93 @@
-"""Batches of the training: reproducible, of the right noise and signal, with contrasts that are contrasts."""
+"""Batches of the training: reproducible, with the right noise, signal and contrasts, and kept in a file."""
 
+import errno
 import math
-from collections import Counter
+import os
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
+from recon.mbir.problem import NormalisedProblem
+from recon.mbir.unrolled import first_views
 from train.config import DataConfig, Situation
-from train.data import ROIS, Data
+from train.data import ROIS, Data, Views, turn
 
 CONFIG = DataConfig(
-    shape=(16, 12, 12), voxel_mm=0.4, views=120, pool=30, situations=(Situation(42.0, 0.0), Situation(-20.0, 38.0)),
+    shape=(16, 12, 12),
+    voxel_mm=0.4,
+    views=120,
+    scenes_kept=24,
+    situations=(Situation(42.0, 0.0), Situation(-20.0, 38.0)),
     exposure_s=(0.5, 2.0),
-)  # fmt: skip
+)
+BATCH = 4
 
 
 @pytest.fixture(scope="module")
-def data():
-    return Data(CONFIG)
+def data(tmp_path_factory):
+    return Data(CONFIG, 3, tmp_path_factory.mktemp("views"))
 
 
-def test_pure_function_of_seed_step_and_index(data):
-    whole = data.batch(3, 7, range(4))
-    part = Data(CONFIG).batch(3, 7, [2, 0])
+def test_pure_function_of_seed_step_and_index(data, tmp_path):
+    """Also where the views come from another file."""
+    whole = data.batch(5, BATCH, range(4))
+    again, other = Data(CONFIG, 3, tmp_path), Data(CONFIG, 4, tmp_path)
+    again._grams = other._grams = data._grams
+    part = again.batch(5, BATCH, [2, 0])
     assert whole.size == 4
-    assert whole.problem.beta.shape == (8, *CONFIG.shape)
-    for name in ("truth", "contrast", "voxels"):
+    assert whole.problem.beta.shape == (12, *CONFIG.shape)
+    for name in ("truth", "contrast", "voxels", "lots", "edges", "bodies"):
         assert torch.equal(getattr(whole, name)[[2, 0]], getattr(part, name)), name
-    torch.testing.assert_close(whole.problem.beta[[2, 0, 6, 4]], part.problem.beta)
-    assert not torch.equal(whole.truth, data.batch(3, 8, range(4)).truth)
+    assert torch.equal(whole.problem.beta[[2, 0, 6, 4, 10, 8]], part.problem.beta)
+    assert not torch.equal(whole.truth, data.batch(4, BATCH, range(4)).truth)
+    assert not torch.equal(whole.truth[2], other.batch(5, BATCH, [2]).truth[0])
 
 
-def test_scenes_of_a_batch_differ(data):
-    """In what they show, whichever way they are mirrored, in their exposure and in their noise."""
+def test_an_epoch_takes_every_scene_once(data):
+    assert data.batches_in_epoch(BATCH) == 6
+    epochs = [[data.numbers(6 * epoch + k, BATCH) for k in range(6)] for epoch in range(2)]
+    for epoch in epochs:
+        assert sorted(n for numbers in epoch for n in numbers) == list(range(24))
+        assert all(len({n % 2 for n in numbers}) == 1 for numbers in epoch), "one Gram operator in a step"
+    assert epochs[0] != epochs[1]
+    assert data.batches_in_epoch(5) == 4
+
+
+def test_two_draws_of_noise_are_independent_of_each_other_and_of_other_scenes(data):
+    """What is not H u has the covariance H, whose quadratic forms are known."""
     for step in range(3):
-        batch = data.batch(2, step, range(4))
-        sorted_values = batch.truth.flatten(1).sort(1).values
-        exposures = batch.problem.scale_hu[:4]
-        noise = (batch.problem.beta[:4] - batch.with_noise_free.beta[8:]).flatten(1)
-        assert torch.pdist(sorted_values).min() > 1.0
-        assert torch.pdist(exposures.reshape(4, 1)).min() > 0.0
-        assert torch.corrcoef(noise).fill_diagonal_(0.0).abs().max() < 0.5
+        batch = data.batch(step, BATCH, range(4))
+        p, n = batch.problem, batch.size
+        noise = p.beta[: 2 * n] - torch.cat([p.beta[2 * n :], p.beta[2 * n :]])
+        assert torch.corrcoef(noise.flatten(1)).fill_diagonal_(0.0).abs().max() < 0.5
+        assert torch.pdist(batch.truth.flatten(1).sort(1).values).min() > 1.0
+        probe = torch.zeros(CONFIG.shape)
+        probe[4:12, 3:9, 3:9] = 1.0
+        expected = float((probe * p.apply(probe.expand(3 * n, -1, -1, -1))).sum((1, 2, 3))[0])
+        found = (noise * probe).sum((1, 2, 3))
+        assert float(found.square().mean()) == pytest.approx(expected, rel=1.6)
 
 
-def test_statistic_is_signal_and_two_draws_of_noise(data):
-    """What is not H u has the covariance H, whose quadratic forms are known, and is independent in both draws."""
-    batch = data.batch(0, 1, range(6))
-    p = batch.problem
-    u = torch.cat([batch.truth, batch.truth]) / p.scale_hu.reshape(-1, 1, 1, 1)
-    noise = p.beta - p.apply(u)
-    first, second = noise[:6], noise[6:]
-    probe = torch.zeros(CONFIG.shape)
-    probe[4:12, 3:9, 3:9] = 1.0
-    expected = float((probe * p.apply(probe.expand(12, -1, -1, -1))).sum((1, 2, 3))[0])
-    found = torch.cat([(first * probe).sum((1, 2, 3)), (second * probe).sum((1, 2, 3))])
-    assert float(found.square().mean()) == pytest.approx(expected, rel=1.2)
-    assert abs(float((found[:6] * found[6:]).mean())) < 1.5 * expected
+def test_views_are_those_of_the_method(data):
+    """To the rounding of half precision; the last third is the scene itself, blurred as a scan is."""
+    batch = data.batch(1, BATCH, range(4))
+    found = first_views(batch.problem, bilateral=True)
+    for kept, made in zip(batch.views, found, strict=True):
+        assert kept is not None
+        assert float((kept - made).abs().max()) < 0.02 * float(made.std())
+    scale = batch.problem.scale_hu[8:].reshape(-1, 1, 1, 1)
+    signal = batch.problem.part(range(8, 12))
+    error = signal.beta - signal.apply(batch.truth / scale)
+    assert float(error.std()) < 0.2 * float(signal.beta.std())
 
 
 def test_contrasts_are_differences_of_means(data):
     """Weights of a core add up to 1, of its surround to -1, or all are 0; the number of voxels is the smaller one's."""
     seen = 0
     for step in range(12):
-        batch = data.batch(1, step, range(4))
+        batch = data.batch(step, BATCH, range(4))
         assert batch.contrast.shape == (4, ROIS, *CONFIG.shape)
         for contrast, voxels in zip(batch.contrast.flatten(0, 1), batch.voxels.flatten(), strict=True):
             if not float(voxels):
@@ -76,49 +100,72 @@ def test_contrasts_are_differences_of_means(data):
     assert seen >= 6
 
 
-def test_vessels_run_about_every_axis():
-    """By the share of scenes whose vessel is longest along an axis: a vessel along x covers more of x than of z."""
-    config = DataConfig(shape=(16, 16, 16), voxel_mm=0.4, views=120, along_z=0.0, pool=40,
-                        scenes={"free_probability": 0.0, "tilt": 5.0, "texture_probability": 0.0})  # fmt: skip
-    made = Data(config)
-    longest = []
-    for number in range(20):
-        bodies = made._scene(0, number)[0].float().abs() > 60
-        if bodies.any():
-            longest.append(max(range(3), key=lambda a: int(bodies.amax(tuple(k for k in range(3) if k != a)).sum())))
-    assert longest.count(0) < longest.count(1) + longest.count(2)
-    assert longest.count(1) > 0
-    assert longest.count(2) > 0
-
-
 def test_exposures_lie_in_their_range(data):
-    scales = torch.cat([data.batch(5, step, range(4)).problem.scale_hu for step in range(3)])
+    scales = torch.cat([data.batch(step, BATCH, range(4)).problem.scale_hu for step in range(3)])
     ratio = float(scales.max() / scales.min())
     assert 1.1 < ratio < 1.3 * math.sqrt(4.0)  # two situations: their information differs
 
 
-@pytest.mark.extended
-def test_scenes_are_painted_beforehand_as_when_they_are_used():
-    made = Data(CONFIG)
-    ahead = Data(replace(CONFIG, pool=3))
-    ahead.paint(4, 1)
-    for number in range(3):
-        assert torch.equal(ahead._pool[4, number], made._scene(4, number))
+@pytest.mark.parametrize("number", range(16))
+def test_every_orientation_has_its_inverse(number):
+    v = torch.arange(2 * 3 * 4 * 4.0).reshape(2, 3, 4, 4)
+    there, back = turn(number, square=True)
+    assert torch.equal(back(there(v)), v)
+    assert torch.equal(there(v), v) == (number == 0)
+    oblong = torch.arange(24.0).reshape(1, 2, 3, 4)
+    there, back = turn(number, square=False)
+    assert there(oblong).shape == oblong.shape
+    assert torch.equal(back(there(oblong)), oblong)
 
 
 @pytest.mark.extended
-def test_draws_are_used_several_times():
-    """About as often as asked for, and a resumed run finds the same."""
-    config = replace(CONFIG, reuse=3, situations=CONFIG.situations[:1])
-    made, seen = Data(config), Counter()
-    for step in range(40):
-        for batch in made.batches(1, step, [0, 1]):
-            assert batch.size == 1
-            seen[id(batch)] += 1
-    assert len(made.batches(1, 0, range(3))) == 3
-    assert len(Data(CONFIG).batches(1, 0, range(3))) == 1
-    assert max(seen.values()) > 1
-    later = Data(config).batches(1, 39, [0, 1])
-    for one, other in zip(made.batches(1, 39, [0, 1]), later, strict=True):
+def test_views_are_computed_once(data, tmp_path, monkeypatch):
+    """By processes beforehand as when they are used; a later run reads them, also one that shares the folder."""
+    few = replace(CONFIG, scenes_kept=2, situations=CONFIG.situations[:1])
+    ahead = Data(few, 3, tmp_path)
+    ahead.prepare(1)
+    used = Data(few, 3, tmp_path / "other")
+    used._grams = data._grams
+    with monkeypatch.context() as patch:
+        patch.setattr(Data, "_computed", lambda *a: pytest.fail("computed again"))
+        again = Data(few, 3, tmp_path)
+        for number in range(2):
+            assert number in again.views
+            again.sample(number)
+    for number in range(2):
+        one, other = ahead.sample(number), used.sample(number)
         assert torch.equal(one.truth, other.truth)
-        assert torch.equal(one.problem.beta, other.problem.beta)
+        assert torch.equal(one.labels, other.labels)
+        torch.testing.assert_close(one.views, other.views, rtol=2e-3, atol=2e-3)
+        assert one.exposure == other.exposure
+
+
+def test_folders_of_other_data_are_not_mixed_up(tmp_path):
+    folders = {
+        Views(tmp_path, c, seed).folder for c, seed in ((CONFIG, 1), (CONFIG, 2), (replace(CONFIG, views=60), 1))
+    }
+    assert len(folders) == 3
+    path = Views(tmp_path, CONFIG, 1).folder / "truth.npy"
+    np.save(path, np.zeros((3, 3), np.float16))
+    with pytest.raises(ValueError, match="damaged"):
+        Views(tmp_path, CONFIG, 1)
+
+
+def test_a_disk_that_is_too_small_is_noticed_at_the_start(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    with pytest.raises(OSError, match=r"no room for .* GB of views .*--views"):
+        Views(tmp_path, CONFIG, 1)
+    assert not [p for p in tmp_path.rglob("*") if p.is_file()]
+
+
+def test_beta_in_noise_units_makes_the_same_problem(data):
+    gram, hu = data.gram(0)
+    b = torch.randn(2, *CONFIG.shape)
+    exposure = torch.tensor([0.5, 2.0])
+    one = NormalisedProblem.from_statistic(gram, b, exposure, hu, 0.4)
+    other = NormalisedProblem.with_beta(gram, one.beta, exposure, hu, 0.4)
+    assert torch.equal(one.scale_hu, other.scale_hu)
+    assert torch.equal(one.factor, other.factor)

@@ -6,7 +6,7 @@ import signal
 import pytest
 import torch
 from fresh_python import run_python
-from tiny_training import StubData, StubObjective, assert_same_run, send, stub_model
+from tiny_training import StubObjective, assert_same_run, send, stub_build
 
 from recon.mbir.network import NetworkConfig
 from recon.mbir.unrolled import Unrolled
@@ -17,7 +17,7 @@ from train.checkpoint import start_from
 @pytest.fixture
 def objective(monkeypatch):
     stub = StubObjective()
-    monkeypatch.setattr(command_line, "build", lambda config, device: (stub_model(config.seed), StubData(), stub))
+    monkeypatch.setattr(command_line, "build", stub_build(stub))
     return stub
 
 

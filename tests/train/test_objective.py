@@ -6,12 +6,13 @@ import pytest
 import torch
 from torch import nn
 
-from recon.mbir.unrolled import start
+from recon.mbir.network import NetworkConfig
+from recon.mbir.unrolled import Unrolled
 from train.config import DataConfig, ObjectiveConfig, Situation
-from train.data import Data
-from train.objective import Objective, _edges
+from train.data import Data, _edges
+from train.objective import Objective
 
-CONFIG = DataConfig(shape=(24, 20, 20), voxel_mm=0.4, views=120, pool=10, situations=(Situation(42.0, 0.0),))
+CONFIG = DataConfig(shape=(20, 16, 16), voxel_mm=0.4, views=120, scenes_kept=40, situations=(Situation(42.0, 0.0),))
 
 
 class Given(nn.Module):
@@ -19,39 +20,43 @@ class Given(nn.Module):
 
     def __init__(self, volumes=None):
         super().__init__()
-        self.volumes, self.steps, self.fidelities = volumes, [], []
+        self.volumes, self.steps, self.fidelities, self.sizes = volumes, [], [], []
 
-    def forward(self, problem, fidelity, steps=None):
+    def forward(self, problem, fidelity, steps=None, views=None, prior=None):
         self.steps.append(steps)
         self.fidelities.append(fidelity)
-        return torch.zeros_like(problem.beta) if self.volumes is None else self.volumes
+        self.sizes.append(len(problem.beta))
+        volumes = self.volumes(problem) if callable(self.volumes) else self.volumes
+        return torch.zeros_like(problem.beta) if volumes is None else volumes
 
 
 @pytest.fixture(scope="module")
-def data():
-    return Data(CONFIG)
+def data(tmp_path_factory):
+    return Data(CONFIG, 0, tmp_path_factory.mktemp("views"))
 
 
 def truth_of(batch):
-    return torch.cat([batch.truth, batch.truth]) / batch.problem.scale_hu.reshape(-1, 1, 1, 1)
+    return torch.cat([batch.truth, batch.truth]) / batch.problem.scale_hu[: 2 * batch.size].reshape(-1, 1, 1, 1)
+
+
+def with_contrast(data):
+    return next(b for step in range(10) if (b := data.batch(step, 4, range(4))).contrast[:, -1].any())
 
 
 def test_the_truth_has_no_loss(data):
-    batch = data.batch(0, 0, range(3))
+    batch = data.batch(0, 4, range(3))
     loss = Objective()(Given(truth_of(batch)), batch)
     assert float(loss.total) == pytest.approx(0.0, abs=1e-6)
 
 
 def test_terms_by_their_definitions(data):
     """A constant error c everywhere: no contrast error, c² (1 + edge in bodies), c² times the mean of H 1."""
-    batch = data.batch(0, 0, range(2))
-    error = 0.3 * torch.ones_like(batch.problem.beta)
-    config = ObjectiveConfig(edge=0.0)
-    parts = Objective(config)(Given(truth_of(batch) + error), batch).parts
+    batch = data.batch(0, 4, range(2))
+    noisy = batch.problem.part(range(4))
+    error = 0.3 * torch.ones_like(noisy.beta)
+    parts = Objective(ObjectiveConfig(edge=0.0))(Given(truth_of(batch) + error), batch).parts
     assert parts["white"] == pytest.approx(2 * 0.09, rel=1e-4)
-    assert parts["data"] == pytest.approx(
-        float((error * batch.problem.apply(error)).mean((1, 2, 3)).sum()) / 2, rel=1e-4
-    )
+    assert parts["data"] == pytest.approx(float((error * noisy.apply(error)).mean((1, 2, 3)).sum()) / 2, rel=1e-4)
     assert parts["contrast"] == pytest.approx(0.0, abs=1e-4)
     more = Objective(ObjectiveConfig(edge=2.0))(Given(truth_of(batch) + error), batch).parts
     assert parts["white"] < more["white"] < 3 * parts["white"]
@@ -59,7 +64,7 @@ def test_terms_by_their_definitions(data):
 
 def test_noise_costs_once_and_bias_with_its_weight(data):
     """Contrast errors that are opposite in both draws are noise: κ d₁ d₂ gives back; equal ones are bias: it adds."""
-    batch = next(b for step in range(40) if (b := data.batch(0, step, range(4))).contrast[:, -1].any())
+    batch = with_contrast(data)
     roi = batch.contrast[:, -1]
     push = roi / roi.square().sum((1, 2, 3), keepdim=True).clamp_min(1e-6)
     for signs, expected in (((1.0, -1.0), -1.0), ((1.0, 1.0), 1.0)):
@@ -70,7 +75,7 @@ def test_noise_costs_once_and_bias_with_its_weight(data):
 
 
 def test_steps_follow_the_training(data):
-    batch, model, objective = data.batch(0, 0, range(2)), Given(), Objective(single=0.5)
+    batch, model, objective = data.batch(0, 4, range(2)), Given(), Objective(single=0.5)
     for progress in (0.0, 0.49, 0.5, 1.0):
         objective(model, batch, progress)
     assert model.steps == [1, 1, None, None]
@@ -79,41 +84,8 @@ def test_steps_follow_the_training(data):
     assert 0 <= float(fidelity.min()) <= float(fidelity.max()) <= 1
 
 
-class Linear(nn.Module):
-    """The linear start itself, times a gain."""
-
-    def __init__(self, gain=1.0):
-        super().__init__()
-        self.gain = gain
-
-    def forward(self, problem, fidelity):
-        return self.gain * start(problem, problem.spectrum())
-
-
-@pytest.mark.extended
-def test_validation_of_the_linear_start():
-    """The start against itself: a lesion factor of 1 (but for slopes that differ from scene to scene), at any gain."""
-    data = Data(replace(CONFIG, shape=(28, 24, 24), voxel_mm=0.3))
-    objective = Objective(ObjectiveConfig(validation_exposures_s=(1.0,), validation_draws=4))
-    found = objective.validate(Linear(), data, 0)
-    f = found.figures
-    assert 0.4 < f["slope_1s"] < 1.2
-    assert f["lesion_1s"] == pytest.approx(1.0, abs=0.05)
-    assert f["sd_hu_1s"] > 0
-    assert f["rmse_hu_1s"] > f["fat_hu_1s"] > 0
-    assert found.pictures["1s_0"].shape == (24, 48)
-    again = objective.validate(Linear(), data, 0)
-    assert again.figures == f
-    assert again.score == found.score
-    half = objective.validate(Linear(0.5), data, 0).figures
-    assert half["slope_1s"] == pytest.approx(0.5 * f["slope_1s"], rel=1e-4)
-    assert half["fat_hu_1s"] == pytest.approx(0.5 * f["fat_hu_1s"], rel=1e-4)
-    for same in ("sd_hu_1s", "lesion_1s"):
-        assert half[same] == pytest.approx(f[same], rel=1e-3)
-
-
 def test_bias_weighs_more_where_one_measures(data):
-    batch = next(b for step in range(40) if (b := data.batch(0, step, range(4))).contrast[:, -1].any())
+    batch = with_contrast(data)
     roi = batch.contrast[:, -1]
     push = roi / roi.square().sum((1, 2, 3), keepdim=True).clamp_min(1e-6)
     given = Given(truth_of(batch) + 0.01 * torch.cat([push, push]))
@@ -128,44 +100,71 @@ def test_bias_weighs_more_where_one_measures(data):
 
 def test_the_scene_without_noise_counts_with_its_weight(data):
     """Half of the scenes, each for two; there the model sees it behind the two draws, in one call."""
+    batch = data.batch(0, 4, range(2))
+    free = []
 
-    class Constant(nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.calls = []
+    def off_by_a_constant(problem):
+        scene = torch.tensor([0, 1, 0, 1, *free])[: len(problem.beta)]
+        return batch.truth[scene] / problem.scale_hu.reshape(-1, 1, 1, 1) + 0.3
 
-        def forward(self, problem, fidelity, steps=None):
-            self.calls.append(len(problem.beta))
-            scene = torch.tensor([0, 1, 0, 1, *free])[: len(problem.beta)]
-            return batch.truth[scene] / problem.scale_hu.reshape(-1, 1, 1, 1) + 0.3
-
-    batch = data.batch(0, 0, range(2))
-    three = batch.with_noise_free
-    assert torch.equal(three.beta[: 2 * batch.size], batch.problem.beta)
-    signal = three.apply(batch.truth.repeat(3, 1, 1, 1) / three.scale_hu.reshape(-1, 1, 1, 1))
-    torch.testing.assert_close(three.beta[2 * batch.size :], signal[2 * batch.size :])
-    free, model = [], Constant()
+    model = Given(off_by_a_constant)
     without = Objective(ObjectiveConfig(contrast=0.0))(model, batch)
     assert "noise_free" not in without.parts
     added = {}
     for lots in ((0.9, 0.9), (0.1, 0.9), (0.9, 0.1), (0.1, 0.1)):
         free = [k for k, lot in enumerate(lots) if lot < 0.5]
-        drawn = replace(batch, lots=torch.tensor([[0.5, lot] for lot in lots]), kept={})
+        drawn = replace(batch, lots=torch.tensor([[0.5, lot] for lot in lots]))
         total = Objective(ObjectiveConfig(contrast=0.0, noise_free=0.5))(model, drawn).total
         added[tuple(free)] = float(total) - float(without.total)
-        assert model.calls[-1] == 4 + len(free)
+        assert model.sizes[-1] == 4 + len(free)
     # Two draws and the scene have the same error: with a weight of a half and half of the scenes, once more.
     assert added[()] == pytest.approx(0.0, abs=1e-4)
     assert added[0, 1] == pytest.approx(float(without.total), rel=1e-4)
     assert added[0,] + added[1,] == pytest.approx(added[0, 1], rel=1e-4)
-    lots = torch.cat([data.batch(0, step, range(4)).lots for step in range(20)])
-    assert 0.3 < float((lots[:, 1] < 0.5).float().mean()) < 0.7
+    lots = torch.cat([data.batch(step, 4, range(4)).lots for step in range(10)])
+    assert 0.25 < float((lots[:, 1] < 0.5).float().mean()) < 0.75
+
+
+def test_the_network_sees_its_views_turned_and_gives_volumes_that_are_not(data):
+    """A network that does what it does in every orientation has the same loss in all of them; another has not."""
+    model = Unrolled(NetworkConfig((4, 4, 4), 0.4, bilateral=True), steps=1).train()
+    batch = data.batch(0, 4, range(2))
+    assert sum(torch.equal(data.batch(k, 4, [0]).turned(batch.truth), batch.truth) for k in range(10)) < 5
+    loss = float(Objective()(model, batch).total.detach())
+    model.network.forward = lambda estimate, towards, condition, smoothed: 0.5 * (towards + smoothed)
+    still = replace(batch, turned=lambda v: v, unturned=lambda v: v)
+    one, other = (float(Objective()(model, b).total) for b in (batch, still))
+    assert one == pytest.approx(other, rel=1e-5)
+    assert one != pytest.approx(loss)
+
+
+@pytest.mark.extended
+def test_validation_is_relative_to_the_filter(data):
+    """The filter in the network's place has ratios of 1; half of its error has half of them, whatever the scene."""
+    held_out = Data(replace(CONFIG, scenes_kept=8), 9, data.views.folder.parent)
+    held_out._grams = data._grams
+    model = Unrolled(NetworkConfig((4, 4, 4), 0.4, bilateral=True), steps=1).eval()
+    with torch.no_grad():
+        model.network.leave.weight.zero_()
+        model.network.share.fill_(1.0)  # the network is the filter
+    found = Objective().validate(model, held_out)
+    for dose in ("low", "high"):
+        for name in ("error", "all"):
+            assert found.figures[f"{name}_{dose}"] == pytest.approx(1.0, abs=1e-3)
+    assert found.score == pytest.approx(0.0, abs=3e-3)
+    assert found.pictures["held_out_0"].shape == (16, 48)
+    with torch.no_grad():
+        model.network.share.fill_(0.0)
+    worse = Objective().validate(model, held_out)
+    assert worse.score < found.score - 0.5
+    again = Objective().validate(model, held_out)
+    assert again.figures == worse.figures
 
 
 def test_edges_reach_two_voxels_to_either_side():
-    truth = torch.zeros(1, 9, 9, 12)
+    truth = torch.zeros(9, 9, 12)
     truth[..., 6:] = 100.0
     truth[..., 9:] += 10.0  # no more than texture
     found = _edges(truth)
-    assert found[0, 4, 4].tolist() == [0.0] * 4 + [1.0] * 4 + [0.0] * 4
+    assert found[4, 4].tolist() == [False] * 4 + [True] * 4 + [False] * 4
     assert torch.equal(_edges(truth + 50.0), found)

@@ -175,7 +175,7 @@ def test_resume_refuses_another_configuration_or_model(tmp_path, caplog):
     with pytest.raises(ValueError, match=r"learning_rate, objective\.white"):
         run(tmp_path / "x", stub_config(learning_rate=1.0, objective=ObjectiveConfig(white=0.1)), resume=True)
     with pytest.raises(TensorFileError, match="another model"):
-        train(stub_config(), nn.Linear(6, 1), StubData(), StubObjective(), tmp_path / "x", resume=True)
+        train(stub_config(), nn.Linear(6, 1), StubData(), StubData(), StubObjective(), tmp_path / "x", resume=True)
     threads = torch.get_num_threads()
     try:
         torch.set_num_threads(threads + 1)
@@ -206,6 +206,22 @@ def test_learning_rate_follows_the_updates():
     assert rate_factor(config, 505) == pytest.approx(0.55, abs=1e-3)
     assert rate_factor(config, 999) == pytest.approx(0.1, abs=1e-4)
     assert rate_factor(stub_config(steps=1, warmup=0), 0) == 1.0
+    late = stub_config(steps=1000, warmup=10, decay=0.2, final_fraction=0.1)
+    assert rate_factor(late, 9) == rate_factor(late, 800) == 1.0
+    assert rate_factor(late, 900) == pytest.approx(0.55)
+    assert rate_factor(late, 1000) == pytest.approx(0.1)
+
+
+def test_a_run_may_be_made_longer_until_the_rate_falls(tmp_path):
+    """It then gives the bits of one that was as long from the start."""
+    long, short = (stub_config(steps=n, decay=0.25, unroll=1) for n in (2 * STEPS, STEPS))
+    run(tmp_path / "long", long)
+    run(tmp_path / "x", short, StubObjective({6: send(signal.SIGTERM)}))
+    run(tmp_path / "x", long, resume=True)
+    assert_same_run(tmp_path / "x", tmp_path / "long")
+    run(tmp_path / "y", short, StubObjective({9: send(signal.SIGTERM)}))
+    with pytest.raises(ValueError, match="steps"):
+        run(tmp_path / "y", long, resume=True)
 
 
 def test_it_trains_and_the_best_average_is_shipped(uninterrupted):
@@ -217,7 +233,7 @@ def test_it_trains_and_the_best_average_is_shipped(uninterrupted):
     assert header["score"] == max(scores)
     model = stub_model(5).eval()
     model.load_state_dict(weights)
-    assert StubObjective().validate(model, StubData(), 0).score == pytest.approx(max(scores), rel=1e-5)
+    assert StubObjective().validate(model, StubData()).score == pytest.approx(max(scores), rel=1e-5)
     first, last = (rows(uninterrupted / "log.csv")[i] for i in (0, -1))
     assert list(first) == ["step", "lr", "grad_norm", "skipped", "loss", "square", "scenes"]
     assert float(first["scenes"]) == 1.0

@@ -1,77 +1,144 @@
-"""Scenes on grids: area-averaged voxel values."""
+"""Scenes on grids: averages over voxels, of small cells within them."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
-from train.scenes.paint_kernels import KINDS, QUADRIC_COLUMNS, TABLE_ROWS, TUBE_COLUMNS, paint
-from train.scenes.scene import Solid, TrainingScene, Triple
+from train.scenes.paint_kernels import (
+    HALO,
+    INNER,
+    LUMEN,
+    OUTER,
+    QUADRIC,
+    QUADRIC_IN_TUBE,
+    STENT,
+    paint,
+)
+from train.scenes.scene import COLUMNS, Solid, Tissue, TrainingScene
 
-__all__ = ["rasterise"]
+__all__ = ["Painted", "rasterise"]
 
-# Spacing in mm of the tables over z, well below the shortest bump.
-TABLE_STEP = 0.1
+CELLS = 2
+"""Cells along each edge of a voxel: at voxels of 0.2 mm, averages are within a HU rms of converged ones near faces."""
+QUADRIC_COLUMNS = 17
+"""Centre (3), rows of the rotation into its own axes (9), semi-axes (3), exponent, cap to the lumen."""
 
 
-def rasterise(scene: TrainingScene, shape: tuple[int, int, int], spacing_mm: Triple) -> NDArray[np.float32]:
-    """Averages over the voxels of a grid about the origin, ``(3, nz, ny, nx)`` float32.
+@dataclass(frozen=True)
+class Painted:
+    """Averages over the voxels of a grid about the origin, ``(nz, ny, nx)`` float32.
 
-    Image in HU; volume fraction of all cores, of the virtual ones too; volume fraction of the fibrous layers of the
-    vessels that hold them.
+    Args:
+        image: HU. data: the same as blurred by focal spot and motion, which is what a scan holds.
+        signal, around: volume fractions of the tissues that the scene names so.
     """
-    diagonal = math.sqrt(sum(s * s for s in spacing_mm))
-    half = 0.5 * shape[0] * spacing_mm[0]
-    # A foot lies at most reach · sin(tilt) above or below its point
-    pad = 4.0 if scene.vessels else 0.0
-    count = math.ceil(2 * (half + pad) / TABLE_STEP) + 1
-    z: NDArray[np.float64] = (np.arange(count, dtype=np.float64) - 0.5 * (count - 1)) * TABLE_STEP
-    bodies: list[tuple[int, int, int]] = []
-    values: list[float] = [scene.background]
-    roles: list[str] = [""]
-    tubes, tables, quadrics = [], [], []
 
-    def add(solid: Solid, tube: int) -> None:
-        quadrics.append((*solid.centre, *solid.rotation, *solid.semi_axes, solid.exponent, solid.cap, diagonal))
-        bodies.append((KINDS[solid.kind], tube, len(quadrics) - 1))
-        values.append(solid.hu)
-        roles.append("core" if solid.kind == "core" else solid.kind)
+    image: NDArray[np.float32]
+    data: NDArray[np.float32]
+    signal: NDArray[np.float32]
+    around: NDArray[np.float32]
 
-    for solid in scene.tissues:
-        add(solid, -1)
-    for index, vessel in enumerate(scene.vessels):
-        table = vessel.tables(z)
-        steepest = math.sqrt(1.0 + float(np.max(table[2] ** 2 + table[3] ** 2)))
-        # Calcifications may stick out of the vessel.
-        outside = max((max(s.semi_axes) for s in vessel.solids if s.kind == "calcification"), default=0.0)
-        reach = steepest * (float(table[4].max()) + outside + 1.5 * diagonal)
-        turns = [(math.cos(a), math.sin(a)) for a in (vessel.angle, vessel.lumen_angle)]
-        tubes.append((vessel.aspect, *turns[0], vessel.wall, *turns[1], reach))
-        tables.append(table)
-        bodies += [(KINDS[name], index, -1) for name in ("wall", "fibrous", "lumen")]
-        values += [vessel.wall_hu, vessel.fibrous_hu, vessel.lumen_hu]
-        roles += ["wall", "surround" if vessel.cores else "fibrous", "lumen"]
-        for solid in vessel.solids:
-            add(solid, index)
-    for solid in scene.free:
-        add(solid, -1)
-    groups: list[tuple[str, ...]] = [("core",), ("surround",)]
-    if scene.textures:
-        groups += [("", "free"), ("wall", "fibrous", "surround", "core")]
-    weights = np.array([values] + [[float(role in group) for role in roles] for group in groups])
-    maps = paint(
-        shape,
-        spacing_mm,
-        weights,
-        np.array(bodies, dtype=np.int64).reshape(-1, 3),
-        np.array(tables).reshape(-1, len(TABLE_ROWS), count),
-        np.array(tubes).reshape(-1, len(TUBE_COLUMNS)),
-        np.array(quadrics).reshape(-1, QUADRIC_COLUMNS),
-        float(z[0]),
-        TABLE_STEP,
+
+def rasterise(scene: TrainingScene, shape: tuple[int, int, int], voxel_mm: float, cells: int = CELLS) -> Painted:
+    """A scene on a grid of cubic voxels.
+
+    Args:
+        scene: what is painted.
+        shape: ``(nz, ny, nx)``.
+        voxel_mm: edge of a voxel.
+        cells: along each edge of a voxel.
+    """
+    fine = (shape[0] * cells, shape[1] * cells, shape[2] * cells)
+    cell = voxel_mm / cells
+    maps = paint(fine, cell, _arrays(scene, cell), int(scene.signal), int(scene.around))
+    image = maps[0]
+    for texture, weight in zip(scene.textures, maps[3:], strict=False):
+        image = image + weight * texture.field(fine, (cell,) * 3)
+    widths = (0.0, math.hypot(scene.blur, scene.motion[0]), math.hypot(scene.blur, scene.motion[1]))
+    blurred = ndimage.gaussian_filter(image, [w / cell for w in widths], mode="nearest") if any(widths) else image
+    return Painted(*(_averaged(m, cells) for m in (image, blurred, maps[1], maps[2])))
+
+
+def _averaged(fine: NDArray[np.float32], cells: int) -> NDArray[np.float32]:
+    z, y, x = (n // cells for n in fine.shape)
+    means: NDArray[np.float32] = fine.reshape(z, cells, y, cells, x, cells).mean((1, 3, 5), dtype=np.float64)
+    return means.astype(np.float32)
+
+
+def _mask(tissues: tuple[Tissue, ...]) -> int:
+    return sum(1 << int(t) for t in tissues)
+
+
+def _arrays(scene: TrainingScene, cell: float) -> tuple[Any, ...]:
+    """What :func:`train.scenes.paint_kernels.paint` reads of a scene, in the order of painting."""
+    bodies: list[tuple[int, int, int, int]] = []
+    values: list[float] = []
+    rows: list[NDArray[np.float64]] = []
+
+    def add(kind: int, vessel: int, tissue: Tissue, displaces: tuple[Tissue, ...], hu: float, row: Any = ()) -> None:
+        bodies.append((kind, vessel, int(tissue), _mask(displaces)))
+        values.append(hu)
+        rows.append(np.pad(np.asarray(row, dtype=np.float64), (0, QUADRIC_COLUMNS - len(row))))
+
+    def solid(s: Solid) -> None:
+        row = (*s.centre, *s.rotation, *s.semi_axes, s.exponent, s.cap)
+        add(QUADRIC if s.vessel < 0 else QUADRIC_IN_TUBE, s.vessel, s.tissue, s.displaces, s.hu, row)
+
+    outside = (Tissue.BACKGROUND, Tissue.BESIDE, Tissue.INSERT)
+    within = (Tissue.WALL, Tissue.FIBROUS, Tissue.LAYER, Tissue.CORE, Tissue.LUMEN)
+    for s in scene.beside:
+        solid(s)
+    for h in scene.halos:
+        add(HALO, h.vessel, Tissue.BACKGROUND, (), h.hu, (h.width, 0.55 * h.softness, h.towards, h.one_sided))
+    for v, vessel in enumerate(scene.vessels):
+        add(OUTER, v, Tissue.WALL, outside, vessel.wall_hu)
+    for v, vessel in enumerate(scene.vessels):
+        layer = Tissue.LAYER if vessel.holds_core else Tissue.FIBROUS
+        add(INNER, v, layer, (Tissue.WALL,), vessel.fibrous_hu)
+    for s in scene.cores:
+        solid(s)
+    for v, vessel in enumerate(scene.vessels):
+        add(LUMEN, v, Tissue.LUMEN, within, vessel.lumen_hu)
+    for s in scene.solids:
+        solid(s)
+    for t in scene.stents:
+        row = (t.inset, 0.5 * t.wire, t.pitch, float(t.waves), t.amplitude, t.first, t.last)
+        add(STENT, t.vessel, Tissue.HARD, tuple(Tissue), t.hu, row)
+    reaches = [_reach(scene, v, cell) for v in range(len(scene.vessels))]
+    tubes = [
+        (
+            *(math.cos(v.outer_angle), math.sin(v.outer_angle), math.cos(v.lumen_angle), math.sin(v.lumen_angle)),
+            *(v.wall, v.along, v.across),
+        )
+        for v in scene.vessels
+    ]
+    tables = np.stack([v.table for v in scene.vessels]) if scene.vessels else np.empty((0, len(COLUMNS), 2))
+    return (
+        tables,
+        np.array(tubes, dtype=np.float64).reshape(-1, 7),
+        np.array(reaches, dtype=np.float64),
+        np.array(bodies, dtype=np.int64).reshape(-1, 4),
+        np.array(values, dtype=np.float64),
+        np.array(rows).reshape(-1, QUADRIC_COLUMNS),
+        float(scene.background),
     )
-    for texture, weight in zip(scene.textures, maps[3:], strict=True):
-        maps[0] += weight * texture.field(shape, spacing_mm)
-    return maps[:3]
+
+
+def _reach(scene: TrainingScene, number: int, cell: float) -> float:
+    """Distance from the curve beyond which a vessel and all that lies in its frame leave no trace, mm."""
+    rows = {name: scene.vessels[number].table[COLUMNS.index(name)] for name in COLUMNS[13:]}
+    outer = np.hypot(rows["outer_u"], rows["outer_w"]) + np.maximum(rows["outer_a"], rows["outer_b"])
+    far = [float(outer.max())]
+    far += [
+        math.hypot(s.centre[0], s.centre[1]) + math.hypot(*s.semi_axes) if max(s.semi_axes) < 50.0 else 0.0
+        for s in (*scene.cores, *scene.solids)
+        if s.vessel == number
+    ]
+    far += [far[0] + h.width + 5.0 * h.softness for h in scene.halos if h.vessel == number]
+    return max(far) + 3.0 * cell

@@ -145,15 +145,15 @@ def test_noise_of_the_guide_is_that_of_draws(normalised):
 @pytest.fixture(scope="module")
 def normalised():
     """Noise alone, and the first step towards it."""
-    from recon.mbir.problem import filtered
+    from recon.mbir.problem import NormalisedProblem, filtered
     from recon.mbir.unrolled import start
     from train.config import DataConfig
-    from train.data import Data
+    from train.data import situation_gram
 
-    data = Data(DataConfig(shape=(28, 28, 28), views=120))
-    batch = data.batch(0, 0, range(4))
-    first, clean = batch.problem, batch.with_noise_free
-    problem = replace(first, beta=first.beta - torch.cat([clean.beta[8:], clean.beta[8:]]))
+    config = DataConfig(shape=(28, 28, 28), views=120)
+    gram, hu = situation_gram(config.situations[0], config)
+    noise = gram.noise((8,), generator=torch.Generator().manual_seed(0))
+    problem = NormalisedProblem.from_statistic(gram, noise, torch.ones(8), hu, config.voxel_mm)
     spectrum = problem.spectrum()
     v = start(problem, spectrum)
     return problem, v + filtered(problem.beta - problem.apply(v), 1.0 / (spectrum + 0.1))
