@@ -168,6 +168,7 @@ class _Divergent(Geometry):
 
     sod: float
     sdd: float
+    pitch: Any
     detector: str
 
     def _validate_divergent(self) -> None:
@@ -212,7 +213,8 @@ class _Divergent(Geometry):
     def fov_radius(self) -> float:
         """Radius in mm of the disc about the isocentre that every view sees whole (outer cell edges)."""
         u = self.column_positions
-        half_pitch = 0.5 * (u[-1] - u[0]) / max(self.columns - 1, 1) if self.columns > 1 else 0.0
+        pitch = self.pitch[1] if isinstance(self.pitch, tuple) else self.pitch
+        half_pitch = 0.5 * (u[-1] - u[0]) / (self.columns - 1) if self.columns > 1 else 0.5 * pitch
         edge = min(-(u[0] - half_pitch), u[-1] + half_pitch)
         gamma = edge / self.sdd if self.detector == "curved" else math.atan(edge / self.sdd)
         return self.sod * math.sin(max(gamma, 0.0))

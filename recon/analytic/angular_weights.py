@@ -27,6 +27,9 @@ Floats = NDArray[np.float64]
 PARALLEL_GAP_RAD = math.radians(5.0)
 #: Views that lack inside of the covered arc: neighbours stand for them up to this angle in rad, with a warning.
 INNER_GAP_RAD = math.radians(5.0)
+#: A short scan may lack this angle in rad, or one step if that is less, of half a turn and the fan: lines at the fan's
+#: edge are not measured then.
+SHORT_RAD = math.radians(2.0)
 #: The largest angle in rad that one view may stand for: five views a turn pass, as a test of operators, not of images.
 WIDEST_STEP_RAD = math.radians(75.0)
 
@@ -172,8 +175,8 @@ def angular_weights(geometry: Geometry, grid: VolumeGrid | None = None) -> Float
                 'reconstruct by "pwls" or "mbir"'
             )
         reach = float(min(-gamma[0], gamma[-1]))
-    slack = float(steps.max())  # the scan's ends are known to about one step
-    if half_fan < reach - slack:
+    # The scan's ends are known to about one step, but a step may be wider than what may lack.
+    if 2.0 * (reach - half_fan) > min(float(steps.max()), SHORT_RAD) * (1.0 + 1e-6):
         raise ValueError(
             f"the views cover {math.degrees(span):.1f}°, but this fan needs 180° + {math.degrees(2 * reach):.1f}° = "
             f"{math.degrees(math.pi + 2 * reach):.1f}°: add views, or "

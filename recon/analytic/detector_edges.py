@@ -30,6 +30,8 @@ _CUT, _CUT_VIEWS = 0.03, 0.05
 """Rows are cut off if their end exceeds a share of the highest line integral in more than a share of the views."""
 _CUT_RANGES = 40
 _LEFT_OUT = 0.1
+_FEWEST_COLUMNS = 4
+"""Readings that a cylinder is fitted to at least; rows of fewer are not continued."""
 _WIDEST_RAD = math.radians(85.0)
 
 
@@ -135,7 +137,7 @@ def mirrored(rows: Rows, grid: VolumeGrid, travel: float = 0.0) -> Rows:
     if not _leaves_out_short_side(rows.weights, g):
         return rows
     t = reach(g)
-    half_cell = 0.5 * (t[-1] - t[0]) / (t.size - 1)
+    half_cell = 0.5 * (t[-1] - t[0]) / max(t.size - 1, 1)
     if grid.in_plane_radius + travel <= min(-t[0], t[-1]) + half_cell:
         return rows
     pitch = g.pitch[1] if isinstance(g, ConeBeam) else g.pitch
@@ -157,13 +159,13 @@ def continued(rows: Rows, sides: tuple[bool, bool], outside: float) -> Rows:
     """
     g = rows.geometry
     room = [space if side else 0 for space, side in zip(_room(g), sides, strict=True)]
-    if outside <= 0 or not any(room):
+    if outside <= 0 or not any(room) or g.columns < _FEWEST_COLUMNS:
         return rows
     wide = _wider(g, *room)
     t = reach(wide)
     cone = isinstance(g, ConeBeam)
     heights = g.row_positions if cone else np.zeros(1)
-    fit = max(4, min(32, g.columns // 20))
+    fit = max(_FEWEST_COLUMNS, min(32, g.columns // 20))
     parts = [rows.lines]
     for side, space in enumerate(room):
         if not space:

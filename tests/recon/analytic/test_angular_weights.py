@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from recon.analytic.angular_weights import angular_weights, parker_share
 from recon.analytic.coverage import view_notes
 from torchpcct.angles import view_steps
-from torchpcct.geometry import FanBeam, ParallelBeam, full_turn
+from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, full_turn
 
 FAN = dict(sod=570.0, sdd=1040.0, columns=81, pitch=8.0)
 HALF_FAN = math.atan(40 * 8.0 / 1040.0)
@@ -160,3 +160,22 @@ def test_too_few_views_are_refused():
         ValueError, match=r"cover 200\.0°, but this fan needs 180° \+ 34\.\d°.*or reconstruct by \"pwls\""
     ):
         angular_weights(FanBeam(np.arange(200) * math.pi / 180, **FAN))
+
+
+@pytest.mark.parametrize("kind", [FanBeam, ConeBeam])
+@pytest.mark.parametrize("step", [0.5, 2.0, 5.0, 9.0])
+@pytest.mark.parametrize("lacking", [0.0, 3.0, 7.0])
+def test_a_short_scan_that_lacks_some_of_its_fan(kind, step, lacking):
+    """What may lack does not grow with the step: at 5° a whole fan of 7° once passed without a word."""
+    cells = (100,) if kind is FanBeam else (100, 2)
+    half_fan = math.degrees(math.atan(50 * 0.5 / 400.0)) - math.degrees(0.25 / 400.0)
+    needed = 180.0 + 2.0 * half_fan
+    views = math.ceil((needed - lacking) / step)
+    # Equal steps that cover exactly so much, half a step beyond the first and the last view.
+    angles = np.deg2rad(np.arange(views) * (needed - lacking) / views)
+    geometry = kind(angles, 300.0, 400.0, *cells, 0.5)
+    if lacking:
+        with pytest.raises(ValueError, match="but this fan needs 180°"):
+            angular_weights(geometry)
+    else:
+        assert angular_weights(geometry).shape == (views, 100)
