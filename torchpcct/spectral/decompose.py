@@ -8,6 +8,7 @@ also keep rays without any count finite; see :mod:`torchpcct.spectral.decompose_
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +18,7 @@ from torch import Tensor
 
 from torchpcct.scan import Scan
 from torchpcct.spectral.decompose_kernels import solve
-from torchpcct.spectral.model import SpectralModel, evaluate
+from torchpcct.spectral.model import SpectralModel, evaluate, one_bin
 from torchpcct.threads import run
 from torchpcct.validate import checked
 
@@ -32,6 +33,9 @@ COARSE_TOLERANCE = 0.5
 
 EXACT_TOLERANCE = 1e-7
 """The same for noise-free counts, where standard deviations are no measure."""
+
+NAMED, REFUSED = 0.01, 0.5
+"""Shares of rays that one bin alone counts from which on they are named, and refused."""
 
 STEP_LIMIT = 160
 """Most rays take three steps; a few in a million, with a handful of counts, need their steps damped."""
@@ -95,8 +99,9 @@ def decompose(
 
     Raises:
         TypeError: counts that are no floating-point tensor.
-        ValueError: a wrong number of bins, negative or non-finite counts, indices outside the detector, a tolerance
-            outside (0, 1).
+        ValueError: a wrong number of bins, negative or non-finite counts, counts in a bin for which the model expects
+            none, indices outside the detector, a tolerance outside (0, 1); more than half of the rays counted by one
+            bin alone. (Of fewer, from 1 % on, a ``UserWarning`` says how many.)
     """
     if not isinstance(counts, Tensor) or counts.dtype not in (torch.float32, torch.float64):
         kind = counts.dtype if isinstance(counts, Tensor) else type(counts).__name__
@@ -112,6 +117,7 @@ def decompose(
     box = np.ascontiguousarray(model.bounds)
     column, intensity = model.rays(tuple(counts.shape[1:]), columns, scale)
     n, shape = counts.detach().contiguous().reshape(model.bins, -1), counts.shape[1:]
+    _check_bins(n.numpy(), model, column)
     line_integrals, information = (torch.empty((k, column.size), dtype=counts.dtype) for k in (2, 3))
     steps = torch.empty(column.size, dtype=torch.int32)
     # One step goes at most two attenuation lengths at 60 keV.
@@ -127,6 +133,26 @@ def decompose(
     low_, high_ = (torch.from_numpy(b.copy()).reshape(2, *(1,) * (counts.ndim - 1)).to(counts.dtype) for b in box.T)
     at_bound = ((line_integrals <= low_) | (line_integrals >= high_)).any(0)
     return Decomposition(line_integrals, information, at_bound, (steps > 0).reshape(shape))
+
+
+def _check_bins(counts: Any, model: SpectralModel, column: Any) -> None:
+    """Refuse, or name, rays ``(bins, rays)`` that cannot tell two materials apart."""
+    silent = model.spectra.sum(-1) == 0.0  # (columns, bins)
+    for b in np.flatnonzero(silent.any(0)):
+        if (counts[b] * silent[column, b] > 0).any():
+            raise ValueError(
+                f"bin {b} counted photons in a column where the model expects none: build the model from the scanner "
+                "and the thresholds of the scan"
+            )
+    share = float(one_bin(counts).mean()) if counts.shape[1] else 0.0
+    if share < NAMED:
+        return
+    text = (
+        f"{100 * share:.3g} % of the rays are counted by one energy bin alone, which cannot tell two materials apart"
+    )
+    if share > REFUSED:
+        raise ValueError(f"{text}: set lower thresholds, or a higher tube voltage, or sum the bins and reconstruct HU")
+    warnings.warn(f"{text}: their line integrals hang on single photons", UserWarning, stacklevel=4)
 
 
 @checked

@@ -26,7 +26,7 @@ from torchpcct.spectral.decompose_kernels import expected
 from torchpcct.threads import run
 from torchpcct.validate import reals, shaped
 
-__all__ = ["SpectralModel"]
+__all__ = ["ONE_BIN", "SpectralModel", "one_bin"]
 
 Floats = NDArray[np.float64]
 
@@ -42,6 +42,9 @@ _NODES = 64
 _LOWEST, _HIGHEST = -4.0, 16.0  # bounds of the estimates as line integrals at 60 keV
 
 _NEGLIGIBLE = 1e-12
+ONE_BIN = (100.0, 5.0)
+"""Where one bin counts this much or more, and all others together less than the second number, a ray says nothing of
+two materials: its estimate hangs on single photons."""
 _ALIKE = 1e-7
 """Spectra of two bins that differ by less are one: their information is singular in float64."""
 
@@ -58,7 +61,8 @@ class SpectralModel:
 
     Raises:
         ValueError: shapes that do not fit, negative or non-finite spectra, a column without counts, fewer than 2 bins,
-            a column whose bins all have one spectrum (they cannot tell two materials apart).
+            a column whose bins all have one spectrum, or of which one alone counts in air (they cannot tell two
+            materials apart).
     """
 
     energies: Floats
@@ -84,6 +88,14 @@ class SpectralModel:
             raise ValueError(
                 f"the bins of column {int(alike.argmax())} have one spectrum but for its height, or counts in one bin "
                 "only: they cannot tell two materials apart; set other thresholds, or leave dead columns out"
+            )
+        if (starved := one_bin(spectra.sum(-1).T)).any():
+            column = int(starved.argmax())
+            strongest, others = spectra[column].sum(-1).max(), np.sort(spectra[column].sum(-1))[:-1].sum()
+            raise ValueError(
+                f"of column {column} one bin is expected to count {strongest:.3g} photons in air and all others "
+                f"together {others:.2g}: they cannot tell two materials apart; set lower thresholds, or a higher tube "
+                "voltage"
             )
         # Energies that no column detects cost time, and where the model is asked for negative lengths they matter.
         share = (spectra / spectra.sum((1, 2), keepdims=True)).max((0, 1))
@@ -265,6 +277,12 @@ def evaluate(model: SpectralModel, line_integrals: Tensor, column: Any, intensit
         slopes, operations=6 * model.spectra[0].size,
     )  # fmt: skip
     return counts, slopes
+
+
+def one_bin(counts: Floats) -> NDArray[np.bool_]:
+    """Rays of which one bin alone counts, see :data:`ONE_BIN`; ``counts`` ``(bins, ...)``."""
+    strongest = counts.max(0)
+    return np.asarray((strongest >= ONE_BIN[0]) & (counts.sum(0) - strongest < ONE_BIN[1]))
 
 
 def _one_spectrum(spectra: Floats) -> NDArray[np.bool_]:

@@ -245,3 +245,40 @@ def test_another_basis(model):
 def test_empty_input(model):
     found = decompose(torch.zeros(8, 0, 4), model)
     assert found.line_integrals.shape == (2, 0, 4)
+
+
+def two_bins(low, high):
+    """A model of one column and two bins, which differ in energy and expect so many photons in air."""
+    energies = np.linspace(30.0, 90.0, 7)
+    shape = np.array([[4, 3, 2, 1, 0, 0, 0], [0, 0, 0, 1, 2, 3, 4]]) / 10.0
+    return SpectralModel(energies, shape[None] * np.array([low, high])[:, None])
+
+
+def test_bins_of_which_one_alone_counts_are_refused():
+    """The estimate hangs on single photons then: 122 mm off, and called converged."""
+    with pytest.raises(ValueError, match="cannot tell two materials apart"):
+        two_bins(2.6e5, 0.16)
+    assert two_bins(20.0, 0.16).bins == 2  # few photons in both are noise, no fault
+    model = two_bins(2.6e5, 9.0)
+    counts = torch.tensor([[2e5, 1e5, 5e4], [0.0, 1.0, 0.0]])
+    with pytest.raises(ValueError, match="100 % of the rays are counted by one energy bin alone"):
+        decompose(counts, model, columns=0)
+
+
+def test_rays_that_one_bin_alone_counts_are_named():
+    model = two_bins(2e4, 1e4)
+    counts = model.expected(truth(*[20.0, 5.0] * 50), columns=0).float()
+    assert decompose(counts, model, columns=0).converged.all()
+    counts[1, :10] = 0.0
+    with pytest.warns(UserWarning, match="20 % of the rays are counted by one energy bin alone"):
+        decompose(counts, model, columns=0)
+
+
+def test_counts_where_the_model_expects_none_are_refused():
+    energies = np.linspace(30.0, 90.0, 3)
+    spectra = np.array([[[500.0, 300, 0], [0, 300, 500], [0, 0, 0]]])
+    model = SpectralModel(energies, spectra)
+    sound = torch.tensor([[300.0], [400.0], [0.0]])
+    assert decompose(sound, model, columns=0).converged.all()
+    with pytest.raises(ValueError, match="bin 2 counted photons"):
+        decompose(sound + 1.0, model, columns=0)
