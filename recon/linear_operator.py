@@ -24,6 +24,6 @@ class NormalOperator(Protocol):
         """Eigenvalues of a circulant approximation on the frequencies of ``rfftn``."""
         ...
 
-    def information(self, mu_per_hu: float) -> float:
-        """On a wave of 0.5 lp/mm, 1/(HU² mm³) (2-D: mm²); ``mu_per_hu`` is 1 HU in mm⁻¹."""
+    def information(self, mu_per_hu: float, frequency: float = ...) -> float:
+        """On a wave of ``frequency`` lp/mm (0.5), 1/(HU² mm³) (2-D: mm²); ``mu_per_hu`` is 1 HU in mm⁻¹."""
         ...

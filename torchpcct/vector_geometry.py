@@ -169,8 +169,9 @@ class VectorGeometry(Geometry):
         width = np.linalg.norm(u, axis=1)
         if not self.parallel:
             orbit = np.linalg.norm(source[:, :2], axis=1)
-            depth = ((source - centre)[:, :2] * source[:, :2]).sum(1) / np.maximum(orbit, 1e-9)
-            width = width * orbit / np.maximum(np.abs(depth), 1e-9)
+            least = 1e-9 * float(np.abs(self.vectors).max())
+            depth = ((source - centre)[:, :2] * source[:, :2]).sum(1) / np.maximum(orbit, least)
+            width = width * orbit / np.maximum(np.abs(depth), least)
         return float(np.median(width))
 
     def select(self, views: Any) -> VectorGeometry:
@@ -253,12 +254,16 @@ class VectorGeometry(Geometry):
             axes = 2 if self.rows is None else 3
             motion = self.of(found).vectors[:, :axes] - v[:, :axes]
         motion = np.ascontiguousarray(motion[:, ::-1])
-        again, scale = self.of(found, motion).vectors, float(np.abs(v).max())
+        again, far = self.of(found, motion).vectors, float(np.abs(v).max())
+        scale = np.full(v.shape[1], far)
         if self.parallel:  # a ray's direction has no length, and its line no sense
             v[:, :2] *= (np.sign((v[:, :2] * again[:, :2]).sum(1)) / np.linalg.norm(v[:, :2], axis=1))[:, None]
-        if np.abs(again - v).max() > 1e-9 * scale:
+            axes = 2 if self.rows is None else 3
+            far = float(np.abs(v[:, axes:]).max())
+            scale[:axes], scale[axes:] = 1.0, far
+        if (np.abs(again - v) > 1e-9 * scale).any():
             return None
-        return found, None if np.abs(motion).max() <= 1e-9 * scale else motion
+        return found, None if np.abs(motion).max() <= 1e-9 * far else motion
 
     def _with(self, *parts: Any) -> VectorGeometry:
         """Other vectors: place, ``(views, 3)`` or None (unchanged), in turn."""

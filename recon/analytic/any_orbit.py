@@ -58,7 +58,7 @@ def ideal_circle(geometry: VectorGeometry) -> IdealCircle:
     """
     work = _parallel if geometry.parallel else _divergent
     found = work(geometry.poses, geometry.rows or 1, geometry.columns, geometry.rows is not None)
-    far = max(1.0, float(np.abs(geometry.vectors).max()))
+    far = float(np.abs(geometry.vectors).max())
     still = found.motion is None or np.abs(found.motion).max() < 1e-9 * far
     return found._replace(motion=None) if still else found
 
@@ -101,7 +101,8 @@ def at_slices(sinogram: Tensor, slices: Floats, grid: VolumeGrid) -> Tensor:
     place = np.interp(grid.axes[0], slices, np.arange(slices.size))
     # The outermost rows reach half a row beyond their centres.
     half = 0.5 * float(slices[1] - slices[0]) if slices.size > 1 else 0.0
-    if grid.axes[0][0] < slices[0] - half - 1e-6 or grid.axes[0][-1] > slices[-1] + half + 1e-6:
+    slack = 1e-6 * max(half, grid.spacing[0])
+    if grid.axes[0][0] < slices[0] - half - slack or grid.axes[0][-1] > slices[-1] + half + slack:
         raise ValueError(f"the grid's slices must lie in the rows' {slices[0]:g} … {slices[-1]:g} mm")
     below = np.minimum(place.astype(int), max(slices.size - 2, 0))
     share = torch.from_numpy(place - below).to(sinogram)[:, None, None]

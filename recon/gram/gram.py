@@ -33,7 +33,7 @@ from torchpcct.projector.operator import apply_linear
 from torchpcct.threads import run
 from torchpcct.validate import number
 
-__all__ = ["Gram", "check_weights", "cholesky", "information_at_reference", "make_definite"]
+__all__ = ["REFERENCE_FREQUENCY", "Gram", "check_weights", "cholesky", "information_at", "make_definite"]
 
 # Frequencies in plane that are not made definite, in steps of the padded grid's, and at most in periods per voxel. With
 # them changed as well, the error on a vessel was 0.25 % (1968 views of the paper's scan), 1.7 % (360 views) and 2.7 %
@@ -106,8 +106,13 @@ def _points(terms: int) -> NDArray[np.float64]:
 
 # Bands along z whose energy is below this share of the kernel's are dropped (float32 rounding).
 BAND_ENERGY = 1e-13
-# Reference frequency of `information`, line pairs per mm.
-REFERENCE_FREQUENCY = 0.5
+# Usual frequency of `information`, line pairs per mm, and the share of it by which others are still averaged over.
+REFERENCE_FREQUENCY, AROUND = 0.5, 0.2
+# Highest frequency per voxel that is looked at: beyond, the corners of the voxels' own spectrum say little, and may be
+# negative.
+HIGHEST_PER_VOXEL = 0.25
+# Of the information that a voxel's own response stands for: less is rounding, or cut off with the grid.
+LEAST_INFORMATION = 0.1
 
 
 class Gram:
@@ -244,19 +249,21 @@ class Gram:
         """The b_c on the in-plane grid, ``(terms, ny, nx)``; the first is 1."""
         return self._basis
 
-    def information(self, mu_per_hu: float) -> float:
-        """The data's information on a 0.5 lp/mm in-plane wave, in 1/(HU² mm³) (2-D: 1/(HU² mm²)).
+    def information(self, mu_per_hu: float, frequency: float = REFERENCE_FREQUENCY) -> float:
+        """The data's information on an in-plane wave, in 1/(HU² mm³) (2-D: 1/(HU² mm²)).
 
         Its inverse is the noise power that unregularised least squares has there, in HU² mm³. It is proportional to
-        the exposure and does not depend on the voxel size (as long as voxels are below 1 mm).
+        the exposure and hardly depends on the voxel size.
 
         Args:
             mu_per_hu: 1 HU in mm⁻¹ (μ_ref / 1000).
+            frequency: of the wave, lp/mm.
         """
         kernel = self._spectra[0]
         # A wave that is constant along z sees the sum over the bands.
         summed = (kernel[:1].real + 2 * kernel[1:].real.sum(0, keepdim=True)).sum(0)
-        return information_at_reference(summed, self.padded, self.grid.spacing, mu_per_hu) * self.factor
+        found = information_at(frequency, summed, self.padded, self.grid.spacing, mu_per_hu)
+        return found * self.factor
 
     def noise(self, batch: tuple[int, ...] = (), *, generator: torch.Generator) -> Tensor:
         """Draw AᵀW n for counting noise n ~ N(0, W⁻¹) without a projector: covariance G (stationary part).
@@ -292,26 +299,35 @@ class Gram:
         return out.squeeze(-3) if self._flat else out
 
 
-def information_at_reference(
-    spectra: Tensor, period: tuple[int, int], spacing: tuple[float, ...], mu_per_hu: float
+def information_at(
+    frequency: float, spectra: Tensor, period: tuple[int, int], spacing: tuple[float, ...], mu_per_hu: float
 ) -> float:
-    """Information on a 0.5 lp/mm in-plane wave that is constant along z, in 1/(HU² mm³) (2-D: 1/(HU² mm²)).
+    """Information on an in-plane wave that is constant along z, in 1/(HU² mm³) (2-D: 1/(HU² mm²)); > 0.
 
     Args:
+        frequency: of the wave, lp/mm. What voxels or grid do not hold is read off the nearest that they do, by the law
+            of the ramp, S ∝ 1/f.
         spectra: ``(slices, period[0], period[1] // 2 + 1)`` in-plane spectra of what AᵀWA answers to such waves.
         period: voxels of the ring that the spectra are of.
         spacing: voxel size per axis in mm.
         mu_per_hu: 1 HU in mm⁻¹.
     """
     hy, hx = spacing[-2:]
-    f = torch.hypot(torch.fft.fftfreq(period[0], hy)[:, None], torch.fft.rfftfreq(period[1], hx)[None, :])
-    # Voxels larger than 1 mm do not hold the reference: the corner of their spectrum comes next, and may be negative.
-    wanted = min(REFERENCE_FREQUENCY, 0.5 / max(hy, hx))
+    double: Any = {"dtype": torch.float64, "device": "cpu"}
+    f = torch.hypot(
+        torch.fft.fftfreq(period[0], hy, **double)[:, None], torch.fft.rfftfreq(period[1], hx, **double)[None, :]
+    )
+    spectra = spectra.double().cpu()
+    wanted = min(frequency, HIGHEST_PER_VOXEL / max(hy, hx))
     distance = (f - wanted).abs() + torch.where(f == 0, math.inf, 0.0)
-    ring = distance <= max(0.1, float(distance.min()) * 1.001)
-    # S ∝ 1/f: refer every frequency of the ring to the reference.
-    per_slice = (spectra[:, ring.to(spectra.device)] * (f[ring] / REFERENCE_FREQUENCY).to(spectra)).mean(1)
-    return float(per_slice.median()) * mu_per_hu**2 / math.prod(spacing)
+    # Rounding must not decide about frequencies on the ring's edge: the unit of length would, too.
+    ring = distance <= max(AROUND * wanted, float(distance.min()) * 1.001) * (1.0 + 1e-9)
+    per_slice = (spectra[:, ring] * (f[ring] / frequency)).mean(1)
+    # A voxel's own response is the mean of the spectrum over the square of frequencies that voxels hold, on which the
+    # mean of 1/f is 4 ln(1 + √2) voxels. So it tells c of S = c / f where a grid of few voxels tells nothing else.
+    own = torch.fft.irfft2(spectra, s=period)[:, 0, 0] / (4.0 * math.log(1.0 + math.sqrt(2.0)) * math.sqrt(hy * hx))
+    found = max(float(per_slice.median()), LEAST_INFORMATION * float(own.median()) / frequency)
+    return found * mu_per_hu**2 / math.prod(spacing)
 
 
 def check_weights(weights: Any, shape: tuple[int, ...]) -> None:

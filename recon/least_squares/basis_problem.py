@@ -26,6 +26,7 @@ from recon.analytic.inset import static_fbp
 from recon.gram.gram import Gram
 from recon.least_squares.pwls import PwlsOptions, mean_weights, pwls
 from recon.least_squares.qggmrf import DEFAULT_PRIOR, QGGMRF
+from recon.least_squares.surround import length_unit
 from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import VolumeGrid
 from torchpcct.projector import Projector
@@ -170,7 +171,8 @@ class BasisProblem:
 
         Args:
             lines, window: decomposed line integrals, see :meth:`data`.
-            prior: None: :data:`recon.least_squares.qggmrf.DEFAULT_PRIOR`.
+            prior: None: :data:`recon.least_squares.qggmrf.DEFAULT_PRIOR` in the length unit of the scan, as for
+                :class:`recon.least_squares.inset_problem.InsetProblem`.
             dose: of the data relative to the model's exposure; it scales the information.
             options: of :func:`recon.least_squares.pwls.pwls`.
 
@@ -181,8 +183,9 @@ class BasisProblem:
             ValueError: shapes that do not fit, ``dose`` ≤ 0.
         """
         number("dose", dose, positive=True, unit="of the model's exposure")
+        prior = prior or DEFAULT_PRIOR.stretched(length_unit(self.geometry), self.grid.ndim)
         result = pwls(
-            self.projector, self.data(lines, window), self.information * dose, prior or DEFAULT_PRIOR, mu_per_hu=1.0,
+            self.projector, self.data(lines, window), self.information * dose, prior, mu_per_hu=1.0,
             gram=self.gram.scaled(dose), **options,
         )  # fmt: skip
         images = self.whitening.undo(result.x) + self.level.to(lines.dtype).reshape(2, 1, 1, 1)

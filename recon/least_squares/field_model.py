@@ -24,7 +24,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from recon.gram.gram import check_weights, information_at_reference
+from recon.gram.gram import REFERENCE_FREQUENCY, check_weights, information_at
 from recon.least_squares.model_solver import mean_share
 from recon.least_squares.qggmrf import BoundPrior
 
@@ -110,18 +110,25 @@ class FieldModel:
         inner = [self.spectrum if z == self.at[0] else self._spectrum((z, *self.at[1:])) for z in slices[1:-1]]
         return list(zip([outer[0], *inner, outer[1]], _shares(slices, self.seen), strict=True))
 
-    def information(self, mu_per_hu: float, spacing: tuple[float, ...] | None = None) -> float:
-        """The data's information at 0.5 lp/mm in the middle of the grid, see :meth:`recon.gram.gram.Gram.information`.
+    def information(
+        self, mu_per_hu: float, frequency: float = REFERENCE_FREQUENCY, spacing: tuple[float, ...] | None = None
+    ) -> float:
+        """The data's information in the middle of the grid, see :meth:`recon.gram.gram.Gram.information`.
 
         Args:
             mu_per_hu: 1 HU in mm⁻¹.
+            frequency: of the wave, lp/mm.
             spacing: as if the voxels had this size in mm; None: their own.
         """
         rolled = torch.roll(self._column, [-k for k in self.at[-2:]], (-2, -1))
         # Slices that the rays do not meet say nothing.
         kept = rolled[rolled[..., 0, 0] > 0]
-        return information_at_reference(
-            torch.fft.rfft2(kept).real, (rolled.shape[-2], rolled.shape[-1]), spacing or self.grid.spacing, mu_per_hu
+        return information_at(
+            frequency,
+            torch.fft.rfft2(kept).real,
+            (rolled.shape[-2], rolled.shape[-1]),
+            spacing or self.grid.spacing,
+            mu_per_hu,
         )
 
     def scaled(self, factor: float) -> FieldModel:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -52,14 +51,7 @@ def field_prior(voxel_mm: float, dimensions: int = 3) -> QGGMRF:
         voxel_mm: in-plane voxel size.
         dimensions: of the volume.
     """
-    ratio = voxel_mm / REFERENCE_VOXEL_MM
-    # The threshold counts in (λ mm³)^(−1/2). With all lengths times m, and the information at 0.5 lp/mm divided by m⁴
-    # (of a plane m³), gradients are divided by m.
-    return replace(
-        DEFAULT_PRIOR,
-        strength=DEFAULT_PRIOR.strength * ratio**3,
-        threshold=DEFAULT_PRIOR.threshold * ratio ** (-dimensions / 2),
-    )
+    return DEFAULT_PRIOR.stretched(voxel_mm / REFERENCE_VOXEL_MM, dimensions)
 
 
 def is_whole_field(scan: Scan, grid: VolumeGrid) -> bool:

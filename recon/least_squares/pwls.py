@@ -326,7 +326,7 @@ def solve_normal(
         b: ``(..., [channels,] *grid.shape)``.
         exact: x ↦ H x = AᵀWA x; ``gram.apply`` itself solves the model's problem.
         gram: the model of H: ``apply(x)``, ``periodic_spectrum()`` and, for a :class:`QGGMRF`,
-            ``information(mu_per_hu)``; or a :class:`recon.least_squares.field_model.FieldModel`.
+            ``information(mu_per_hu, frequency)``; or a :class:`recon.least_squares.field_model.FieldModel`.
         spacing: voxel size per axis in mm.
         channels: whether the volumes have an axis of channels, which the prior joins and ``gram`` treats alike.
         data: yᵀW y of each volume, ``(batch,)``, and the number of readings of positive weight, for ``misfit``.
@@ -339,9 +339,9 @@ def solve_normal(
     whole("max_exact", max_exact)
     if start is not None and tuple(start.shape[-axes:]) != tuple(shape):
         raise ValueError(f"start must have shape (..., {', '.join(map(str, shape))}), got {tuple(start.shape)}")
-    bound = (
-        prior.bind(gram.information(mu_per_hu), spacing, mu_per_hu, channels) if isinstance(prior, QGGMRF) else prior
-    )
+    bound = prior
+    if isinstance(prior, QGGMRF):
+        bound = prior.bind(gram.information(mu_per_hu, prior.frequency), spacing, mu_per_hu, channels)
     lead = b.shape[:-axes]
     b = b.reshape(-1, *shape)
     proposer: ModelSolver | GradientStep

@@ -27,7 +27,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -49,14 +49,15 @@ class QGGMRF:
     """A q-GGMRF prior in noise-normalised units.
 
     Args:
-        strength: s ≥ 0. The prior's curvature equals that of the data at ``0.5 · s^(-1/3)`` line pairs per mm, at
-            any dose and voxel size: s = 1 blurs at 0.5 lp/mm, s = 1/8 at 1 lp/mm. The resolution of small contrasts
-            hence stays and the noise falls as dose^(−1/2).
+        strength: s ≥ 0. The prior's curvature equals that of the data at ``frequency · s^(-1/3)``, at any dose and
+            voxel size: with the frequency 0.5 lp/mm s = 1 blurs at 0.5 lp/mm, s = 1/8 at 1 lp/mm. The resolution of
+            small contrasts hence stays and the noise falls as dose^(−1/2).
         threshold: T in HU/mm, or, with ``relative=True``, in units of ``(λ mm³)^(−1/2)``, a gradient scale that follows
             the noise (∝ dose^(−1/2)). ``inf`` makes the prior quadratic.
         p, q: exponents of small and large gradients, 1 ≤ q ≤ p ≤ 2.
         neighbors: 26 (2-D: 8) or 6 (2-D: 4).
         relative: how to read ``threshold``.
+        frequency: line pairs per mm, at which the data are asked how much they know.
 
     Raises:
         ValueError: a value outside its range.
@@ -68,8 +69,10 @@ class QGGMRF:
     q: float = 1.0
     neighbors: int = 26
     relative: bool = False
+    frequency: float = 0.5
 
     def __post_init__(self) -> None:
+        number("frequency", self.frequency, positive=True, unit="lp/mm")
         number("strength", self.strength, low=0.0)
         number("threshold", self.threshold, positive=True, finite=False)
         if not 1.0 <= self.q <= self.p <= 2.0:
@@ -77,20 +80,33 @@ class QGGMRF:
         if self.neighbors not in (6, 26):
             raise ValueError(f"neighbors must be 6 or 26 (2-D: 4 or 8), got {self.neighbors}")
 
+    def stretched(self, factor: float, dimensions: int = 3) -> QGGMRF:
+        """The prior of a scan that has all lengths ``factor`` times as large: its image is the same, voxel by voxel.
+
+        Args:
+            factor: > 0.
+            dimensions: of the volume.
+        """
+        # With all lengths times m and attenuations divided by it, gradients are divided by m, and the energy keeps its
+        # value if λ is divided by m^(dimensions − 2).
+        power = dimensions / 2 if self.relative else 1.0
+        factor = number("factor", factor, positive=True)
+        return replace(self, frequency=self.frequency / factor, threshold=self.threshold * factor**-power)
+
     def bind(
         self, information: float, spacing: Sequence[float], mu_per_hu: float, channels: bool = False
     ) -> BoundPrior:
         """The prior for one grid and noise level.
 
         Args:
-            information: the data's information at 0.5 lp/mm, in 1/(HU² mm³) (``Gram.information(mu_per_hu)``); the same
-                for each channel.
+            information: the data's information at ``frequency``, in 1/(HU² mm³)
+                (``Gram.information(mu_per_hu, frequency)``); the same for each channel.
             spacing: voxel size per axis in mm, (y, x) or (z, y, x).
             mu_per_hu: 1 HU in mm⁻¹ (μ_ref / 1000); the value of the channels that counts as 1 HU.
             channels: for volumes with an axis of channels.
         """
         number("information", information, positive=True)
-        lam = self.strength * information / math.pi**2  # (2π · 0.5 lp/mm)² = π² mm⁻²
+        lam = self.strength * information / (2.0 * math.pi * self.frequency) ** 2
         threshold = self.threshold
         if self.relative and lam > 0:
             threshold = self.threshold / math.sqrt(lam)

@@ -35,8 +35,9 @@ def reconstruct_pwls(
         scans: realisations of one scan at one exposure; of a whole field scans of one geometry.
         grid: the inset, or the field.
         progress: called with the finished fraction.
-        prior: None: :data:`recon.least_squares.qggmrf.DEFAULT_PRIOR`; of a whole field
-            :func:`recon.least_squares.field_problem.field_prior`.
+        prior: None: :data:`recon.least_squares.qggmrf.DEFAULT_PRIOR` in the length unit of the scan
+            (:func:`recon.least_squares.surround.length_unit`); of a whole field
+            :func:`recon.least_squares.field_problem.field_prior`. Neither depends on the unit of length.
         problem: kept from an earlier call with the same scan and grid; None: made here.
         batch: volumes of an inset solved at a time; they iterate until the slowest has converged.
         options: of :func:`recon.least_squares.pwls.pwls`; ``tolerance`` is 1 HU unless given.

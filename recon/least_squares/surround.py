@@ -29,15 +29,30 @@ from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, VolumeGrid
 from torchpcct.projector import Projector
 
-__all__ = ["UnknownSurround"]
+__all__ = ["CELL_MM", "UnknownSurround", "length_unit"]
 
-# Voxels of the whole field, and its detector cells at the axis, in mm: about 1 lp/mm.
+# The scanner on which lengths were chosen, that of the paper: detector cell at the axis, radius of the field of view,
+# mm.
+CELL_MM, FIELD_MM = 0.35 * 626.0 / 1098.0, 626.0 * math.sin(0.35 * 1500 / 2 / 1098.0)
+# Voxels of the whole field, and its detector cells at the axis, in mm: about 1 lp/mm. On other scanners so many times
+# as large as the field of view is, and not less than a cell.
 COARSE_MM = 0.6
 # The second FBP, which adds what the first does not explain, does with so much larger ones in the plane: cupping and
 # steps at the ends, no details.
 SECOND = 2
-# Rows are joined to about this height at the axis, in mm: patients change slowly along z.
+# Rows are joined to about this height at the axis, in mm, likewise: patients change slowly along z.
 COARSE_ROW_MM = 1.5
+# Of a count: rounding of what it is computed from must not decide between two whole numbers.
+TIE = 1e-9
+
+
+def length_unit(geometry: ConeBeam) -> float:
+    """How many times as large the detector cells at the axis are as those of :data:`CELL_MM`.
+
+    What was chosen in mm for an inset, the default prior, is taken so many times as large: a scan with all lengths
+    times any number, in another unit or of a smaller scanner, gives the same image.
+    """
+    return geometry.pitch[1] / geometry.magnification / CELL_MM
 
 
 class UnknownSurround:
@@ -56,7 +71,7 @@ class UnknownSurround:
     def __init__(self, geometry: ConeBeam, grid: VolumeGrid, window: DetectorWindow, projector: Projector) -> None:
         self.geometry, self.grid, self.window, self.projector = geometry, grid, window, projector
         self._all = DetectorWindow.full(geometry)
-        self._first, self._second = (_Field(geometry, grid, mm) for mm in (COARSE_MM, SECOND * COARSE_MM))
+        self._first, self._second = (_Field(geometry, grid, size) for size in (COARSE_MM, SECOND * COARSE_MM))
         self.coarse = self._first.grid
         self._left = Projector(self._second.inner, self.coarse)
         self._around = Projector(geometry, self.coarse, window)
@@ -123,7 +138,7 @@ class _Field:
     Args:
         geometry: of the whole scan.
         inset: grid of the inset: the voxels are a whole multiple of its own, and one corner is its first one.
-        size: mm, of voxels and cells in the plane.
+        size: mm, of voxels and cells in the plane of the scanner of the paper.
 
     Attributes:
         inner: the joined detector.
@@ -133,10 +148,14 @@ class _Field:
     def __init__(self, geometry: ConeBeam, inset: VolumeGrid, size: float) -> None:
         g = geometry
         scale = g.sdd / g.sod
+        share = g.fov_radius / FIELD_MM
+        self._coarse_row, size = (
+            max(length * share, pitch / scale) for length, pitch in zip((COARSE_ROW_MM, size), g.pitch, strict=True)
+        )
         self._views = _joined_views(g, size)
         self._bin = (
-            min(max(round(COARSE_ROW_MM * scale / g.pitch[0]), 1), g.rows),
-            max(round(size * scale / g.pitch[1]), 1),
+            min(max(_rounded(self._coarse_row * scale / g.pitch[0]), 1), g.rows),
+            max(_rounded(size * scale / g.pitch[1]), 1),
         )
         # Rows and columns that do not fill a bin are left out, as many at either end as the other.
         self._skip = tuple((n % b) // 2 for n, b in zip((g.rows, g.columns), self._bin, strict=True))
@@ -164,10 +183,10 @@ class _Field:
     def _whole_multiple(self, inset: VolumeGrid, size: float, half_height: float) -> VolumeGrid:
         shape, spacing, center = [], [], []
         for axis, (n, h, c) in enumerate(zip(inset.shape, inset.spacing, inset.center, strict=True)):
-            wanted, reach = (COARSE_ROW_MM, half_height) if axis == 0 else (size, self.inner.fov_radius)
-            coarse = h * max(round(wanted / h), 1)
+            wanted, reach = (self._coarse_row, half_height) if axis == 0 else (size, self.inner.fov_radius)
+            coarse = h * max(_rounded(wanted / h), 1)
             corner = c - n * h / 2
-            before, after = math.ceil((corner + reach) / coarse), math.ceil((reach - corner) / coarse)
+            before, after = (math.ceil(way / coarse - TIE) for way in (corner + reach, reach - corner))
             shape.append(before + after)
             spacing.append(coarse)
             center.append(corner + (after - before) * coarse / 2)
@@ -187,6 +206,11 @@ class _Field:
         """
         extended = torch.cat([data[:, :1]] * self._extra + [data] + [data[:, -1:]] * self._extra, dim=1)
         return torch.nan_to_num(fbp(extended, self._extended, self.grid, outside=outside))
+
+
+def _rounded(value: float) -> int:
+    """The nearest whole number, upwards from a half whatever the rounding of the last digit."""
+    return math.floor(value + 0.5 + TIE)
 
 
 def _joined_views(g: ConeBeam, size: float) -> int:

@@ -31,11 +31,11 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from recon.gram.gram import REFERENCE_FREQUENCY
 from recon.least_squares.field_model import FieldModel
 from recon.least_squares.field_problem import FieldProblem, field_prior
 from recon.least_squares.memory import require_memory
 from recon.least_squares.pwls import pwls
-from recon.least_squares.qggmrf import QGGMRF
 from recon.mbir.mbir import Mbir, average_onto
 from recon.mbir.problem import NormalisedProblem
 from recon.mbir.unrolled import REFERENCE_SCALE_HU, Prior, low_residual
@@ -105,11 +105,11 @@ class FieldGram:
         """Eigenvalues of the circulant model at the middle, ``rfftn`` layout; of slices the same at all z."""
         return self._spectrum
 
-    def information(self, mu_per_hu: float) -> float:
+    def information(self, mu_per_hu: float, frequency: float = REFERENCE_FREQUENCY) -> float:
         """So that the noise scale of the middle is right, see :class:`recon.mbir.problem.NormalisedProblem`."""
         n = self._model.grid.ndim
         spacing = (self._voxel_mm,) * n
-        return self._model.information(mu_per_hu, spacing) * self._voxel_mm ** (n - 3)
+        return self._model.information(mu_per_hu, frequency, spacing) * self._voxel_mm ** (n - 3)
 
 
 def _turned(spectrum: Tensor, shape: Sequence[int]) -> Tensor:
@@ -308,7 +308,9 @@ def _surround(problem: FieldProblem, slices: Sequence[tuple[Tensor, Tensor]]) ->
     """The edges of each slice in mm⁻¹: PWLS with :data:`SURROUND_STRENGTH` times the strength of the default prior."""
     voxel = problem.work.spacing[-1]
     usual = field_prior(voxel, problem.work.ndim)
-    prior = QGGMRF(SURROUND_STRENGTH * usual.strength, SURROUND_STEP_HU / voxel)
+    prior = replace(
+        usual, strength=SURROUND_STRENGTH * usual.strength, threshold=SURROUND_STEP_HU / voxel, relative=False
+    )
     hu = problem.mu_ref / 1000.0
     found = []
     for y, w in slices:

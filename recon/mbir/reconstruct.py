@@ -9,6 +9,7 @@ import torch
 
 from recon.least_squares.field_problem import is_whole_field
 from recon.least_squares.inset_problem import InsetProblem
+from recon.least_squares.surround import CELL_MM, length_unit
 from recon.mbir.field import field_solutions
 from recon.mbir.mbir import Mbir, average_onto, working_grid
 from recon.mbir.outlines import OutlineMbir
@@ -21,6 +22,10 @@ from torchpcct.scan import Scan
 from torchpcct.validate import renamed
 
 __all__ = ["reconstruct_mbir"]
+
+
+FARTHEST_CELL = 4.0
+"""Detector cells at the axis may be so many times as large, or as small, as the network's voxels: clinical scanners."""
 
 
 def reconstruct_mbir(
@@ -69,8 +74,9 @@ def reconstruct_mbir(
         ``outlines``: whether a vessel was drawn, or why not; with ``tissues`` what was read of them, under that name.
 
     Raises:
-        ValueError, TypeError: see :class:`recon.least_squares.inset_problem.InsetProblem`; a problem that was made for
-            another grid; a fidelity outside of 0 … 1; for a whole field see :func:`recon.mbir.field.field_solutions`.
+        ValueError, TypeError: see :class:`recon.least_squares.inset_problem.InsetProblem`; an inset of a scanner whose
+            cells have another size than the network's voxels by far; a problem that was made for another grid; a
+            fidelity outside of 0 … 1; for a whole field see :func:`recon.mbir.field.field_solutions`.
         FileNotFoundError: the package has no weights.
     """
     network = network or Mbir.load()
@@ -92,6 +98,7 @@ def reconstruct_mbir(
         network = TissueMbir(network, point, vessel_prior=vessel_prior)
     elif outlines:
         network = OutlineMbir(network, vessel_prior)
+    _check_cells(scans[0], network.voxel_mm)
     work = working_grid(grid, network.voxel_mm)
     problem = problem or InsetProblem(scans[0], work)
     if problem.grid != work:
@@ -130,3 +137,13 @@ def reconstruct_mbir(
             )
         yield found
         progress(min(i + batch, len(scans)) / len(scans))
+
+
+def _check_cells(scan: Scan, voxel_mm: float) -> None:
+    """Refuse a scanner, or a unit of length, on which the network's voxels mean nothing (ValueError)."""
+    cell = length_unit(scan.geometry) * CELL_MM
+    if not 1.0 / FARTHEST_CELL <= cell / voxel_mm <= FARTHEST_CELL:
+        raise ValueError(
+            f"MBIR of an inset works on voxels of {voxel_mm:g} mm, what its network was trained for, and the detector "
+            f'cells of this scan have {cell:.3g} mm at the axis: use method="pwls", or check that lengths are in mm'
+        )

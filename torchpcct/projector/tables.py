@@ -128,7 +128,7 @@ def layer_spacing(pose: NDArray[np.float64], grid: VolumeGrid, row0: float, row_
     depth = (offset * pose[:, None, 3:5]).sum(axis=-1) / (pose[:, None, 3:5] ** 2).sum(axis=-1)
     near = depth.min()
     if near <= 0:
-        return 1e-6  # slabs one by one
+        return 1e-6  # of λ: slabs one by one
     depth = depth[:, 4].min()
     blur = math.hypot(hz, depth * row_pitch)
-    return float(min(LAYER_SHIFT * blur / max(min(rise, reach / depth), 1e-12), near / 4))
+    return float(min(LAYER_SHIFT * blur / max(min(rise, reach / depth), 1e-12 * blur), near / 4))
