@@ -13,15 +13,16 @@ import torchpcct  # noqa: F401  (first: it settles how torch's threads wait)
 
 if TYPE_CHECKING:
     from recon.analytic.fbp import fbp
-    from recon.api import METHODS, reconstruct
+    from recon.api import reconstruct
     from recon.least_squares.pwls import pwls
+    from recon.names import METHODS
 
 __all__ = ["METHODS", "fbp", "pwls", "reconstruct"]
 
 _SOURCES = {
     "fbp": "recon.analytic.fbp",
     "pwls": "recon.least_squares.pwls",
-    "METHODS": "recon.api",
+    "METHODS": "recon.names",
     "reconstruct": "recon.api",
 }
 

@@ -16,6 +16,7 @@ from recon.least_squares.pwls import PwlsOptions
 from recon.least_squares.reconstruct import reconstruct_pwls
 from recon.mbir.reconstruct import reconstruct_mbir
 from recon.metal import metal_warnings
+from recon.names import METHODS
 from recon.solution import Solution, tested
 from torchpcct.checks.defects import dead_readings, repair_defects
 from torchpcct.checks.readings import reading_warnings
@@ -31,8 +32,6 @@ if TYPE_CHECKING:
     from recon.plaque.vessel_prior import VesselPrior
 
 __all__ = ["METHODS", "MethodOptions", "reconstruct", "require_light"]
-
-METHODS: tuple[str, ...] = ("fbp", "pwls", "mbir")
 
 _LOG = logging.getLogger(__name__)
 

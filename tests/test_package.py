@@ -55,6 +55,47 @@ def test_one_version():
     assert headings[:2] == ["Unreleased", torchpcct.__version__]
 
 
+def test_the_addresses_of_the_project_agree():
+    """Whoever hosts it elsewhere changes them in three places; links of badges lead to workflows that there are."""
+    urls = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["urls"]
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    source = urls["Source"]
+    assert citation["repository-code"] == source
+    assert citation["url"] == urls["Documentation"]
+    assert urls["Issues"].startswith(source)
+    assert urls["Changelog"] == f"{source}/blob/main/CHANGELOG.md"
+    assert set(re.findall(r"https://github\.com/[\w-]+/[\w-]+", readme)) == {source}
+    workflows = ROOT / ".github" / "workflows"
+    assert {name for name in re.findall(r"actions/workflows/([\w.]+)", readme) if (workflows / name).exists()} == {
+        "ci.yml"
+    }
+
+
+def test_workflows_run_what_there_is():
+    """They cannot be run here; that they are read and name what exists can be seen."""
+    ci, release = (
+        yaml.safe_load((ROOT / ".github" / "workflows" / f"{name}.yml").read_text(encoding="utf-8"))
+        for name in ("ci", "release")
+    )
+    steps = [step for job in ci["jobs"].values() for step in job["steps"]]
+    assert ".ci/run" in [step.get("run") for step in steps]
+    assert release["jobs"]["publish"]["permissions"] == {"id-token": "write"}  # trusted publishing, and nothing else
+    assert release["jobs"]["publish"]["needs"] == "build"
+    site = yaml.safe_load((ROOT / ".readthedocs.yaml").read_text(encoding="utf-8"))
+    assert (ROOT / site["sphinx"]["configuration"]).is_file()
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    assert set(site["python"]["install"][0]["extra_requirements"]) <= set(extras)
+
+
+def test_articles_of_the_bibliography_can_be_found():
+    entries = (ROOT / "notebooks" / "docs" / "references.bib").read_text(encoding="utf-8").strip().splitlines()
+    assert len(entries) > 15
+    for entry in entries:
+        found = re.search(r"doi = \{(10\.\d{4,}/[^\s{}]+)\}|url = \{(https://[^\s{}]+)\}", entry)
+        assert found, entry
+
+
 def test_the_cards_are_those_of_the_weights():
     """card.md is written by hand, training.md and card.json by the training: new weights need all three."""
     from recon.mbir.mbir import Mbir

@@ -19,6 +19,7 @@ __all__ = [
     "choice",
     "coverage",
     "meant",
+    "memory_bytes",
     "number",
     "numbers",
     "per_axis",
@@ -134,18 +135,42 @@ def per_axis(name: str, value: Any, axes: int, **limits: Any) -> tuple[float, ..
     return (number(name, value, **limits),) * axes
 
 
-def whole(name: str, value: Any, low: int = 1) -> int:
-    """``value`` as an int of at least ``low``; ``True`` and ``3.0`` are refused.
+def whole(name: str, value: Any, low: int = 1, high: int | None = None) -> int:
+    """``value`` as an int of at least ``low`` and, if given, at most ``high``; ``True`` and ``3.0`` are refused.
 
     Raises:
         TypeError: no whole number.
-        ValueError: less than ``low``.
+        ValueError: less than ``low``, more than ``high``.
     """
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise TypeError(f"{name} must be a whole number, got {value!r} ({type(value).__name__})")
     if value < low:
         raise ValueError(f"{name} must be at least {low}, got {value}")
+    if high is not None and value > high:
+        raise ValueError(f"{name} must be at most {high}, got {value}")
     return int(value)
+
+
+_UNITS = {"": 1, "B": 1, **{f"{p}{b}": k**n for n, p in enumerate("KMGT", 1) for b, k in (("B", 1000), ("IB", 1024))}}
+
+
+def memory_bytes(value: int | str) -> int:
+    """A limit of memory in bytes: a whole number, or a text such as ``4GB`` (10⁹) or ``4 GiB`` (2³⁰).
+
+    Raises:
+        ValueError: no such text, or 0. TypeError: neither text nor whole number.
+    """
+    if not isinstance(value, str):
+        return whole("memory", value)
+    text = value.strip().upper()
+    digits = text.rstrip("KMGTIB ")
+    try:
+        found = int(float(digits) * _UNITS[text[len(digits) :].strip()])
+    except (ValueError, KeyError, OverflowError):
+        found = 0
+    if found < 1:
+        raise ValueError(f"memory must be bytes or a text like 4GB or 500MiB, got {value!r}")
+    return found
 
 
 def choice(name: str, value: Any, options: Collection[str]) -> str:

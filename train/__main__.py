@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from recon.cli.parsing import Parser
     from recon.mbir.unrolled import Unrolled
     from train.config import TrainConfig
     from train.data import Data
@@ -27,47 +28,52 @@ if TYPE_CHECKING:
 __all__ = ["build", "main"]
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+def _parser() -> Parser:
+    from recon.cli.parsing import MOST, Parser, add_options
+
+    parser = Parser(
         prog="torchpcct train",
         description="Train the unrolled reconstruction's prior on scenes that are made as it goes.\n"
         "Interrupt it at any moment: --resume continues bit for bit.",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog="examples:\n  torchpcct train --quick --out runs/first\n  torchpcct train --out runs/mine --resume\n"
         "N processes share a step with\n  torchrun --nproc_per_node=N -m recon.cli train --out runs/mine\n",
     )
-    parser.add_argument("--config", type=Path, metavar="FILE", help="YAML file (default: train/configs/default.yaml)")
-    parser.add_argument("--quick", action="store_true", help="train/configs/quick.yaml: a look at whether it works")
-    parser.add_argument(
-        "--out", type=Path, default=Path("runs/train"), metavar="PATH", help="folder of the run (default runs/train)"
+    many = {"limits": {"high": 10**9}}
+    add_options(
+        parser,
+        ("--config", Path, "FILE", "YAML file (default: train/configs/default.yaml)", {"read": True}),
+        ("--quick", bool, None, "train/configs/quick.yaml: a look at whether it works"),
+        ("--out", Path, "PATH", "folder of the run (default runs/train)", {"default": Path("runs/train")}),
+        ("--resume", bool, None, "continue the run in --out"),
+        ("--steps", int, "N", "optimisation steps, instead of the configuration's", many),
+        ("--seed", int, "N", "seed, instead of the configuration's", {"limits": {"low": 0, "high": 2**62}}),
+        (
+            "--weights",
+            Path,
+            "FILE",
+            "start from the weights of another run, of a network as wide or less",
+            {"read": True},
+        ),
+        ("--threads", int, "N", "threads per process (default: torch's choice)", {"limits": {"high": MOST}}),
+        ("--device", str, "NAME", "where it trains: cpu (default) or cuda", {"default": "cpu"}),
+        (
+            "--views",
+            Path,
+            "PATH",
+            "folder of what the network sees of the scenes, several GB; runs of one seed and the same data share it "
+            "(default: the folder views in --out)",
+        ),
+        (
+            "--painters",
+            int,
+            "N",
+            "processes that make all views beforehand (default: each is made when it is first used; needed for the "
+            "speed of a GPU)",
+            {"limits": {"high": MOST}},
+        ),
+        ("--no-progress", bool, None, "no progress line"),
+        ("--no-tensorboard", bool, None, "no TensorBoard events"),
     )
-    parser.add_argument("--resume", action="store_true", help="continue the run in --out")
-    parser.add_argument("--steps", type=int, metavar="N", help="optimisation steps, instead of the configuration's")
-    parser.add_argument("--seed", type=int, metavar="N", help="seed, instead of the configuration's")
-    parser.add_argument(
-        "--weights",
-        type=Path,
-        metavar="FILE",
-        help="start from the weights of another run, of a network as wide or less",
-    )
-    parser.add_argument("--threads", type=int, metavar="N", help="threads per process (default: torch's choice)")
-    parser.add_argument("--device", default="cpu", metavar="NAME", help="where it trains: cpu (default) or cuda")
-    parser.add_argument(
-        "--views",
-        type=Path,
-        metavar="PATH",
-        help="folder of what the network sees of the scenes, several GB; runs of one seed and the same data share it "
-        "(default: the folder views in --out)",
-    )
-    parser.add_argument(
-        "--painters",
-        type=int,
-        metavar="N",
-        help="processes that make all views beforehand (default: each is made when it is first used; needed for the "
-        "speed of a GPU)",
-    )
-    parser.add_argument("--no-progress", action="store_true", help="no progress line")
-    parser.add_argument("--no-tensorboard", action="store_true", help="no TensorBoard events")
     return parser
 
 
@@ -123,6 +129,7 @@ def _run(arguments: argparse.Namespace, command: str) -> int:
 
     from recon.mbir.mbir import WEIGHTS_FORMAT
     from recon.mbir.weights_io import read_tensors
+    from torchpcct.files import WriteError
     from train.checkpoint import Store, start_from
     from train.config import TrainConfig, load_config, packaged_config
     from train.loop import train
@@ -159,9 +166,10 @@ def _run(arguments: argparse.Namespace, command: str) -> int:
                 progress=first and not arguments.no_progress,
                 tensorboard=not arguments.no_tensorboard,
             )
-    except (ValueError, OSError, DivergedError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
+    except (DivergedError, WriteError) as error:
+        return _failed(str(error), 1)
+    except (ValueError, TypeError, OSError, ImportError) as error:
+        return _failed(str(error), 2)
     if not first:
         return 0
     if state.step < config.steps:
@@ -175,22 +183,30 @@ def _run(arguments: argparse.Namespace, command: str) -> int:
     return 0
 
 
+def _failed(text: str, status: int) -> int:
+    print(f"torchpcct train: {text}", file=sys.stderr)
+    return status
+
+
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit status (128 + signal after an interruption)."""
+    """Run the command line; returns the exit status: 0 done, 1 diverged or not finished, 2 refused input, 128 + signal
+    after an interruption."""
+    from recon.cli.parsing import check_limits
+
     words = list(sys.argv[1:] if argv is None else argv)
     parser = _parser()
     arguments = parser.parse_args(words)
+    try:
+        check_limits(arguments, parser)
+    except (ValueError, OSError) as error:
+        return _failed(str(error), 2)
     if arguments.config is not None and arguments.quick:
         parser.error("--config and --quick exclude each other")
     if arguments.weights is not None and arguments.resume:
         parser.error("--weights starts a new run; --resume continues one")
-    if arguments.painters is not None and arguments.painters < 1:
-        parser.error(f"--painters must be at least 1, got {arguments.painters}")
     # Before torch loads: OpenMP threads that wait should sleep, on machines shared with others by far the faster way.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     if arguments.threads is not None:
-        if arguments.threads < 1:
-            parser.error(f"--threads must be at least 1, got {arguments.threads}")
         os.environ["OMP_NUM_THREADS"] = os.environ["NUMBA_NUM_THREADS"] = str(arguments.threads)
     logging.basicConfig(format="%(message)s")
     logging.getLogger("train").setLevel(logging.INFO)

@@ -68,7 +68,7 @@ def filter_sinogram(
         sinogram: line integrals ``(..., views, [rows,] columns)``, float32 or float64. Data of another device are
             filtered on the CPU and sent back.
         geometry: parallel, fan or cone beam.
-        kernel: reconstruction kernel (:data:`recon.analytic.ramp.KERNELS`) or a sequence of them.
+        kernel: reconstruction kernel (:data:`recon.names.KERNELS`) or a sequence of them.
         window: return only these readings of every view (rows and columns); default: all. Its rows must be held.
         held: the readings that ``sinogram`` holds, default: all; what is not held is zero.
         weights: angular weights ``(views,)`` or ``(views, columns)`` in rad that replace

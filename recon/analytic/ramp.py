@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.fft import next_fast_len
 
+from recon.names import KERNELS
 from torchpcct.validate import checked, choice
 
-__all__ = ["KERNELS", "apodization", "fast_length", "ramp_kernel"]
+__all__ = ["apodization", "fast_length", "ramp_kernel"]
 
 Floats = NDArray[np.float64]
 
@@ -29,9 +30,6 @@ _POINTS: dict[str, tuple[float, ...]] = {
     "bone": _BONE,
     "ram-lak": (1.0, 1.0, 1.0, 1.0, 1.0),
 }
-
-#: Names of the reconstruction kernels, from smooth to sharp.
-KERNELS: tuple[str, ...] = tuple(_POINTS)
 
 
 def _points(kernel: Any) -> tuple[float, ...]:

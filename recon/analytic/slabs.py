@@ -37,7 +37,7 @@ from recon.api import reconstruct, require_light
 from recon.evaluate import execute
 from recon.evaluate.sources import source_digest
 from recon.evaluate.store import Store
-from recon.least_squares.memory import available_bytes, memory_bytes, pwls_bytes, resident_bytes
+from recon.least_squares.memory import available_bytes, pwls_bytes, resident_bytes
 from recon.least_squares.qggmrf import QGGMRF
 from recon.metal import metal_warnings
 from torchpcct.checks.defects import (
@@ -59,7 +59,7 @@ from torchpcct.readings import MOST_DEAD
 from torchpcct.scan import Scan
 from torchpcct.scan_file import NoSlicesError
 from torchpcct.scan_grid import grid_of
-from torchpcct.validate import checked, choice
+from torchpcct.validate import checked, choice, memory_bytes
 from torchpcct.volume import from_hu, to_hu
 
 __all__ = ["ScanSlices", "SlabPlan", "StackOptions", "plan_slabs", "reconstruct_to"]

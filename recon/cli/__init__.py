@@ -9,12 +9,14 @@ files, :mod:`~recon.cli.plaque` reads tissues,
 from __future__ import annotations
 
 import argparse
+import codecs
+import io
 import itertools
 import shutil
 import sys
 import textwrap
+import unicodedata
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from recon.cli.looking import add_info, add_view
@@ -27,7 +29,7 @@ from recon.cli.measuring import (
     add_study,
     add_verify,
 )
-from recon.cli.parsing import Commands, Ended, Parser, as_options, check_limits, ending_by_signals, saying
+from recon.cli.parsing import Commands, Ended, Parser, as_options, check_limits, ending_by_signals, is_path, saying
 
 # What loads torch or numba is imported by the commands: help and refusals come at once.
 from recon.cli.plaque import add_plaque
@@ -100,16 +102,39 @@ class _Completion(argparse.Action):
             parser.error("--print-completion needs shtab: pip install 'torchpcct[completion]'")
         for sub in next(a for a in parser._actions if a.dest == "command").choices.values():
             for action in sub._actions:
-                if action.type is Path:
+                if is_path(action):
                     action.complete = shtab.FILE
         print(shtab.complete(parser, values))
         parser.exit()
+
+
+def _plain(error: UnicodeError) -> tuple[str, int]:
+    """What a terminal shows that does not know a character: the nearest ASCII."""
+    assert isinstance(error, UnicodeEncodeError)
+    given = error.object[error.start : error.end]
+    text = unicodedata.normalize("NFKD", "".join(_ASCII.get(c, c) for c in given))
+    return "".join(c if c.isascii() else "?" for c in text if not unicodedata.combining(c)), error.end
+
+
+_ASCII = {"×": "x", "·": "*", "−": "-", "–": "-", "…": "...", "±": "+/-", "≥": ">=", "≤": "<=", "→": "->", "←": "<-",
+          "°": " deg", "µ": "u", "μ": "mu", "⟨": "<", "⟩": ">", "⁻": "^-", "²": "^2", "³": "^3", "ᵀ": "^T", "≈": "~",
+          "α": "alpha", "β": "beta", "γ": "gamma", "σ": "sigma", "χ": "chi", "Δ": "Delta", "√": "sqrt",
+          "“": '"', "”": '"', "’": "'"}  # fmt: skip
+
+
+def _speak_plainly() -> None:
+    """Let no character end a command on terminals of few characters (ASCII, cp1252)."""
+    codecs.register_error("torchpcct.plain", _plain)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="torchpcct.plain")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit status: 0 done, 1 not written (a full disk) or, of ``doctor``, something is
     broken, 2 refused input, 130 interrupted, 128 + N ended by signal N. Without a command it says where to begin,
     which is no error."""
+    _speak_plainly()
     words = list(sys.argv[1:] if arguments is None else arguments)
     if words[:1] == ["train"]:
         return train(words[1:])

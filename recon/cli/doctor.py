@@ -7,6 +7,8 @@ import json
 import os
 import platform
 import re
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from importlib import metadata, resources
 from pathlib import Path
@@ -16,9 +18,25 @@ from torchpcct.files import require_writable
 
 __all__ = ["outcomes"]
 
-_MODULES = {"scikit-image": "skimage", "pyyaml": "yaml", "markdown-it-py": "markdown_it"}
+_MODULES = {
+    "scikit-image": "skimage",
+    "pyyaml": "yaml",
+    "markdown-it-py": "markdown_it",
+    "astra-toolbox": "astra",
+}
 """Modules of packages with another name."""
-_EXTRAS = ("io", "train", "completion", "rivals", "interop")
+_FOR_DEVELOPERS = ("test", "docs", "notebooks")
+"""Extras that change nothing of what the package does."""
+_LOAD = """
+import importlib, sys
+for name in sys.argv[1:]:
+    try:
+        importlib.import_module(name)
+        said = "loads"
+    except BaseException as error:
+        said = (str(error).strip().splitlines() or [type(error).__name__])[0]
+    print("LOADED", name, said, flush=True)
+"""
 _AGAIN = "install torchpcct again, in its folder: pip install --force-reinstall --no-deps ."
 
 
@@ -49,13 +67,43 @@ def _numbers(version: str) -> list[int]:
 
 
 def _extras() -> str:
-    parts = []
-    requirements = metadata.requires("torchpcct") or []
-    for extra in _EXTRAS:
-        names = [re.split(r"[>;=<\[ ]", r)[0] for r in requirements if re.search(f"extra == .{extra}.", r)]
-        missing = [n for n in names if not _installed(n)]
+    extras: dict[str, dict[str, str]] = {}  # extra → package → least version
+    for requirement in metadata.requires("torchpcct") or []:
+        found = re.match(r"([\w.-]+)(?:>=([\w.]+))?\s*;.*extra == .([\w-]+).", requirement)
+        if found and found[3] not in _FOR_DEVELOPERS:
+            extras.setdefault(found[3], {})[found[1]] = found[2] or ""
+    there = [name for names in extras.values() for name in names if _installed(name)]
+    faults = _faults(there)
+    parts, wrong = [], []
+    for extra, names in extras.items():
+        missing = [name for name in names if name not in there]
         parts.append(f"{extra} lacks {', '.join(missing)} (pip install 'torchpcct[{extra}]')" if missing else extra)
+        for name in (n for n in names if n in there):
+            version, least = metadata.version(name), names[name]
+            if name in faults:
+                wrong.append(
+                    f"{name} of {extra} does not load ({faults[name]}): pip install --force-reinstall '{name}'"
+                )
+            elif _numbers(version) < _numbers(least):
+                wrong.append(f"{name} {version} of {extra} is older than {least}: pip install '{name}>={least}'")
+    if wrong:
+        raise ValueError("; ".join(wrong))
     return "; ".join(parts)
+
+
+def _faults(names: list[str]) -> dict[str, str]:
+    """Why installed packages do not load; in a process of its own, which a broken binary may end."""
+    modules = {_MODULES.get(name, name).replace("-", "_"): name for name in names}
+    faults: dict[str, str] = {}
+    left = list(modules)
+    while left:
+        done = subprocess.run([sys.executable, "-P", "-c", _LOAD, *left], capture_output=True, text=True, check=False)
+        told = dict(re.findall(r"^LOADED (\S+) (.*)$", done.stdout, re.MULTILINE))
+        faults |= {modules[name]: said for name, said in told.items() if said != "loads"}
+        left = [name for name in left if name not in told]
+        if left:  # it ended at the first of them
+            faults[modules[left.pop(0)]] = f"it ends the process, status {done.returncode}"
+    return faults
 
 
 def _installed(name: str) -> bool:

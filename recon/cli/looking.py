@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 # What loads torch or numba is imported by the commands: help and refusals come at once.
 from recon.cli.parsing import (
     FORCE,
+    MANY,
     SCAN_ENDINGS,
     Commands,
     add_options,
@@ -98,7 +99,9 @@ def add_info(commands: Commands) -> None:
         commands, "info", _info, "what a scan or volume file holds", "What a file holds.",
         "torchpcct info scan.h5", "torchpcct info volume.nii.gz --json",
     )  # fmt: skip
-    add_options(parser, ("file", Path, "FILE", "scan or volume"), ("--json", bool, None, "everything, as JSON"))
+    add_options(
+        parser, ("file", Path, "FILE", "scan or volume", {"read": True}), ("--json", bool, None, "everything, as JSON")
+    )
 
 
 def _view(arguments: argparse.Namespace, progress: ProgressBars) -> None:
@@ -113,7 +116,9 @@ def _view(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     check_ending(arguments.out, (".html", ".htm") if page else _PICTURE_ENDINGS)
     check_output(arguments, _is_page if page else is_picture, *files)
     for file in files:
-        if file.exists() and not _is_volume(file):
+        if not file.exists():
+            raise FileNotFoundError(f"no such file: {file}")
+        if not _is_volume(file):
             raise ValueError(f"{file} is a scan, no volume: torchpcct reconstruct it first, info says what it holds")
     from torchpcct.volume import Volume
 
@@ -194,13 +199,25 @@ def add_view(commands: Commands) -> None:
         ("files", Path, "VOLUME", ".nii, .nii.gz, .mha, .h5, .dcm or a DICOM folder", {"nargs": "+"}),
         ("--html", Path, "FILE", "page to write (.html), of one volume or several"),
         ("--out", Path, "PATH", "picture: .png, .pdf or .svg (default VOLUME.png)"),
-        ("--level", float, None, "centre of the grey scale (default 40 HU; in mm⁻¹ by the values)"),
-        ("--window", float, None, "its width (default 400 HU; in mm⁻¹ by the values)", {"limits": {"positive": True}}),
+        (
+            "--level",
+            float,
+            None,
+            "centre of the grey scale (default 40 HU; in mm⁻¹ by the values)",
+            {"limits": {"low": -1e9, "high": 1e9}},
+        ),
+        (
+            "--window",
+            float,
+            None,
+            "its width (default 400 HU; in mm⁻¹ by the values)",
+            {"limits": {"positive": True, "high": 1e9}},
+        ),
         FORCE,
     )
     add_options(
         parser,
         ("--plane", str, None, "axis across the slice (default z)", {"choices": ("z", "y", "x"), "default": "z"}),
-        ("--slice", int, "K", "index along it (default: the middle)"),
+        ("--slice", int, "K", "index along it (default: the middle)", {"limits": {"low": 0, "high": MANY}}),
         group="the picture",
     )

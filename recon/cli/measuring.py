@@ -13,9 +13,23 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 # What loads torch or numba is imported by the commands: help and refusals come at once.
-from recon.cli.parsing import Commands, Parser, add_execution, add_options, check_results, command, executing
+from recon.cli.parsing import (
+    EXPOSURE,
+    LENGTH,
+    MANY,
+    PLACE,
+    Commands,
+    Parser,
+    add_execution,
+    add_options,
+    check_results,
+    command,
+    executing,
+)
+from recon.names import METHODS
 from recon.study import registry
 from torchpcct.files import atomic_write, require_writable
+from torchpcct.validate import choice
 
 if TYPE_CHECKING:
     from recon.study.study import ProgressBars
@@ -45,6 +59,12 @@ _MEASURED = ("noise", "noise_reference", "dose_factor", "f50", "resolution")
 
 
 def _evaluate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
+    from recon.evaluate.names import check_method, check_task
+
+    for name in arguments.task or []:
+        check_task(name)
+    for name in [*(arguments.method or []), *map(_denoiser, arguments.denoiser or [])]:
+        check_method(name)
     from recon.evaluate.experiment import evaluate, export_scans
     from recon.evaluate.methods import names_module
     from recon.evaluate.report import save, text_of
@@ -192,15 +212,24 @@ def _study(arguments: argparse.Namespace, progress: ProgressBars) -> None:
 
 def _own_study(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     """A study that is a command of its own, with options named like its settings."""
+    from recon.evaluate.names import check_method
+
+    for name in arguments.methods or []:
+        if arguments.command == "compare":
+            check_method(name)
+        else:
+            choice("method", name, (*METHODS, "tissues"))
     given = {name: value for name, value in vars(arguments).items() if value is not None}
     settings = registry.part(arguments.command).Settings.of(given, arguments.quick)
     _run_study(arguments.command, settings, arguments, progress)
 
 
 def _verify(arguments: argparse.Namespace, progress: ProgressBars) -> None:
+    root = arguments.root
+    for name in arguments.again:
+        registry.folder(name)
     from recon.study import results
 
-    root = arguments.root
     stale = []
     for name, text in results.render(root).items():
         if not (root / name).exists() or (root / name).read_text(encoding="utf-8") != text:
@@ -235,6 +264,9 @@ methods: fbp:KERNEL, pwls, mbir, mbir:fidelity=1, mbir:weights=FILE, mbir:tissue
 """
 
 
+REALISATIONS = {"low": 8, "high": MANY}
+
+
 def add_evaluate(commands: Commands) -> None:
     parser = command(
         commands, "evaluate", _evaluate, "how much dose does a method save at a task?",
@@ -252,14 +284,14 @@ def add_evaluate(commands: Commands) -> None:
     add_options(
         parser,
         ("--scans", Path, "FILE", "measured scans instead of tasks: two of one object, or one, which is halved; noise "
-         "at equal resolution", {"nargs": "+"}),
+         "at equal resolution", {"nargs": "+", "read": True}),
         ("--volumes", Path, "FOLDER", "volumes of two scans of one object instead of tasks: in each folder one file "
-         "per method, of the same name", {"nargs": 2}),
+         "per method, of the same name", {"nargs": 2, "read": True}),
         ("--reference", str, "NAME", "with --volumes: the one by a linear method that smoothed nothing (default fbp)",
          {"default": "fbp"}),
-        ("--voxel", float, "MM", "with --scans: voxel size (default: the detector's)"),
-        ("--extent", float, "MM", "with --scans: of the volume, Z Y X", {"nargs": "+"}),
-        ("--center", float, "MM", "with --scans: of the volume, Z Y X", {"nargs": "+"}),
+        ("--voxel", float, "MM", "with --scans: voxel size (default: the detector's)", {"limits": LENGTH}),
+        ("--extent", float, "MM", "with --scans: of the volume, Z Y X", {"nargs": "+", "limits": LENGTH}),
+        ("--center", float, "MM", "with --scans: of the volume, Z Y X", {"nargs": "+", "limits": PLACE}),
         group="measured scans and volumes, of which nobody knows the truth",
     )  # fmt: skip
     add_options(parser, ("--export", Path, "FOLDER", "write the noisy scans for another program instead of evaluating"))
@@ -281,15 +313,19 @@ def add_dose_factor(commands: Commands) -> None:
 
 def _add_common(parser: Parser, n: int) -> None:
     many = {"action": "append"}
+    exposures = {"dest": "exposures_s", "nargs": "+", "limits": EXPOSURE}
     add_options(
         parser,
         ("--task", str, "TASK", "name (see show-task) or YAML file, repeatable", many),
         ("--method", str, "METHOD", "see below (repeatable)", many),
         ("--denoiser", str, "FUNCTION@BASE", "function of (volume) or (volume, sigma), HU, after BASE", many),
-        ("--exposure", float, "S", "in s (default: those of each task)", {"dest": "exposures_s", "nargs": "+"}),
+        ("--exposure", float, "S", "in s (default: those of each task)", exposures),
     )
     add_execution(parser)
-    add_options(parser, ("--n", int, None, f"noise realisations, at least 8 (default {n})", {"default": n}))
+    add_options(
+        parser,
+        ("--n", int, None, f"noise realisations, at least 8 (default {n})", {"default": n, "limits": REALISATIONS}),
+    )
 
 
 def add_show_task(commands: Commands) -> None:
@@ -312,7 +348,7 @@ def add_compare(commands: Commands) -> None:
     )  # fmt: skip
     add_options(
         parser,
-        ("--n", int, "N", "realisations (default 16)"),
+        ("--n", int, "N", "realisations, at least 8 (default 16)", {"limits": REALISATIONS}),
         ("--methods", str, "METHOD", "as of evaluate --method", {"nargs": "+"}),
         ("--quick", bool, None, "reduced views and methods: a first look, some minutes"),
     )
@@ -332,7 +368,7 @@ def add_hardcases(commands: Commands) -> None:
         ("--quick", bool, None, "an eighth of the views, by FBP alone"),
         ("--methods", str, "M", "fbp pwls mbir (default: all)", {"nargs": "+"}),
         ("--cases", str, "NAME", "only these cases", {"nargs": "+"}),
-        ("--views", int, "N", "views of the scan (default 984)"),
+        ("--views", int, "N", "views of the scan (default 360)", {"limits": {"low": 120, "high": MANY}}),
     )
     add_execution(parser)
 
@@ -343,7 +379,7 @@ def add_study(commands: Commands) -> None:
         commands, "study", _study, "any study of the paper by its name; torchpcct study --help lists them",
         "Run a study of the paper at full scale and print its figures beside the published ones. After an interruption "
         "the same command goes on.",
-        "torchpcct study noise --quick", "torchpcct study motion --set views=492", before=f"studies:\n{listed}\n",
+        "torchpcct study noise --quick", "torchpcct study motion --set thinning=4", before=f"studies:\n{listed}\n",
         out="folder for report.html, .md, .json and the figures (default out/NAME)",
     )  # fmt: skip
     add_options(parser, ("name", str, "NAME", "of the study"))
@@ -366,7 +402,7 @@ def add_verify(commands: Commands) -> None:
     parser.set_defaults(no_progress=False)
     add_options(
         parser,
-        ("--root", Path, None, "folder of the repository (default: this one)", {"default": Path()}),
+        ("--root", Path, None, "folder of the repository (default: this one)", {"default": Path(), "read": True}),
         ("--write", bool, None, "write what is rendered"),
         ("--again", str, "STUDY", "compute these studies again, in full", {"nargs": "*", "default": []}),
     )

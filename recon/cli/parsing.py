@@ -21,7 +21,12 @@ from torchpcct.files import WriteError, atomic_write, require_folder, require_wr
 from torchpcct.validate import meant, number, numbers, whole
 
 __all__ = [
+    "EXPOSURE",
     "FORCE",
+    "LENGTH",
+    "MANY",
+    "MOST",
+    "PLACE",
     "SCAN_ENDINGS",
     "Commands",
     "Ended",
@@ -38,6 +43,7 @@ __all__ = [
     "ending_by_signals",
     "examples",
     "executing",
+    "is_path",
     "is_picture",
     "length_of",
     "saying",
@@ -53,7 +59,15 @@ Commands = Any
 """What ``add_subparsers`` gives; argparse does not publish its type."""
 
 
-_COMMON, _SEED = "common options", {"low": 0}
+_COMMON, _SEED = "common options", {"low": 0, "high": 2**62}
+MOST = 4096
+"""More processes or threads than a machine has use for."""
+MANY = 10**6
+"""More views, realisations or particles than anything here can hold."""
+LENGTH: dict[str, Any] = {"positive": True, "high": 1e12, "unit": "mm"}
+EXPOSURE: dict[str, Any] = {"positive": True, "high": 1e6, "unit": "s"}
+PLACE: dict[str, Any] = {"low": -1e12, "high": 1e12, "unit": "mm"}
+"""Limits of lengths and positions: scans of any unit of length pass, slips of a power of ten by far do not."""
 FORCE = ("--force", bool, None, "replace a file that another command or software has made")
 
 
@@ -73,6 +87,7 @@ class Parser(argparse.ArgumentParser):
     Attributes:
         listing: what stands in the help in place of argparse's list of commands.
         limits: of the values of options, see :func:`add_options`.
+        read: options that name what is read.
     """
 
     listing = ""
@@ -80,6 +95,7 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, **options: Any) -> None:
         super().__init__(formatter_class=_Help, **options)
         self.limits: dict[str, dict[str, Any]] = {}
+        self.read: list[str] = []
 
     def error(self, message: str) -> NoReturn:
         """Say it with the nearest command, option or value, and exit with status 2."""
@@ -109,6 +125,26 @@ class Parser(argparse.ArgumentParser):
         return self.format_usage() + "\n" + formatter.format_help()
 
 
+def _path(text: str) -> Path:
+    return Path(_text(text))
+
+
+def _text(text: str) -> str:
+    if not text.strip():
+        raise argparse.ArgumentTypeError("it is empty")
+    return text
+
+
+_TYPES: dict[Any, Callable[[str], Any]] = {Path: _path, str: _text}
+"""What nobody means by an empty text: a path would be the current folder."""
+_HINTS = {"scan": " (torchpcct simulate makes scans)", "config": " (torchpcct show-config prints an example)"}
+
+
+def is_path(action: argparse.Action) -> bool:
+    """Whether an option takes a path."""
+    return action.type is _path
+
+
 def examples(parser: argparse.ArgumentParser, *lines: str, before: str = "") -> None:
     """Example commands, and what stands before them, at the end of a command's help."""
     word = "example" if len(lines) == 1 else "examples"
@@ -122,29 +158,42 @@ def add_options(parser: Parser, *rows: tuple[Any, ...], group: str = "") -> None
         parser: of the command.
         rows: flags (without dashes: an argument), type (``bool``: a switch), metavar or None, help, and, where there is
             more to say, a mapping of ``limits`` (of :func:`torchpcct.validate.number`, for several values of each; of
-            whole numbers only ``low``) and of what ``add_argument`` takes.
+            whole numbers ``low`` and ``high``), ``read`` (True: files that must be there), and of what
+            ``add_argument`` takes.
         group: title of the group in the help; "": with the others.
     """
     to = parser.add_argument_group(group) if group else parser
     for flag, kind, metavar, text, *more in rows:
         keys: dict[str, Any] = dict(more[0]) if more else {}
-        limits = keys.pop("limits", None)
-        keys |= {"action": "store_true"} if kind is bool else {"type": kind, "metavar": metavar}
+        limits, read = keys.pop("limits", None), keys.pop("read", False)
+        keys |= {"action": "store_true"} if kind is bool else {"type": _TYPES.get(kind, kind), "metavar": metavar}
         action = to.add_argument(*flag.split(), help=text, **keys)
         if limits is not None:
             parser.limits[action.dest] = limits
+        if read:
+            parser.read.append(action.dest)
 
 
 def check_limits(arguments: argparse.Namespace, parser: Parser) -> None:
-    """Refuse values beyond the limits of their options (ValueError), before a command does anything."""
+    """Refuse, before a command does anything, values beyond the limits of their options, and files that are not there.
+
+    Raises:
+        ValueError: a value out of range. FileNotFoundError: no such file.
+    """
     for name, limits in parser.limits.items():
-        value, flag = getattr(arguments, name), f"--{name.replace('_', '-')}"
+        value = getattr(arguments, name)
+        flag = next(o for a in parser._actions if a.dest == name for o in a.option_strings if o.startswith("--"))
         if isinstance(value, int):
             whole(flag, value, **limits)
         elif isinstance(value, float):
             number(flag, value, **limits)
         elif value is not None:
             numbers(flag, value, **limits)
+    for name in parser.read:
+        given = getattr(arguments, name) or []
+        for path in given if isinstance(given, list) else [given]:
+            if not path.exists():
+                raise FileNotFoundError(f"no such file: {path}{_HINTS.get(name, '')}")
 
 
 def command(
@@ -296,15 +345,21 @@ def tell(arguments: argparse.Namespace, short: str, config: dict[str, Any], **su
     print(text if arguments.json else f"{file}: {short}")
 
 
+def _address(text: str) -> str:
+    if not (re.fullmatch(r"(\w+://)?[^\s/:]+:\d+/?", text) or "://" in text or Path(_text(text)).is_file()):
+        raise argparse.ArgumentTypeError(f"{text!r} is neither an address, tcp://HOST:PORT, nor a scheduler's file")
+    return text
+
+
 def add_execution(parser: Parser, dry_run: bool = True) -> None:
     """Where jobs are run, for :func:`executing`; ``dry_run``: False of a command that has this option already."""
     scheduler = os.environ.get("DASK_SCHEDULER_ADDRESS")
     add_options(
         parser,
-        ("--workers", int, "N", "processes of this machine (default: this one alone)"),
-        ("--scheduler", str, "ADDRESS", "Dask scheduler, tcp://HOST:PORT or its file (default: "
+        ("--workers", int, "N", "processes of this machine (default: this one alone)", {"limits": {"high": MOST}}),
+        ("--scheduler", _address, "ADDRESS", "Dask scheduler, tcp://HOST:PORT or its file (default: "
          "$DASK_SCHEDULER_ADDRESS); extra: cluster", {"default": scheduler}),
-        ("--threads", int, "K", "threads of each worker (default: cores / N; Dask: 1)"),
+        ("--threads", int, "K", "threads of each worker (default: cores / N; Dask: 1)", {"limits": {"high": MOST}}),
         *([("--dry-run", bool, None, "list the jobs, their time and memory; run none")] if dry_run else []),
         group="several processes or machines",
     )  # fmt: skip
@@ -317,6 +372,8 @@ def executing(arguments: argparse.Namespace, out: Path) -> Iterator[Any]:
     Yields:
         The executor; None: everything is done here, one after another.
     """
+    if arguments.threads is not None and arguments.workers is None and not arguments.scheduler:
+        raise ValueError("--threads K is of the workers: give --workers N or --scheduler ADDRESS with it")
     from recon.evaluate import execute
 
     executor: Any = None
@@ -327,8 +384,6 @@ def executing(arguments: argparse.Namespace, out: Path) -> Iterator[Any]:
     elif arguments.scheduler:
         executor = execute.Cluster(arguments.scheduler, arguments.threads)
         print(f"{executor.workers} workers, dashboard: {executor.dashboard}", file=sys.stderr)
-    elif arguments.threads is not None:
-        raise ValueError("--threads K is of the workers: give --workers N or --scheduler ADDRESS with it")
     if executor is not None:
         executor.log = out / f"jobs-{time.strftime('%Y%m%d-%H%M%S')}.log"
     try:

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 # What loads torch or numba is imported by the command: help and refusals come at once.
-from recon.cli.parsing import Commands, add_options, check_results, command
+from recon.cli.parsing import LENGTH, MANY, PLACE, Commands, add_options, check_results, command
 from torchpcct import VolumeGrid
+from torchpcct.validate import number
 
 if TYPE_CHECKING:
     from recon.study.study import ProgressBars
@@ -18,8 +19,9 @@ __all__ = ["add_plaque"]
 
 
 def _plaque(arguments: argparse.Namespace, progress: ProgressBars) -> None:
-    if not arguments.scan.exists():
-        raise FileNotFoundError(f"{arguments.scan} does not exist (torchpcct simulate makes scans)")
+    for name in ("wall", "fibrous"):
+        if getattr(arguments, name) is not None:
+            number(f"--{name} SD", getattr(arguments, name)[1], positive=True, unit="HU")
     folder = arguments.out or Path("out") / "plaque"
     names = ("report.md", "report.json", "tissues.nii.gz", "image.nii.gz", "plaque.png")
     check_results(arguments, folder, lambda report: "presence" in report, *names)
@@ -73,17 +75,24 @@ def add_plaque(commands: Commands) -> None:
         "torchpcct plaque plaque.h5 --beside mbir --out reading",
         out="folder for report.md, report.json, tissues.nii.gz, image.nii.gz and plaque.png (default out/plaque)",
     )  # fmt: skip
-    length, place = {"positive": True, "unit": "mm"}, {"nargs": 3, "limits": {"unit": "mm"}}
+    length, place = LENGTH, {"nargs": 3, "limits": PLACE}
+    value = {"nargs": 2, "limits": {"low": -1e5, "high": 1e5, "unit": "HU"}}
     believed = "value that is expected of this tissue, and its standard deviation (default: see the report)"
     axes = ("Z", "Y", "X")
     add_options(
         parser,
-        ("scan", Path, "SCAN", "scan file written by simulate"),
+        ("scan", Path, "SCAN", "scan file written by simulate", {"read": True}),
         ("--point", float, axes, "where a reader sees the plaque, mm", place),
         ("--point-sd", float, "MM", "its standard deviation (default 0.4)", {"default": 0.4, "limits": length}),
-        ("--particles", int, "N", "vessel shapes to try (default 300)", {"default": 300, "limits": {"low": 50}}),
-        ("--wall", float, ("HU", "SD"), believed, {"nargs": 2}),
-        ("--fibrous", float, ("HU", "SD"), believed, {"nargs": 2}),
+        (
+            "--particles",
+            int,
+            "N",
+            "vessel shapes to try (default 300)",
+            {"default": 300, "limits": {"low": 50, "high": MANY}},
+        ),
+        ("--wall", float, ("HU", "SD"), believed, value),
+        ("--fibrous", float, ("HU", "SD"), believed, value),
         ("--beside", str, None, "read these images, too", {"nargs": "*", "default": [], "choices": ("pwls", "mbir")}),
         ("--voxel", float, "MM", "voxel size (default 0.2)", {"default": 0.2, "limits": length}),
         ("--center", float, axes, "centre in mm (default: of the region that was scanned)", place),

@@ -7,6 +7,7 @@ import contextlib
 import io
 import json
 import math
+import re
 import shlex
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -14,6 +15,10 @@ from typing import TYPE_CHECKING, Any
 
 # What loads torch or numba is imported by the commands: help and refusals come at once.
 from recon.cli.parsing import (
+    EXPOSURE,
+    LENGTH,
+    MANY,
+    PLACE,
     SCAN_ENDINGS,
     Commands,
     Parser,
@@ -28,10 +33,19 @@ from recon.cli.parsing import (
     tell,
     without_ending,
 )
+from recon.names import KERNELS, METHODS
 from torchpcct import VolumeGrid
-from torchpcct.files import VERSION, WriteError, atomic_write, fingerprint, is_own_hdf5, require_writable
+from torchpcct.files import (
+    VERSION,
+    WriteError,
+    atomic_write,
+    fingerprint,
+    is_own_hdf5,
+    require_folder,
+    require_writable,
+)
 from torchpcct.formats.volume_files import check_target, is_own_volume
-from torchpcct.validate import choice
+from torchpcct.validate import choice, memory_bytes
 
 if TYPE_CHECKING:
     from recon.study.study import ProgressBars
@@ -41,7 +55,6 @@ if TYPE_CHECKING:
 __all__ = ["add_lower_dose", "add_reconstruct", "add_show_config", "add_simulate", "grid_of_scan"]
 
 _PAPER_VIEWS = 1968
-_LENGTH = {"positive": True, "unit": "mm"}
 MOST_VOXELS = 2**31
 """Of a volume, 8 GiB: what is asked for beyond is a slip of the voxel size."""
 _NO_SIZE = " (the file does not know their size: --pitch MM)"
@@ -81,8 +94,8 @@ def _paper(arguments: argparse.Namespace) -> SimulationConfig:
 def _simulate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     check_ending(arguments.out, SCAN_ENDINGS)
     check_output(arguments, _is_scan, arguments.config, beside=True)
-    if arguments.config is not None and not arguments.config.exists():
-        raise FileNotFoundError(f"{arguments.config} does not exist: torchpcct show-config prints an example")
+    if arguments.config is not None and (arguments.views is not None or arguments.whole):
+        raise ValueError("--views and --whole are the plaque scan's: put views and region into the configuration")
     from torchpcct.acquisition.acquire import acquire, plan
     from torchpcct.acquisition.config import read_config
     from torchpcct.scene.voxels import VoxelScene
@@ -90,8 +103,6 @@ def _simulate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     if arguments.config is None:
         config = _paper(arguments)
     else:
-        if arguments.views is not None or arguments.whole:
-            raise ValueError("--views and --whole are the plaque scan's: put views and region into the configuration")
         config = read_config(arguments.config, exposure_s=arguments.exposure, seed=arguments.seed)
         check_output(arguments, _is_scan, config.values["scene"].get("file"), beside=True)
     voxels = isinstance(config.scene, VoxelScene)
@@ -153,9 +164,15 @@ def add_simulate(commands: Commands) -> None:
     )  # fmt: skip
     add_options(
         parser,
-        ("--config", Path, "YAML", "scene, scanner and exposure"),
-        ("--exposure", float, "S", "exposure in s (default: noise free)", {"limits": {"positive": True, "unit": "s"}}),
-        ("--views", int, None, f"views per rotation of the plaque scan (default {_PAPER_VIEWS})", {"limits": {}}),
+        ("--config", Path, "YAML", "scene, scanner and exposure", {"read": True}),
+        ("--exposure", float, "S", "exposure in s (default: noise free)", {"limits": EXPOSURE}),
+        (
+            "--views",
+            int,
+            None,
+            f"views per rotation of the plaque scan (default {_PAPER_VIEWS})",
+            {"limits": {"high": MANY}},
+        ),
         ("--whole", bool, None, "keep the whole detector, not only the plaque's surroundings"),
         *_OUTPUT,
     )
@@ -180,20 +197,43 @@ def add_show_config(commands: Commands) -> None:
 # --- reconstruct --------------------------------------------------------------------------------------------------
 
 
+def _size(text: str) -> str:
+    """``4GB`` of a command line, as it is."""
+    try:
+        memory_bytes(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no size such as 4GB or 500MiB") from None
+    return text
+
+
+def _slices(text: str) -> slice:
+    """``A:B`` of a command line, either end left out."""
+    found = re.fullmatch(r"\s*(\d*):(\d*)\s*", text)
+    if not found or found[1] == found[2] == "":
+        raise argparse.ArgumentTypeError(f"{text!r} is not A:B, the first slice and the one after the last, from 0")
+    first, stop = (int(end) if end else None for end in found.groups())
+    if first is not None and stop is not None and first >= stop:
+        raise argparse.ArgumentTypeError(f"{text!r} holds no slice: the second number must be the larger one")
+    return slice(first, stop)
+
+
 def _add_reader_options(parser: Parser, many: bool = False) -> None:
     """The scan, or many of them, and what its file may not know, see :func:`_reader_options`."""
-    nargs = {"nargs": "+"} if many else {}
+    nargs = {"nargs": "+"} if many else {"read": True}
     add_options(parser, ("scan", Path, "SCAN", ".h5 (ours or Data Exchange), .yaml stack, CatSim, DICOM-CT-PD folder",
                          nargs))  # fmt: skip
     add_options(
         parser,
         ("--geometry", Path, "YAML", "geometry of files that do not hold it; one with kind: vectors, kind: rtk or "
-         "pose: takes the place of the file's own"),
-        ("--mu-water", float, "MM⁻¹", "attenuation of water; with it the volume is in HU"),
-        ("--axis", float, "COLUMN", "where the rotation axis projects to, counted from 0"),
-        ("--pitch", float, "MM", "cell width of parallel beams, where the file does not hold it"),
-        ("--photons", float, "N", "photons of an unattenuated reading, of scans given as line integrals"),
-        ("--slices", str, "A:B", "read only these slices (parallel, fan) or rows (cone beam)"),
+         "pose: takes the place of the file's own", {"read": True}),
+        ("--mu-water", float, "MM⁻¹", "attenuation of water; with it the volume is in HU",
+         {"limits": {**LENGTH, "unit": "mm⁻¹"}}),
+        ("--axis", float, "COLUMN", "where the rotation axis projects to, counted from 0",
+         {"limits": {"low": 0.0, "high": 1e6}}),
+        ("--pitch", float, "MM", "cell width of parallel beams, where the file does not hold it", {"limits": LENGTH}),
+        ("--photons", float, "N", "photons of an unattenuated reading, of scans given as line integrals",
+         {"limits": {"positive": True, "high": 1e18}}),
+        ("--slices", _slices, "A:B", "read only these slices (parallel, fan) or rows (cone beam)"),
         group="what the file does not know of its scan",
     )  # fmt: skip
 
@@ -202,11 +242,7 @@ def _reader_options(arguments: argparse.Namespace) -> dict[str, Any]:
     given = {name: getattr(arguments, name) for name in ("axis", "pitch", "mu_water", "photons")}
     options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     if arguments.slices is not None:
-        try:
-            first, last = (int(part) if part else None for part in arguments.slices.split(":"))
-        except ValueError:
-            raise ValueError(f"--slices must be first:last, got {arguments.slices!r}") from None
-        options["slices"] = slice(first, last)
+        options["slices"] = arguments.slices
     if arguments.geometry is not None:
         from torchpcct.formats.damage import read_yaml, reading
         from torchpcct.formats.geometry_yaml import geometry_of
@@ -247,6 +283,9 @@ def _method_options(arguments: argparse.Namespace) -> dict[str, Any]:
     Raises:
         ValueError: an option of another method.
     """
+    choice("method", arguments.method, METHODS)
+    if arguments.kernel is not None:
+        choice("kernel", arguments.kernel, KERNELS)
     given = {k: v for k, v in vars(arguments).items() if k in _OPTIONS and v is not None and v is not False}
     for name in given:
         if arguments.method != _OPTIONS[name]:
@@ -259,13 +298,16 @@ def _method_options(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     """One scan, or many, each as if it were alone."""
+    elsewhere = arguments.workers or arguments.threads or arguments.scheduler
     if len(arguments.scan) == 1:
         arguments.scan = arguments.scan[0]
-        if arguments.memory is None or arguments.dry_run:
+        if arguments.dry_run or not elsewhere:
             _reconstruct_scan(arguments, progress)
-        else:  # by slabs, which are jobs
+        elif arguments.memory is not None:  # by slabs, which are jobs
             with executing(arguments, (arguments.out or Path()).parent):
                 _reconstruct_scan(arguments, progress)
+        else:
+            _reconstruct_elsewhere(arguments, progress)
         return
     from recon.evaluate import execute
 
@@ -278,14 +320,7 @@ def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     twice = {name for name in outs if outs.count(name) > 1}
     if twice:
         raise ValueError(f"several scans would become {', '.join(sorted(twice))}: give the files other names")
-    common = {k: v for k, v in vars(arguments).items() if k not in ("run", "warn", "scan", "out")}
-    jobs = [
-        execute.Job(
-            str(scan), reconstruct_one, ({**common, "scan": scan.resolve()}, out), (f"{out}*",),
-            mib=4 * scan.stat().st_size / 2**20 if scan.is_file() else 0.0,
-        )
-        for scan, out in zip(arguments.scan, outs, strict=True)
-    ]  # fmt: skip
+    jobs = [_job(arguments, scan, out) for scan, out in zip(arguments.scan, outs, strict=True)]
     refused = []
 
     def tell_of(name: str, messages: list[str], text: str, error: str) -> None:
@@ -304,6 +339,32 @@ def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
             (folder / f"{out}{_DONE}").unlink(missing_ok=True)
     if refused:
         raise ValueError(f"{len(refused)} of {len(jobs)} scans are not reconstructed: {'; '.join(refused)}")
+
+
+def _reconstruct_elsewhere(arguments: argparse.Namespace, progress: ProgressBars) -> None:
+    """One scan as a job of the workers that were asked for."""
+    from recon.evaluate import execute
+
+    out = arguments.out or Path(f"{without_ending(arguments.scan)}_{arguments.method}.nii.gz")
+    require_folder(out)
+    with executing(arguments, out.parent) as executor:
+        job = _job(arguments, arguments.scan, out.name)
+        messages, text, error = execute.run([job], out.parent, executor, progress)[job.name]
+    out.with_name(f"{out.name}{_DONE}").unlink(missing_ok=True)
+    for message in messages:
+        arguments.warn(message)
+    if error:
+        raise ValueError(error)
+    print(text)
+
+
+def _job(arguments: argparse.Namespace, scan: Path, out: str) -> Any:
+    """The reconstruction of a scan into a folder's file ``out``."""
+    from recon.evaluate import execute
+
+    common = {k: v for k, v in vars(arguments).items() if k not in ("run", "warn", "scan", "out")}
+    mib = 4 * scan.stat().st_size / 2**20 if scan.is_file() else 0.0
+    return execute.Job(str(scan), reconstruct_one, ({**common, "scan": scan.resolve()}, out), (f"{out}*",), mib=mib)
 
 
 def reconstruct_one(folder: Path, options: dict[str, Any], out: str) -> tuple[list[str], str, str]:
@@ -367,10 +428,9 @@ def _reconstruct_scan(arguments: argparse.Namespace, progress: ProgressBars) -> 
         raise FileNotFoundError(f"{arguments.scan} does not exist (torchpcct simulate makes scans)")
     import yaml
 
-    from recon.api import METHODS, reconstruct
+    from recon.api import reconstruct
     from torchpcct.formats.scans import open_scan
 
-    choice("method", arguments.method, METHODS)
     if slabs:
         _reconstruct_slabs(arguments, options, progress)
         return
@@ -503,21 +563,33 @@ def add_reconstruct(commands: Commands) -> None:
         parser,
         ("--method", str, None, "fbp, pwls or mbir (default fbp)", {"default": "fbp"}),
         ("--kernel", str, None, "of FBP, from quiet to sharp: soft, standard (default), detail, bone, ram-lak"),
-        ("--fidelity --look", float, "F", "of MBIR, from 0 (quiet) to 1 (more contrast and noise; default 0.5)"),
+        (
+            "--fidelity --look",
+            float,
+            "F",
+            "of MBIR, from 0 (quiet) to 1 (more contrast and noise; default 0.5)",
+            {"limits": {"low": 0.0, "high": 1.0}},
+        ),
         ("--no-outlines", bool, None, "MBIR of an inset without drawing a vessel's outlines first"),
         ("--tissues", bool, None, "MBIR that first fits the tissues of the vessel in the inset"),
-        ("--weights", Path, "FILE", "of MBIR, from your own training (default: those that ship)"),
-        ("--point", float, ("Z", "Y", "X"), "with --tissues: where a reader sees the plaque, mm", {"nargs": 3}),
+        ("--weights", Path, "FILE", "of MBIR, from your own training (default: those that ship)", {"read": True}),
+        (
+            "--point",
+            float,
+            ("Z", "Y", "X"),
+            "with --tissues: where a reader sees the plaque, mm",
+            {"nargs": 3, "limits": PLACE},
+        ),
         group="method",
     )
     add_options(
         parser,
-        ("--voxel", float, "MM", "voxel size (default: the region's or the detector's)", {"limits": _LENGTH}),
+        ("--voxel", float, "MM", "voxel size (default: the region's or the detector's)", {"limits": LENGTH}),
         ("--center", _length, "MM", f"centre, Z Y X (default: region or axis); {own}",
-         {"nargs": "+", "limits": {"unit": "mm"}}),
+         {"nargs": "+", "limits": PLACE}),
         ("--extent", _length, "MM", f"edge lengths, Z Y X (default: what is seen); {own}",
-         {"nargs": "+", "limits": _LENGTH}),
-        ("--memory", str, "SIZE", "limit of a process, e.g. 4GB, for volumes larger than memory: slab by slab, by "
+         {"nargs": "+", "limits": LENGTH}),
+        ("--memory", _size, "SIZE", "limit of a process, e.g. 4GB, for volumes larger than memory: slab by slab, by "
          "--workers too, to .nii or .zarr (default SCAN_METHOD.nii); after an interruption the same command goes on"),
         group="voxels",
     )  # fmt: skip

@@ -20,9 +20,10 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from recon.evaluate.experiment import Evaluation, evaluate, export_scans
     from recon.evaluate.methods import Method, deepinv_denoiser, denoiser, method_of
+    from recon.evaluate.names import TASKS
     from recon.evaluate.report import save
     from recon.evaluate.task import Task
-    from recon.evaluate.tasks import TASKS, read_task
+    from recon.evaluate.tasks import read_task
     from recon.evaluate.without_truth import evaluate_scans, evaluate_volumes
 
 __all__ = [
@@ -43,10 +44,11 @@ __all__ = [
 
 _SOURCES = {
     "experiment": ("Evaluation", "evaluate", "export_scans"),
+    "names": ("TASKS",),
     "methods": ("Method", "deepinv_denoiser", "denoiser", "method_of"),
     "report": ("save",),
     "task": ("Task",),
-    "tasks": ("TASKS", "read_task"),
+    "tasks": ("read_task",),
     "without_truth": ("evaluate_scans", "evaluate_volumes"),
 }
 

@@ -27,7 +27,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from recon.analytic.ramp import KERNELS
+from recon.evaluate.names import check_method, mbir_options, meant_method
 from recon.evaluate.rivals import FILTERS, SMOOTHED_BY, flat_noise, tuned
 from recon.mbir.mbir import Mbir
 from recon.mbir.network import bilateral_prior
@@ -35,7 +35,7 @@ from recon.mbir.outlines import OutlineMbir
 from recon.mbir.tissues import TissueMbir
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
-from torchpcct.validate import checked, choice, meant, number, renamed
+from torchpcct.validate import checked, number
 from torchpcct.volume import Volume
 
 __all__ = ["Draw", "Method", "deepinv_denoiser", "denoiser", "method_of", "names_module"]
@@ -135,23 +135,21 @@ def names_module(spec: str) -> bool:
 
 
 def _named(spec: str) -> Method:
+    check_method(spec)
     head, _, base = spec.partition("@")
     if base:
         return _filtered(head, base, spec) if head in FILTERS else denoiser(_loaded(head), base, spec)
     name, _, rest = spec.partition(":")
     if name == "fbp":
-        kernel = choice("kernel", rest or "standard", KERNELS)
+        kernel = rest or "standard"
         return Method(f"fbp:{kernel}", lambda draw: draw.fbp(kernel), kernels=(kernel,), is_fbp=True)
-    if name == "pwls" and not rest:
+    if name == "pwls":
         return Method("pwls", lambda draw: draw.pwls())
     if name == "mbir":
         return _mbir(spec, rest)
     if name == "files":
         return _of_files(spec, Path(rest))
-    if rest:
-        return _of_function(spec, _loaded(spec))
-    known = "fbp:KERNEL, pwls, mbir, FILTER@BASE, package.module:function, files:FOLDER"
-    raise ValueError(f"unknown method {spec!r}: one of {known}{_meant(spec)}")
+    return _of_function(spec, _loaded(spec))
 
 
 def denoiser(function: Callable[..., Any], base: Any, name: str = "") -> Method:
@@ -205,8 +203,6 @@ def deepinv_denoiser(model: Callable[..., Any], *, unit_hu: float = 1000.0, slic
 def _filtered(name: str, base: str, spec: str) -> Method:
     """A filter of :mod:`recon.evaluate.rivals` with the settings that were tuned for it."""
     before = method_of(base)
-    if not before.is_fbp:
-        raise ValueError(f"a filter needs FBP before it, got {before.name!r}: fbp:KERNEL")
 
     def run(draw: Draw) -> Tensor:
         settings = tuned(name, before.kernels[0], draw.exposure_s)
@@ -218,24 +214,16 @@ def _filtered(name: str, base: str, spec: str) -> Method:
 
 
 def _mbir(spec: str, rest: str) -> Method:
-    given: dict[str, str] = {}
-    for part in filter(None, rest.split(",")):
-        key, _, value = part.partition("=")
-        key = renamed("mbir:look", "mbir:fidelity", "fidelity") if key == "look" else key
-        given[choice("option of mbir", key, ("weights", "fidelity", "tissues", "outlines", "prior"))] = value
+    given = mbir_options(rest)
     network = Mbir.load(given.get("weights"))
     if "fidelity" in given:
-        network = network.with_fidelity(number("fidelity", float(given["fidelity"]), low=0.0, high=1.0))
+        network = network.with_fidelity(float(given["fidelity"]))
     if "prior" in given:
-        choice("prior of mbir", given["prior"], ("bilateral",))
         network = Mbir(network.model, network.fidelity, prior=bilateral_prior)
-    outlines = choice("outlines of mbir", given.get("outlines", "yes"), ("yes", "no")) == "yes"
     if "tissues" in given:
-        if not outlines:
-            raise ValueError("tissues of mbir are drawn within outlines: leave out outlines=no")
         fitted = TissueMbir(network)
         return Method(spec, lambda draw: draw.mbir(fitted), key=network.weights_sha256)
-    if outlines:
+    if given.get("outlines") != "no":
         network = OutlineMbir(network)
     return Method(spec, lambda draw: draw.mbir(network), key=network.weights_sha256, network=network)
 
@@ -246,9 +234,6 @@ def _of_function(name: str, function: Callable[..., Any]) -> Method:
 
 
 def _of_files(spec: str, folder: Path) -> Method:
-    if not folder.is_dir():
-        raise FileNotFoundError(f"no folder {folder} with volumes")
-
     def run(draw: Draw) -> Tensor:
         found = sorted(folder.glob(f"{draw.label}.*"))
         if not found:
@@ -265,19 +250,14 @@ def _of_files(spec: str, folder: Path) -> Method:
     return Method(spec, run, key=str(folder.resolve()))
 
 
-def _meant(head: str) -> str:
-    return meant(head, ("fbp", "pwls", "mbir", "files", *FILTERS))
-
-
 def _loaded(spec: str) -> Callable[..., Any]:
     module, _, name = spec.partition(":")
-    if not name:
-        raise ValueError(f"unknown method {spec!r}: a function is package.module:function, a filter one of "
-                         f"{', '.join(FILTERS)}{_meant(module)}")  # fmt: skip
     try:
         found = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError) as error:
-        raise ValueError(f"cannot load {spec!r}: {error} (is its folder on PYTHONPATH?){_meant(module)}") from error
+        raise ValueError(
+            f"cannot load {spec!r}: {error} (is its folder on PYTHONPATH?){meant_method(module)}"
+        ) from error
     if not callable(found):
         raise TypeError(f"{spec} is no function")
     return found

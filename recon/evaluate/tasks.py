@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from recon.evaluate.names import TASKS
 from recon.evaluate.store import Store
 from recon.evaluate.task import Facts, SomeViews, Task, contrast_limit
 from recon.evaluate.vessels import SHAPES, Vessel
@@ -29,13 +30,11 @@ from torchpcct.scene.scene import Scene
 from torchpcct.validate import choice, number, numbers, whole
 from torchpcct.volume import Volume
 
-__all__ = ["TASKS", "VesselTask", "VoxelTask", "read_task", "task_text"]
+__all__ = ["VesselTask", "VoxelTask", "read_task", "task_text"]
 
 Floats = NDArray[np.float64]
 
 _FOLDER = resources.files("recon") / "evaluate" / "tasks"
-TASKS: tuple[str, ...] = tuple(sorted(Path(str(p)).stem for p in _FOLDER.iterdir() if str(p).endswith(".yaml")))
-"""Names of the tasks that come with the package."""
 _KEYS = ("name", "title", "scene", "scanner", "signal", "background", "inset", "exposures_s", "reference", "rois",
          "tolerance_hu", "vessel", "voxels")  # fmt: skip
 _VOXEL_MM = 0.2

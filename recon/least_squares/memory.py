@@ -13,7 +13,7 @@ from recon.gram.impulse_response import slice_reach
 from torchpcct.geometry import Geometry, VolumeGrid
 from torchpcct.validate import whole
 
-__all__ = ["available_bytes", "gram_bytes", "memory_bytes", "pwls_bytes", "require_memory", "resident_bytes"]
+__all__ = ["available_bytes", "gram_bytes", "pwls_bytes", "require_memory", "resident_bytes"]
 
 # Arrays of one volume's size that live at once: statistic, volume, gradients, two steps with their images, the prior's
 # and the transform's temporaries, the spectra of a whole field.
@@ -46,28 +46,6 @@ def resident_bytes() -> int:
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except (OSError, ValueError, AttributeError):
         return 0
-
-
-_UNITS = {"": 1, "B": 1, **{f"{p}{b}": k**n for n, p in enumerate("KMGT", 1) for b, k in (("B", 1000), ("IB", 1024))}}
-
-
-def memory_bytes(value: int | str) -> int:
-    """A limit of memory in bytes: a whole number, or a text such as ``4GB`` (10⁹) or ``4 GiB`` (2³⁰).
-
-    Raises:
-        ValueError: no such text, or 0. TypeError: neither text nor whole number.
-    """
-    if not isinstance(value, str):
-        return whole("memory", value)
-    text = value.strip().upper()
-    digits = text.rstrip("KMGTIB ")
-    try:
-        found = int(float(digits) * _UNITS[text[len(digits) :].strip()])
-    except (ValueError, KeyError, OverflowError):
-        found = 0
-    if found < 1:
-        raise ValueError(f"memory must be bytes or a text like 4GB or 500MiB, got {value!r}")
-    return found
 
 
 def pwls_bytes(A: Any, batch: int, dtype: torch.dtype, device: torch.device) -> int:

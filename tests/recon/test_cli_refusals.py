@@ -3,9 +3,13 @@
 import io
 import json
 import os
+import re
 import resource
+import shlex
 import shutil
+import socket
 import time
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import h5py
@@ -15,9 +19,14 @@ import pytest
 import torch
 from fresh_python import run_python
 
+from recon.cli import _parser
+from recon.cli.parsing import check_limits
+from recon.cli.scans import _length
 from recon.evaluate.store import Store
+from recon.study import registry
 from torchpcct import ParallelBeam, Scan, Volume, VolumeGrid
 from torchpcct.files import _part, atomic_write, require_writable
+from train.__main__ import _parser as train_parser
 
 
 @pytest.mark.parametrize(
@@ -55,15 +64,148 @@ def test_refusals_name_value_and_remedy_and_leave_nothing(here, cli, words, mess
     assert [p.name for p in here.iterdir()] == ["f"]
 
 
-def test_help_and_refusals_load_neither_torch_nor_numba():
+_LIGHT = """\
+--help
+simulate --views 0 --out a.h5
+simulate --config none.yaml --out a.h5
+reconstruct x --voxel 0 --out a.h5
+reconstruct f.h5 --method art
+reconstruct f.h5 --kernel sotf
+reconstruct f.h5 --fidelity 2
+reconstruct f.h5 --memory 4XB
+reconstruct f.h5 --slices 3
+reconstruct f.h5 --workers 0
+reconstruct f.h5 --scheduler nowhere
+reconstruct f.h5 --threads 2 --workers -1
+lower-dose f.h5 --fraction 0
+info none.h5
+view none.nii
+plaque f.h5 --wall 0 -1
+evaluate --task nodul
+evaluate --task none.yaml
+evaluate --method fbp:sotf
+evaluate --method mbir:fidelity=2
+evaluate --method mbir:weights=none
+evaluate --method files:nowhere
+evaluate --method pwls:x
+evaluate --denoiser mine.nets:run@pwls
+evaluate --scans none.h5
+evaluate --n 7
+dose-factor --exposure 0
+compare --methods mbri
+hardcases --methods art
+study nosie
+verify --again nosie
+train --steps 0
+train --weights none
+"""
+
+
+def test_help_and_refusals_load_neither_torch_nor_numba(tmp_path):
+    (tmp_path / "f.h5").write_bytes(b"no scan")
     code = (
-        "import sys, contextlib\nfrom recon.cli import main\n"
-        "for a in (['--help'], ['simulate', '--views', '0', '--out', 'a.h5'], ['reconstruct', 'x', '--voxel', '0', "
-        "'--out', 'a.h5']):\n"
-        "    with contextlib.suppress(SystemExit): main(a)\n"
+        "import sys, contextlib, shlex\nfrom recon.cli import main\n"
+        f"for words in {_LIGHT.splitlines()}:\n"
+        "    with contextlib.suppress(SystemExit): main(shlex.split(words))\n"
         "print('LOADED', sorted({'torch', 'numba', 'scipy'} & set(sys.modules)))"
     )
-    assert "LOADED []" in run_python(code).stdout
+    done = run_python(code, cwd=tmp_path)
+    assert "LOADED []" in done.stdout
+    assert len(done.stderr.splitlines()) == len(_LIGHT.splitlines()) - 1, done.stderr
+    assert [p.name for p in tmp_path.iterdir()] == ["f.h5"]
+
+
+_FIRST = {"reconstruct": ["s"], "lower-dose": ["s"], "view": ["v"], "info": ["f"], "plaque": ["s"], "study": ["noise"]}
+
+
+def _parsers():
+    return {**_parser()[1].choices, "train": train_parser()}
+
+
+def _options():
+    """Every option of every command that takes a value, with what else the command needs."""
+    for name, parser in _parsers().items():
+        needed = [a.option_strings[0] for a in parser._actions if a.required and a.option_strings]
+        for action in parser._actions:
+            if action.option_strings and action.nargs != 0:
+                words = [f"{flag}=0.5" for flag in needed if flag not in action.option_strings]
+                yield name, parser, action, [*words, *_FIRST.get(name, [])]
+
+
+def _refused(parser, action, words, value):
+    """Whether a value ends with status 2, or with a sentence of :func:`check_limits` that names the option."""
+    flag, count = action.option_strings[0], action.nargs if isinstance(action.nargs, int) else 1
+    given = [f"{flag}={value}"] if count == 1 else [flag, *[value] * count]
+    try:
+        arguments = parser.parse_args([*words, *given])
+        parser.read.clear()
+        check_limits(arguments, parser)
+    except SystemExit as stop:
+        return stop.code == 2
+    except ValueError as error:
+        return str(error).startswith(flag)
+    return False
+
+
+def test_every_number_of_the_command_line_has_limits(capsys):
+    numbers = [option for option in _options() if option[2].type in (int, float, _length)]
+    assert len(numbers) > 60
+    values = ("nan", "inf", "-inf", "1e400", "1e30", "9" * 40, "x")
+    assert not [(n, a.dest, v) for n, p, a, words in numbers for v in values if not _refused(p, a, words, v)]
+    # Below 0 are places, grey values and HU alone.
+    below = {action.dest for _, parser, action, words in numbers if not _refused(parser, action, words, "-3")}
+    assert below == {"center", "level", "point", "wall", "fibrous"}
+    assert all(line.startswith("torchpcct ") for line in capsys.readouterr().err.splitlines())
+
+
+def test_no_option_takes_an_empty_text(capsys):
+    assert not [(n, a.dest) for n, p, a, words in _options() for v in ("", "  ") if not _refused(p, a, words, v)]
+    assert all(line.startswith("torchpcct ") for line in capsys.readouterr().err.splitlines())
+
+
+def test_the_examples_of_studies_are_settings_that_they_take():
+    """One named a field that the study does not have."""
+    for name in ("study", "compare", "hardcases"):
+        examples = re.findall(r"^  torchpcct (.*)$", _parsers()[name].epilog, re.MULTILINE)
+        assert examples
+        for line in examples:
+            given = _parser()[0].parse_args(shlex.split(line))
+            if name == "study":
+                assert registry.build_settings(given.name, quick=given.quick, changes=given.changes)
+            else:
+                values = {key: value for key, value in vars(given).items() if value is not None}
+                assert registry.part(name).Settings.of(values, given.quick)
+    assert f"(default {registry.part('hardcases').Settings().views})" in _parsers()["hardcases"].format_help()
+
+
+def test_a_scan_alone_is_given_to_the_workers_that_were_asked_for(here, lines, cli, monkeypatch):
+    shutil.copy(lines / "one.h5", "one.h5")
+    for words, message in (
+        ("--workers 0", "--workers must be at least 1, got 0"),
+        ("--threads 0 --workers 1", "--threads must be at least 1"),
+        ("--threads 2", "--threads K is of the workers"),
+        ("--scheduler nowhere", "'nowhere' is neither an address"),
+    ):
+        assert message in cli(f"reconstruct one.h5 {words}", 2)
+    assert [p.name for p in here.iterdir()] == ["one.h5"]
+    asked = []
+    monkeypatch.setattr("recon.evaluate.execute.Processes", lambda *n: asked.append(n) or ThreadPoolExecutor(1))
+    assert "one_fbp.nii.gz: 1 × " in cli("reconstruct one.h5 --workers 3 --threads 2")
+    assert asked == [(3, 2)]
+    assert {p.name for p in here.iterdir() if not p.name.startswith("jobs-")} == {
+        "one.h5", "one_fbp.nii.gz", "one_fbp.nii.gz.json", "one_fbp.nii.gz.yaml"
+    }  # fmt: skip
+    assert "unknown kernel" in cli("reconstruct one.h5 --workers 1 --kernel sotf", 2)
+
+
+@pytest.mark.cluster
+def test_a_scheduler_that_is_gone_is_said(here, lines, cli):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    said = cli(f"reconstruct {lines / 'one.h5'} --scheduler tcp://127.0.0.1:{port} --out one.nii", 2)
+    assert re.fullmatch(rf"torchpcct reconstruct: no Dask scheduler answers at \S+:{port} within \d+ s\n", said)
+    assert not (here / "one.nii").exists()
 
 
 def test_what_a_killed_process_left_is_swept_by_the_next_write(tmp_path):

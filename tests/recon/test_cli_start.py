@@ -5,6 +5,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
 import pytest
@@ -95,6 +96,7 @@ def test_the_demo_does_what_its_lines_do(quick, tmp_path, cli, monkeypatch):
 
 
 def test_doctor_names_what_is_broken_and_what_to_do(capsys, cli, monkeypatch):
+    monkeypatch.setattr(doctor, "_faults", lambda names: {})  # tried below
     output = cli("doctor")
     assert len(re.findall("^ok ", output, re.MULTILINE)) == len(doctor._CHECKS)
     assert re.search("weights +sha256 [0-9a-f]{64}, as their card says", output)
@@ -112,6 +114,71 @@ def test_doctor_names_what_is_broken_and_what_to_do(capsys, cli, monkeypatch):
     assert "reads up to 9.0 HU off" in lines["FBP"]
     assert "differ by" in lines["adjoint"]
     assert all("pip install" in text or "set NUMBA_CACHE_DIR" in text for text in lines.values())
+
+
+def test_doctor_loads_the_packages_of_the_extras(tmp_path, monkeypatch):
+    """What is installed may still be broken: an error, a missing symbol, an end of the process."""
+    for name, text in (
+        ("sound", ""),
+        ("raises", "raise ImportError('undefined symbol: x\\nmore')"),
+        ("ends", "import os; os.abort()"),
+        ("old", ""),
+    ):
+        (tmp_path / f"{name}.py").write_text(text, encoding="utf-8")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    versions = {"sound": "1.0", "raises": "1.0", "ends": "1.0", "old": "1.9"}
+    monkeypatch.setattr("importlib.metadata.version", lambda name: versions.get(name) or _no_package(name))
+    monkeypatch.setattr(
+        "importlib.metadata.requires",
+        lambda _: [
+            'sound>=1; extra == "a"',
+            'raises>=1; extra == "a"',
+            'ends>=1; sys_platform == "linux" and extra == "b"',
+            'old>=1.10; extra == "b"',
+            'lacking; extra == "c"',
+            'broken; extra == "test"',
+            "numpy>=1",
+        ],
+    )
+    with pytest.raises(ValueError, match="does not load") as found:
+        doctor._extras()
+    assert sorted(str(found.value).split("; ")) == [
+        "ends of b does not load (it ends the process, status -6): pip install --force-reinstall 'ends'",
+        "old 1.9 of b is older than 1.10: pip install 'old>=1.10'",
+        "raises of a does not load (undefined symbol: x): pip install --force-reinstall 'raises'",
+    ]
+    monkeypatch.setattr("importlib.metadata.requires", lambda _: ['sound>=1; extra == "a"', 'lacking; extra == "c"'])
+    assert doctor._extras() == "a; c lacks lacking (pip install 'torchpcct[c]')"
+
+
+def _no_package(name):
+    raise PackageNotFoundError(name)
+
+
+def test_the_module_is_the_command(tmp_path):
+    for module in ("torchpcct", "recon.cli"):
+        done = subprocess.run(
+            [sys.executable, "-m", module, "reconstruct", "x.h5", "--voxel", "0"],
+            capture_output=True, text=True, cwd=tmp_path, env={"PYTHONPATH": str(ROOT)},
+        )  # fmt: skip
+        assert done.returncode == 2
+        assert done.stderr == "torchpcct reconstruct: --voxel must be greater than 0 mm, got 0\n"
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "cp1252"])
+def test_terminals_of_few_characters_get_the_nearest(encoding, tmp_path):
+    code = "from recon.cli import main\nmain([])\nprint('8 × 8 voxels, ⟨Aᵀy⟩ ± 3°, Ängström, ☃')\n"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, cwd=tmp_path,
+        env={"PYTHONPATH": str(ROOT), "PYTHONIOENCODING": encoding},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    last = done.stdout.decode(encoding).splitlines()[-1]
+    expected = {
+        "ascii": "8 x 8 voxels, <A^Ty> +/- 3 deg, Angstrom, ?",
+        "cp1252": "8 × 8 voxels, <A^Ty> ± 3°, Ängström, ?",
+    }
+    assert last == expected[encoding]
 
 
 def test_train_is_ours_whatever_lies_in_the_folder(tmp_path):

@@ -32,7 +32,7 @@ def test_command_line(tmp_path, objective, capsys):
     assert "stopped at step 8 of 12" in message
     assert command_line.main([*start, *common]) == 1
     assert "--resume" in capsys.readouterr().err
-    assert command_line.main(["--resume", "--seed", "5", *common]) == 1
+    assert command_line.main(["--resume", "--seed", "5", *common]) == 2
     assert "seed" in capsys.readouterr().err
     objective.at = {}
     assert command_line.main(["--resume", *common]) == 0
@@ -41,7 +41,7 @@ def test_command_line(tmp_path, objective, capsys):
     weights = out / "weights.safetensors"
     plain = ["--no-progress", "--no-tensorboard"]
     assert command_line.main([*start, "--out", str(tmp_path / "y"), "--weights", str(weights), *plain]) == 0
-    assert command_line.main([*start, "--out", str(tmp_path / "z"), "--weights", str(out / "training.md")]) == 1
+    assert command_line.main([*start, "--out", str(tmp_path / "z"), "--weights", str(out / "training.md")]) == 2
     assert "training.md is damaged or not a safetensors file" in capsys.readouterr().err
 
 
@@ -57,14 +57,23 @@ def test_second_interrupt_stops_at_once(tmp_path, objective, capsys):
 
 
 def test_refusals(tmp_path, objective, capsys):
-    for words in (["--quick", "--config", "x.yaml"], ["--threads", "0"], ["--resume", "--weights", "x"]):
-        with pytest.raises(SystemExit):
+    here = str(tmp_path)
+    for words in (["--quick", "--config", here], ["--steps", "x"], ["--resume", "--weights", here]):
+        with pytest.raises(SystemExit, match="2"):
             command_line.main(words)
+    for words, message in (
+        (["--threads", "0"], "--threads must be at least 1, got 0"),
+        (["--painters", "-1"], "--painters must be at least 1, got -1"),
+        (["--weights", "x"], "no such file: x"),
+    ):
+        capsys.readouterr()
+        assert command_line.main(words) == 2
+        assert capsys.readouterr().err == f"torchpcct train: {message}\n"
     (tmp_path / "c.yaml").write_text("stepps: 1")
-    assert command_line.main(["--config", str(tmp_path / "c.yaml"), "--out", str(tmp_path / "o")]) == 1
+    assert command_line.main(["--config", str(tmp_path / "c.yaml"), "--out", str(tmp_path / "o")]) == 2
     assert "c.yaml: unknown key 'stepps'" in capsys.readouterr().err
-    assert command_line.main(["--config", str(tmp_path / "none.yaml")]) == 1
-    assert command_line.main(["--resume", "--out", str(tmp_path / "none")]) == 1
+    assert command_line.main(["--config", str(tmp_path / "none.yaml")]) == 2
+    assert command_line.main(["--resume", "--out", str(tmp_path / "none")]) == 2
     assert "no checkpoint" in capsys.readouterr().err
 
 

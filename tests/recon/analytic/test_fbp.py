@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from recon.analytic.fbp import Fbp, backproject, fbp, filter_sinogram, interleave
-from recon.analytic.ramp import KERNELS
+from recon.names import KERNELS
 from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid, full_turn
 

@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from refusals import refused
 
-from recon.analytic.ramp import KERNELS, apodization, fast_length, ramp_kernel
+from recon.analytic.ramp import _POINTS, apodization, fast_length, ramp_kernel
+from recon.names import KERNELS
 
 POINTS = {
     "soft": [1, 0.815, 0.4564, 0.1636, 0],
@@ -70,3 +71,7 @@ def test_bad_kernels_name_the_options():
         ("greater than 0", lambda: ramp_kernel(3, 0.0)),
         ("180°", lambda: ramp_kernel(400, 0.01, equiangular=True)),
     )
+
+
+def test_every_kernel_that_has_a_name_has_its_points():
+    assert tuple(_POINTS) == KERNELS

@@ -13,10 +13,11 @@ from tiny_studies import INSERT
 from recon.evaluate.estimates import pivot
 from recon.evaluate.experiment import evaluate, export_scans
 from recon.evaluate.methods import Method, deepinv_denoiser, denoiser, method_of
+from recon.evaluate.names import TASKS
 from recon.evaluate.report import COLUMNS, save, text_of
 from recon.evaluate.rivals import tuned
 from recon.evaluate.store import Store
-from recon.evaluate.tasks import TASKS, read_task, task_text
+from recon.evaluate.tasks import read_task, task_text
 from recon.evaluate.without_truth import evaluate_scans, evaluate_volumes
 from torchpcct import Volume
 from torchpcct.geometry import VolumeGrid

@@ -9,7 +9,7 @@ import torch
 from refusals import refused
 from scipy import ndimage
 
-from recon.evaluate import rivals
+from recon.evaluate import names, rivals
 from recon.evaluate.rivals import FILTERS, denoised, flat_noise, perona_malik
 
 SHAPE = (10, 12, 14)
@@ -188,3 +188,7 @@ def test_refusals_of_the_flat_region(noise):
         ("0 voxels", lambda: flat_noise(noise, ~everywhere)),
         ("no noise", lambda: flat_noise(torch.zeros(SHAPE), everywhere)),
     )
+
+
+def test_every_filter_that_has_a_name_is_there():
+    assert tuple(FILTERS) == names.FILTERS
