@@ -247,7 +247,7 @@ def _object(rng: Any, fov: float, height: float, mu: float) -> tuple[str, list[S
         mu: its attenuation, mm⁻¹.
     """
     plane = math.isinf(height)
-    names = ["round", "off-centre", "ellipse", "several", "shell"]
+    names = ["round", "off-centre", "ellipse", "several", "shell", "box"]
     if not plane:
         names += ["tilted", "pancake", "disc", "disc", "tall", "tooth", "animal", "plate"]
     name = str(rng.choice(names))
@@ -281,6 +281,11 @@ def _object(rng: Any, fov: float, height: float, mu: float) -> tuple[str, list[S
         for s in _inserts(rng, int(rng.integers(0, 4)), 0.7 * min(a, b), math.inf if c > height else 0.5 * c, mu):
             cx, cy, cz = s.center
             bodies.append(replace(s, center=(cx + x, cy + y, cz + zz)))
+    elif name == "box":
+        a, turn = fov * rng.uniform(0.2, 0.65), float(rng.choice([0.0, 0.5 * math.pi, rng.uniform(0, 3)]))
+        c = min(a * rng.uniform(0.4, 1.2), 0.9 * high)
+        x, y = placed(1.42 * a)
+        bodies = [Solid(BOX, (x, y, z(c)), (a, a * rng.uniform(0.2, 1.0), c), mu, turn)]
     elif name == "several":
         bodies = []
         for _ in range(int(rng.integers(2, 6))):
@@ -338,7 +343,7 @@ def _object(rng: Any, fov: float, height: float, mu: float) -> tuple[str, list[S
             Solid(BALL, (x + 0.35 * a, y, z(0.4 * height)), (a * 0.25, b * 0.4, height * 0.4), -0.7 * mu),
             Solid(CYLINDER, (x, y - 0.6 * b, 0.0), (a * 0.1, a * 0.1, 0.7 * c), mu, 0.0, rng.uniform(-0.15, 0.15)),
         ]
-    upright = ("round", "off-centre", "ellipse", "several", "shell")
+    upright = ("round", "off-centre", "ellipse", "several", "shell", "box")
     return f"{name}, endless" if endless and not plane and name in upright else name, bodies
 
 
@@ -407,7 +412,7 @@ def draw(seed: int, *, kind: str | None = None, readings: int = 600_000) -> Draw
     half = kind != "parallel" and turn == "turn" and rng.random() < 0.12
     if half:  # reaches far to one side, a little to the other
         side = rng.uniform(0.15, 0.5)
-        offset = (1 - side) / 2 * columns * pitch * (1 if rng.random() < 0.5 else -1)
+        offset = (1 - side) / 4 * columns * pitch * (1 if rng.random() < 0.5 else -1)
         columns = int(columns * (1 + side) / 2)
     detector = "curved" if kind != "parallel" and rng.random() < 0.4 else "flat"
     rightly = ["views are few", "seen in every view"]
@@ -448,11 +453,13 @@ def draw(seed: int, *, kind: str | None = None, readings: int = 600_000) -> Draw
     if densest > 0:
         solids = [replace(s, value=s.value * wanted / densest) for s in solids]
         water *= wanted / densest
-    # Empty rows or columns beside the body would be all there is of some draws: such a scan shows nothing.
-    options: dict[str, Any] = {"subs": (3, 3, 1)}
+    # Thin bodies take many rays: those that miss them between two others would be another object's.
+    thin = min((s.radii[2] for s in solids if s.value), default=math.inf)
+    across = 1 if kind != "cone" else int(np.clip(math.ceil(4 * row_pitch / zoom / thin), 2, 16))
+    options: dict[str, Any] = {"subs": (3, across, 1)}
     step = abs(float(angles[1] - angles[0]))
     if rng.random() < 0.3:
-        options |= {"arc": step, "subs": (3, 2, 3)}
+        options |= {"arc": step, "subs": (3, across, 3)}
     if kind != "parallel" and rng.random() < 0.3:
         options["spot"] = pitch / max(zoom - 1.0, 0.3) * rng.uniform(0.2, 1.2)
     profile: Any = 1.0
@@ -467,9 +474,10 @@ def draw(seed: int, *, kind: str | None = None, readings: int = 600_000) -> Draw
     if kind == "cone":
         slices = int(np.clip(rows // 2, 1, 5))
         grid = VolumeGrid((slices, 24, 24), (min(2 * height / max(slices, 2), side_mm / 24), *(side_mm / 24,) * 2))
+    shape = "" if kind == "parallel" else f", {detector}"
     text = (
         f"{kind} {scale} {name}; {views} views ({turn}), {rows}×{columns} cells of {pitch:.2g} mm, "
-        f"{photons:.0f} photons, p ≤ {wanted:.2g}{', offset detector' if half else ''}{', ' + detector if kind != 'parallel' else ''}"
+        f"{photons:.0f} photons, p ≤ {wanted:.2g}{shape}{', offset detector' if half else ''}"
         f"{', arc' if 'arc' in options else ''}{', spot' if 'spot' in options else ''}"
         f"{f', {frames} air frames' if frames else ''}{', electronic noise' if noise else ''}"
     )

@@ -34,6 +34,9 @@ _NEIGHBOURS = 4
 # Share of single lost readings from which zeros up to three wide are taken for lost, too.
 _FREQUENT = 0.005
 _SIGMAS = 8.0
+_TOGETHER, _BENT, _ABOUT = 2, 0.25, 5
+"""Most cells of a wrong gain side by side; the bend beside them, over their error, that is no outline; and the columns
+to either side in which outlines are looked for."""
 _LASTING = 3
 """Views from which a cell that reads 0 without a break is dead for part of the turn, and not a lost reading."""
 _WIDTH = 6
@@ -228,10 +231,48 @@ def wrong_cells(sums: NDArray[np.float64], lost: NDArray[np.bool_], photon: floa
         usual = MEDIAN_TO_SD * np.median(np.abs(deviation[some])) if some.any() else 0.0
         error = np.hypot(np.sqrt(1.5 * photon / np.maximum(level * times, photon)), usual)
         hot = some & (np.abs(deviation) > np.maximum(GAIN_ERROR, _SIGMAS * error)) & (level > light)
-        # The neighbours of a hot cell deviate by half as much, the other way.
-        strength = np.pad(np.where(hot, np.abs(deviation), 0.0), ((0, 0), (1, 1)))
-        hot &= np.abs(deviation) >= np.maximum(strength[:, :-2], strength[:, 2:])
+        hot = _alone(deviation, hot, some)
     return Cells(lost, dead, hot)
+
+
+def _alone(deviation: NDArray[np.float64], found: NDArray[np.bool_], known: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Those cells of a wrong gain that stand out of a smooth row, up to :data:`_TOGETHER` side by side.
+
+    The outline of a body that is round about the axis stays on its cells, too, and on others in every row: many of the
+    cells about one of its own deviate. Gains are gone once their cells are bridged: those beside them then lie on a
+    line with the next. An outline bends the row wherever it is bridged.
+
+    Args:
+        deviation: how far cells lie above the mean of their neighbours in the row.
+        found: cells that do by much.
+        known: of which that is known.
+    """
+    columns = deviation.shape[1]
+    hot = np.zeros_like(found)
+    for r, c in np.argwhere(found):
+        about = np.abs(deviation[max(r - 1, 0) : r + 2, max(c - _ABOUT, 0) : c + _ABOUT + 1])
+        if np.quantile(about, 0.8) > _BENT * abs(deviation[r, c]):
+            continue
+        best: tuple[float, int, NDArray[np.float64]] | None = None
+        for count in range(1, _TOGETHER + 1):
+            bends = np.eye(count) - 0.5 * (np.eye(count, k=1) + np.eye(count, k=-1))
+            for start in range(max(c - count + 1, 1), min(c, columns - 1 - count) + 1):
+                inside = slice(start, start + count)
+                if not known[r, inside].all():
+                    continue
+                excess = np.linalg.solve(bends, deviation[r, inside])
+                size = float(np.abs(excess).min())
+                ends = [
+                    deviation[r, at] + 0.5 * own
+                    for at, own in ((start - 1, excess[0]), (start + count, excess[-1]))
+                    if known[r, at]
+                ]
+                left = max((abs(end) for end in ends), default=0.0) / max(size, 1e-300)
+                if left < _BENT and size > GAIN_ERROR and (best is None or left < best[0]):
+                    best = left, start, excess
+        if best is not None:
+            hot[r, best[1] : best[1] + best[2].size] = True
+    return hot
 
 
 def _beside(cells: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -262,13 +303,27 @@ def _dimmed(level: NDArray[np.float64], dead: NDArray[np.bool_]) -> NDArray[np.f
     return found
 
 
-def _isolated(n: NDArray[Any], at: NDArray[np.int64], light: float, reach: int = 1) -> NDArray[np.int64]:
+def _isolated(
+    n: NDArray[Any], at: NDArray[np.int64], first: NDArray[np.int64], light: float, reach: int = 1
+) -> NDArray[np.int64]:
     """Those of the zeros ``at`` ``(k, 3)`` whose non-zero neighbours in the row and the next rows are bright on both
-    sides."""
+    sides; and not both dim in the rows, or the views, beside: a detail as narrow as a cell goes on there."""
     values = [[_around(n, at, side * dc) for dc in range(1, reach + 1)] for side in (-1, 1)]
     stacked = np.ma.masked_less_equal(np.stack([np.concatenate(v) for v in values]), 0.0)
     sides = np.ma.filled(np.ma.median(stacked, axis=1), 0.0)
-    return at[(sides > light).all(0)]
+    good = (sides > light).all(0)
+    onward = []
+    for step in (-1, 1):
+        there = np.clip(at[:, 0] + step, 0, len(n) - 1)
+        column = first[at[:, 0]] - first[there]
+        around = np.nan_to_num(_around(n, at, column, step))
+        onward.append(around[len(around) // 2])
+    pairs = [np.stack(onward)]
+    if n.shape[1] > 1:
+        pairs.append(_around(n, at, 0)[[0, 2]])
+    for pair in pairs:
+        good &= (pair <= 0).all(0) | (pair > light).any(0)
+    return at[good]
 
 
 def _around(n: NDArray[Any], at: NDArray[np.int64], column: Any, view: Any = 0) -> NDArray[Any]:
@@ -311,13 +366,13 @@ def _unshadowed(
         return at, 0, 0
     # From view to view a footprint moves by so many columns at most.
     moving = math.ceil(math.pi * columns / len(n))
-    single = _isolated(n, at, light)
+    single = _isolated(n, at, first, light)
     if len(single) > _FREQUENT * n.size:
         # So many are no accident, unless they follow each other: neighbours on one side are often lost together.
         follow = np.mean(_company(n, single, first, -1, moving) & _company(n, single, first, 1, moving))
         chance = (1 - (1 - np.mean(n <= 0)) ** (2 * moving + 1)) ** 2
         if follow < chance + 0.25:
-            lost = np.unique(np.concatenate([single, _isolated(n, at, light, reach=3)]), axis=0)
+            lost = np.unique(np.concatenate([single, _isolated(n, at, first, light, reach=3)]), axis=0)
             return lost, 0, 0
     # Cells of the detector, one after the other, each view by view: what follows without a break is one run.
     cell = at[:, 2] + first[at[:, 0]]

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchpcct.checks.opposite_rays import UNKNOWN, ScanTest
+from torchpcct.checks.orbit_plane import lack_of_cells, orbit_plane
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, view_step
 
 __all__ = ["STEP_TOLERANCE", "WEIGHT_TOLERANCE", "moment_test"]
@@ -34,6 +35,11 @@ WEIGHT_TOLERANCE = 0.002
 STEP_TOLERANCE = 0.005
 """Relative error of the steps between views that the moments of a sound scan may show."""
 _SIGMAS = 4.0
+_THIN = 0.5
+"""Of a view's sum, what ends between the rows that are averaged and the next, from which nothing is said of it: of a
+dense disc thinner than a row the readings tell the shadow, not the attenuation."""
+_LACKING = 0.25
+"""Of what cells lack at the ends of the object at most, how much may change with the direction besides."""
 _DIRECTIONS, _LEAST_ARC = 24, 0.8 * math.pi
 """Fewest directions, and the smallest arc of them, that are tested."""
 
@@ -61,17 +67,20 @@ def moment_test(lines: Tensor, geometry: Geometry) -> ScanTest:
     values = lines.detach().to("cpu", torch.float64)
     if not bool(torch.isfinite(values).all()):
         raise ValueError("lines hold NaN or Inf: bridge dead readings before (torchpcct.readings.bridge)")
+    turned, lacking = 0.0, torch.zeros(g.views, g.columns, dtype=torch.float64)
     if isinstance(g, ConeBeam):
-        middle = np.abs(g.row_positions) <= 0.5 * g.pitch[0] + 1e-9
-        if not middle.any():
+        plane = orbit_plane(values, g)
+        if plane is None or plane.part > _THIN:
             return UNKNOWN
-        values = values[:, torch.from_numpy(middle)].mean(1)
+        closed = bool(np.ptp(g.angles) + view_step(g.angles) > 1.9 * math.pi)
+        values, lacking, turned = plane.lines[:, 0], plane.lacking, plane.turned(closed=closed)
     order = np.argsort(g.angles, kind="stable")
-    angles, p = g.angles[order], values.numpy()[order]
+    angles, p, lack = g.angles[order], values.numpy()[order], lacking.numpy()[order]
     if isinstance(g, ParallelBeam):
         theta, t = angles, np.asarray(g.column_positions)
     else:
-        theta, p = _parallel(angles, g.fan_angles, p)
+        theta, both = _parallel(angles, g.fan_angles, np.concatenate([p, lack], 1))
+        p, lack = np.split(both, 2, axis=1)
         t = g.sod * np.sin(g.fan_angles)
     if theta.size < _DIRECTIONS or np.ptp(theta) + view_step(theta) < _LEAST_ARC:
         return UNKNOWN
@@ -81,13 +90,13 @@ def moment_test(lines: Tensor, geometry: Geometry) -> ScanTest:
     weight, weight_error = _weight(theta, moments[0])
     step, step_error = _step(theta, moments[1:])
     findings = []
-    if abs(step) - _SIGMAS * step_error > STEP_TOLERANCE:
+    if abs(step) - _SIGMAS * step_error > STEP_TOLERANCE + turned:
         findings.append(
             "the centre of mass and the width of the views do not turn with them: the steps between the views are "
             f"described about {100 * abs(step):.2g} ± {100 * step_error:.1g} % too {'small' if step > 0 else 'large'}: "
             "the range of the angles is wrong, or the object moved"
         )
-    elif weight - _SIGMAS * weight_error > WEIGHT_TOLERANCE:
+    elif weight - _SIGMAS * weight_error > WEIGHT_TOLERANCE + turned + _edges(theta, p, lack, p.sum(1)):
         findings.append(
             f"the sum of a view's line integrals changes with its direction, by {100 * weight:.2g} ± "
             f"{100 * weight_error:.1g} % (root mean square), that of any object does not: the readings lack most where "
@@ -101,7 +110,10 @@ def moment_test(lines: Tensor, geometry: Geometry) -> ScanTest:
 
 
 def _parallel(angles: Floats, gamma: Floats, p: Floats) -> tuple[Floats, Floats]:
-    """Directions θ = β − γ that all columns measured, and the readings there, ``(directions, columns)``."""
+    """Directions θ = β − γ that all columns measured, and the readings there, ``(directions, columns)``.
+
+    ``p`` may hold several blocks of columns side by side.
+    """
     span, usual = float(np.ptp(angles)), view_step(angles)
     if abs(span + usual - 2 * math.pi) < 0.5 * usual:  # a turn that closes
         angles = np.concatenate([angles - 2 * math.pi, angles, angles + 2 * math.pi])
@@ -110,7 +122,8 @@ def _parallel(angles: Floats, gamma: Floats, p: Floats) -> tuple[Floats, Floats]
     else:
         first, last = angles[0] - gamma.min(), angles[-1] - gamma.max()
         theta = np.arange(first, last, usual) if usual > 0 else np.zeros(0)
-    sorted_p = np.stack([np.interp(theta + a, angles, p[:, k]) for k, a in enumerate(gamma)], 1)
+    parts = p.shape[1] // gamma.size
+    sorted_p = np.stack([np.interp(theta + a, angles, p[:, k]) for k, a in enumerate(np.tile(gamma, parts))], 1)
     return theta, sorted_p
 
 
@@ -124,6 +137,20 @@ def _fit(design: Floats, y: Floats) -> tuple[Floats, Floats]:
     spread = np.diag(variance * np.linalg.pinv(design.T @ design, hermitian=True))
     # Nothing to see, no scatter: rounding alone is below 0.
     return np.asarray(found, np.float64), np.sqrt(np.maximum(spread, 0.0))
+
+
+def _edges(theta: Floats, p: Floats, lacking: Floats, sums: Floats) -> float:
+    """Relative change of the sum with the direction that cells may cause in which the object ends.
+
+    Args:
+        theta, sums: directions, and the sum of each.
+        p: readings sorted into parallel ones ``(directions, columns)``.
+        lacking: what they lack for the object's ends along the rows' axis, the same shape.
+    """
+    if sums.mean() <= 0:
+        return 0.0
+    most = (lack_of_cells(p[:, 2:] - p[:, :-2]) + lacking[:, 1:-1]).sum(1)
+    return _weight(theta, most + sums.mean())[0] + _LACKING * float(most.mean() / sums.mean())
 
 
 def _waves(theta: Floats, orders: tuple[int, ...]) -> Floats:

@@ -42,6 +42,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
+from torchpcct.checks.orbit_plane import PARTED, orbit_plane, shared_square
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, view_step
 from torchpcct.validate import checked
@@ -64,8 +65,8 @@ _ROWS, _COLUMNS = 9, (5, 25)
 _DIFFER, _STRANGERS = 0.03, 0.3
 """Mean square of the difference over that of what changes from view to view: from the first one opposite rays differ,
 from the second one they have nothing to do with each other."""
-_FLAT_CELLS, _PLANE_CELLS = 2.0, 1.0
-"""Rows count whose opposite rays part by less, along z: for shifts of the columns, and for turns of the views."""
+_FLAT_CELLS = 2.0
+"""Rows count whose opposite rays part by less, along z."""
 _INTERPOLATED = 0.5
 """What a cause explains at least, of what interpolation leaves: a sound scan of few readings 0.2, errors of 1 % 1.3."""
 _EXPLAINED = 0.1
@@ -148,15 +149,14 @@ def geometry_test(
     pairs = _Pairs.of(lines, geometry, window, about)
     if pairs is None:
         return UNKNOWN
-    # What a cone's rays lie apart along z looks like an error of the angles, not like one of the centre.
-    plane = pairs if window is not None or pairs.rays.flat else _Pairs.of(lines, geometry, window, about, _PLANE_CELLS)
     centre, explained = _centre(pairs, FALSE_ALARMS / 3.0)
     ranked = [(explained / pairs.here.numel(), text) for text in centre.findings]
     sizes, errors = ({k: v for k, v in values.items() if k == "centre"} for values in (centre.sizes, centre.errors))
-    causes = [(pairs, "roll"), *((plane, name) for name in ("scale", "step") if plane is not None)]
+    stack = _Pairs.stacked(lines, geometry, window, about) if window is None else pairs
+    causes = [(stack, "roll"), (pairs, "scale"), (pairs, "step")]
     for of, name in causes:
-        cause = of.cause(name)
-        if cause is None:
+        cause = None if of is None else of.cause(name)
+        if of is None or cause is None:
             continue
         pattern, tolerance = cause
         tried = [of.fit(pattern, tolerance, columns) for columns in _COLUMNS]
@@ -167,12 +167,12 @@ def geometry_test(
         level = FALSE_ALARMS / (3.0 * len(causes) * len(_COLUMNS))
         best = next((f for f in reversed(fits) if f.found(level, tolerance, _LARGEST)), fits[0])
         sizes[name], errors[name] = best.size, best.error
-        if best.found(level, tolerance, _LARGEST) and best.explained > _INTERPOLATED * of.interpolated:
+        if best.found(level, tolerance, _LARGEST) and best.explained > of.unexplained:
             ranked.append((best.explained / of.here.numel(), _TEXTS[name](best.size, best.error)))
-    mismatch, differ = (math.nan, 0) if plane is None else plane.mismatch(FALSE_ALARMS / 3.0)
-    mirrored = plane is not None and differ > 0 and plane.agrees_mirrored(min(_DIFFER, mismatch / 4.0))
+    mismatch, differ = pairs.mismatch(FALSE_ALARMS / 3.0)
+    mirrored = differ > 0 and pairs.agrees_mirrored(min(_DIFFER, mismatch / 4.0))
     explained = max((share for share, _ in ranked), default=0.0)
-    if plane is not None and differ and (mirrored or explained < _EXPLAINED * plane.disagreement):
+    if differ and (mirrored or explained < _EXPLAINED * pairs.disagreement):
         ranked = [(math.inf, _mismatch_text(mismatch, differ == 2, mirrored))]
     if math.isfinite(mismatch):
         sizes["mismatch"] = mismatch
@@ -231,7 +231,8 @@ def _centre(pairs: _Pairs, false_alarms: float) -> tuple[ScanTest, float]:
             turn = 2.0 * pairs.angles
             waves = [_blocks(power * wave(turn), pairs.used(columns)) for wave in (np.cos, np.sin)]
             score, power = (_blocks(v, pairs.used(columns)) for v in sums)
-            test = _tested(score, power, np.stack([power, *waves], 1), false_alarms / len(_COLUMNS))
+            design = np.stack([power, *waves], 1)
+            test = _tested(score, power, design, false_alarms / len(_COLUMNS), pairs.unexplained)
             found.append((test, test.sizes.get("centre", 0.0) ** 2 * float(power.sum())))
     return next((f for f in found if f[0].findings), found[0] if found else (UNKNOWN, 0.0))
 
@@ -281,7 +282,7 @@ Pattern = tuple[Tensor, str]
 class _Pairs:
     """Readings, those of their opposite rays, and the slopes of both."""
 
-    def __init__(self, rays: OppositeRays, values: Tensor) -> None:
+    def __init__(self, rays: OppositeRays, values: Tensor, parted: float = 0.0) -> None:
         self.rays, self._values = rays, values
         angles = rays.geometry.angles
         self._order = np.argsort(angles % (2 * math.pi), kind="stable")
@@ -290,33 +291,41 @@ class _Pairs:
         self.angles = angles[self.base]
         self.here, self.opposite, self.known = self._look(self.base)
         self.difference = self.here - self.opposite
+        self.parted = parted * float(self.known.sum())
         self._slopes: dict[tuple[str, int], tuple[Any, ...]] = {}
         self._whole: dict[int, Tensor] = {}
         self._beside: Any = None
 
     @classmethod
     def of(
-        cls,
-        lines: Tensor,
-        geometry: Geometry,
-        window: DetectorWindow | None,
-        about: tuple[float, float],
-        cells: float = _FLAT_CELLS,
+        cls, lines: Tensor, geometry: Geometry, window: DetectorWindow | None, about: tuple[float, float]
     ) -> _Pairs | None:
-        """None where no row lies near the plane of the source."""
+        """Of a whole cone beam the plane of the source; None where no row lies near it."""
+        if window is not None or not isinstance(geometry, ConeBeam):
+            return cls.stacked(lines, geometry, window, about)
+        _check(lines, geometry, DetectorWindow.full(geometry))
+        plane = orbit_plane(lines.detach().to("cpu", torch.float32), geometry)
+        if plane is None:
+            return None
+        fan = geometry.central_fan
+        return cls(OppositeRays(fan, DetectorWindow.full(fan), about), plane.lines, plane.parted)
+
+    @classmethod
+    def stacked(
+        cls, lines: Tensor, geometry: Geometry, window: DetectorWindow | None, about: tuple[float, float]
+    ) -> _Pairs | None:
+        """Of a cone beam the rows near the plane of the source, each with its own; None where there is none."""
         window = DetectorWindow.full(geometry) if window is None else window
-        expected = window.shape if isinstance(geometry, ConeBeam) else (window.views, window.columns)
-        if tuple(lines.shape) != expected or window.views != geometry.views:
-            raise ValueError(f"lines must have the shape {expected}, got {tuple(lines.shape)}")
+        _check(lines, geometry, window)
         values = lines.detach().to("cpu", torch.float32).reshape(window.shape)
-        if not bool(torch.isfinite(values).all()):
-            raise ValueError("lines hold NaN or Inf: bridge dead readings before (torchpcct.readings.bridge)")
+        parted = 0.0
         if isinstance(geometry, ConeBeam):
-            window, values = _flat_part(geometry, window, values, cells)
+            window, values = _flat_part(geometry, window, values)
             if not values.shape[1]:
                 return None
+            parted = _parted(geometry, window, values, about)
             geometry, window, values = _joined_rows(geometry, window, values)
-        return cls(OppositeRays(geometry, window, about), values)
+        return cls(OppositeRays(geometry, window, about), values, parted)
 
     def _look(self, views: NDArray[np.int64]) -> tuple[Tensor, Tensor, Tensor]:
         return self._values[torch.from_numpy(views)], *self.rays.opposite(self._values, views)
@@ -425,6 +434,11 @@ class _Pairs:
         turned = 4.0 * float(_product(self._between_views(), self.known).sum())
         return max(along, 0.0) / 120.0 + max(turned, 0.0) / 120.0
 
+    @cached_property
+    def unexplained(self) -> float:
+        """Of the squared difference, what a cause must explain more than to be one."""
+        return _INTERPOLATED * self.interpolated + self.parted
+
     @property
     def disagreement(self) -> float:
         """Mean square of the difference, noise taken off."""
@@ -453,7 +467,7 @@ class _Pairs:
         sampled = float(stray.sum() / signal.sum())
 
         def beyond(value: Floats, limit: float) -> bool:
-            return _above(value - limit * signal) < false_alarms / 3
+            return _above(value - limit * signal - self.parted / signal.size) < false_alarms / 3
 
         grade = sum(beyond(different, max(limit, 2.0 * sampled)) for limit in (_DIFFER, _STRANGERS))
         # Views that their neighbours do not foretell, in steps that they should: out of order.
@@ -472,6 +486,14 @@ class _Pairs:
         return bool(difference < most * 2.0 * _product(here - here.mean(0), known).sum())
 
 
+def _check(lines: Tensor, geometry: Geometry, window: DetectorWindow) -> None:
+    expected = window.shape if isinstance(geometry, ConeBeam) else (window.views, window.columns)
+    if tuple(lines.shape) != expected or window.views != geometry.views:
+        raise ValueError(f"lines must have the shape {expected}, got {tuple(lines.shape)}")
+    if not bool(torch.isfinite(lines).all()):
+        raise ValueError("lines hold NaN or Inf: bridge dead readings before (torchpcct.readings.bridge)")
+
+
 def _product(values: Tensor, known: Tensor) -> Floats:
     """Sum of the products of close columns in every view, whose noise is independent: squares without noise.
 
@@ -482,18 +504,32 @@ def _product(values: Tensor, known: Tensor) -> Floats:
     return products
 
 
-def _flat_part(
-    geometry: ConeBeam, window: DetectorWindow, values: Tensor, cells: float
-) -> tuple[DetectorWindow, Tensor]:
-    """The rows whose opposite rays part by less than so many cells over what the window shows."""
+def _flat_part(geometry: ConeBeam, window: DetectorWindow, values: Tensor) -> tuple[DetectorWindow, Tensor]:
+    """The rows whose opposite rays part by less than :data:`_FLAT_CELLS` over what the window shows."""
     row, column = geometry.pitch
     reach = window.columns * column / geometry.magnification / 2
-    flat = np.abs(geometry.row_positions) <= max(0.5 * cells, cells * geometry.sod / reach) * row * (1 + 1e-9)
+    flat = np.abs(geometry.row_positions) <= max(0.5 * _FLAT_CELLS, _FLAT_CELLS * geometry.sod / reach) * row + 1e-9
     kept = np.flatnonzero(flat[window.first_row : window.first_row + window.rows])
     if kept.size == 0:
         return window, values[:, :0]
     first, count = int(kept[0]), int(kept[-1] - kept[0] + 1)
     return window.with_rows(window.first_row + first, count), values[:, first : first + count]
+
+
+def _parted(geometry: ConeBeam, window: DetectorWindow, values: Tensor, about: tuple[float, float]) -> float:
+    """Mean square by which opposite rays of rows ``(views, rows, columns)`` may differ, since they part along z.
+
+    To first order by 2 (s / sod) v ∂p/∂v (:mod:`torchpcct.checks.orbit_plane`), v the height of the row.
+    """
+    rays = OppositeRays(geometry, window, about)
+    if values.shape[1] < 2:
+        return 0.0
+    turn = geometry.angles
+    off = geometry.sod * np.sin(rays.fan_angles(np.arange(turn.size)) - rays.path(turn)[0][:, None])
+    height = geometry.row_positions[window.first_row : window.first_row + window.rows] / geometry.pitch[0]
+    height = torch.from_numpy((height[1:] + height[:-1]) / 2)[:, None].float()
+    steps = height * values.diff(dim=1) * torch.from_numpy(2.0 * off / geometry.sod)[:, None].float()
+    return PARTED * float(np.mean([shared_square(part) for part in steps.unbind(1)]))
 
 
 def _joined_rows(geometry: ConeBeam, window: DetectorWindow, values: Tensor) -> Any:
@@ -507,19 +543,21 @@ def _joined_rows(geometry: ConeBeam, window: DetectorWindow, values: Tensor) -> 
     return wider, window.with_rows(0, rows), values
 
 
-def _tested(score: Floats, power: Floats, waves: Floats, false_alarms: float) -> ScanTest:
+def _tested(score: Floats, power: Floats, waves: Floats, false_alarms: float, least: float) -> ScanTest:
+    """``least``: of the squared difference, what may be there without an error."""
     if power.sum() <= 0.0:
         return UNKNOWN
     fit = _fitted(score, power, CENTRE_TOLERANCE)
     swing, swinging = _swing(score, waves)
     findings = []
-    if fit.found(false_alarms / 2, CENTRE_TOLERANCE):
+    if fit.found(false_alarms / 2, CENTRE_TOLERANCE) and fit.explained > least:
         findings.append(
             f"opposite rays disagree: the geometry puts the columns about {abs(fit.size):.2f} ± {fit.error:.2g} "
             f"columns too {'high' if fit.size > 0 else 'low'}: the rotation centre (the detector's column offset) is "
             "wrong, or the object moved"
         )
-    if swinging < false_alarms / 2:
+    # A wave has half the square of its amplitude.
+    if swinging < false_alarms / 2 and 0.5 * swing**2 * power.sum() > least:
         findings.append(
             f"opposite rays disagree by {swing:.2f} columns to either side in the course of a turn: the object moved, "
             "or the angles of the views are wrong"
@@ -531,7 +569,8 @@ def _tested(score: Floats, power: Floats, waves: Floats, false_alarms: float) ->
 def _swing(score: Floats, waves: Floats) -> tuple[float, float]:
     """Amplitude of the second and third of ``waves`` ``(blocks, 3)`` in the scores, and its p-value.
 
-    Blocks enter with the same weight but for their power: what noise leaves has the variance of the residuals.
+    Where a few blocks hold most of what is seen, theirs is what noise leaves: the likelier of the usual covariance
+    and that of White (1980, Econometrica 48:817).
     """
     from scipy import stats
 
@@ -539,14 +578,18 @@ def _swing(score: Floats, waves: Floats) -> tuple[float, float]:
     design, y = waves / scale, score / scale
     if np.linalg.cond(design) > 20.0:
         return math.nan, 1.0  # a part of the turn: the wave is not told from the constant
-    found, left = np.linalg.lstsq(design, y, rcond=None)[:2]
+    found = np.linalg.lstsq(design, y, rcond=None)[0]
     count = y.size - 3
-    covariance = np.linalg.inv(design.T @ design)[1:, 1:] * max(float(left.sum()) / count, np.finfo(np.float64).tiny)
+    residuals = y - design @ found
+    inverse = np.linalg.inv(design.T @ design)
+    usual = max(float(residuals @ residuals) / count, np.finfo(np.float64).tiny) * inverse
+    white = inverse @ ((design * residuals[:, None] ** 2).T @ design) @ inverse * (y.size / count)
     amplitude = float(np.hypot(*found[1:]))
     if amplitude <= CENTRE_TOLERANCE:
         return amplitude, 1.0
     rest = found[1:] * (1.0 - CENTRE_TOLERANCE / amplitude)
-    return amplitude, float(stats.f.sf(rest @ np.linalg.solve(covariance, rest) / 2.0, 2, count))
+    statistic = min(rest @ np.linalg.solve(covariance[1:, 1:], rest) / 2.0 for covariance in (usual, white))
+    return amplitude, float(stats.f.sf(statistic, 2, count))
 
 
 def _slope(values: Tensor, rows: int, columns: int) -> Tensor:
