@@ -73,6 +73,7 @@ _NO_WORKER_S = 30.0
 """Until it is said that a cluster has no worker."""
 _LAST_S = 5.0
 """For processes that are told to end."""
+_SAFE_PATH = "PYTHONSAFEPATH"
 
 _DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)
 
@@ -197,7 +198,12 @@ class Processes(ThreadPoolExecutor):
     def _in_process(self, fn: Callable[..., Any], *args: Any) -> Any:
         pool: Pool | None = getattr(self._own, "pool", None)
         if pool is None:
-            pool = Pool(1, multiprocessing.get_context("spawn"), initializer=_begin_process)
+            pool = Pool(
+                1,
+                multiprocessing.get_context("spawn"),
+                initializer=_begin_process,
+                initargs=(os.environ.get(_SAFE_PATH),),
+            )
             self._own.pool = pool
             self._pools.append(pool)
         try:
@@ -248,15 +254,19 @@ def _without_current_folder() -> Iterator[None]:
 
     Python looks there first for the modules that it needs to start (https://docs.python.org/3/using/cmdline.html).
     """
-    before = os.environ.get("PYTHONSAFEPATH")
-    os.environ["PYTHONSAFEPATH"] = "1"
+    before = os.environ.get(_SAFE_PATH)
+    os.environ[_SAFE_PATH] = "1"
     try:
         yield
     finally:
-        if before is None:
-            del os.environ["PYTHONSAFEPATH"]
-        else:
-            os.environ["PYTHONSAFEPATH"] = before
+        _set_safe_path(before)
+
+
+def _set_safe_path(value: str | None) -> None:
+    if value is None:
+        os.environ.pop(_SAFE_PATH, None)
+    else:
+        os.environ[_SAFE_PATH] = value
 
 
 class _Told(BaseException):
@@ -267,7 +277,14 @@ _working = False
 """Whether this process, one of :class:`Processes`, is at a job."""
 
 
-def _begin_process() -> None:
+def _begin_process(safe_path: str | None) -> None:
+    """First thing in a process of :class:`Processes`.
+
+    Args:
+        safe_path: what Python's variable of this name was before it was started; its own programs find that again.
+    """
+    _set_safe_path(safe_path)
+
     def told(number: int, frame: Any) -> None:
         if not _working:
             os._exit(128 + number)

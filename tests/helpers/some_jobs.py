@@ -65,7 +65,7 @@ def holds(folder, seconds):
 
 def found_in(folder, module):
     """Where a module is found, and what of the current folder was loaded before."""
-    return importlib.import_module(module).__file__, sys.modules["queue"].__file__
+    return importlib.import_module(module).__file__, sys.modules["selectors"].__file__
 
 
 @njit(cache=True)

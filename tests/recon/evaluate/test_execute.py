@@ -298,7 +298,7 @@ def test_workers_of_a_machine_compile_a_kernel_once(tmp_path, monkeypatch):
 @pytest.mark.skipif(os.name != "posix", reason="signals")
 def test_a_signal_ends_the_processes_and_takes_back_what_is_half_written(tmp_path):
     """SIGTERM to the command alone, as ``kill`` sends it; a batch system sends it to its processes, too."""
-    log, jobs = tmp_path / "log", [Job("quick", noted, ("q", 1)), Job("holds", holds, (600.0,), after=("quick",))]
+    log, jobs = tmp_path / "log", [Job("quick", noted, ("q", 1)), Job("holds", holds, (60.0,), after=("quick",))]
     log.mkdir()
 
     def signalled():
@@ -354,7 +354,7 @@ def test_a_signal_ends_evaluate(tmp_path, name):
 
 def test_what_lies_in_the_current_folder_hides_no_module(tmp_path, monkeypatch):
     """Neither in a process when it starts, nor later; a module of the user's own is found there, after all others."""
-    for name in ("queue", "spekpy", "mine"):
+    for name in ("selectors", "spekpy", "mine"):
         (tmp_path / f"{name}.py").write_text("")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [p for p in sys.path if p not in ("", str(tmp_path))])
