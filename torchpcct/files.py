@@ -13,6 +13,7 @@ import re
 import secrets
 import shutil
 import signal
+import stat
 import tempfile
 import threading
 import time
@@ -20,6 +21,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+from torchpcct.formats.hdf5 import require_inside
 
 __all__ = [
     "LEFTOVER",
@@ -32,6 +35,7 @@ __all__ = [
     "marker",
     "read_hdf5",
     "require_folder",
+    "require_ordinary",
     "require_writable",
     "seal",
     "write_hdf5",
@@ -53,6 +57,32 @@ def require_folder(path: str | os.PathLike[str]) -> None:
     parent = Path(path).parent
     if not parent.is_dir():
         raise FileNotFoundError(f"cannot write {path}: the folder {parent} does not exist, create it first")
+
+
+def require_ordinary(path: str | os.PathLike[str]) -> None:
+    """Raise ``ValueError`` if a path is a device, a pipe or a socket, which may never end, or never begin; of a folder,
+    if anything in it is. Links count as what they lead to.
+
+    A path that is not there passes: whoever opens it says so.
+    """
+    given = Path(path)
+    try:
+        mode = given.stat().st_mode
+    except OSError:
+        return
+    kinds = (
+        (stat.S_ISCHR, "a device"),
+        (stat.S_ISBLK, "a device"),
+        (stat.S_ISFIFO, "a pipe"),
+        (stat.S_ISSOCK, "a socket"),
+    )
+    for is_kind, kind in kinds:
+        if is_kind(mode):
+            raise ValueError(f"{given} is {kind}, not a file: copy what it gives into a file first")
+    if stat.S_ISDIR(mode):
+        for place, _, names in os.walk(given):
+            for name in names:
+                require_ordinary(os.path.join(place, name))
 
 
 def require_writable(folder: str | os.PathLike[str]) -> None:
@@ -292,6 +322,7 @@ def is_own_hdf5(path: str | os.PathLike[str], kind: str) -> bool:
     import h5py
 
     try:
+        require_ordinary(path)
         with h5py.File(path, "r") as file:
             return bool(file.attrs.get("format") == f"torchpcct-{kind}")
     except (OSError, RuntimeError, ValueError, KeyError):
@@ -299,6 +330,7 @@ def is_own_hdf5(path: str | os.PathLike[str], kind: str) -> bool:
 
 
 def _check_seal(path: str | os.PathLike[str], kind: str) -> None:
+    require_ordinary(path)
     with open(path, "rb") as file:
         head = file.read(_BLOCK)
         if head.startswith(_HDF5_SIGNATURE):
@@ -330,6 +362,7 @@ def read_hdf5(path: str | os.PathLike[str], kind: str) -> Iterator[Any]:
         with h5py.File(path, "r") as file:
             if file.attrs.get("format") != f"torchpcct-{kind}":
                 raise ValueError(f"{path} is an HDF5 file, but not a torchpcct {kind}")
+            require_inside(file)
             yield file
     except FileNotFoundError:
         raise

@@ -13,13 +13,13 @@ import torch
 from torch import Tensor
 
 from torchpcct.files import read_hdf5, write_hdf5
+from torchpcct.formats.damage import check_expansion
+from torchpcct.formats.dicom_series import read_dicom, write_dicom
 from torchpcct.formats.volume_files import (
     check_volume_name,
     format_of,
-    read_dicom,
     read_meta_image,
     read_nifti,
-    write_dicom,
     write_meta_image,
     write_nifti,
 )
@@ -126,26 +126,38 @@ class Volume:
             file.create_dataset("data", data=self.data.detach().cpu().numpy())
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Volume:
+    def load(cls, path: str | os.PathLike[str], unit: str | None = None) -> Volume:
         """Read a volume of any format that :meth:`save` writes, or one DICOM image (``.dcm``, ``.ima``, no ending).
 
         The report comes back from HDF5 only.
 
+        Args:
+            path: file or folder.
+            unit: of its numbers, for files of other software, which do not say it: None: HU, and of DICOM only what is
+                said to be HU.
+
         Raises:
             FileNotFoundError: no such file or folder.
-            ValueError: an unknown ending; a file that is damaged, foreign, oblique or incomplete.
+            ValueError: an unknown ending; a file that is damaged, foreign, oblique or incomplete, or says another unit.
             ImportError: the package that reads the format is not installed.
         """
+        if unit is not None:
+            choice("unit", unit, UNITS)
         form = format_of(path)
         if form != "HDF5":
             read = {"NIfTI": read_nifti, "MetaImage": read_meta_image, "DICOM": read_dicom, "OME-Zarr": read_ome_zarr}[
                 form
             ]
-            values, grid, unit = read(path)
-            return cls(torch.from_numpy(values), grid, {"file": str(path)}, unit)
+            values, grid, said = read(path, unit)
+            return cls(torch.from_numpy(values), grid, {"file": str(path)}, said)
         with read_hdf5(path, "volume") as file:
-            data = torch.from_numpy(file["data"][()])
+            held = file["data"]
+            check_expansion(held.shape, "the volume", held.id.get_storage_size, held.dtype.itemsize)
+            data = torch.from_numpy(held[()])
             grid = VolumeGrid(
                 tuple(int(n) for n in data.shape), tuple(file.attrs["spacing_mm"]), tuple(file.attrs["center_mm"])
             )
-            return cls(data, grid, json.loads(file.attrs["report"]), str(file.attrs["unit"]))
+            said = str(file.attrs["unit"])
+            if unit not in (None, said):
+                raise ValueError(f"it gives the unit {said!r}, not {unit!r}")
+            return cls(data, grid, json.loads(file.attrs["report"]), said)

@@ -42,11 +42,13 @@ def _is_volume(path: Path) -> bool:
 
         with reading(path, "HDF5"), h5py.File(path, "r") as file:
             return str(file.attrs.get("format")) == "torchpcct-volume"
+    if path.name.lower().endswith((".nii", ".nii.gz", ".mha", ".zarr")):
+        return True
     if path.is_dir() or _is_dicom(path):  # a series or an image, or projections
         from torchpcct.formats.dicom_ct_pd import holds_projections
 
         return not holds_projections(path)
-    return str(path).endswith((".nii", ".nii.gz", ".mha"))
+    return False
 
 
 def _is_dicom(path: Path) -> bool:

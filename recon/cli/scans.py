@@ -220,8 +220,8 @@ def _slices(text: str) -> slice:
 def _add_reader_options(parser: Parser, many: bool = False) -> None:
     """The scan, or many of them, and what its file may not know, see :func:`_reader_options`."""
     nargs = {"nargs": "+"} if many else {"read": True}
-    add_options(parser, ("scan", Path, "SCAN", ".h5 (ours or Data Exchange), .yaml stack, CatSim, DICOM-CT-PD folder",
-                         nargs))  # fmt: skip
+    formats = ".h5 (ours, Data Exchange, NeXus), .yaml stack, .xtekct, .txrm, .mat, CatSim, DICOM-CT-PD folder"
+    add_options(parser, ("scan", Path, "SCAN", formats, nargs))
     add_options(
         parser,
         ("--geometry", Path, "YAML", "geometry of files that do not hold it; one with kind: vectors, kind: rtk or "
@@ -234,12 +234,56 @@ def _add_reader_options(parser: Parser, many: bool = False) -> None:
         ("--photons", float, "N", "photons of an unattenuated reading, of scans given as line integrals",
          {"limits": {"positive": True, "high": 1e18}}),
         ("--slices", _slices, "A:B", "read only these slices (parallel, fan) or rows (cone beam)"),
+        ("--angles-deg", _angles, "FILE|START:STEP", "angles of Data Exchange and NeXus in degrees: a text file with "
+         "one a line, or the first and their step"),
+        ("--air", _number_or_file, "N|FILE", "reading without the object, of files that hold none: a number, or .tif, "
+         ".npy, a pattern"),
+        ("--dark", _number_or_file, "N|FILE", "reading without beam, as --air"),
+        ("--entry", str, "NAME", "of a NeXus file with several scans"),
+        ("--variable", str, "NAME", "of a MATLAB file with several arrays"),
+        ("--spot", int, "K", "of a flying focal spot: only the views from its position K",
+         {"limits": {"low": 0, "high": 63}}),
         group="what the file does not know of its scan",
     )  # fmt: skip
 
 
+def _number_or_file(text: str) -> float | str:
+    """A number, or a file or pattern by its full path: workers may stand in another folder."""
+    try:
+        value = float(text)
+    except ValueError:
+        return _there(text)
+    if not math.isfinite(value) or value < 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is no reading: a finite number of 0 or more, or a file")
+    return value
+
+
+def _there(text: str) -> str:
+    """A file that is there, or a pattern, by its full path."""
+    path = Path(text).absolute()
+    if not text.strip():
+        raise argparse.ArgumentTypeError("it is empty")
+    if not path.exists() and not any(c in text for c in "*?["):
+        raise argparse.ArgumentTypeError(f"{text!r} is neither a number nor a file that is there")
+    return str(path)
+
+
+def _angles(text: str) -> dict[str, float] | str:
+    """``START:STEP`` in degrees, or a text file by its full path."""
+    try:
+        start, step = map(float, text.split(":"))
+    except ValueError:
+        return _there(text)
+    if not math.isfinite(start) or not math.isfinite(step) or step == 0:
+        raise argparse.ArgumentTypeError(f"{text!r}: start and step must be finite, the step not 0")
+    return {"start": start, "step": step}
+
+
+_READ_WITH = ("axis", "pitch", "mu_water", "photons", "angles_deg", "air", "dark", "entry", "variable", "spot")
+
+
 def _reader_options(arguments: argparse.Namespace) -> dict[str, Any]:
-    given = {name: getattr(arguments, name) for name in ("axis", "pitch", "mu_water", "photons")}
+    given = {name: getattr(arguments, name) for name in _READ_WITH}
     options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     if arguments.slices is not None:
         options["slices"] = arguments.slices

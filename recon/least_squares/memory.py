@@ -11,6 +11,7 @@ from torch import Tensor
 
 from recon.gram.impulse_response import slice_reach
 from torchpcct.geometry import Geometry, VolumeGrid
+from torchpcct.memory import free_bytes
 from torchpcct.validate import whole
 
 __all__ = ["available_bytes", "gram_bytes", "pwls_bytes", "require_memory", "resident_bytes"]
@@ -26,18 +27,7 @@ def available_bytes(device: torch.device) -> int:
     """Memory that can still be allocated: of the device, of the container, or of the machine."""
     if device.type == "cuda":
         return int(torch.cuda.mem_get_info(device)[0])
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-        free = next(1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
-    except (OSError, StopIteration):  # no Linux
-        free = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else 2**62
-    try:
-        most = Path("/sys/fs/cgroup/memory.max").read_text().strip()
-        used = int(Path("/sys/fs/cgroup/memory.current").read_text())
-        free = free if most == "max" else min(free, int(most) - used)
-    except (OSError, ValueError):  # no container
-        pass
-    return free
+    return free_bytes()
 
 
 def resident_bytes() -> int:

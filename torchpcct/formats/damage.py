@@ -2,14 +2,32 @@
 
 from __future__ import annotations
 
+import codecs
 import importlib
+import io
+import math
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-__all__ = ["MOST_READINGS", "check_size", "needed", "read_yaml", "reading", "yaml_values"]
+import numpy as np
+
+from torchpcct.files import require_ordinary
+from torchpcct.memory import free_bytes
+
+__all__ = [
+    "MOST_READINGS",
+    "check_expansion",
+    "check_size",
+    "needed",
+    "read_numbers",
+    "read_text",
+    "read_yaml",
+    "reading",
+    "yaml_values",
+]
 
 MOST_READINGS = 2**36
 """Headers that promise more numbers than this are damaged; nothing is allocated for them."""
@@ -25,6 +43,11 @@ def needed(package: str) -> Any:
 
 _MOST_TEXT, _LONGEST_TEXT, _MOST_VALUES, _DEEPEST_YAML = 2**24, 2**14, 2**20, 32
 """Of a YAML file: 16 MiB, a million numbers (twelve of each of 87 000 views)."""
+_LONGEST_TABLE = 2**28
+"""Bytes of a text file of numbers."""
+_MOST_EXPANSION, _SMALL = 200, 2**30
+"""No scan or volume of more bytes than the second is packed into a file so many times as small."""
+_MARKS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"))
 
 
 @contextmanager
@@ -33,10 +56,12 @@ def reading(path: str | os.PathLike[str], what: str) -> Iterator[None]:
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: anything that the libraries raise at damaged contents; errors of this package pass with the path.
+        ValueError: a device or a pipe; anything that the libraries raise at damaged contents; errors of this package
+            pass with the path.
     """
     if not Path(path).exists():
         raise FileNotFoundError(f"no such file: {path}")
+    require_ordinary(path)
     try:
         yield
     except (ImportError, KeyboardInterrupt):
@@ -55,8 +80,48 @@ def read_yaml(path: str | os.PathLike[str], what: str) -> Any:
         FileNotFoundError: no such file.
         ValueError: no YAML, or one that asks for more than its bounds.
     """
-    with reading(path, what), open(path, "rb") as file:
-        return yaml_values(file.read(_MOST_TEXT + 1).decode("utf-8"))
+    with reading(path, what):
+        return yaml_values(_decoded(_beginning(path, _MOST_TEXT + 1)))
+
+
+def _beginning(path: str | os.PathLike[str], most: int) -> bytes:
+    with open(path, "rb") as file:
+        return file.read(most)
+
+
+def _decoded(content: bytes) -> str:
+    """Text in UTF-8, or as its byte-order mark says, which editors of Windows set."""
+    return content.decode(next((name for mark, name in _MARKS if content.startswith(mark)), "utf-8"))
+
+
+def read_text(path: str | os.PathLike[str], what: str) -> str:
+    """A text file of at most 256 MiB, read as ``what``, with or without a byte-order mark.
+
+    Raises:
+        FileNotFoundError: no such file. ValueError: no text, or a longer one.
+    """
+    with reading(path, what):
+        return _text(path)
+
+
+def _text(path: str | os.PathLike[str]) -> str:
+    content = _beginning(path, _LONGEST_TABLE + 1)
+    if len(content) > _LONGEST_TABLE:
+        raise ValueError(f"it has more than {_LONGEST_TABLE} bytes")
+    return _decoded(content)
+
+
+def read_numbers(path: str | os.PathLike[str], what: str) -> Any:
+    """Numbers of a ``.npy`` or text file, in columns as they stand there.
+
+    Raises:
+        FileNotFoundError: no such file. ValueError: damaged, or something else than numbers.
+    """
+    with reading(path, what):
+        if Path(path).suffix.lower() == ".npy":
+            # A map of the file fails where its header promises more than there is.
+            return np.array(np.load(path, mmap_mode="r", allow_pickle=False))
+        return np.loadtxt(io.StringIO(_text(path)), dtype=np.float64)
 
 
 def yaml_values(text: str) -> Any:
@@ -119,3 +184,28 @@ def check_size(shape: Any, what: str) -> None:
         total *= int(n)
     if total > MOST_READINGS:
         raise ValueError(f"{what} has the shape {tuple(shape)}: too large to be true")
+
+
+def check_expansion(shape: Any, what: str, packed: int | Callable[[], int], each: int = 4) -> None:
+    """Refuse numbers that are to be read into memory if they do not fit, or if no file so small can hold them.
+
+    Args:
+        shape: of the numbers.
+        what: they are, for the message.
+        packed: bytes that hold them in the file, or a function that counts them.
+        each: bytes of a number in memory.
+
+    Raises:
+        ValueError: more than the memory that is free; more than 1 GiB, and 200 times what the file holds.
+    """
+    check_size(shape, what)
+    size = math.prod(int(n) for n in shape) * each
+    if size > _SMALL:
+        held = packed() if callable(packed) else packed
+        if size > _MOST_EXPANSION * held:
+            raise ValueError(
+                f"{what} of {size / 2**30:.3g} GiB is packed into {held / 2**20:.3g} MiB: no scan or volume is so empty"
+            )
+    free = free_bytes()
+    if size > free:
+        raise ValueError(f"{what} needs {size / 2**30:.3g} GiB, {free / 2**30:.3g} GiB of memory are free")

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,18 +18,34 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchpcct.formats.damage import check_size, needed, reading
+from torchpcct.formats.damage import check_expansion, reading
+from torchpcct.formats.dicom_series import dicom_files, open_dicom
 from torchpcct.geometry import ConeBeam
 from torchpcct.scan import Scan
+from torchpcct.validate import whole
 
 __all__ = ["ClinicalProjections", "holds_projections", "read_dicom_ct_pd"]
 
 _TAGS = {
-    "spacing": 0x70291002, "row_spacing": 0x70291006, "shape": 0x7029100B, "rows": 0x70291010, "columns": 0x70291011,
-    "angle": 0x70311001, "height": 0x70311002, "radius": 0x70311003, "distance": 0x70311031, "centre": 0x70311033,
-    "shift_angle": 0x7033100B, "shift_height": 0x7033100C, "shift_radius": 0x7033100D, "spot": 0x7033100E,
-    "water": 0x70411001, "photons": 0x70331065,
-}  # fmt: skip
+    "spacing": 0x70291002,
+    "row_spacing": 0x70291006,
+    "shape": 0x7029100B,
+    "rows": 0x70291010,
+    "columns": 0x70291011,
+    "angle": 0x70311001,
+    "height": 0x70311002,
+    "radius": 0x70311003,
+    "distance": 0x70311031,
+    "centre": 0x70311033,
+    "shift_angle": 0x7033100B,
+    "shift_height": 0x7033100C,
+    "shift_radius": 0x7033100D,
+    "spot": 0x7033100E,
+    "water": 0x70411001,
+    "photons": 0x70331065,
+}
+_SAME_SPOT = (2e-5, 0.01, 0.01)
+"""Differences of deflections (rad, mm, mm) that are those of one position."""
 _TURN_MM = 0.05
 """Travel of the table from which a scan is a helix."""
 
@@ -97,94 +114,181 @@ def holds_projections(path: str | os.PathLike[str]) -> bool:
     Raises:
         FileNotFoundError: no DICOM files. ValueError: a damaged one. ImportError: pydicom is not installed.
     """
-    pydicom = needed("pydicom")
-    first = Path(path) if Path(path).is_file() else _files(path)[0]
+    first = Path(path) if Path(path).is_file() else dicom_files(path)[0]
     with reading(first, "DICOM"):
-        return _TAGS["rows"] in pydicom.dcmread(first, stop_before_pixels=True)
+        return _TAGS["rows"] in open_dicom(first, stop_before_pixels=True)
 
 
-def _files(folder: str | os.PathLike[str]) -> list[Path]:
-    found = Path(folder).iterdir() if Path(folder).is_dir() else ()
-    paths = sorted(p for p in found if p.suffix.lower() in (".dcm", ".ima"))
-    if not paths:
-        raise FileNotFoundError(f"no .dcm files in {folder}")
-    return paths
-
-
-def read_dicom_ct_pd(folder: str | os.PathLike[str], *, ignore_flying_spot: bool = False) -> ClinicalProjections:
+def read_dicom_ct_pd(
+    folder: str | os.PathLike[str], *, ignore_flying_spot: bool = False, spot: int | None = None
+) -> ClinicalProjections:
     """Read a folder of DICOM-CT-PD files.
 
     Args:
-        folder: with one ``.dcm`` file a view; the instance numbers give their order.
+        folder: with one file a view; the instance numbers give their order.
         ignore_flying_spot: take a deflected focal spot for one at rest: some blur instead of an error.
+        spot: of a flying focal spot, which of its positions, from 0: only the views are read that were taken from it,
+            say every second one, with the source where it was; z counts from its height.
 
     Raises:
         FileNotFoundError: no such folder, or no files in it.
-        ValueError: a damaged or foreign file, missing views, a flat or spherical detector, a flying focal spot.
+        ValueError: a damaged or foreign file, missing views, a flat or spherical detector, a focal spot that flies
+            within the views that are read.
         ImportError: pydicom is not installed.
     """
-    pydicom = needed("pydicom")
-    paths = _files(folder)
-    views: list[tuple[int, float, float, float, Any]] = []
+    paths = dicom_files(folder)
+    views: list[_View] = []
     first: dict[str, Any] = {}
     for path in paths:
         with reading(path, "a DICOM-CT-PD projection"):
-            file = pydicom.dcmread(path)
+            file = open_dicom(path)
+            detector = _detector(file)
             if not first:
-                first = _detector(file, ignore_flying_spot)
-                check_size((len(paths), first["rows"], first["columns"]), "the scan")
-            elif _detector(file, ignore_flying_spot) != first:
+                first = detector
+                size = sum(p.stat().st_size for p in paths)
+                check_expansion((len(paths), first["rows"], first["columns"]), "the scan", size)
+            elif detector != first:
                 raise ValueError("its detector differs from that of the first file")
-            radius = float(_value(file, "radius")[0])
-            views.append((int(file.InstanceNumber), float(_value(file, "angle")[0]), float(_value(file, "height")[0]),
-                          radius, _pixels(file, first)))  # fmt: skip
+            angle, height, radius = (float(_value(file, name)[0]) for name in ("angle", "height", "radius"))
+            shift = tuple(float(_value(file, f"shift_{k}", np.zeros(1))[0]) for k in ("angle", "height", "radius"))
+            views.append(_View(int(file.InstanceNumber), angle, height, radius, shift, _pixels(file, first)))
             photons = np.asarray(_value(file, "photons", np.zeros(0)), dtype=np.float64)
-    views.sort(key=lambda v: v[0])
-    numbers = np.array([v[0] for v in views])
-    if np.any(np.diff(numbers) != 1):
-        raise ValueError(
-            f"{folder}: the instance numbers have gaps or repeats after {numbers[np.argmax(np.diff(numbers) != 1)]}"
-        )
-    radii = np.array([v[3] for v in views])
+    views.sort(key=lambda v: v.number)
+    _check_complete(folder, np.array([v.number for v in views]))
+    g = first
+    views, shift = _from_one_spot(folder, views, g["spot"], ignore_flying_spot, spot)
+    radii = np.array([v.radius for v in views])
     if np.ptp(radii) > 1e-3 * radii.mean():
         raise ValueError(f"{folder}: the focal spot's radius changes from {radii.min():g} to {radii.max():g} mm")
-    angles, heights = np.array([v[1] for v in views]) + math.pi / 2, np.array([v[2] for v in views])
-    g = first
+    angles, heights = np.array([v.angle for v in views]) + math.pi / 2, np.array([v.height for v in views])
     # Element i is seen counter-clockwise, our columns run clockwise about the source.
-    offset = (g["offset"][0], g["offset"][1])
     geometry = ConeBeam(
-        angles, float(radii.mean()), g["sdd"], g["columns"], g["rows"], (g["row_pitch"], g["pitch"]), offset, "curved"
+        angles,
+        float(radii.mean()),
+        g["sdd"],
+        g["columns"],
+        g["rows"],
+        (g["row_pitch"], g["pitch"]),
+        g["offset"],
+        "curved",
     )
+    if any(shift):
+        geometry = _seen_from(geometry, *shift)
     motion = None
     if np.ptp(heights) > _TURN_MM:
         motion = np.zeros((len(views), 3))
         motion[:, 0] = heights[0] - heights
     water = float(g["water"]) if g["water"] else None
-    info = {"file": str(folder), "format": "DICOM-CT-PD", "flying_focal_spot": g["spot"]}
-    lines = torch.from_numpy(np.stack([v[4] for v in views]))
+    info: dict[str, Any] = {"file": str(folder), "format": "DICOM-CT-PD", "flying_focal_spot": g["spot"]}
+    if any(shift):
+        info["focal_spot_shift"] = dict(zip(("angle_rad", "height_mm", "radius_mm"), shift, strict=True))
+    lines = torch.from_numpy(np.stack([v.lines for v in views]))
     use = photons if photons.size == g["columns"] and (photons > 0).all() else None
     return ClinicalProjections(lines, geometry, motion, water, None if use is None else use[::-1].copy(), info)
 
 
-def _detector(file: Any, ignore_flying_spot: bool) -> dict[str, Any]:
+class _View(NamedTuple):
+    """A projection: the instance's number, the focal spot at rest, its deflection, and the line integrals."""
+
+    number: int
+    angle: float
+    height: float
+    radius: float
+    shift: tuple[float, ...]
+    lines: Any
+
+
+def _check_complete(folder: Any, numbers: Any) -> None:
+    """Raise ``ValueError`` unless instance numbers count up in equal steps: every view, or every second one, …"""
+    steps = np.diff(numbers)
+    if steps.size and (steps.min() < 1 or np.ptp(steps)):
+        usual = max(1, int(np.median(steps)))
+        raise ValueError(
+            f"{folder}: the instance numbers have gaps or repeats after {numbers[np.argmax(steps != usual)]}"
+        )
+
+
+def _from_one_spot(
+    folder: Any, views: list[_View], kind: str, ignore: bool, spot: int | None
+) -> tuple[list[_View], tuple[float, ...]]:
+    """Views from one position of the focal spot, and how far that is deflected: angle (rad), height, radius (mm)."""
+    positions: list[tuple[float, ...]] = []
+    of = []
+    for view in views:
+        near = (k for k, p in enumerate(positions) if (np.abs(np.subtract(p, view.shift)) <= _SAME_SPOT).all())
+        of.append(next(near, len(positions)))
+        if of[-1] == len(positions):
+            positions.append(view.shift)
+    if spot is not None:
+        whole("spot", spot, low=0)
+        if spot >= len(positions):
+            raise ValueError(f"spot must be one of the {len(positions)} positions of the focal spot, got {spot}")
+        views = [view for view, k in zip(views, of, strict=True) if k == spot]
+        _check_complete(folder, np.array([v.number for v in views]))
+        return views, positions[spot]
+    if ignore:
+        return views, (0.0, 0.0, 0.0)
+    named = kind not in ("", "FFSNONE")
+    if len(positions) > 1 or (named and not any(positions[0])):
+        where = f"between {len(positions)} positions" if len(positions) > 1 else "and where to is not said"
+        raise ValueError(
+            f"{folder}: its focal spot flies ({kind}) {where}: pass spot=0 for the views from the first position, "
+            "or ignore_flying_spot=True to take it for one at rest"
+        )
+    return views, positions[0]
+
+
+def _seen_from(at_rest: ConeBeam, angle: float, height: float, radius: float) -> ConeBeam:
+    """The geometry of a source that is deflected against its detector, the same in all views.
+
+    The detector stays an arc about the spot at rest; about the deflected one it is an arc to a twentieth of a cell.
+
+    Args:
+        at_rest: geometry of the spot at rest.
+        angle: by which the spot turns on, rad; height, radius: mm by which it rises, and moves out.
+    """
+    g = at_rest
+    distance = g.sod + radius
+    source = distance * np.array([math.cos(angle), math.sin(angle)])
+    seen = np.asarray(g.fan_angles)  # of the cells, from the spot at rest at (sod, 0), along e_t = (0, 1)
+    cells = np.stack([g.sod - g.sdd * np.cos(seen), g.sdd * np.sin(seen)], -1) - source
+    central = -source / distance
+    across = np.array([central[1], -central[0]])  # e_t of the deflected spot
+    found = np.arctan2(cells @ across, cells @ central)
+    sdd = float(np.hypot(*cells.T).mean())
+    step, middle = (
+        np.polyfit(np.arange(g.columns) - (g.columns - 1) / 2, found * sdd, 1)
+        if g.columns > 1
+        else (g.pitch[1], float(found[0] * sdd))
+    )
+    return replace(
+        g,
+        angles=g.angles + angle,
+        sod=distance,
+        sdd=sdd,
+        pitch=(g.pitch[0], float(step)),
+        offset=(g.offset[0] - height, float(middle)),
+    )
+
+
+def _detector(file: Any) -> dict[str, Any]:
     shape = _value(file, "shape").upper()
     if shape != "CYLINDRICAL":
         raise ValueError(f"its detector is {shape or 'unknown'}: only cylindrical ones are read")
     spot = _value(file, "spot", "FFSNONE").upper()
-    shifted = any(float(_value(file, f"shift_{k}", np.zeros(1))[0]) != 0.0 for k in ("angle", "height", "radius"))
-    if (spot not in ("", "FFSNONE") or shifted) and not ignore_flying_spot:
-        raise ValueError(
-            f"its focal spot flies ({spot}), which no geometry here describes: pass ignore_flying_spot=True"
-        )
     rows, columns = int(_value(file, "rows")[0]), int(_value(file, "columns")[0])
     pitch, row_pitch = float(_value(file, "spacing")[0]), float(_value(file, "row_spacing")[0])
     column, row = (float(c) for c in _value(file, "centre")[:2])  # counted from 1
     return {
-        "rows": rows, "columns": columns, "pitch": pitch, "row_pitch": row_pitch,
-        "sdd": float(_value(file, "distance")[0]), "spot": spot,
+        "rows": rows,
+        "columns": columns,
+        "pitch": pitch,
+        "row_pitch": row_pitch,
+        "sdd": float(_value(file, "distance")[0]),
+        "spot": spot,
         "offset": (((rows + 1) / 2 - row) * row_pitch, (column - (columns + 1) / 2) * pitch),
         "water": float(_value(file, "water", np.zeros(1))[0]),
-    }  # fmt: skip
+    }
 
 
 def _pixels(file: Any, g: dict[str, Any]) -> Any:

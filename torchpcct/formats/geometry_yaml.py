@@ -45,13 +45,13 @@ from typing import Any
 
 import numpy as np
 
-from torchpcct.formats.damage import reading
+from torchpcct.formats.damage import read_numbers
 from torchpcct.formats.rtk import read_rtk
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam
-from torchpcct.validate import choice, number, whole
+from torchpcct.validate import choice, number, reals, whole
 from torchpcct.vector_geometry import VectorGeometry, helical_motion
 
-__all__ = ["geometry_of", "geometry_values"]
+__all__ = ["angles_of", "geometry_of", "geometry_values"]
 
 _OWN = {
     "parallel": {"columns", "pitch", "offset"},
@@ -83,7 +83,7 @@ def geometry_of(values: Any, folder: Path = Path()) -> Geometry:
     kind = choice("geometry.kind", given.pop("kind", None), (*_KINDS, *_VECTORS))
     own = (_OWN | _VECTORS)[kind]
     pose = given.pop("pose", None) if kind in _KINDS else None
-    angles = _angles(given.pop("angles_deg", None), folder) if kind in _KINDS else None
+    angles = angles_of(given.pop("angles_deg", None), folder) if kind in _KINDS else None
     unknown = sorted(map(str, set(given) - own))
     if unknown:
         raise ValueError(f"unknown in a {kind} geometry: {', '.join(unknown)}; it takes {', '.join(sorted(own))}")
@@ -101,9 +101,7 @@ def geometry_of(values: Any, folder: Path = Path()) -> Geometry:
 def _table(name: str, value: Any, folder: Path) -> Any:
     """Numbers as they are, or those of a ``.npy`` or text file."""
     if isinstance(value, str):
-        path = folder / value
-        with reading(path, f"a table of {name}"):
-            return np.load(path, allow_pickle=False) if path.suffix == ".npy" else np.loadtxt(path, dtype=np.float64)
+        return read_numbers(folder / value, f"a table of {name}")
     return value
 
 
@@ -121,6 +119,25 @@ def _posed(circle: Any, pose: Any, folder: Path) -> VectorGeometry:
     return found.shifted(**{name: numbers[name] for name in _SHIFTED if name in numbers})
 
 
+def angles_of(value: Any, folder: Path = Path(), views: int | None = None) -> Any:
+    """Angles ``(views,)`` in rad that ``angles_deg`` describes.
+
+    Args:
+        value: mapping of start (0, if left out), step and count, a list, or the name of a text or ``.npy`` file with
+            one angle a line; all in degrees.
+        folder: where the file is looked for.
+        views: how many there must be; then a mapping needs no count.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError, TypeError: missing, unknown or bad values, another number of angles.
+    """
+    found = _angles(value if views is None or not isinstance(value, Mapping) else {"count": views, **value}, folder)
+    if views is not None and found.shape != (views,):
+        raise ValueError(f"angles_deg must be {views} angles, one a view, got the shape {found.shape}")
+    return found
+
+
 def _angles(value: Any, folder: Path) -> Any:
     if isinstance(value, Mapping):
         unknown = sorted(map(str, set(value) - {"start", "step", "count"}))
@@ -133,10 +150,10 @@ def _angles(value: Any, folder: Path) -> Any:
         start = number("angles_deg.start", value.get("start", 0.0), unit="°")
         return np.deg2rad(start + step * np.arange(count))
     if isinstance(value, str):
-        return np.deg2rad(np.loadtxt(folder / value, dtype=np.float64, ndmin=1))
+        return np.deg2rad(np.atleast_1d(read_numbers(folder / value, "a table of angles")))
     if value is None:
         raise ValueError("geometry needs angles_deg: {start, step, count}, a list or the name of a text file")
-    return np.deg2rad(np.asarray(value, dtype=np.float64))
+    return np.deg2rad(reals("angles_deg", value))
 
 
 def geometry_values(geometry: Any) -> dict[str, Any]:

@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import os
 import xml.etree.ElementTree as ElementTree
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from torchpcct.formats.damage import reading
+from torchpcct.formats.damage import read_text, reading
 from torchpcct.validate import number, per_axis, whole
 from torchpcct.vector_geometry import VectorGeometry
 
@@ -40,8 +39,8 @@ def read_rtk(path: str | os.PathLike[str], columns: int, rows: int, pitch: Any, 
     dv, du = per_axis("pitch", pitch, 2, positive=True, unit="mm")
     v0, u0 = (-(rows - 1) / 2 * dv, -(columns - 1) / 2 * du) if origin is None else per_axis("origin", origin, 2)
     u, v = u0 + (columns - 1) / 2 * du, v0 + (rows - 1) / 2 * dv
+    text = read_text(path, "an RTK geometry")
     with reading(path, "an RTK geometry"):
-        text = Path(path).read_text(encoding="utf-8")
         if "<!ENTITY" in text:
             raise ValueError("it defines XML entities, which no geometry needs")
         root = ElementTree.fromstring(text)

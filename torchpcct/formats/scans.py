@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
@@ -15,7 +16,12 @@ from torchpcct.formats.catsim import read_catsim
 from torchpcct.formats.damage import reading
 from torchpcct.formats.data_exchange import read_data_exchange
 from torchpcct.formats.dicom_ct_pd import read_dicom_ct_pd
+from torchpcct.formats.hdf5 import inside
+from torchpcct.formats.matlab import read_mat_scan
+from torchpcct.formats.nexus import holds_nexus, read_nexus
+from torchpcct.formats.nikon import read_xtekct
 from torchpcct.formats.stack import read_stack
+from torchpcct.formats.zeiss import read_txrm
 from torchpcct.geometry import Geometry, ParallelBeam
 from torchpcct.scan import Scan
 from torchpcct.scan_file import slice_axis, sliced
@@ -24,44 +30,123 @@ from torchpcct.vector_geometry import VectorGeometry
 
 __all__ = ["adapted", "check_scan_name", "open_scan", "own_options"]
 
-_HDF5, _YAML, _CATSIM = (".h5", ".hdf5", ".hdf"), (".yaml", ".yml"), (".prep", ".scan")
+
+class _Reader(NamedTuple):
+    """How scans of a format are read.
+
+    Attributes:
+        name: of the format, in messages.
+        endings: of its files.
+        is_one: whether a file of such an ending is of the format.
+        read: function of the path, and of the geometry if ``geometry`` is not "own", and of its options.
+        options: that it takes itself: what has to be known while reading, or is the format's own.
+        geometry: "own": the files hold it, "given": they do not, "both": some do.
+    """
+
+    name: str
+    endings: tuple[str, ...]
+    is_one: Callable[[Path], bool]
+    read: Callable[..., Scan]
+    options: frozenset[str]
+    geometry: str = "own"
+
+
+_COUNTS = {"gain", "flux", "dead", "electronic_noise", "linearisation", "exposure_s"}
+_LINES = {"dead", "linearisation", "exposure_s"}
+_FRAMES = {"air", "dark"}
+_HDF5 = (".h5", ".hdf5", ".hdf", ".nxs", ".nx5", ".nx")
+_CATSIM = (".prep", ".scan")
+
+
+def _any(path: Path) -> bool:
+    return True
+
+
+def _catsim(path: Path, geometry: Geometry, **options: Any) -> Scan:
+    return read_catsim(path, geometry, **options)
+
+
+_READERS = (
+    _Reader(
+        "a DICOM-CT-PD folder",
+        (),
+        _any,
+        lambda path, **options: read_dicom_ct_pd(path, **options).scan(),
+        frozenset({"ignore_flying_spot", "spot"}),
+    ),
+    _Reader("a torchpcct scan", _HDF5, lambda path: _is_own(path), Scan.load, frozenset({"slices"})),
+    _Reader(
+        "Data Exchange",
+        _HDF5,
+        lambda path: _holds(path, "exchange/data"),
+        read_data_exchange,
+        frozenset({"slices", "angles_deg"} | _FRAMES | _COUNTS),
+    ),
+    _Reader(
+        "NeXus",
+        _HDF5,
+        lambda path: _holds(path, None),
+        read_nexus,
+        frozenset({"slices", "angles_deg", "entry"} | _FRAMES | _COUNTS),
+    ),
+    _Reader(
+        "a .yaml stack",
+        (".yaml", ".yml"),
+        _any,
+        read_stack,
+        frozenset({"slices", "gain", "electronic_noise", "photons"}),
+        "both",
+    ),
+    _Reader(
+        "CatSim's line integrals",
+        _CATSIM,
+        lambda path: path.with_suffix(".prep").exists(),
+        _catsim,
+        frozenset(_LINES | {"photons"}),
+        "given",
+    ),
+    _Reader("CatSim's readings", _CATSIM, _any, _catsim, frozenset(_COUNTS), "given"),
+    _Reader("a Nikon scan", (".xtekct",), _any, read_xtekct, frozenset({"slices"} | _FRAMES | _COUNTS)),
+    _Reader("a Zeiss scan", (".txrm",), _any, read_txrm, frozenset({"slices"} | _FRAMES | _COUNTS)),
+    _Reader(
+        "a MATLAB array",
+        (".mat",),
+        _any,
+        read_mat_scan,
+        frozenset({"variable", "photons"} | _FRAMES | _COUNTS),
+        "given",
+    ),
+)
+"""In the order in which they are asked; a folder is the first one's."""
+
+_ANY = {"axis", "pitch", "slices", "mu_water", "photons"}
+"""Options that every scan is changed by, or refuses (:func:`adapted`), whatever its format."""
 
 
 def check_scan_name(path: str | os.PathLike[str]) -> None:
     """Raise ``ValueError`` unless the ending of ``path`` names a scan format (a folder: DICOM-CT-PD)."""
     name = Path(path)
-    if not (name.is_dir() or name.suffix.lower() in (*_HDF5, *_YAML, *_CATSIM)):
+    if not (name.is_dir() or any(name.suffix.lower() in reader.endings for reader in _READERS)):
         raise ValueError(
-            f"unknown scan format {name.name!r}: use .h5 (torchpcct or Data Exchange), .yaml (TIFF or NumPy stack), "
-            ".prep or .scan (CatSim), or a folder of DICOM-CT-PD files"
+            f"unknown scan format {name.name!r}: use .h5 (torchpcct, Data Exchange or NeXus), .yaml (TIFF, NumPy or "
+            "MATLAB stack), .xtekct (Nikon), .txrm (Zeiss), .mat (MATLAB), .prep or .scan (CatSim), or a folder of "
+            "DICOM-CT-PD files"
         )
-
-
-_COUNTS = {"gain", "flux", "dead", "electronic_noise", "linearisation", "exposure_s"}
-_LINES = {"dead", "linearisation", "exposure_s"}
-_OPTIONS = {
-    "Data Exchange": {"slices"} | _COUNTS,
-    "CatSim's readings": _COUNTS,
-    "CatSim's line integrals": _LINES | {"photons"},
-    "a torchpcct scan": {"slices"},
-    "a .yaml stack": {"slices", "gain", "electronic_noise", "photons"},
-    "a DICOM-CT-PD folder": {"ignore_flying_spot"},
-}
-"""What the readers take themselves: what has to be known while reading, or is the format's own."""
-_ANY = {"axis", "pitch", "slices", "mu_water", "photons"}
 
 
 def open_scan(path: str | os.PathLike[str], geometry: Geometry | None = None, **options: Any) -> Scan:
     """A scan from a file or folder, by its ending and contents.
 
     Args:
-        path: ``.h5`` (torchpcct, or Data Exchange by its contents), ``.yaml``, CatSim's ``.prep`` or ``.scan``, or a
-            folder of DICOM-CT-PD files.
-        geometry: of files that do not hold one (CatSim, a stack without); or, for any file, a
+        path: ``.h5`` (torchpcct, Data Exchange or NeXus by its contents), ``.yaml``, Nikon's ``.xtekct``, Zeiss'
+            ``.txrm``, ``.mat``, CatSim's ``.prep`` or ``.scan``, or a folder of DICOM-CT-PD files.
+        geometry: of files that do not hold one (CatSim, MATLAB, a stack without); or, for any file, a
             :class:`~torchpcct.vector_geometry.VectorGeometry` that takes the place of the nominal one. The slices of a
             parallel stack are then the detector's rows, if it has rows.
-        options: of :func:`adapted`, for every format; of :meth:`torchpcct.Scan.from_counts` for Data Exchange, of it
-            or :meth:`torchpcct.Scan.from_line_integrals` for CatSim; ``ignore_flying_spot`` for DICOM-CT-PD.
+        options: of :func:`adapted`, for every format; of :meth:`torchpcct.Scan.from_counts` for Data Exchange, NeXus,
+            Nikon and Zeiss, of it or :meth:`torchpcct.Scan.from_line_integrals` for CatSim and MATLAB; ``angles_deg``
+            and, there and for the microscopes, ``air`` and ``dark`` in the place of what the file holds; ``entry`` of
+            NeXus, ``variable`` of MATLAB; ``spot`` and ``ignore_flying_spot`` of DICOM-CT-PD.
 
     Raises:
         FileNotFoundError: no such file.
@@ -71,47 +156,49 @@ def open_scan(path: str | os.PathLike[str], geometry: Geometry | None = None, **
     """
     check_scan_name(path)
     name = Path(path)
-    what = _format(name)
-    own = {k: v for k, v in options.items() if k in _OPTIONS.get(what, ()) and v is not None}
-    unknown = sorted(set(options) - _ANY - _OPTIONS.get(what, set()))
+    reader = _reader(name)
+    own = {k: v for k, v in options.items() if k in reader.options and v is not None}
+    unknown = sorted(set(options) - _ANY - reader.options)
     if unknown:
-        takes = sorted(_ANY | _OPTIONS.get(what, set()))
-        raise TypeError(f"{', '.join(unknown)}: no option of {what}, which takes {', '.join(takes)}")
-    return adapted(_read(name, what, geometry, own), **{k: v for k, v in options.items() if k not in own and k in _ANY})
+        takes = sorted(_ANY | reader.options)
+        raise TypeError(f"{', '.join(unknown)}: no option of {reader.name}, which takes {', '.join(takes)}")
+    rest = {k: v for k, v in options.items() if k not in own and k in _ANY}
+    return adapted(_read(name, reader, geometry, own), **rest)
 
 
 def own_options(path: str | os.PathLike[str]) -> set[str]:
     """Options that the reader of a file takes itself; with "slices" it reads no more of the file than those."""
     check_scan_name(path)
-    return _OPTIONS.get(_format(Path(path)), set())
+    return set(_reader(Path(path)).options)
 
 
-def _format(name: Path) -> str:
-    ending = name.suffix.lower()
-    if ending in _CATSIM:
-        return "CatSim's line integrals" if name.with_suffix(".prep").exists() else "CatSim's readings"
-    if ending in _YAML:
-        return "a .yaml stack"
+def _reader(name: Path) -> _Reader:
+    """Of a file by its ending and contents; of a folder the first.
+
+    Raises:
+        FileNotFoundError: no such HDF5 file. ValueError: an HDF5 file of no known format.
+    """
     if name.is_dir():
-        return "a DICOM-CT-PD folder"
-    return "a torchpcct scan" if _is_own(name) else "Data Exchange"
+        return _READERS[0]
+    for reader in _READERS:
+        if name.suffix.lower() in reader.endings and reader.is_one(name):
+            return reader
+    raise ValueError(
+        f"{name} is no scan of a known format: neither of torchpcct, nor Data Exchange (/exchange/data), nor NeXus "
+        "(image_key)"
+    )
 
 
-def _read(name: Path, what: str, geometry: Geometry | None, options: dict[str, Any]) -> Scan:
-    if what.startswith("CatSim"):
-        if geometry is None:
-            raise ValueError(f"{name.name}: CatSim's files do not hold the geometry, give it")
-        return read_catsim(name, geometry, **options)
-    if what == "a .yaml stack":
-        return read_stack(name, geometry, **options)
+def _read(name: Path, reader: _Reader, geometry: Geometry | None, options: dict[str, Any]) -> Scan:
+    if reader.geometry == "given" and geometry is None:
+        raise ValueError(f"{name.name}, {reader.name}: such files do not hold the geometry, give it")
+    if reader.geometry != "own":
+        return reader.read(name, geometry, **options)
     if geometry is not None and not isinstance(geometry, VectorGeometry):
         raise ValueError(
             f"{name.name} holds its geometry: leave out geometry, or give a VectorGeometry (kind: vectors) in its place"
         )
-    if what == "a DICOM-CT-PD folder":
-        scan = read_dicom_ct_pd(name, **options).scan()
-    else:
-        scan = Scan.load(name, **options) if what == "a torchpcct scan" else read_data_exchange(name, **options)
+    scan = reader.read(name, **options)
     return scan if geometry is None else _placed(scan, geometry)
 
 
@@ -156,9 +243,11 @@ def adapted(
     if mu_water is not None:
         mu = number("mu_water", mu_water, positive=True, unit="mm⁻¹")
         if scan.unit != "mm^-1":
-            known = "it does not know the size of its pixels: give pitch=, too" if scan.unit == "pixel^-1" else (
-                f"the attenuation of water, {scan.linearisation.mu_ref:.5g} mm⁻¹, is known to the scan"
-            )  # fmt: skip
+            known = (
+                "it does not know the size of its pixels: give pitch=, too"
+                if scan.unit == "pixel^-1"
+                else (f"the attenuation of water, {scan.linearisation.mu_ref:.5g} mm⁻¹, is known to the scan")
+            )
             raise ValueError(f"mu_water= does not fit this scan: {known}")
         scan = replace(scan, linearisation=replace(scan.linearisation, mu_ref=mu), unit="HU")
     if photons is not None:
@@ -195,3 +284,11 @@ def _is_own(path: Path) -> bool:
             return True
         with h5py.File(path, "r") as file:
             return "format" in file.attrs
+
+
+def _holds(path: Path, name: str | None) -> bool:
+    """Whether an HDF5 file has something by a path; None: whether it is NeXus."""
+    import h5py
+
+    with reading(path, "HDF5"), h5py.File(path, "r") as file:
+        return holds_nexus(file) if name is None else inside(file, name) is not None

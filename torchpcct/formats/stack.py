@@ -9,19 +9,21 @@ from typing import Any
 
 import numpy as np
 
-from torchpcct.formats.damage import check_size, needed, read_yaml, reading
+from torchpcct.formats.arrays import read_array
+from torchpcct.formats.damage import read_yaml, reading
 from torchpcct.formats.geometry_yaml import geometry_of
+from torchpcct.formats.signed_readings import unwrapped
 from torchpcct.geometry import Geometry
 from torchpcct.scan import Scan
 from torchpcct.scan_file import slice_axis, sliced
 from torchpcct.validate import choice
 from torchpcct.vector_geometry import VectorGeometry
 
-__all__ = ["EXAMPLE", "read_array", "read_stack"]
+__all__ = ["EXAMPLE", "read_stack"]
 
 EXAMPLE = """\
 # A stack of projections: torchpcct reconstruct scan.yaml; files are looked for beside this one
-readings: proj/*.tif        # a pattern, in the order of the names; or one .npy, .zarr, .tif with all views
+readings: proj/*.tif        # a pattern, in the order of the numbers in the names, or a list; or one .npy, .zarr, .tif
 kind: counts                # or line_integrals: -ln of the transmission
 air: flat.tif               # of counts, without the object: a file, a pattern (several frames) or a number
 dark: dark.npy              # optional, of counts without beam; as air
@@ -48,64 +50,10 @@ _LINES = {"photons", "dead", "linearisation", "mu_water", "exposure_s"}
 _FILES = {"air", "dark", "dead", "flux", "photons"}
 
 
-def read_array(name: str, folder: Path = Path(), pick: Any = None) -> Any:
-    """Numbers of ``.npy``, Zarr or TIFF files: one file, or a pattern whose files are stacked in the order of their
-    names.
-
-    Args:
-        name: of the file, or a pattern.
-        folder: that the name starts from.
-        pick: function of the array's shape that returns the index, one slice an axis, of what to read; None: all.
-
-    Raises:
-        FileNotFoundError: no file. ValueError: damaged, an unknown ending, files of several shapes.
-    """
-    paths = sorted(folder.glob(name)) if any(c in name for c in "*?[") else [folder / name]
-    if not paths:
-        raise FileNotFoundError(f"no file matches {folder / name}")
-    if len(paths) == 1:
-        return _one(paths[0], pick)
-    at = (slice(None),) if pick is None else pick((len(paths), *_one(paths[0]).shape))
-    arrays = [_one(path) if pick is None else _one(path, lambda shape: at[1:]) for path in paths[at[0]]]
-    shapes = {a.shape for a in arrays}
-    if len(shapes) > 1:
-        raise ValueError(f"the files of {name} have several shapes: {sorted(shapes)}")
-    return np.stack(arrays)
-
-
-def _one(path: Path, pick: Any = None) -> Any:
-    """The numbers of a file; with ``pick``, a function of the number of axes and the first length, no more of them than
-    the index that it returns."""
-    if path.suffix == ".npy":
-        with reading(path, "a NumPy array"):
-            values = np.load(path, mmap_mode=None if pick is None else "r", allow_pickle=False)
-            return values if pick is None else np.array(values[pick(values.shape)])
-    if path.suffix == ".zarr":
-        zarr = needed("zarr")
-        with reading(path, "a Zarr array"):
-            values = zarr.open_array(path, mode="r")
-            check_size(values.shape, "the array")
-            return values[... if pick is None else pick(values.shape)]
-    if path.suffix in (".tif", ".tiff"):
-        tifffile = needed("tifffile")
-        with reading(path, "a TIFF image"), tifffile.TiffFile(path) as file:
-            # A page that is cut off reads as zeros in some readers: sizes are checked before.
-            size = path.stat().st_size
-            for page in file.pages:
-                ends = [o + n for o, n in zip(page.dataoffsets, page.databytecounts, strict=True)]
-                if not ends or max(ends) > size:
-                    raise ValueError("it ends before its last image")
-                if page.compression == 1 and sum(page.databytecounts) < page.nbytes:
-                    raise ValueError(f"it holds {sum(page.databytecounts)} bytes of an image of {page.nbytes}")
-            shape = file.series[0].shape
-            check_size(shape, "the image")
-            if pick is None:
-                return file.asarray()
-            at = pick(shape)
-            if len(shape) < 3 or len(file.pages) != shape[0]:
-                return file.asarray()[at]
-            return np.stack([file.pages[int(k)].asarray()[at[1:]] for k in np.arange(shape[0])[at[0]]])
-    raise ValueError(f"{path.name}: readings must be .npy, .zarr, .tif or .tiff")
+def _is_name(value: Any) -> bool:
+    """Whether a value is the name of a file, a pattern, or a list of names."""
+    listed = isinstance(value, list) and len(value) > 0 and all(isinstance(each, str) for each in value)
+    return listed or isinstance(value, str)
 
 
 def read_stack(
@@ -137,8 +85,8 @@ def read_stack(
         elif described is not None and not isinstance(geometry, VectorGeometry):
             raise ValueError("it holds its geometry: leave out geometry, or give a VectorGeometry in its place")
         name = given.pop("readings", None)
-        if not isinstance(name, str):
-            raise ValueError("readings must name a file or a pattern of files")
+        if not _is_name(name):
+            raise ValueError("readings must name a file, a pattern of files, or be a list of names")
         allowed = _COUNTS if kind == "counts" else _LINES
         unknown = sorted(map(str, set(given) - allowed))
         if unknown:
@@ -147,7 +95,7 @@ def read_stack(
             )
         if kind == "counts" and "air" not in given:
             raise ValueError("counts need air, the readings without the object")
-    options = {k: read_array(v, folder) if k in _FILES and isinstance(v, str) else v for k, v in given.items()}
+    options = {k: read_array(v, folder) if k in _FILES and _is_name(v) else v for k, v in given.items()}
     if "dead" in options:
         options["dead"] = np.asarray(options["dead"]).astype(bool)
     info: dict[str, Any] = {"file": str(path), "format": "stack"}
@@ -160,6 +108,11 @@ def read_stack(
         return tuple(slice(*info["slices"][:2]) if k == axis else slice(None) for k in range(3))
 
     readings = read_array(name, folder, None if slices is None else pick)
+    if kind == "counts":
+        held = {"readings": readings, **{k: options[k] for k in ("air", "dark") if k in options}}
+        held = unwrapped(held, str(path))
+        readings = held.pop("readings")
+        options |= held
     if not geometry.has_rows and readings.ndim == 3 and readings.shape[0] == geometry.views:
         readings = np.moveaxis(readings, 0, 1)
     if slices is not None:

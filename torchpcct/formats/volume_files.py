@@ -1,4 +1,4 @@
-"""Volumes as NIfTI, MetaImage and DICOM series: what :class:`torchpcct.volume.Volume` saves and loads.
+"""Volumes as NIfTI and MetaImage, and the names of all formats: what :class:`torchpcct.volume.Volume` saves and loads.
 
 The scanner's x, y, z are taken for right, anterior, superior: NIfTI's axes. DICOM and ITK have x and y the other way,
 so the same point carries the opposite sign there; every reader shows the same volume at the same place.
@@ -7,17 +7,22 @@ so the same point carries the opposite sign there; every reader shows the same v
 from __future__ import annotations
 
 import gzip
+import io
 import json
+import math
 import os
+import re
 import shutil
 import zlib
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from torchpcct.files import atomic_write, is_own_hdf5, require_folder, require_writable
-from torchpcct.formats.damage import check_size, needed, reading
+from torchpcct.files import atomic_write, is_own_hdf5, require_folder, require_ordinary, require_writable
+from torchpcct.formats.damage import check_expansion, check_size, needed, reading
+from torchpcct.formats.dicom_series import DICOM_ENDINGS, check_series
+from torchpcct.formats.volume_grid import STRAIGHT, grid_from
 from torchpcct.geometry import VolumeGrid
 from torchpcct.validate import UNITS
 
@@ -28,10 +33,8 @@ __all__ = [
     "format_of",
     "is_own_volume",
     "nifti_header",
-    "read_dicom",
     "read_meta_image",
     "read_nifti",
-    "write_dicom",
     "write_meta_image",
     "write_nifti",
 ]
@@ -39,25 +42,27 @@ __all__ = [
 ENDINGS = {"NIfTI": (".nii", ".nii.gz"), "MetaImage": (".mha",), "HDF5": (".h5", ".hdf5"), "OME-Zarr": (".zarr",)}
 """Of files, and of the folder of an OME-Zarr; a name without ending is a folder for a DICOM series."""
 
-_DICOM = (".dcm", ".ima")
-_STRAIGHT = 1e-4
+_ENDING = re.compile(r"\.[A-Za-z][A-Za-z0-9]{0,7}$")
+"""What is meant to name a format."""
 _MADE_BY = "torchpcct, "
-_HU_RANGE = (-32768, 32767)
-_ROUNDED = 1e-9
-"""Relative, of a decimal string of ten digits."""
+_MM = {0: 1.0, 1: 1e3, 2: 1.0, 3: 1e-3}
+"""Millimetres of NIfTI's units of length: unknown (in practice mm), metre, millimetre, micrometre."""
+_AFTER_VOXELS = 2**20
+"""Bytes that may stand behind the voxels of a packed NIfTI."""
 
 
 def format_of(path: str | os.PathLike[str]) -> str:
-    """Name of the format that the ending of ``path`` stands for; a file of one DICOM image is "DICOM", too.
+    """Name of the format that the ending of ``path`` stands for, in any capitals; a file of one DICOM image is "DICOM",
+    too, and so is any folder: dots in the names of archives (``1.2.840.113619``) are no endings.
 
     Raises:
-        ValueError: none.
+        ValueError: another ending.
     """
-    name = str(path)
+    name, ending = Path(path).name.lower(), Path(path).suffix
     for form, endings in ENDINGS.items():
         if name.endswith(endings):
             return form
-    if Path(path).suffix.lower() in _DICOM or (not Path(path).suffix and Path(path).name not in ("", ".", "..")):
+    if ending.lower() in DICOM_ENDINGS or Path(path).is_dir() or (name not in ("", "..") and not _ENDING.match(ending)):
         return "DICOM"
     known = ", ".join(e for endings in ENDINGS.values() for e in endings)
     raise ValueError(f"unknown volume format {Path(path).name!r}: use {known}, or no ending for a DICOM series")
@@ -66,7 +71,7 @@ def format_of(path: str | os.PathLike[str]) -> str:
 def check_volume_name(path: str | os.PathLike[str]) -> None:
     """Raise ``ValueError`` unless the ending of ``path`` names a volume format that is written; none: a folder for a
     DICOM series."""
-    if format_of(path) == "DICOM" and Path(path).suffix.lower() in _DICOM:
+    if format_of(path) == "DICOM" and Path(path).suffix.lower() in DICOM_ENDINGS:
         raise ValueError(f"{Path(path).name!r} would be one slice: a DICOM series is a folder, a name without ending")
 
 
@@ -89,7 +94,7 @@ def check_target(path: str | os.PathLike[str], voxels: int = 0, unit: str = "HU"
     target, form = Path(path), format_of(path)
     if form == "DICOM":
         needed("pydicom")
-        _check_series(target, unit)
+        check_series(target, unit)
     elif target.is_dir() and not (form == "OME-Zarr" and is_own_volume(target)):
         raise ValueError(f"{target} is a folder: name a file to write")
     if form == "OME-Zarr":
@@ -118,32 +123,25 @@ def is_own_volume(path: str | os.PathLike[str]) -> bool:
         except (OSError, ValueError, KeyError, TypeError):
             return False
     try:
+        require_ordinary(path)
         with gzip.open(path) if str(path).endswith(".gz") else open(path, "rb") as file:
             header = file.read(2**12)
-    except (OSError, EOFError, zlib.error):
+    except (OSError, EOFError, ValueError, zlib.error):
         return False
     return (_MADE_BY.encode() in header[:348]) if form == "NIfTI" else b"\nUnit = " in header
 
 
-def _check_series(folder: Path, unit: str) -> None:
-    """Raise ``ValueError`` unless a CT series can be written to a new or empty folder."""
-    if unit != "HU":
-        raise ValueError(f"a DICOM CT series holds HU, this volume is in {unit}: save it as .nii.gz, .mha or .h5")
-    if folder.exists() and not folder.is_dir():
-        raise ValueError(f"{folder} is a file: name a new folder, or .nii.gz, .mha or .h5")
-    if folder.is_dir() and any(folder.iterdir()):
-        raise ValueError(f"{folder} is not empty: series in one folder mix, name a new one")
-
-
-def _unit(written: str, name: str) -> str:
-    """The unit that a file of ours names; files of other software (``written`` empty) are in HU.
+def _unit(written: str, name: str, given: str | None) -> str:
+    """The unit that a file of ours names; files of other software (``written`` empty) are in what was ``given``, or HU.
 
     Raises:
-        ValueError: another unit.
+        ValueError: another unit, or a given one that is not the file's.
     """
     if written and written not in UNITS:
         raise ValueError(f"its {name} gives the unit {written!r}, expected {' or '.join(UNITS)}")
-    return written or "HU"
+    if written and given is not None and given != written:
+        raise ValueError(f"its {name} gives the unit {written!r}, not {given!r}")
+    return written or given or "HU"
 
 
 def write_nifti(path: str | os.PathLike[str], data: Any, grid: VolumeGrid, unit: str) -> None:
@@ -177,42 +175,78 @@ def nifti_header(grid: VolumeGrid, unit: str) -> Any:
     return header
 
 
-def read_nifti(path: str | os.PathLike[str]) -> tuple[Any, VolumeGrid, str]:
-    """Data ``(z, y, x)`` float32, grid and unit of a NIfTI volume, axes in any order or direction.
+def read_nifti(path: str | os.PathLike[str], unit: str | None = None) -> tuple[Any, VolumeGrid, str]:
+    """Data ``(z, y, x)`` float32, grid in mm and unit of a NIfTI volume, axes in any order or direction.
+
+    Lengths are in the file's unit (metres, millimetres, micrometres; mm where it is unknown). Axes of one behind the
+    third are left out.
+
+    Args:
+        path: ``.nii`` or ``.nii.gz``.
+        unit: of the numbers of other software's files; None: HU.
 
     Raises:
-        FileNotFoundError: no such file. ValueError: damaged, not 3-D, oblique, or an affine without inverse; a volume
-            of ours in an unknown unit.
+        FileNotFoundError: no such file. ValueError: damaged, several volumes, oblique, or an affine without inverse; a
+            volume of ours in an unknown unit, or in another than ``unit``.
     """
     import nibabel
 
     with reading(path, "NIfTI"):
-        if str(path).endswith(".gz"):
-            with gzip.open(path) as file:  # to its end, where its checksum stands: NiBabel stops after the last voxel
-                while file.read(2**24):
-                    pass
+        packed = str(path).lower().endswith(".gz")
+        if packed:
+            _check_packed(path)
+        # By what it holds, not by an ending in capitals.
         image: Any = nibabel.load(path)
-        check_size(image.shape, "the volume")
-        if len(image.shape) != 3:
-            raise ValueError(f"it has the shape {image.shape}, expected three axes")
+        shape, kind = tuple(image.shape), image.header.get_data_dtype()
+        check_expansion(shape, "the volume", os.stat(path).st_size, max(4, kind.itemsize))
+        if len(shape) < 3 or any(n > 1 for n in shape[3:]):
+            volumes = math.prod(shape[3:])
+            raise ValueError(
+                f"it has the shape {shape}, {volumes} volumes: split them into files of one"
+                if volumes > 1
+                else f"it has the shape {shape}, expected three axes"
+            )
+        if kind.kind not in "iuf":
+            raise ValueError(f"its voxels are {kind}, no real numbers")
+        image = image.slicer[(..., *(0,) * (len(shape) - 3))] if len(shape) > 3 else image
         image = nibabel.as_closest_canonical(image)
-        matrix = image.affine[:3, :3]
-        if not np.isfinite(image.affine).all():
+        code = int(image.header["xyzt_units"]) % 8
+        if code not in _MM:
+            raise ValueError(f"its unit of length is the unknown code {code}")
+        affine = image.affine.copy()
+        affine[:3] *= _MM[code]
+        matrix = affine[:3, :3]
+        if not np.isfinite(affine).all():
             raise ValueError("its affine is not finite")
         spacing = np.diag(matrix).copy()
-        if (spacing <= 0).any() or np.abs(matrix - np.diag(spacing)).max() > _STRAIGHT * spacing.max():
+        if (spacing <= 0).any() or np.abs(matrix - np.diag(spacing)).max() > STRAIGHT * spacing.max():
             raise ValueError("its axes are oblique: resample it to straight axes first")
         text = bytes(image.header["descrip"]).rstrip(b"\0").decode("ascii", "replace")
-        unit = _unit(text.removeprefix(_MADE_BY) if text.startswith(_MADE_BY) else "", "descrip")
+        unit = _unit(text.removeprefix(_MADE_BY) if text.startswith(_MADE_BY) else "", "descrip", unit)
         data = np.asarray(image.dataobj, dtype=np.float32).transpose(2, 1, 0)
-        return np.ascontiguousarray(data), _grid(data.shape, spacing, image.affine[:3, 3]), unit
+        return np.ascontiguousarray(data), grid_from(data.shape, spacing, affine[:3, 3]), unit
 
 
-def _grid(shape: tuple[int, ...], spacing: Any, first: Any) -> VolumeGrid:
-    """Grid from spacing and first voxel, both x, y, z in mm."""
-    s, f = np.asarray(spacing, dtype=np.float64)[::-1], np.asarray(first, dtype=np.float64)[::-1]
-    center = f + s * (np.array(shape) - 1) / 2
-    return VolumeGrid(tuple(int(n) for n in shape), tuple(float(v) for v in s), tuple(float(v) for v in center))
+def _check_packed(path: str | os.PathLike[str]) -> None:
+    """Unpack a ``.nii.gz`` to its end, where its checksum stands: NiBabel stops after the last voxel.
+
+    Raises:
+        ValueError: it holds more than its header says.
+    """
+    import nibabel
+
+    with gzip.open(path) as file:
+        begin = file.read(1024)
+        header: Any = nibabel.Nifti1Header if begin[:4] in (b"\x5c\x01\0\0", b"\0\0\x01\x5c") else nibabel.Nifti2Header
+        held = header.from_fileobj(io.BytesIO(begin), check=False)
+        bits, shape = int(held["bitpix"]), held.get_data_shape()
+        check_size(shape, "the volume")
+        most = int(held["vox_offset"]) + math.prod(map(int, shape)) * bits // 8 + _AFTER_VOXELS
+        total = len(begin)
+        while part := file.read(2**24):
+            total += len(part)
+            if total > most:
+                raise ValueError(f"it unpacks to more than the {most - _AFTER_VOXELS} bytes that its header says")
 
 
 def write_meta_image(path: str | os.PathLike[str], data: Any, grid: VolumeGrid, unit: str) -> None:
@@ -221,20 +255,29 @@ def write_meta_image(path: str | os.PathLike[str], data: Any, grid: VolumeGrid, 
     packed = zlib.compress(np.ascontiguousarray(np.asarray(data, dtype="<f4")).tobytes(), 2)
     x, y, z = (float(axis[0]) for axis in grid.axes[::-1])
     fields = {
-        "ObjectType": "Image", "NDims": "3", "BinaryData": "True", "BinaryDataByteOrderMSB": "False",
-        "CompressedData": "True", "CompressedDataSize": str(len(packed)),
-        "TransformMatrix": "-1 0 0 0 -1 0 0 0 1", "Offset": f"{-x!r} {-y!r} {z!r}", "CenterOfRotation": "0 0 0",
+        "ObjectType": "Image",
+        "NDims": "3",
+        "BinaryData": "True",
+        "BinaryDataByteOrderMSB": "False",
+        "CompressedData": "True",
+        "CompressedDataSize": str(len(packed)),
+        "TransformMatrix": "-1 0 0 0 -1 0 0 0 1",
+        "Offset": f"{-x!r} {-y!r} {z!r}",
+        "CenterOfRotation": "0 0 0",
         "ElementSpacing": " ".join(map(repr, reversed(grid.spacing))),
-        "DimSize": " ".join(map(str, reversed(grid.shape))), "Unit": unit, "ElementType": "MET_FLOAT",
+        "DimSize": " ".join(map(str, reversed(grid.shape))),
+        "Unit": unit,
+        "ElementType": "MET_FLOAT",
         "ElementDataFile": "LOCAL",
-    }  # fmt: skip
+    }
     with atomic_write(path) as part, part.open("wb") as file:
         file.write("".join(f"{name} = {value}\n" for name, value in fields.items()).encode())
         file.write(packed)
 
 
-def read_meta_image(path: str | os.PathLike[str]) -> tuple[Any, VolumeGrid, str]:
-    """Data ``(z, y, x)`` float32, grid and unit of a MetaImage by SimpleITK; errors as :func:`read_nifti`."""
+def read_meta_image(path: str | os.PathLike[str], unit: str | None = None) -> tuple[Any, VolumeGrid, str]:
+    """Data ``(z, y, x)`` float32, grid and unit of a MetaImage by SimpleITK; arguments and errors as
+    :func:`read_nifti`."""
     sitk = needed("SimpleITK")
     with reading(path, "a MetaImage"):
         reader = sitk.ImageFileReader()
@@ -243,15 +286,16 @@ def read_meta_image(path: str | os.PathLike[str]) -> tuple[Any, VolumeGrid, str]
         check_size(reader.GetSize(), "the volume")
         if reader.GetDimension() != 3 or reader.GetNumberOfComponents() != 1:
             raise ValueError(f"it has {reader.GetDimension()} axes of {reader.GetNumberOfComponents()} components")
-        unit = _unit(reader.GetMetaData("Unit").strip() if reader.HasMetaDataKey("Unit") else "", "field Unit")
+        unit = _unit(reader.GetMetaData("Unit").strip() if reader.HasMetaDataKey("Unit") else "", "field Unit", unit)
+        check_expansion(reader.GetSize(), "the volume", os.stat(path).st_size)
         _check_compressed(Path(path).read_bytes())
         image = sitk.DICOMOrient(reader.Execute(), "RAS")
         direction = np.array(image.GetDirection()).reshape(3, 3)
-        if np.abs(direction - np.diag([-1.0, -1.0, 1.0])).max() > _STRAIGHT:
+        if np.abs(direction - np.diag([-1.0, -1.0, 1.0])).max() > STRAIGHT:
             raise ValueError("its axes are oblique: resample it to straight axes first")
         data = sitk.GetArrayFromImage(image).astype(np.float32)
         x, y, z = image.GetOrigin()
-        return data, _grid(data.shape, image.GetSpacing(), (-x, -y, z)), unit
+        return data, grid_from(data.shape, image.GetSpacing(), (-x, -y, z)), unit
 
 
 def _check_compressed(content: bytes) -> None:
@@ -267,128 +311,3 @@ def _check_compressed(content: bytes) -> None:
     unpack.flush()
     if not unpack.eof:
         raise ValueError("its compressed voxels end too early")
-
-
-def write_dicom(folder: str | os.PathLike[str], data: Any, grid: VolumeGrid, unit: str) -> None:
-    """Write a CT series in HU, one file a slice, into a new or empty folder, which appears whole or not at all.
-
-    int16, intercept 0, slope 1, or where values lie beyond int16 the least slope that holds them.
-
-    Raises:
-        ValueError: a volume in mm⁻¹, values that are not finite, a folder that holds files.
-    """
-    pydicom = needed("pydicom")
-    from pydicom.uid import CTImageStorage, generate_uid
-
-    _check_series(Path(folder), unit)
-    values = np.asarray(data, dtype=np.float64)
-    if not np.isfinite(values).all():
-        raise ValueError("DICOM holds finite HU, the volume has NaN or infinite values: save it as .nii.gz or .h5")
-    slope = float(_ds(max(1.0, values.max() / _HU_RANGE[1], values.min() / _HU_RANGE[0]) * (1 + _ROUNDED)))
-    slope = 1.0 if slope < 1 + 2 * _ROUNDED else slope
-    stored = np.rint(values / slope).astype("<i2")
-    study, series, frame = (generate_uid() for _ in range(3))
-    x, y, z = (float(axis[0]) for axis in grid.axes[::-1])
-    dz, dy, dx = grid.spacing
-    images = []
-    for k, image in enumerate(stored):
-        d = pydicom.Dataset()
-        d.SOPClassUID = CTImageStorage
-        d.StudyInstanceUID, d.SeriesInstanceUID, d.FrameOfReferenceUID = study, series, frame
-        d.Modality, d.Manufacturer, d.SeriesDescription = "CT", "torchpcct", "simulated or reconstructed by torchpcct"
-        d.ImageType = ["DERIVED", "PRIMARY", "AXIAL"]
-        d.PatientName, d.PatientID, d.PatientBirthDate, d.PatientSex = "", "torchpcct", "", ""
-        d.StudyDate = d.StudyTime = d.StudyID = d.AccessionNumber = d.ReferringPhysicianName = ""
-        d.SeriesNumber, d.InstanceNumber, d.PositionReferenceIndicator = 1, k + 1, ""
-        d.ImageOrientationPatient = [-1, 0, 0, 0, -1, 0]
-        d.ImagePositionPatient = [_ds(-x), _ds(-y), _ds(z + k * dz)]
-        d.PixelSpacing, d.SliceThickness = [_ds(dy), _ds(dx)], _ds(dz)
-        d.RescaleSlope, d.RescaleIntercept, d.RescaleType = _ds(slope), "0", "HU"
-        d.ImagesInAcquisition = len(stored)
-        d.WindowCenter, d.WindowWidth, d.KVP, d.AcquisitionNumber = "40", "400", "", ""
-        d.set_pixel_data(image, "MONOCHROME2", 16)
-        images.append(d)
-    with atomic_write(os.path.realpath(folder)) as part:
-        part.mkdir()
-        for k, d in enumerate(images):
-            d.save_as(part / f"{k + 1:04d}.dcm", enforce_file_format=True)
-
-
-def _ds(value: float) -> str:
-    """A DICOM decimal string: at most 16 characters."""
-    return f"{value:.10g}"
-
-
-def read_dicom(path: str | os.PathLike[str]) -> tuple[Any, VolumeGrid, str]:
-    """Data ``(z, y, x)`` float32, grid and unit (HU) of a DICOM CT series in a folder, or of one image's file.
-
-    Slices that lack within a series are found by their places, those at its ends only in series of ours, which know
-    how many there are. One slice is as thick as it says, else 1 mm.
-
-    Raises:
-        FileNotFoundError: no such file or folder, or no files in it.
-        ValueError: damaged files, several series, missing or doubled slices, oblique axes.
-        ImportError: pydicom is not installed.
-    """
-    pydicom = needed("pydicom")
-    root = Path(path)
-    paths = sorted(p for p in root.iterdir() if p.is_file() and not p.name.startswith(".")) if root.is_dir() else [root]
-    if not paths:
-        raise FileNotFoundError(f"no DICOM files in {path}")
-    slices = []
-    for file in paths:
-        with reading(file, "a DICOM image"):
-            d = pydicom.dcmread(file)
-            check_size((len(paths), d.Rows, d.Columns), "the series")
-            pixels = d.pixel_array.astype(np.float32) * np.float32(d.RescaleSlope) + np.float32(d.RescaleIntercept)
-            ours = root.is_dir() and str(d.get("Manufacturer", "")) == _MADE_BY.strip(", ")
-            slices.append(_Slice(
-                str(d.SeriesInstanceUID), tuple(float(v) for v in d.ImageOrientationPatient),
-                np.array([float(v) for v in d.ImagePositionPatient]), tuple(float(v) for v in d.PixelSpacing), pixels,
-                float(d.get("SliceThickness") or 1.0), int(d.get("ImagesInAcquisition") or 0) if ours else 0,
-            ))  # fmt: skip
-    with reading(path, "a DICOM series"):
-        return *_joined(slices), "HU"
-
-
-class _Slice(NamedTuple):
-    series: str
-    orientation: tuple[float, ...]
-    position: Any
-    pixel: tuple[float, ...]
-    image: Any
-    thickness: float
-    of: int
-    """Slices of its series, 0: unknown."""
-
-
-def _joined(slices: list[_Slice]) -> tuple[Any, VolumeGrid]:
-    series, orientation, _, pixel, image, thickness, count = slices[0]
-    for other in slices[1:]:
-        if other.series != series:
-            raise ValueError("it holds several series: keep each in a folder of its own")
-        if other.orientation != orientation or other.pixel != pixel or other.image.shape != image.shape:
-            raise ValueError("its slices differ in orientation, spacing or size")
-    row, column = np.array(orientation[:3]), np.array(orientation[3:])
-    if abs(abs(row[0]) - 1) > _STRAIGHT or abs(abs(column[1]) - 1) > _STRAIGHT:
-        raise ValueError("its slices are not axial: resample it to straight axes first")
-    slices.sort(key=lambda s: float(s.position[2]))
-    z = np.array([float(s.position[2]) for s in slices])
-    gaps = np.diff(z)
-    if gaps.size and (gaps.min() <= 0 or np.ptp(gaps) > 0.01 * float(np.median(gaps))):
-        at = int(np.argmax(np.abs(gaps - np.median(gaps))))
-        raise ValueError(f"slices lack or repeat between z = {z[at]:g} and {z[at + 1]:g} mm")
-    if count and count != len(slices):
-        raise ValueError(f"it holds {len(slices)} of the {count} slices of its series")
-    drift = np.abs(np.array([s.position[:2] for s in slices]) - slices[0].position[:2]).max()
-    if drift > 0.01 * min(pixel):
-        raise ValueError("its slices are shifted against each other (gantry tilt)")
-    data = np.stack([s.image for s in slices])
-    x, y = -slices[0].position[0], -slices[0].position[1]  # LPS to RAS
-    dy, dx = pixel
-    if row[0] > 0:  # columns run to the left: ours to the right
-        data, x = data[..., ::-1], x - (data.shape[2] - 1) * dx
-    if column[1] > 0:
-        data, y = data[:, ::-1], y - (data.shape[1] - 1) * dy
-    dz = float(np.median(gaps)) if gaps.size else thickness
-    return np.ascontiguousarray(data), _grid(data.shape, (dx, dy, dz), (x, y, z[0]))

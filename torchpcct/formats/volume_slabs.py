@@ -6,7 +6,10 @@ journal (``.unfinished.json``). Nothing takes the name that was asked for before
 
 from __future__ import annotations
 
+import hashlib
+import itertools
 import json
+import math
 import os
 import re
 import shutil
@@ -18,7 +21,8 @@ from typing import Any
 import numpy as np
 
 from torchpcct.files import WriteError, atomic_write, require_folder
-from torchpcct.formats.damage import check_size, needed, reading
+from torchpcct.formats.damage import check_expansion, needed, reading
+from torchpcct.formats.lengths import MM
 from torchpcct.formats.volume_files import nifti_header
 from torchpcct.geometry import VolumeGrid
 from torchpcct.validate import UNITS
@@ -96,7 +100,7 @@ class SlabFile:
         values, first = np.ascontiguousarray(data, dtype="<f4"), self.done
         with self._writing():
             if self.path.suffix == ".zarr":
-                needed("zarr").open_group(self.part, mode="r+")["0"][first : first + len(values)] = values
+                _fill(needed("zarr").open_group(self.part, mode="r+"), slice(first, first + len(values)), values)
                 if hasattr(os, "sync"):
                     os.sync()
             else:
@@ -115,7 +119,8 @@ class SlabFile:
             if self.path.suffix == ".zarr":
                 group = needed("zarr").open_group(self.part, mode="r+")
                 text = json.dumps(dict(report), default=str)
-                group.attrs["torchpcct"] = {"unit": self.unit, "report": json.loads(text)}
+                group.attrs["torchpcct"] = _about(self.unit, json.loads(text))
+                _seal(self.part)
             _remove_ome_zarr(self.path)
             os.replace(self.part, self.path)
             self.journal.unlink(missing_ok=True)
@@ -172,13 +177,68 @@ def _create(path: Path, grid: VolumeGrid, unit: str, chunk: int) -> Any:
         "axes": [{"name": name, "type": "space", **length} for name in "zyx"],
         "datasets": [{"path": "0", "coordinateTransformations": transforms}],
     }
-    attributes = {"ome": {"version": "0.5", "multiscales": [image]}, "torchpcct": {"unit": unit}}
+    attributes = {"ome": {"version": "0.5", "multiscales": [image]}, "torchpcct": _about(unit)}
     group = zarr.create_group(path, zarr_format=3, attributes=attributes)
     chunks = (min(chunk, grid.shape[0]), *(min(n, _CHUNK_PLANE) for n in grid.shape[1:]))
     group.create_array(
-        "0", shape=grid.shape, chunks=chunks, dtype="float32", dimension_names=("z", "y", "x"), fill_value=float("nan")
+        "0",
+        shape=grid.shape,
+        chunks=chunks,
+        dtype="float32",
+        dimension_names=("z", "y", "x"),
+        fill_value=float("nan"),
+        compressors=[zarr.codecs.ZstdCodec(), zarr.codecs.Crc32cCodec()],
     )
     return group
+
+
+def _fill(group: Any, at: Any, values: Any) -> None:
+    """Write voxels, every chunk of them: one that is not there is lost."""
+    group["0"].with_config({"write_empty_chunks": True})[at] = values
+
+
+def _about(unit: str, report: Any = None) -> dict[str, Any]:
+    """What stands in the attributes beside the format's own; the digest is written by :func:`_seal`."""
+    return {"unit": unit, **({} if report is None else {"report": report}), "metadata": _DIGEST.format("0" * 64)}
+
+
+_DIGEST = "torchpcct-sha256:{}"
+_DIGESTS = re.compile(rb"torchpcct-sha256:([0-9a-f]{64})")
+
+
+def _metadata_digest(path: Path) -> tuple[bytes, list[bytes]]:
+    """SHA-256 of what describes the voxels, with zeros in the place of the digests in it, and those."""
+    parts = [(path / "zarr.json").read_bytes(), (path / "0" / "zarr.json").read_bytes()]
+    clean = _DIGESTS.sub(b"torchpcct-sha256:" + b"0" * 64, parts[0])
+    return hashlib.sha256(clean + b"\0" + parts[1]).hexdigest().encode(), _DIGESTS.findall(parts[0])
+
+
+def _seal(path: Path) -> None:
+    """Write the digest of the metadata into them; voxels have checksums of their own, one a chunk."""
+    digest, _ = _metadata_digest(path)
+    file = path / "zarr.json"
+    file.write_bytes(_DIGESTS.sub(b"torchpcct-sha256:" + digest, file.read_bytes()))
+
+
+def _check_sealed(path: Path) -> None:
+    """Raise ``ValueError`` if the metadata of a volume of ours are not what they were when it was written.
+
+    Earlier versions wrote no digest, and no checksums of chunks.
+    """
+    names = [path / "zarr.json", path / "0" / "zarr.json"]
+    if not all(name.is_file() for name in names):
+        return
+    about, array = (name.read_bytes() for name in names)
+    digest, written = _metadata_digest(path)
+    if written and written != [digest]:
+        raise ValueError("its zarr.json is damaged: it does not have the checksum that it was written with")
+    for name, content in zip(("zarr.json", "0/zarr.json"), (about, array), strict=True):
+        try:
+            json.loads(content)
+        except ValueError as error:
+            raise ValueError(f"its {name} is damaged: {error}") from error
+    if not written and b"torchpcct" in about and b"crc32c" in array:
+        raise ValueError("its zarr.json is damaged: the checksum that it was written with is not there")
 
 
 def write_ome_zarr(path: str | os.PathLike[str], data: Any, grid: VolumeGrid, unit: str) -> None:
@@ -189,7 +249,8 @@ def write_ome_zarr(path: str | os.PathLike[str], data: Any, grid: VolumeGrid, un
     """
     _require_own(path)
     with atomic_write(path) as part:
-        _create(part, grid, unit, CHUNK)["0"][...] = np.asarray(data, dtype=np.float32)
+        _fill(_create(part, grid, unit, CHUNK), ..., np.asarray(data, dtype=np.float32))
+        _seal(part)
         _remove_ome_zarr(Path(path))
 
 
@@ -228,32 +289,75 @@ def _remove_ome_zarr(folder: Path) -> None:
         shutil.rmtree(folder)
 
 
-def read_ome_zarr(path: str | os.PathLike[str]) -> tuple[Any, VolumeGrid, str]:
-    """Data ``(z, y, x)`` float32, grid and unit of the first resolution of an OME-Zarr 0.4 or 0.5 with axes z, y, x.
+def read_ome_zarr(path: str | os.PathLike[str], unit: str | None = None) -> tuple[Any, VolumeGrid, str]:
+    """Data ``(z, y, x)`` float32, grid in mm and unit of the first resolution of an OME-Zarr 0.4 or 0.5.
+
+    Axes of time and channel of one are left out.
+
+    Args:
+        path: folder.
+        unit: of the numbers of other software's files; None: HU.
 
     Raises:
-        FileNotFoundError: no such folder. ValueError: damaged, other axes or lengths than mm and µm.
+        FileNotFoundError: no such folder.
+        ValueError: a damaged or lost part, which is named; other axes than z, y, x, an unknown unit of length.
         ImportError: ``zarr`` is not installed.
     """
     zarr = needed("zarr")
     with reading(path, "an OME-Zarr"):
+        _check_sealed(Path(path))
         group = zarr.open_group(path, mode="r")
         about = dict(group.attrs)
         image = about.get("ome", about)["multiscales"][0]
-        if [axis["name"] for axis in image["axes"]] != ["z", "y", "x"]:
-            raise ValueError(f"its axes are {', '.join(axis['name'] for axis in image['axes'])}, expected z, y, x")
-        lengths = [_MM[axis.get("unit", "millimeter")] for axis in image["axes"]]
         array = group[image["datasets"][0]["path"]]
-        check_size(array.shape, "the volume")
-        found = {t["type"]: t[t["type"]] for t in image["datasets"][0]["coordinateTransformations"]}
-        spacing, first = (np.array(found.get(name, [start] * 3)) * lengths
-                          for name, start in (("scale", 1.0), ("translation", 0.0)))  # fmt: skip
-        center = first + spacing * (np.array(array.shape) - 1) / 2
-        unit = about.get("torchpcct", {}).get("unit", "HU")
-        if unit not in UNITS:
-            raise ValueError(f"it gives the unit {unit!r}, expected {' or '.join(UNITS)}")
-        grid = VolumeGrid(tuple(array.shape), tuple(map(float, spacing)), tuple(map(float, center)))
-        return np.asarray(array[...], dtype=np.float32), grid, unit
+        names = [axis["name"] for axis in image["axes"]]
+        lead = len(names) - 3
+        if names[lead:] != ["z", "y", "x"] or any(n != 1 for n in array.shape[:lead]):
+            raise ValueError(f"its axes are {', '.join(names)} of {array.shape}, expected one volume of z, y, x")
+        units = [str(axis.get("unit", "millimeter")) for axis in image["axes"][lead:]]
+        if not set(units) <= set(MM):
+            raise ValueError(f"its lengths are in {', '.join(sorted(set(units) - set(MM)))}, which is no known unit")
+        lengths = [MM[name] for name in units]
+        check_expansion(array.shape, "the volume", array.nbytes_stored)
+        spacing, first = np.ones(3), np.zeros(3)
+        for transforms in (image["datasets"][0], image):  # of the resolution, then of all
+            for step in transforms.get("coordinateTransformations", []):
+                if step["type"] == "scale":
+                    factor = np.array(step["scale"][lead:], dtype=np.float64)
+                    spacing, first = spacing * factor, first * factor
+                elif step["type"] == "translation":
+                    first = first + np.array(step["translation"][lead:], dtype=np.float64)
+        spacing, first = spacing * lengths, first * lengths
+        shape = tuple(array.shape[lead:])
+        center = first + spacing * (np.array(shape) - 1) / 2
+        own = about.get("torchpcct")
+        said = None if own is None else own.get("unit", "HU")
+        if said is not None and said not in UNITS:
+            raise ValueError(f"it gives the unit {said!r}, expected {' or '.join(UNITS)}")
+        if said is not None and unit not in (None, said):
+            raise ValueError(f"it gives the unit {said!r}, not {unit!r}")
+        grid = VolumeGrid(shape, tuple(map(float, spacing)), tuple(map(float, center)))
+        data = _chunk_by_chunk(array, Path(path) / image["datasets"][0]["path"], own is not None)
+        return data.reshape(shape), grid, said or unit or "HU"
 
 
-_MM = {"millimeter": 1.0, "micrometer": 1e-3}
+def _chunk_by_chunk(array: Any, folder: Path, whole: bool) -> Any:
+    """All numbers of a Zarr array, float32; a part that cannot be read is named.
+
+    Args:
+        array: Zarr array.
+        folder: that it lies in.
+        whole: whether every chunk was written. Else those of nothing but the fill value may not be there.
+    """
+    data = np.empty(array.shape, dtype=np.float32)
+    counts = [math.ceil(n / c) for n, c in zip(array.shape, array.chunks, strict=True)]
+    for place in itertools.product(*map(range, counts)):
+        name = array.metadata.encode_chunk_key(place)
+        if whole and not (folder / name).is_file():
+            raise ValueError(f"its chunk {folder.name}/{name} is lost")
+        at = tuple(slice(k * c, (k + 1) * c) for k, c in zip(place, array.chunks, strict=True))
+        try:
+            data[at] = array[at]
+        except Exception as error:
+            raise ValueError(f"its chunk {folder.name}/{name} is damaged: {error}") from error
+    return data

@@ -1,6 +1,8 @@
 """Readers of foreign scans: files that h5py, pydicom, tifffile and numpy wrote, and damaged ones."""
 
 import math
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -136,7 +138,7 @@ def test_options_fit_every_format_or_are_refused_by_name(tmp_path):
                 seen = {"axis": axis_column(g), "pitch": g.pitch, "slices": slice(1, 1 + kept),
                         "mu_water": scan.linearisation.mu_ref, "photons": float(scan.air.max())}  # fmt: skip
                 assert seen[option] == (pytest.approx(value) if option != "slices" else value), (name, option)
-        with pytest.raises(TypeError, match=r"gian: no option of .*, which takes axis, "):
+        with pytest.raises(TypeError, match=r"gian: no option of .*, which takes .*axis, "):
             open_scan(tmp_path / name, gian=3.0)
     expected = {("tooth.h5", "photons"), ("a.prep", "slices")}
     expected |= {("own.h5", option) for option in ("pitch", "photons")}
@@ -272,6 +274,49 @@ def test_helical_and_flying_spots_are_refused(tmp_path):
     with pytest.raises(ValueError, match="focal spot flies"):
         read_dicom_ct_pd(flying)
     assert read_dicom_ct_pd(flying, ignore_flying_spot=True).motion is None
+
+
+BALLS = [Ellipsoid((0.5, 2.0, -3.0), (6.0, 14.0, 18.0), value=MU), Ellipsoid((1.0, 6.0, 5.0), 3.0, value=MU)]
+
+
+def _deflected(geometry, angle, height, radius):
+    """Exact line integrals of BALLS from a deflected spot to a detector that stays."""
+    g, lines = geometry, []
+    for beta in g.angles:
+        e_r, e_t = np.array([[math.cos(beta), math.sin(beta), 0.0], [-math.sin(beta), math.cos(beta), 0.0]])
+        turned = np.array([math.cos(beta + angle), math.sin(beta + angle), 0.0])
+        source = (g.sod + radius) * turned + [0.0, 0.0, height]
+        cells = g.sod * e_r + g.sdd * np.stack([np.cos(g.fan_angles), np.sin(g.fan_angles)], -1) @ np.stack([-e_r, e_t])
+        rays = cells + np.array([0.0, 0.0, 1.0]) * g.row_positions[:, None, None] - source
+        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+        lines.append(sum(ball.along(source, rays) for ball in BALLS))
+    return np.stack(lines)
+
+
+@pytest.mark.parametrize("every", [False, True])
+def test_every_second_view_of_a_flying_spot_is_a_scan_from_where_the_spot_was(tmp_path, every):
+    """Chosen by option, or by copying every second file."""
+    spots = [(0.002, 0.3, 0.0), (-0.002, -0.3, 0.5)]
+    lines = np.empty(CURVED.shape)
+    for k, spot in enumerate(spots):
+        lines[k::2] = _deflected(CURVED.select(slice(k, None, 2)), *spot)
+    folder = ct_pd(tmp_path / "ffs", lines, CURVED, spot="FFSXZ", shifts=spots)
+    with pytest.raises(ValueError, match=r"focal spot flies \(FFSXZ\) between 2 positions: pass spot=0"):
+        open_scan(folder)
+    for k, (angle, height, radius) in enumerate(spots):
+        if every:
+            (tmp_path / f"half{k}").mkdir()
+            for path in sorted(folder.iterdir())[::-1][k::2]:  # names run against the instance numbers
+                shutil.copy(path, tmp_path / f"half{k}")
+        scan = open_scan(tmp_path / f"half{k}") if every else open_scan(folder, spot=k)
+        g = scan.geometry
+        assert g.sod == pytest.approx(300.0 + radius, abs=1e-3)
+        np.testing.assert_allclose(g.angles, CURVED.angles[k::2] + angle, atol=1e-5)
+        assert g.offset[0] == pytest.approx(CURVED.offset[0] - height, abs=1e-5)
+        seen = [replace(ball, center=(ball.center[0] - height, *ball.center[1:])) for ball in BALLS]  # z from the spot
+        np.testing.assert_allclose(scan.line_integrals().numpy(), line_integrals(g, seen, sub=1), atol=3e-3)
+    with pytest.raises(ValueError, match="spot must be one of the 2 positions of the focal spot, got 2"):
+        open_scan(folder, spot=2)
 
 
 def test_rtk_matrices(tmp_path):

@@ -1,6 +1,8 @@
 """Volumes in and out: what SimpleITK, nibabel and pydicom see of ours, and we of theirs."""
 
+import re
 import shutil
+import subprocess
 
 import nibabel
 import numpy as np
@@ -36,6 +38,52 @@ def test_round_trip(tmp_path, name):
     assert torch.equal(back.data, DATA)
     assert (back.grid.shape, back.unit) == (GRID.shape, unit)
     np.testing.assert_allclose([*back.grid.spacing, *back.grid.center], [*GRID.spacing, *GRID.center], atol=1e-5)
+
+
+def nifti(path, affine, unit=None, shape=(5, 4, 3), sform=True):
+    image = nibabel.Nifti1Image(np.arange(np.prod(shape), dtype=np.float32).reshape(shape), affine)
+    image.header.set_sform(affine, code=1 if sform else 0)
+    image.header.set_qform(affine, code=0 if sform else 1)
+    if unit is not None:
+        image.header.set_xyzt_units(unit)
+    nibabel.save(image, path)
+    return path
+
+
+@pytest.mark.parametrize(("unit", "mm"), [("micron", 1e-3), ("mm", 1.0), ("meter", 1e3), ("unknown", 1.0), (None, 1.0)])
+@pytest.mark.parametrize("sform", [True, False])
+def test_nifti_lengths_are_in_its_unit(tmp_path, unit, mm, sform):
+    affine = np.diag([-0.05, 0.1, 0.2, 1.0])
+    affine[:3, 3] = 1.0, 2.0, 3.0
+    volume = Volume.load(nifti(tmp_path / "v.NII", affine / mm, unit, sform=sform))
+    np.testing.assert_allclose(volume.grid.spacing, (0.2, 0.1, 0.05), rtol=1e-5)
+    np.testing.assert_allclose(volume.grid.center, (3.2, 2.15, 0.9), rtol=1e-5)
+    raw = bytearray((tmp_path / "v.NII").read_bytes())
+    raw[123] = 5  # xyzt_units: a code that means nothing
+    (tmp_path / "v.NII").write_bytes(raw)
+    with pytest.raises(ValueError, match="its unit of length is the unknown code 5"):
+        Volume.load(tmp_path / "v.NII")
+
+
+def test_nifti_of_one_volume_with_more_axes(tmp_path):
+    plain = Volume.load(nifti(tmp_path / "v.nii", np.eye(4)))
+    for shape in ((5, 4, 3, 1), (5, 4, 3, 1, 1)):
+        more = Volume.load(nifti(tmp_path / "m.nii.gz", np.eye(4), shape=shape))
+        assert torch.equal(more.data, plain.data)
+        assert more.grid == plain.grid
+    with pytest.raises(ValueError, match=r"shape \(5, 4, 3, 2\), 2 volumes: split them into files of one"):
+        Volume.load(nifti(tmp_path / "t.nii", np.eye(4), shape=(5, 4, 3, 2)))
+
+
+def test_a_unit_may_be_given_for_files_that_do_not_say_it(tmp_path):
+    assert Volume.load(nifti(tmp_path / "v.nii", np.eye(4)), unit="mm^-1").unit == "mm^-1"
+    for name in ("v.nii.gz", "v.mha", "v.h5", "v.zarr"):
+        Volume(DATA, GRID, unit="mm^-1").save(tmp_path / name)
+        assert Volume.load(tmp_path / name, unit="mm^-1").unit == "mm^-1"
+        with pytest.raises(ValueError, match=r"gives the unit 'mm\^-1', not 'HU'"):
+            Volume.load(tmp_path / name, unit="HU")
+    with pytest.raises(ValueError, match="unknown unit 'Bq': use one of HU"):
+        Volume.load(tmp_path / "v.nii", unit="Bq")
 
 
 def test_units_of_other_files(tmp_path):
@@ -142,6 +190,161 @@ def test_dicom_series_appear_whole_or_not_at_all(tmp_path, monkeypatch):
         shutil.copy(tmp_path / "last.dcm", tmp_path / "s" / name)
     with pytest.raises(ValueError, match="slices lack or repeat between z"):
         Volume.load(tmp_path / "s")
+
+
+@pytest.fixture
+def series(tmp_path):
+    """A function that writes a series whose slices a function has changed, and returns its folder."""
+    Volume(DATA, GRID).save(tmp_path / "plain")
+
+    def changed(change, name="s"):
+        folder, uid = tmp_path / name, pydicom.uid.generate_uid()
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+        for path in (tmp_path / "plain").iterdir():
+            d = pydicom.dcmread(path)
+            d.SeriesInstanceUID, d.Manufacturer = uid, "another"
+            change(d)
+            d.save_as(folder / path.name)
+        return folder
+
+    return changed
+
+
+@pytest.mark.parametrize("name", ["1.000000-Full Dose Images-53322", "1.2.840.113619.2.55", "scan.v2", "a.nii.d"])
+def test_dicom_folders_may_have_dots_in_their_names(tmp_path, name):
+    (tmp_path / name).mkdir()
+    Volume(DATA, GRID).save(tmp_path / name)
+    assert torch.equal(Volume.load(tmp_path / name).data, DATA)
+
+
+def test_a_series_named_by_an_identifier_is_written_and_other_endings_are_not(tmp_path):
+    Volume(DATA, GRID).save(tmp_path / "1.2.840.113619.2.55")
+    assert torch.equal(Volume.load(tmp_path / "1.2.840.113619.2.55").data, DATA)
+    with pytest.raises(ValueError, match=r"unknown volume format 'v\.nrrd'"):
+        Volume(DATA, GRID).save(tmp_path / "v.nrrd")
+
+
+def test_what_archives_leave_beside_slices_is_left_out_and_damaged_slices_are_not(series):
+    folder = series(lambda d: None)
+    directory, report = pydicom.dcmread(folder / "0001.dcm"), pydicom.dcmread(folder / "0001.dcm")
+    directory.file_meta.MediaStorageSOPClassUID = "1.2.840.10008.1.3.10"
+    directory.save_as(folder / "DICOMDIR")
+    for name in ("Rows", "Columns", "PixelData", "BitsAllocated"):
+        delattr(report, name)
+    report.SOPClassUID = report.file_meta.MediaStorageSOPClassUID = "1.2.840.10008.5.1.4.1.1.88.11"
+    report.save_as(folder / "report.dcm")
+    for name, content in (("readme.txt", b"hello"), ("LICENSE", b"Creative Commons\r\n"), ("._0001.dcm", b"\0\5"),
+                          ("thumbs.db", bytes(600)), ("picture.png", b"\x89PNG" + bytes(200))):  # fmt: skip
+        (folder / name).write_bytes(content)
+    (folder / "folder").mkdir()
+    assert torch.equal(Volume.load(folder).data, DATA)
+    for name, content in (("0005", bytes(900)), ("IM5.dcm", b"text")):
+        (folder / name).write_bytes(content)
+        with pytest.raises(ValueError, match=f"{name} cannot be read as a DICOM image"):
+            Volume.load(folder)
+        (folder / name).unlink()
+    slices = [folder / f"000{k}.dcm" for k in (1, 2, 3, 4)]
+    for path in slices:
+        path.rename(path.with_suffix(""))
+    assert torch.equal(Volume.load(folder).data, DATA)
+
+
+def _no_rescale(d):
+    del d.RescaleSlope, d.RescaleIntercept
+
+
+def _pet(d):
+    d.Modality, d.Units = "PT", "BQML"
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda d: setattr(d, "RescaleType", "US"), r"its RescaleType is US \(unspecified\), not HU; .*unit='HU'"),
+        (lambda d: setattr(d, "RescaleType", "HU_MOD"), "its RescaleType is HU_MOD, not HU"),
+        (lambda d: setattr(d, "RescaleType", "Z_EFF"), "its RescaleType is Z_EFF, not HU"),
+        (_no_rescale, "it has no RescaleSlope and no RescaleIntercept"),
+        (lambda d: delattr(d, "RescaleSlope"), "it has no RescaleSlope: its numbers are no HU"),
+        (lambda d: setattr(d, "RescaleSlope", "0"), "its RescaleSlope is 0"),
+        (_pet, "it is of the modality PT in BQML, whose numbers are no HU"),
+        (lambda d: setattr(d, "Modality", "MR"), "it is of the modality MR"),
+        (lambda d: setattr(d, "NumberOfFrames", 2), "it holds 2 frames"),
+    ],
+)
+def test_dicom_that_does_not_say_that_it_is_in_hu_is_refused(series, change, said):
+    with pytest.raises(ValueError, match=rf"000\d\.dcm cannot be read as a DICOM image: {said}"):
+        Volume.load(series(change))
+
+
+def test_dicom_in_hu_that_does_not_say_the_type_or_is_said_to_be(series):
+    for change in (lambda d: delattr(d, "RescaleType"), lambda d: delattr(d, "Modality")):
+        assert torch.equal(Volume.load(series(change)).data, DATA)
+    unspecified = series(lambda d: setattr(d, "RescaleType", "US"))
+    assert torch.equal(Volume.load(unspecified, unit="HU").data, DATA)
+    plain = Volume.load(series(_no_rescale), unit="mm^-1")
+    assert (torch.equal(plain.data, DATA), plain.unit) == (True, "mm^-1")
+
+
+def _padded(value, marked, limit=None, vr="SS"):
+    """The first row and a pixel inside hold a value, which the header marks."""
+
+    def change(d):
+        pixels = d.pixel_array.copy()
+        pixels[0], pixels[3, 2] = value, value
+        d.PixelData = pixels.tobytes()
+        if marked is not None:
+            d.add_new(0x00280120, vr, marked)
+        if limit is not None:
+            d.add_new(0x00280121, "SS", limit)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("value", "change", "inside"),
+    [
+        (-2000, _padded(-2000, -2000), -1000),
+        (-2000, _padded(-2000, 63536, vr="US"), -1000),
+        (-2000, _padded(-2000, -3024, limit=-1500), -1000),
+        (0, _padded(0, 0), 0),  # water within: the same value, but not at the border
+        (-1000, _padded(-1000, -1000), -1000),
+    ],
+)
+def test_padding_about_the_picture_is_air_and_said(series, value, change, inside):
+    folder = series(change)
+    with pytest.warns(UserWarning, match=r"of 120 pixels are padding about the picture, .* read as air, -1000 HU"):
+        data = Volume.load(folder).data
+    expected = DATA.flip(1, 2).clone()
+    expected[:, 0], expected[:, 3, 2] = -1000.0, inside
+    assert torch.equal(data.flip(1, 2), expected)
+
+
+def test_padding_in_all_corners_that_nothing_marks(series):
+    def corners(d):
+        pixels = d.pixel_array.copy()
+        pixels[[0, -1]] = -3024
+        d.PixelData = pixels.tobytes()
+
+    with pytest.warns(UserWarning, match="40 of 120 pixels are padding"):
+        assert float(Volume.load(series(corners)).data[:, [0, -1]].max()) == -1000.0
+
+
+def test_slices_stand_upright_and_have_what_their_class_demands(tmp_path):
+    """Seen from the feet, anterior up: rows run to the left, columns to the back. Two volumes are two patients."""
+    for name in ("s", "t"):
+        Volume(DATA, GRID).save(tmp_path / name)
+    first, other = (pydicom.dcmread(tmp_path / name / "0001.dcm") for name in ("s", "t"))
+    assert first.ImageOrientationPatient == [1, 0, 0, 0, 1, 0]
+    np.testing.assert_array_equal(first.pixel_array, DATA[0].flip(0, 1).numpy())  # ours: to the right, to the front
+    assert (first.PatientPosition, first.BodyPartExamined) == ("HFS", "WHOLEBODY")
+    assert re.fullmatch(r"\d{8}", first.StudyDate) is not None
+    assert first.PatientID != other.PatientID
+    checker = shutil.which("dciodvfy")
+    if checker is None:
+        pytest.skip("dciodvfy (dicom3tools) is not installed")
+    said = subprocess.run([checker, str(tmp_path / "s" / "0001.dcm")], capture_output=True, text=True, check=False)
+    assert (said.stdout + said.stderr).strip() == "CTImage"
 
 
 def test_dicom_series_are_in_hu_and_whole(tmp_path):

@@ -1,0 +1,195 @@
+"""Files of beamlines: Data Exchange and NeXus, written by h5py alone."""
+
+import h5py
+import numpy as np
+import pytest
+from foreign_files import data_exchange, nexus
+
+from recon.cli import main
+from torchpcct import ParallelBeam
+from torchpcct.formats.scans import open_scan, own_options
+from torchpcct.volume import Volume
+
+GEOMETRY = ParallelBeam(np.arange(60) * np.pi / 60, 32, 0.5)
+
+
+def frames(seed=0):
+    """Projections, flats and darks of three rows of a disc, photons of two units each above a dark of 100."""
+    rng = np.random.default_rng(seed)
+    lines = 0.08 * np.sqrt(np.clip(6.0**2 - GEOMETRY.column_positions**2, 0, None)) * np.ones((60, 3, 1))
+    data, white = (2 * rng.poisson(n) + 100 for n in (1e4 * np.exp(-lines), np.full((6, 3, 32), 1e4)))
+    return lines, data, white, np.full((3, 3, 32), 100) + rng.integers(0, 2, (3, 3, 32))
+
+
+LINES, DATA, WHITE, DARK = frames()
+
+
+@pytest.fixture
+def exchange(tmp_path):
+    return data_exchange(tmp_path / "a.h5", DATA, WHITE, GEOMETRY.angles, DARK, 500.0)
+
+
+def rewritten(path, name, values=None, unit=None):
+    with h5py.File(path, "a") as file:
+        values = file[name][()] if values is None else values
+        del file[name]
+        file[name] = values
+        if unit is not None:
+            file[name].attrs["units"] = unit
+
+
+def close(scan, rows=slice(None)):
+    np.testing.assert_allclose(scan.geometry.angles, GEOMETRY.angles, atol=1e-6)
+    off = scan.line_integrals().numpy() - np.moveaxis(LINES, 0, 1)[rows]
+    assert abs(float(off.mean())) < 2e-3
+    assert float(off.std()) < 0.03
+
+
+@pytest.mark.parametrize("unit", ["deg", "Degrees", "°", "rad", "radian", b"radians", np.array(["rad"], "S3")])
+def test_angles_in_degrees_and_rad_by_their_unit(exchange, unit):
+    text = str(np.ravel(unit)[0])
+    rewritten(exchange, "exchange/theta", GEOMETRY.angles if "rad" in text else np.rad2deg(GEOMETRY.angles), unit)
+    close(open_scan(exchange))
+
+
+@pytest.mark.parametrize("unit", ["mdeg", "mrad", "turn", "gon", "grad", "arcmin", "encoder counts"])
+def test_angles_in_another_unit_are_refused_by_name_and_may_be_given(exchange, unit):
+    rewritten(exchange, "exchange/theta", unit=unit)
+    with pytest.raises(ValueError, match=rf"are in '{unit}', which is neither deg nor rad: give angles_deg="):
+        open_scan(exchange)
+    close(open_scan(exchange, angles_deg={"step": 3.0}))
+
+
+def test_angles_without_a_unit(exchange):
+    rewritten(exchange, "exchange/theta", np.rad2deg(GEOMETRY.angles))
+    close(open_scan(exchange))  # degrees, the format's default
+    for span, turns in ((GEOMETRY.angles, "1 half turn"), (np.linspace(0, 2 * np.pi, 60), "2 half turns")):
+        rewritten(exchange, "exchange/theta", span)
+        with pytest.warns(UserWarning, match=f"have no unit .* taken for rad, {turns}"):
+            np.testing.assert_allclose(open_scan(exchange).geometry.angles, span)
+    rewritten(exchange, "exchange/theta", 0.6 * GEOMETRY.angles)
+    with pytest.raises(ValueError, match=r"have no unit and run over 1\.854: deg or rad"):
+        open_scan(exchange)
+
+
+def test_uint16_that_was_stored_as_int16(exchange):
+    """Some readings, all air frames, no dark frame: beyond 32767."""
+    with h5py.File(exchange, "a") as file:
+        for name, values in (("data", 2 * DATA), ("data_white", 2 * WHITE), ("data_dark", 2 * DARK)):
+            del file[f"exchange/{name}"]
+            file[f"exchange/{name}"] = values.astype(np.uint16).view(np.int16)
+    with pytest.warns(UserWarning, match=r"of type int16 reach down to -\d+: they are read as uint16"):
+        close(open_scan(exchange))
+
+
+def test_what_a_file_lacks_is_asked_for_and_given(exchange, tmp_path):
+    with h5py.File(exchange, "a") as file:
+        del file["exchange/theta"], file["exchange/data_white"], file["exchange/data_dark"]
+    with pytest.raises(ValueError, match="it has no angles, /exchange/theta: give angles_deg="):
+        open_scan(exchange)
+    with pytest.raises(ValueError, match=r"it has no white frames, /exchange/data_white: .* give air="):
+        open_scan(exchange, angles_deg={"step": 3.0})
+    (tmp_path / "angles.txt").write_text("\n".join(str(3.0 * k) for k in range(60)), encoding="utf-8")
+    np.save(tmp_path / "white.npy", WHITE)
+    for angles, air in (({"step": 3.0}, 2e4 + 100), (np.rad2deg(GEOMETRY.angles), WHITE),
+                        (str(tmp_path / "angles.txt"), str(tmp_path / "white.npy"))):  # fmt: skip
+        close(open_scan(exchange, angles_deg=angles, air=air, dark=100.0))
+        close(open_scan(exchange, angles_deg=angles, air=air, dark=100.0, slices=slice(1, 3)), slice(1, 3))
+    with pytest.raises(ValueError, match="angles_deg must be 60 angles, one a view"):
+        open_scan(exchange, angles_deg=[0.0, 1.0], air=2e4)
+    out = tmp_path / "v.h5"
+    command = ["reconstruct", str(exchange), "--out", str(out), "--air", str(tmp_path / "white.npy"), "--dark", "100",
+               "--no-progress"]  # fmt: skip
+    assert main([*command, "--angles-deg", "0:3"]) == 0
+    first = Volume.load(out).data
+    assert main([*command, "--angles-deg", str(tmp_path / "angles.txt")]) == 0
+    np.testing.assert_array_equal(Volume.load(out).data, first)
+
+
+@pytest.mark.parametrize("white", [20100, np.full((1,), 20100), np.full((3, 32), 20100)])
+def test_a_constant_flat(exchange, white):
+    rewritten(exchange, "exchange/data_white", white)
+    close(open_scan(exchange))
+
+
+def test_nexus(tmp_path):
+    path = nexus(tmp_path / "a.nxs", DATA, WHITE, GEOMETRY.angles, DARK, 500.0)
+    scan = open_scan(path, mu_water=0.02)
+    close(scan)
+    assert (scan.geometry.pitch, scan.info["format"], scan.unit) == (0.5, "NeXus", "HU")
+    assert scan.info["signal_of_one_photon"] == pytest.approx(2.0, rel=0.15)
+    close(open_scan(path, slices=slice(0, 2)), slice(0, 2))
+    assert "slices" in own_options(path)
+    close(open_scan(nexus(tmp_path / "b.h5", DATA, WHITE, GEOMETRY.angles, DARK, unit="rad")))
+    longer = nexus(tmp_path / "c.h5", DATA, (WHITE - 100) / 2 + 100, GEOMETRY.angles, DARK, times=(0.2, 0.1))
+    close(open_scan(longer))
+
+
+def test_nexus_that_is_no_scan_or_several(tmp_path):
+    path = nexus(tmp_path / "a.nxs", DATA, WHITE, GEOMETRY.angles, DARK)
+    with h5py.File(path, "a") as file:
+        file.copy(file["entry"], "entry2")
+    with pytest.raises(ValueError, match="it holds 2 scans: give entry=, one of entry, entry2"):
+        open_scan(path)
+    assert open_scan(path, entry="entry2").unit == "pixel^-1"
+    with h5py.File(path, "a") as file:
+        del file["entry2"]
+        key = file["entry/instrument/detector/image_key"]
+        key[key[()] == 1] = 3
+    with pytest.raises(ValueError, match=r"names no flat fields \(1\): give air="):
+        open_scan(path)
+    close(open_scan(path, air=2e4 + 100))
+    with h5py.File(tmp_path / "b.h5", "w") as file:
+        file["table"] = np.zeros(3)
+    with pytest.raises(ValueError, match=r"b\.h5 is no scan of a known format: neither of torchpcct, nor Data"):
+        open_scan(tmp_path / "b.h5")
+
+
+@pytest.mark.parametrize("form", ["exchange", "nexus"])
+@pytest.mark.parametrize("kind", ["external link", "soft link out", "external storage", "virtual", "empty"])
+def test_numbers_that_lie_in_other_files_are_refused_by_name(tmp_path, form, kind):
+    if form == "exchange":
+        path, name = data_exchange(tmp_path / "a.h5", DATA, WHITE, GEOMETRY.angles, DARK), "exchange/data"
+    else:
+        path = nexus(tmp_path / "a.nxs", DATA, WHITE, GEOMETRY.angles, DARK)
+        name = "entry/instrument/detector/data"
+    with h5py.File(path, "a") as file:
+        data = file[name][()]
+        (tmp_path / "other.raw").write_bytes(data.tobytes())
+        with h5py.File(tmp_path / "other.h5", "w") as other:
+            other["data"] = data
+        del file[name]
+        if kind == "external link":
+            file[name] = h5py.ExternalLink("other.h5", "/data")
+        elif kind == "soft link out":
+            file["elsewhere"] = h5py.ExternalLink("other.h5", "/")
+            file[name] = h5py.SoftLink("/elsewhere/data")
+        elif kind == "external storage":
+            file.create_dataset(name, data.shape, data.dtype, external=[("other.raw", 0, data.nbytes)])
+        elif kind == "virtual":
+            layout = h5py.VirtualLayout(data.shape, data.dtype)
+            layout[:] = h5py.VirtualSource(str(tmp_path / "other.h5"), "data", data.shape)
+            file.create_virtual_dataset(name, layout)
+        else:  # 2 GiB of nothing
+            file.create_dataset(name, (len(data), 2**10, 2**14), "u2", chunks=(1, 2**10, 2**10))
+    expected = "is packed into 0 MiB" if kind == "empty" else r"other\.(h5|raw).*copy all into one file first"
+    with pytest.raises(ValueError, match=rf"a\.\w+ cannot be read as .*: .*{expected}"):
+        open_scan(path)
+
+
+def test_soft_links_within_a_file_are_followed_and_circles_refused(exchange):
+    with h5py.File(exchange, "a") as file:
+        file.move("exchange/data", "raw")
+        file["exchange/data"] = h5py.SoftLink("../raw")
+        file["there"] = h5py.SoftLink("/raw")
+    with pytest.raises(ValueError, match=r"leads to \.\./raw, which is not there"):
+        open_scan(exchange)
+    with h5py.File(exchange, "a") as file:
+        del file["exchange/data"]
+        file["exchange/data"] = h5py.SoftLink("/there")
+    close(open_scan(exchange))
+    with h5py.File(exchange, "a") as file:
+        del file["there"]
+        file["there"] = h5py.SoftLink("/exchange/data")
+    with pytest.raises(ValueError, match="leads in a circle"):
+        open_scan(exchange)

@@ -1,0 +1,129 @@
+"""Scans of laboratory machines (Nikon, Zeiss) and MATLAB arrays, written as their descriptions say."""
+
+import math
+
+import h5py
+import numpy as np
+import pytest
+from analytic import Ellipsoid, line_integrals
+from foreign_files import txrm, xtekct
+from scipy.io import savemat
+
+from recon import reconstruct
+from torchpcct import ConeBeam, ParallelBeam, VolumeGrid, full_turn
+from torchpcct.formats.scans import open_scan
+from torchpcct.vector_geometry import VectorGeometry
+
+MU = 0.02
+BODY = [Ellipsoid((2.0, -3.0, 0.5), (9.0, 12.0, 30.0), value=MU), Ellipsoid((7.0, 4.0, 0.0), (3.0, 3.0, 2.0), value=MU)]
+NIKON = ConeBeam(full_turn(24, math.radians(120.0)), 300.0, 500.0, 48, 4, (1.5, 1.7), (0.0, 0.8))
+ZEISS = ConeBeam(-full_turn(24) - math.pi / 2, 300.0, 500.0, 48, 4, 1.7)
+WHITE = 60000.0
+
+
+def same(scan, geometry, lines, rows=slice(None)):
+    assert scan.geometry.shape[1:] == lines[:, rows].shape[1:]
+    np.testing.assert_allclose(np.exp(1j * scan.geometry.angles), np.exp(1j * geometry.angles), atol=1e-5)
+    np.testing.assert_allclose(scan.line_integrals().numpy(), lines[:, rows], atol=2e-3)
+
+
+def test_nikon(tmp_path):
+    lines = line_integrals(NIKON, BODY, sub=1)
+    path = xtekct(tmp_path / "part", WHITE * np.exp(-lines), NIKON, WHITE)
+    scan = open_scan(path, mu_water=MU)
+    same(scan, NIKON, lines)
+    g = scan.geometry
+    assert (g.sod, g.sdd, g.pitch, g.offset) == (300.0, 500.0, (1.5, 1.7), pytest.approx((0.0, 0.8)))
+    inside = reconstruct(scan, VolumeGrid((1, 4, 4), 1.0, (0.0, 0.0, -3.0)), "fbp").data
+    assert float(inside.mean().abs()) < 40
+    same(open_scan(path, slices=slice(1, 3)), NIKON, lines, slice(1, 3))
+    assert open_scan(path, slices=slice(1, 3)).geometry == open_scan(path).geometry.with_rows(1, 2)
+    (tmp_path / "part" / "part_0024.tif").unlink()
+    with pytest.raises(ValueError, match=r"part\.xtekct cannot be read as .*: it says 24 Projections, 23 images"):
+        open_scan(path)
+
+
+def test_nikon_with_another_axis_and_without_a_value(tmp_path):
+    lines = line_integrals(NIKON, BODY, sub=1)
+    path = xtekct(tmp_path / "part", WHITE * np.exp(-lines), NIKON, WHITE, ObjectOffsetX=0.48)
+    assert open_scan(path).geometry.offset == pytest.approx((0.0, 0.8))
+    text = path.read_text(encoding="utf-8-sig")
+    path.write_text(text.replace("ObjectOffsetX=0.48", "ObjectTilt=0.7"), encoding="utf-8")
+    with pytest.warns(UserWarning, match=r"rotation axis is inclined \(ObjectTilt 0\.7°\)"):
+        open_scan(path)
+    path.write_text(text.replace("SrcToObject=300.0", "SrcToObject="), encoding="utf-8")
+    with pytest.raises(ValueError, match="it has no SrcToObject"):
+        open_scan(path)
+
+
+def test_zeiss(tmp_path):
+    lines = line_integrals(ZEISS, BODY, sub=1)
+    path = txrm(tmp_path / "a.txrm", WHITE * np.exp(-lines), ZEISS, np.full((4, 48), WHITE))
+    scan = open_scan(path, mu_water=MU)
+    same(scan, ZEISS, lines)
+    assert (scan.geometry.sod, scan.geometry.sdd) == (300.0, 500.0)
+    np.testing.assert_allclose(scan.geometry.pitch, 1.7, rtol=1e-6)
+    same(open_scan(path, slices=slice(1, 3)), ZEISS, lines, slice(1, 3))
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+    with pytest.raises(ValueError, match=r"a\.txrm cannot be read as a Zeiss scan"):
+        open_scan(path)
+
+
+def test_zeiss_with_images_that_were_shifted_and_without_a_reference(tmp_path):
+    lines, shifts = line_integrals(ZEISS, BODY, sub=1), {"x": np.arange(24) % 3 - 1.0, "y": np.zeros(24)}
+    path = txrm(tmp_path / "a.txrm", WHITE * np.exp(-lines), ZEISS, np.full((4, 48), WHITE), shifts)
+    expected = VectorGeometry.of(ZEISS).shifted(columns=shifts["x"])
+    np.testing.assert_allclose(open_scan(path).geometry.vectors, expected.vectors, atol=1e-3)
+    renamed = path.read_bytes().replace("ReferenceData".encode("utf-16-le"), "ReferencyData".encode("utf-16-le"))
+    path.write_bytes(renamed)
+    with pytest.raises(ValueError, match="it has no reference image: give air="):
+        open_scan(path)
+    np.testing.assert_allclose(open_scan(path, air=WHITE).line_integrals().numpy(), lines, atol=2e-3)
+
+
+PARALLEL = ParallelBeam(np.arange(30) * math.pi / 30, 64, 1.0)
+SINOGRAM = line_integrals(PARALLEL, [Ellipsoid((2.0, -3.0), (14.0, 18.0), value=MU)], sub=1)
+
+
+def mat73(path, **arrays):
+    """A file of version 7.3: HDF5 behind 512 bytes, axes the other way."""
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, values in arrays.items():
+            file[name] = values.T
+    return path
+
+
+@pytest.mark.parametrize("new", [False, True])
+@pytest.mark.parametrize("turned", [False, True])
+def test_matlab_sinograms(tmp_path, new, turned):
+    sinogram = SINOGRAM.T if turned else SINOGRAM
+    arrays = {"sinogram": sinogram, "angles": np.arange(30.0)[None], "name": np.array([65, 66])[None]}
+    path = mat73(tmp_path / "s.mat", **arrays) if new else tmp_path / "s.mat"
+    if not new:
+        savemat(path, {**arrays, "note": "text"}, do_compression=True)
+    for options in ({}, {"variable": "sinogram"}):
+        scan = open_scan(path, PARALLEL, photons=1e6, mu_water=MU, **options)
+        np.testing.assert_allclose(scan.line_integrals().numpy(), SINOGRAM, atol=1e-5)
+    with pytest.raises(ValueError, match=r"s\.mat, a MATLAB array: such files do not hold the geometry"):
+        open_scan(path)
+    with pytest.raises(ValueError, match=r"unknown variable 'm': use one of .*sinogram"):
+        open_scan(path, PARALLEL, variable="m")
+    with pytest.raises(ValueError, match=r"its array of .* is not the geometry's \(30, 63\)"):
+        open_scan(path, ParallelBeam(PARALLEL.angles, 63, 1.0))
+
+
+def test_matlab_readings_stacks_and_arrays_that_leave_it_open(tmp_path):
+    counts = np.rint(1e4 * np.exp(-np.stack([SINOGRAM, 0.5 * SINOGRAM], -1)))  # (views, columns, slices)
+    savemat(tmp_path / "n.mat", {"n": counts, "other": counts[..., 0]})
+    with pytest.raises(ValueError, match=r"it holds 2 arrays: give variable=, .*n \(30, 64, 2\), other \(30, 64\)"):
+        open_scan(tmp_path / "n.mat", PARALLEL)
+    scan = open_scan(tmp_path / "n.mat", PARALLEL, variable="n", air=1e4)
+    np.testing.assert_allclose(scan.line_integrals()[0].numpy(), SINOGRAM, atol=0.02)
+    square = ParallelBeam(PARALLEL.angles, 30, 1.0)
+    savemat(tmp_path / "s.mat", {"s": SINOGRAM[:, :30]})
+    with pytest.warns(UserWarning, match=r"fits the geometry \(30, 30\) in several ways .*: it is taken as it stands"):
+        open_scan(tmp_path / "s.mat", square)
+    savemat(tmp_path / "c.mat", {"s": SINOGRAM * 1j})
+    with pytest.raises(ValueError, match=r"c\.mat cannot be read as a MATLAB file: its variable holds complex128"):
+        open_scan(tmp_path / "c.mat", PARALLEL)

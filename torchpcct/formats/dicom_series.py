@@ -1,0 +1,362 @@
+"""DICOM files: those of a folder, and CT series as volumes in HU."""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+import logging
+import os
+import re
+import warnings
+import zlib
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from torchpcct.files import VERSION, atomic_write, require_ordinary
+from torchpcct.formats.damage import check_expansion, needed, reading
+from torchpcct.formats.volume_grid import STRAIGHT, grid_from
+from torchpcct.geometry import VolumeGrid
+
+__all__ = ["DICOM_ENDINGS", "check_series", "dicom_files", "open_dicom", "read_dicom", "write_dicom"]
+
+_LOG = logging.getLogger(__name__)
+
+DICOM_ENDINGS = (".dcm", ".ima")
+"""Of files that are DICOM whatever is in them."""
+_PREAMBLE, _MARK = 128, b"DICM"
+_DIRECTORY = b"1.2.840.10008.1.3.10"
+"""Class of a DICOMDIR, which lists files and has no pixels."""
+_DEFLATED, _MOST_INFLATED = "1.2.840.10008.1.2.1.99", 2**27
+"""Transfer syntax whose whole data set is packed, and bytes that it may have: an image of 8192² pixels."""
+_CT_CLASS = "1.2.840.10008.5.1.4.1.1.2"
+"""CT Image Storage, and the beginning of its enhanced classes."""
+_MADE_BY = "torchpcct"
+_HU_RANGE = (-32768, 32767)
+_ROUNDED = 1e-9
+"""Relative, of a decimal string of ten digits."""
+_LOWEST, _AIR = -1024.5, -1000.0
+"""HU below which no tissue and no air reads, and those of air."""
+
+
+# --- files --------------------------------------------------------------------------------------------------------
+
+
+def dicom_files(folder: str | os.PathLike[str]) -> list[Path]:
+    """DICOM files of a folder, in the order of their names, without what archives put beside them.
+
+    Left out: hidden files, a DICOMDIR, texts, and files of other endings that do not begin as DICOM does. A file that
+    ends like DICOM, or has no ending, is one, damaged or not.
+
+    Raises:
+        FileNotFoundError: none. ValueError: a device or a pipe.
+    """
+    found = []
+    for path in sorted(Path(folder).iterdir()) if Path(folder).is_dir() else []:
+        if path.name.startswith(".") or path.is_dir():
+            continue
+        require_ordinary(path)
+        with path.open("rb") as file:
+            begin = file.read(1024)
+        if begin[_PREAMBLE : _PREAMBLE + 4] == _MARK:
+            slices = _DIRECTORY + b"\0" not in begin and path.name.upper() != "DICOMDIR"
+        else:
+            ending = path.suffix.lower()
+            slices = ending in DICOM_ENDINGS or not (re.fullmatch(r"\.[a-z]\w*", ending) or _is_text(begin))
+        if slices:
+            found.append(path)
+        else:
+            _LOG.info("%s is no slice: left out", path)
+    if not found:
+        raise FileNotFoundError(f"no DICOM files in {folder}")
+    return found
+
+
+def _is_text(content: bytes) -> bool:
+    try:
+        text = content.decode("utf-8")
+    except UnicodeDecodeError:
+        return False
+    return bool(text) and all(c.isprintable() or c in "\r\n\t\ufeff" for c in text)
+
+
+def open_dicom(path: str | os.PathLike[str], **options: Any) -> Any:
+    """A DICOM data set, for a block of :func:`torchpcct.formats.damage.reading`.
+
+    Args:
+        path: file.
+        options: of ``pydicom.dcmread``.
+
+    Raises:
+        ValueError: a deflated data set of more than 128 MiB, which no image is; several frames; colours.
+        pydicom.errors.InvalidDicomError: no DICOM.
+        ImportError: pydicom is not installed.
+    """
+    pydicom = needed("pydicom")
+    if str(pydicom.filereader.read_file_meta_info(path).get("TransferSyntaxUID", "")) == _DEFLATED:
+        _check_inflated(path, pydicom)
+    data = pydicom.dcmread(path, **options)
+    frames, samples = int(data.get("NumberOfFrames") or 1), int(data.get("SamplesPerPixel") or 1)
+    if frames > 1 or samples > 1:
+        raise ValueError(f"it holds {frames} frames of {samples} colours, expected one grey image")
+    if "Rows" in data and "Columns" in data:
+        check_expansion((data.Rows, data.Columns), "the image", os.stat(path).st_size, 8)
+    return data
+
+
+def _check_inflated(path: str | os.PathLike[str], pydicom: Any) -> None:
+    """Inflate bit by bit and throw away: pydicom would take all at once."""
+    length = int(pydicom.filereader.read_file_meta_info(path).get("FileMetaInformationGroupLength", 0))
+    unpack, total = zlib.decompressobj(-zlib.MAX_WBITS), 0
+    with open(path, "rb") as file:
+        file.seek(_PREAMBLE + len(_MARK) + 12 + length)
+        packed = file.read(2**16)
+        while packed and not unpack.eof:
+            total += len(unpack.decompress(packed, 2**20))
+            if total > _MOST_INFLATED:
+                raise ValueError(f"its deflated data set is of more than {_MOST_INFLATED // 2**20} MiB: no image is")
+            packed = unpack.unconsumed_tail or file.read(2**16)
+
+
+# --- writing ------------------------------------------------------------------------------------------------------
+
+
+def check_series(folder: Path, unit: str) -> None:
+    """Raise ``ValueError`` unless a CT series can be written to a new or empty folder."""
+    if unit != "HU":
+        raise ValueError(f"a DICOM CT series holds HU, this volume is in {unit}: save it as .nii.gz, .mha or .h5")
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"{folder} is a file: name a new folder, or .nii.gz, .mha or .h5")
+    if folder.is_dir() and any(folder.iterdir()):
+        raise ValueError(f"{folder} is not empty: series in one folder mix, name a new one")
+
+
+def write_dicom(folder: str | os.PathLike[str], data: Any, grid: VolumeGrid, unit: str) -> None:
+    """Write a CT series in HU, one file a slice, into a new or empty folder, which appears whole or not at all.
+
+    int16, intercept 0, slope 1, or where values lie beyond int16 the least slope that holds them. Slices are seen from
+    the feet, anterior up, as radiologists expect them. Each volume is a study of a patient of its own.
+
+    Raises:
+        ValueError: a volume in mm⁻¹, values that are not finite, a folder that holds files.
+    """
+    pydicom = needed("pydicom")
+    from pydicom.uid import CTImageStorage, generate_uid
+
+    check_series(Path(folder), unit)
+    values = np.asarray(data, dtype=np.float64)
+    if not np.isfinite(values).all():
+        raise ValueError("DICOM holds finite HU, the volume has NaN or infinite values: save it as .nii.gz or .h5")
+    slope = float(_ds(max(1.0, values.max() / _HU_RANGE[1], values.min() / _HU_RANGE[0]) * (1 + _ROUNDED)))
+    slope = 1.0 if slope < 1 + 2 * _ROUNDED else slope
+    stored = np.rint(values / slope).astype("<i2")[:, ::-1, ::-1]
+    study, series, frame = (generate_uid() for _ in range(3))
+    patient, now = hashlib.sha256(study.encode()).hexdigest()[:12], datetime.datetime.now()
+    date, time = now.strftime("%Y%m%d"), now.strftime("%H%M%S")
+    x, y, z = float(grid.axes[2][-1]), float(grid.axes[1][-1]), float(grid.axes[0][0])  # of the first pixel
+    dz, dy, dx = grid.spacing
+    images = []
+    for k, image in enumerate(stored):
+        d = pydicom.Dataset()
+        d.SOPClassUID = CTImageStorage
+        d.StudyInstanceUID, d.SeriesInstanceUID, d.FrameOfReferenceUID = study, series, frame
+        d.SpecificCharacterSet = "ISO_IR 192"
+        d.Modality, d.Manufacturer, d.SeriesDescription = "CT", _MADE_BY, "simulated or reconstructed by torchpcct"
+        d.ManufacturerModelName, d.SoftwareVersions = _MADE_BY, VERSION
+        d.ImageType = ["DERIVED", "PRIMARY", "AXIAL"]
+        d.PatientID, d.PatientName = f"{_MADE_BY}-{patient}", f"{_MADE_BY}^{patient}"
+        d.PatientBirthDate = d.PatientSex = ""
+        # The scanner's x, y, z are right, anterior, superior. No part with a left and a right one is known.
+        d.PatientPosition, d.BodyPartExamined = "HFS", "WHOLEBODY"
+        d.StudyID, d.AccessionNumber, d.ReferringPhysicianName = "1", "", ""
+        d.StudyDate = d.SeriesDate = d.AcquisitionDate = d.ContentDate = date
+        d.StudyTime = d.SeriesTime = d.AcquisitionTime = d.ContentTime = time
+        d.SeriesNumber, d.InstanceNumber, d.PositionReferenceIndicator = 1, k + 1, ""
+        d.ImageOrientationPatient = [1, 0, 0, 0, 1, 0]
+        d.ImagePositionPatient = [_ds(-x), _ds(-y), _ds(z + k * dz)]
+        d.PixelSpacing, d.SliceThickness = [_ds(dy), _ds(dx)], _ds(dz)
+        d.RescaleSlope, d.RescaleIntercept, d.RescaleType = _ds(slope), "0", "HU"
+        d.ImagesInAcquisition = len(stored)
+        d.WindowCenter, d.WindowWidth, d.KVP, d.AcquisitionNumber = "40", "400", "", 1
+        d.set_pixel_data(np.ascontiguousarray(image), "MONOCHROME2", 16)
+        images.append(d)
+    with atomic_write(os.path.realpath(folder)) as part:
+        part.mkdir()
+        for k, d in enumerate(images):
+            d.save_as(part / f"{k + 1:04d}.dcm", enforce_file_format=True)
+
+
+def _ds(value: float) -> str:
+    """A DICOM decimal string: at most 16 characters."""
+    return f"{value:.10g}"
+
+
+# --- reading ------------------------------------------------------------------------------------------------------
+
+
+def read_dicom(path: str | os.PathLike[str], unit: str | None = None) -> tuple[Any, VolumeGrid, str]:
+    """Data ``(z, y, x)`` float32, grid and unit (HU) of a DICOM CT series in a folder, or of one image's file.
+
+    Slices that lack within a series are found by their places, those at its ends only in series of ours, which know
+    how many there are. One slice is as thick as it says, else 1 mm. Padding about the picture (``PixelPaddingValue``,
+    or one value below −1024 HU in all corners) is read as air, −1000 HU, with a ``UserWarning``.
+
+    Args:
+        path: folder or file.
+        unit: of its numbers, where the images do not say that they are in HU; None: such images are refused.
+
+    Raises:
+        FileNotFoundError: no such file or folder, or no files in it.
+        ValueError: damaged files, several series, missing or doubled slices, oblique axes; images of another modality
+            than CT, without rescale slope and intercept, or whose ``RescaleType`` is not HU.
+        ImportError: pydicom is not installed.
+    """
+    root = Path(path)
+    paths = dicom_files(root) if root.is_dir() else [root]
+    slices: list[_Slice] = []
+    replaced = 0
+    for file in paths:
+        with reading(file, "a DICOM image"):
+            d = open_dicom(file)
+            if root.is_dir() and "Rows" not in d and not str(d.get("SOPClassUID", "")).startswith(_CT_CLASS):
+                _LOG.info("%s holds no image: left out", file)  # reports, contours and the like
+                continue
+            if not slices:
+                check_expansion((len(paths), d.Rows, d.Columns), "the series", sum(p.stat().st_size for p in paths))
+            ours = str(d.get("Manufacturer", "")) == _MADE_BY
+            pixels, padded = _hounsfield(d, unit, ours)
+            replaced += padded
+            slices.append(
+                _Slice(
+                    str(d.SeriesInstanceUID),
+                    tuple(float(v) for v in d.ImageOrientationPatient),
+                    np.array([float(v) for v in d.ImagePositionPatient]),
+                    tuple(float(v) for v in d.PixelSpacing),
+                    pixels,
+                    float(d.get("SliceThickness") or 1.0),
+                    int(d.get("ImagesInAcquisition") or 0) if ours and root.is_dir() else 0,
+                )
+            )
+    if not slices:
+        raise FileNotFoundError(f"no DICOM images in {path}")
+    with reading(path, "a DICOM series"):
+        data, grid = _joined(slices)
+    if replaced:
+        warnings.warn(
+            f"{path}: {replaced} of {data.size} pixels are padding about the picture, not tissue, and read as air, "
+            f"{_AIR:.0f} HU",
+            UserWarning,
+            stacklevel=3,
+        )
+    return data, grid, unit or "HU"
+
+
+def _hounsfield(d: Any, unit: str | None, ours: bool) -> tuple[Any, int]:
+    """Float32 pixels of an image in HU, and how many of them are padding.
+
+    Raises:
+        ValueError: numbers that are not said to be HU.
+    """
+    if unit is None:
+        _check_ct(d)
+    held = {name: d.get(name) for name in ("RescaleSlope", "RescaleIntercept")}
+    missing = [name for name, value in held.items() if value in (None, "")]
+    if missing and unit is None:
+        raise ValueError(f"it has no {' and no '.join(missing)}: its numbers are no HU{_KNOWN}")
+    slope = 1.0 if "RescaleSlope" in missing else float(held["RescaleSlope"])
+    intercept = 0.0 if "RescaleIntercept" in missing else float(held["RescaleIntercept"])
+    if not (np.isfinite([slope, intercept]).all() and slope != 0):
+        raise ValueError(f"its RescaleSlope is {slope:g}, its RescaleIntercept {intercept:g}")
+    stored = d.pixel_array
+    pixels = stored.astype(np.float32) * np.float32(slope) + np.float32(intercept)
+    padding = None if unit not in (None, "HU") else _padding(d, stored, pixels, ours)
+    if padding is None or not padding.any():
+        return pixels, 0
+    pixels[padding] = _AIR
+    return pixels, int(padding.sum())
+
+
+_KNOWN = "; if you know that they are, Volume.load(..., unit='HU') reads them"
+
+
+def _check_ct(d: Any) -> None:
+    """Raise ``ValueError`` unless an image says that its numbers are HU; DICOM's CT need not say the type."""
+    modality, kind = str(d.get("Modality") or "").strip(), str(d.get("RescaleType") or "").strip()
+    if kind not in ("", "HU"):
+        unspecified = " (unspecified)" if kind == "US" else ""
+        raise ValueError(f"its RescaleType is {kind}{unspecified}, not HU{_KNOWN}")
+    if modality != "CT" and not (modality == "" and str(d.get("SOPClassUID", "")).startswith(_CT_CLASS)):
+        units = f" in {d.Units}" if d.get("Units") else ""
+        raise ValueError(f"it is of the modality {modality or 'unknown'}{units}, whose numbers are no HU: only CT is")
+
+
+def _padding(d: Any, stored: Any, pixels: Any, ours: bool) -> Any:
+    """Mask of what fills the square about the picture; None: the image has none.
+
+    A marked value that tissue can have, too, counts where it reaches the border of the image.
+    """
+    if d.get("PixelPaddingValue") is not None:
+        bits = 8 * stored.dtype.itemsize
+        low = high = int(d.PixelPaddingValue)
+        if d.get("PixelPaddingRangeLimit") is not None:
+            high = int(d.PixelPaddingRangeLimit)
+        if stored.dtype.kind == "i":  # written as unsigned by some
+            low, high = ((v + 2 ** (bits - 1)) % 2**bits - 2 ** (bits - 1) for v in (low, high))
+        marked = (stored >= min(low, high)) & (stored <= max(low, high))
+    else:
+        corners = stored[[0, 0, -1, -1], [0, -1, 0, -1]]
+        if ours or np.ptp(corners) or pixels[0, 0] >= _LOWEST:
+            return None
+        marked = stored == corners[0]
+    possible = marked & (pixels >= _LOWEST)
+    if possible.any():
+        from scipy.ndimage import label
+
+        parts, _ = label(possible)
+        at_border = np.unique(np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]]))
+        marked &= ~possible | np.isin(parts, at_border[at_border > 0])
+    return marked
+
+
+class _Slice(NamedTuple):
+    series: str
+    orientation: tuple[float, ...]
+    position: Any
+    pixel: tuple[float, ...]
+    image: Any
+    thickness: float
+    of: int
+    """Slices of its series, 0: unknown."""
+
+
+def _joined(slices: list[_Slice]) -> tuple[Any, VolumeGrid]:
+    series, orientation, _, pixel, image, thickness, count = slices[0]
+    for other in slices[1:]:
+        if other.series != series:
+            raise ValueError("it holds several series: keep each in a folder of its own")
+        if other.orientation != orientation or other.pixel != pixel or other.image.shape != image.shape:
+            raise ValueError("its slices differ in orientation, spacing or size")
+    row, column = np.array(orientation[:3]), np.array(orientation[3:])
+    if abs(abs(row[0]) - 1) > STRAIGHT or abs(abs(column[1]) - 1) > STRAIGHT:
+        raise ValueError("its slices are not axial: resample it to straight axes first")
+    slices.sort(key=lambda s: float(s.position[2]))
+    z = np.array([float(s.position[2]) for s in slices])
+    gaps = np.diff(z)
+    if gaps.size and (gaps.min() <= 0 or np.ptp(gaps) > 0.01 * float(np.median(gaps))):
+        at = int(np.argmax(np.abs(gaps - np.median(gaps))))
+        raise ValueError(f"slices lack or repeat between z = {z[at]:g} and {z[at + 1]:g} mm")
+    if count and count != len(slices):
+        raise ValueError(f"it holds {len(slices)} of the {count} slices of its series")
+    drift = np.abs(np.array([s.position[:2] for s in slices]) - slices[0].position[:2]).max()
+    if drift > 0.01 * min(pixel):
+        raise ValueError("its slices are shifted against each other (gantry tilt)")
+    data = np.stack([s.image for s in slices])
+    x, y = -slices[0].position[0], -slices[0].position[1]  # LPS to RAS
+    dy, dx = pixel
+    if row[0] > 0:  # columns run to the left: ours to the right
+        data, x = data[..., ::-1], x - (data.shape[2] - 1) * dx
+    if column[1] > 0:
+        data, y = data[:, ::-1], y - (data.shape[1] - 1) * dy
+    dz = float(np.median(gaps)) if gaps.size else thickness
+    return np.ascontiguousarray(data), grid_from(data.shape, (dx, dy, dz), (x, y, z[0]))

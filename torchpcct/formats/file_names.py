@@ -1,0 +1,99 @@
+"""Files of one scan: which ones a pattern means, and the order that the numbers in their names give."""
+
+from __future__ import annotations
+
+import glob
+import itertools
+import re
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+
+__all__ = ["in_number_order", "matching"]
+
+_WHOLE = re.compile(r"\d+")
+_DECIMAL = re.compile(r"(?:(?<![0-9A-Za-z])-)?\d+(?:\.\d+)?")
+"""With a sign where it does not join two words, and with a decimal point."""
+_CHAIN = re.compile(r"\d+\.\d+\.\d+")
+"""Sections, dates or identifiers rather than decimals."""
+_SHOWN = 4
+
+
+def matching(pattern: str, folder: Path) -> list[Path]:
+    """Files that a name or pattern means, in the order of the numbers in their names.
+
+    A pattern may be an absolute path, and its ending may differ from the files' in capitals (``.TIF``). Hidden files
+    (``._1.tif`` of a Mac) are left out, as a shell does. A file that is called like the pattern itself is that file.
+
+    Args:
+        pattern: ``*``, ``?``, ``[...]`` and ``**`` as in a shell.
+        folder: that a relative name starts from.
+
+    Raises:
+        FileNotFoundError: no file.
+    """
+    if not glob.has_magic(pattern) or (folder / pattern).exists():
+        return [folder / pattern]
+    stem, point, ending = pattern.rpartition(".")
+    any_case = "".join(f"[{c.lower()}{c.upper()}]" for c in ending)
+    wanted = f"{stem}.{any_case}" if point and ending.isalpha() else pattern
+    found = [folder / name for name in glob.glob(wanted, root_dir=folder, recursive=True)]
+    files = [path for path in found if not path.is_dir() or path.suffix.lower() == ".zarr"]
+    if not files:
+        raise FileNotFoundError(f"no file matches {folder / pattern}")
+    return in_number_order(files)
+
+
+def in_number_order(paths: Sequence[Path]) -> list[Path]:
+    """Files in the order of the numbers in their names: ``p_2`` before ``p_10``.
+
+    Numbers are whole, or have signs and decimals, whichever counts up in equal steps. A ``UserWarning`` says which one
+    was taken where another order is possible and no steps decide: text order where numbers are missing, or decimals
+    against sections (``1.9``, ``1.10``).
+    """
+    text = sorted(paths)
+    if len(text) < 2:
+        return text
+    names = [str(path.with_suffix("")) for path in text]
+    decimals = not any(_CHAIN.search(name) for name in names)
+    kinds = (_WHOLE, _DECIMAL) if decimals else (_WHOLE,)
+    orders = []
+    for kind in kinds:
+        keys = [_parts(name, kind) for name in names]
+        order = [k for _, _, k in sorted(zip(keys, names, range(len(names)), strict=True))]
+        orders.append((order, _counts_up(keys)))
+    known = [order for order, even in orders if even]
+    taken = known[0] if known else orders[-1][0]
+    others = known[1:] if known else [list(range(len(names))), *(order for order, _ in orders)]
+    for other in others:
+        if other != taken:
+            asked, instead = (", ".join(text[k].name for k in order[:_SHOWN]) for order in (taken, other))
+            warnings.warn(
+                f"the names of {len(text)} files leave their order open: they are read as {asked} (by the numbers), "
+                f"not as {instead}; a list of the names decides",
+                UserWarning,
+                stacklevel=2,
+            )
+            break
+    return [text[k] for k in taken]
+
+
+def _parts(name: str, number: re.Pattern[str]) -> tuple[str | float, ...]:
+    """Text and numbers of a name in turn, text first and last."""
+    texts, values = number.split(name), number.findall(name)
+    return tuple(part for pair in zip(texts, [*map(float, values), 0.0], strict=True) for part in pair)
+
+
+def _counts_up(keys: Sequence[tuple[str | float, ...]]) -> bool:
+    """Whether names that differ in numbers alone run through all combinations of evenly spaced ones, each once."""
+    if len({len(key) for key in keys}) > 1 or len(set(keys)) < len(keys):
+        return False
+    combinations = 1
+    for values in map(sorted, map(set, zip(*keys, strict=True))):
+        if len(values) > 1 and isinstance(values[0], str):
+            return False
+        steps = [b - a for a, b in itertools.pairwise(values)]
+        if steps and max(steps) - min(steps) > 1e-6 * max(abs(v) for v in values):
+            return False
+        combinations *= len(values)
+    return combinations == len(keys)

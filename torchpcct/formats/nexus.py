@@ -1,0 +1,202 @@
+"""NeXus files of tomography, NXtomo (https://manual.nexusformat.org/classes/applications/NXtomo.html).
+
+One data set of all frames, of which ``image_key`` says what each is: 0 projection, 1 flat, 2 dark field, 3 invalid.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from torchpcct.formats.damage import check_expansion, check_size, reading
+from torchpcct.formats.data_exchange import Frames, angles_in, given_frames, length_in
+from torchpcct.formats.geometry_yaml import angles_of
+from torchpcct.formats.hdf5 import inside
+from torchpcct.formats.lengths import unit_text
+from torchpcct.scan import Scan
+from torchpcct.validate import choice
+
+__all__ = ["holds_nexus", "read_nexus"]
+
+_PROJECTION, _FLAT, _DARK = 0, 1, 2
+_DEEPEST = 5
+"""Groups between the file and its detector."""
+_SAME_TIME = 1e-3
+"""Relative difference of exposures that are the same."""
+
+
+def _detectors(group: Any, depth: int = 0) -> Iterator[Any]:
+    """Groups of the file itself that hold ``data`` and ``image_key``."""
+    import h5py
+
+    for name in group:
+        if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+            continue
+        found = group[name]
+        if isinstance(found, h5py.Group):
+            if "image_key" in found.keys() and "data" in found.keys():  # noqa: SIM118 (in would follow links)
+                yield found
+            elif depth < _DEEPEST:
+                yield from _detectors(found, depth + 1)
+
+
+def holds_nexus(file: Any) -> bool:
+    """Whether an open HDF5 file says that it is NeXus, or holds frames with an image key."""
+    classes = [
+        unit_text(file[name].attrs["NX_class"])
+        for name in file
+        if _own_group(file, name) and "NX_class" in file[name].attrs
+    ]
+    return "nxentry" in classes or next(_detectors(file), None) is not None
+
+
+def _is_detector(group: Any) -> bool:
+    """Whether a group is where the frames are at home, and no view of them for plotting (NXdata)."""
+    return unit_text(group.attrs.get("NX_class", "")) == "nxdetector"
+
+
+def _own_group(file: Any, name: str) -> bool:
+    import h5py
+
+    return isinstance(file.get(name, getlink=True), h5py.HardLink) and isinstance(file[name], h5py.Group)
+
+
+def read_nexus(
+    path: str | os.PathLike[str],
+    *,
+    entry: str | None = None,
+    pitch: float | None = None,
+    slices: slice | None = None,
+    angles_deg: Any = None,
+    air: Any = None,
+    dark: Any = None,
+    mu_water: float | None = None,
+    **options: Any,
+) -> Scan:
+    """A parallel-beam scan of an NXtomo file, the mean of its flat and of its dark frames as air and dark.
+
+    Flats that were taken with another ``count_time`` than the projections count by the ratio.
+
+    Args:
+        path: HDF5 file.
+        entry: name of the NXentry, of a file that holds several scans.
+        pitch: cell width in mm; None: the detector's ``x_pixel_size``. If the file knows none, lengths are in pixels.
+        slices: rows to read; None: all.
+        angles_deg, air, dark: of :func:`torchpcct.formats.data_exchange.read_data_exchange`, in the place of the
+            file's; ``angles_deg`` of the projections alone.
+        mu_water, options: of :meth:`torchpcct.Scan.from_counts`.
+
+    Returns:
+        Scan with counts ``(slices, views, columns)``, the rotation axis in the detector's middle.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: no NXtomo, damaged, several scans and no ``entry``, one that keeps data in other files; no flats,
+            angles in an unknown unit.
+    """
+    import h5py
+
+    with reading(path, "a NeXus tomography"), h5py.File(path, "r") as file:
+        detector = _detector(file, entry)
+        data, key = inside(file, f"{detector}/data"), np.ravel(inside(file, f"{detector}/image_key")[()]).astype(int)
+        check_size(data.shape, data.name)
+        if data.ndim != 3 or key.size != data.shape[0]:
+            raise ValueError(
+                f"{data.name} has the shape {data.shape}, expected (frames, rows, columns) of {key.size} keys"
+            )
+        rows = slice(None) if slices is None else slices
+        views = np.flatnonzero(key == _PROJECTION)
+        if not views.size:
+            raise ValueError(f"{detector}/image_key names no projections (0)")
+        held = {
+            "air": _taken(data, key == _FLAT, rows) if air is None else given_frames(air, data.shape, rows),
+            "dark": _taken(data, key == _DARK, rows) if dark is None else given_frames(dark, data.shape, rows),
+        }
+        if held["air"] is None:
+            raise ValueError(
+                f"{detector}/image_key names no flat fields (1): give air=, the reading without the object"
+            )
+        black = 0.0 if held["dark"] is None else held["dark"]
+        white = held["air"] if air is not None else _as_long(file, detector, key, held["air"], black)
+        size = inside(file, f"{detector}/x_pixel_size")
+        said = "the file does not know its pixel size"
+        if pitch is not None:
+            said = f"given, {pitch} mm"
+        elif size is not None:
+            pitch, said = length_in(size)
+        part = None if slices is None else [*slices.indices(data.shape[1])[:2], data.shape[1]]
+        return Frames(
+            str(path),
+            "NeXus",
+            _taken(data, key == _PROJECTION, rows),
+            white,
+            black,
+            _angles(file, detector, key, angles_deg),
+            pitch,
+            said,
+            part,
+        ).scan(mu_water, **options)
+
+
+def _detector(file: Any, entry: str | None) -> str:
+    """Path of the detector's group."""
+    import h5py
+
+    found: dict[str, str] = {}
+    for name in file:
+        if _own_group(file, name):
+            groups = sorted(_detectors(file[name]), key=lambda group: not _is_detector(group))
+            if groups:
+                found[name] = groups[0].name
+        elif isinstance(file.get(name, getlink=True), h5py.ExternalLink):
+            inside(file, name)  # says so
+    if not found:
+        raise ValueError("it has no detector with data and image_key (NXtomo)")
+    if entry is not None:
+        return str(found[choice("entry", entry, tuple(found))])
+    if len(found) > 1:
+        raise ValueError(f"it holds {len(found)} scans: give entry=, one of {', '.join(found)}")
+    return str(next(iter(found.values())))
+
+
+def _taken(data: Any, which: Any, rows: slice) -> Any:
+    """Some rows of the frames that are marked, in runs of neighbours; None: there are none."""
+    at = np.flatnonzero(which)
+    if not at.size:
+        return None
+    height = max(1, len(range(*rows.indices(data.shape[1]))))
+    check_expansion((at.size, height, data.shape[2]), data.name, data.id.get_storage_size, data.dtype.itemsize)
+    runs = np.split(at, np.flatnonzero(np.diff(at) > 1) + 1)
+    return np.concatenate([data[run[0] : run[-1] + 1, rows] for run in runs])
+
+
+def _as_long(file: Any, detector: str, key: Any, white: Any, black: Any) -> Any:
+    """Flat frames as they would read if they had been exposed as long as the projections."""
+    given = inside(file, f"{detector}/count_time")
+    times = np.zeros(0) if given is None else np.ravel(given[()]).astype(np.float64)
+    if times.size != key.size:
+        return white
+    view, flat = (float(np.median(times[key == kind])) for kind in (_PROJECTION, _FLAT))
+    if not (view > 0 and flat > 0) or abs(view / flat - 1) < _SAME_TIME:
+        return white
+    below = black if np.ndim(black) < 3 else np.mean(black, axis=0)
+    return below + (white.mean(0) - below) * (view / flat)
+
+
+def _angles(file: Any, detector: str, key: Any, given: Any) -> Any:
+    """Angles of the projections in rad."""
+    views = int((key == _PROJECTION).sum())
+    if given is not None:
+        return angles_of(given, views=views)
+    above = detector.split("/")[1:-1]
+    entries = ["/" + "/".join(above[:n]) for n in range(len(above), 0, -1)]
+    for name in (f"{entry}/{part}/rotation_angle" for entry in entries for part in ("sample", "data")):
+        data = inside(file, name)
+        if data is not None and data.size == key.size:
+            return angles_in(data, key.size, f"{detector}/data", key == _PROJECTION)
+        if data is not None:
+            return angles_in(data, views, f"{detector}/data without flats and darks")
+    raise ValueError(f"it has no angles, {entries[-1]}/sample/rotation_angle: give angles_deg=")

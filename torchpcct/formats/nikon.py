@@ -1,0 +1,146 @@
+"""Cone-beam scans of Nikon / X-Tek machines: ``NAME.xtekct`` beside ``NAME_0001.tif``, …
+
+The files count views as the object turns, columns from the right and rows from the top, as CIL's ``NikonDataReader``
+has found (https://github.com/TomographicImaging/CIL): here the source turns the other way, columns and rows are turned
+over.
+"""
+
+from __future__ import annotations
+
+import configparser
+import os
+import re
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchpcct.formats.arrays import given_array, read_array
+from torchpcct.formats.damage import read_text, reading
+from torchpcct.formats.file_names import in_number_order
+from torchpcct.formats.signed_readings import unwrapped
+from torchpcct.geometry import ConeBeam
+from torchpcct.scan import Scan
+from torchpcct.scan_file import sliced
+from torchpcct.validate import number
+
+__all__ = ["read_xtekct"]
+
+_NEEDED = (
+    "SrcToObject",
+    "SrcToDetector",
+    "DetectorPixelsX",
+    "DetectorPixelsY",
+    "DetectorPixelSizeX",
+    "DetectorPixelSizeY",
+    "Projections",
+    "AngularStep",
+    "WhiteLevel",
+)
+_STRAIGHT_DEG = 1e-3
+"""Tilt of the object's axis that does not matter."""
+
+
+def read_xtekct(
+    path: str | os.PathLike[str],
+    *,
+    slices: slice | None = None,
+    air: Any = None,
+    dark: Any = 0.0,
+    mu_water: float | None = None,
+    **options: Any,
+) -> Scan:
+    """The scan that an ``.xtekct`` file describes.
+
+    Its images are flat-field corrected: a reading without the object is ``WhiteLevel``.
+
+    Args:
+        path: ``.xtekct`` file.
+        slices: detector rows to read, counted upwards; None: all.
+        air: reading without the object; None: the file's ``WhiteLevel``.
+        dark, mu_water, options: of :meth:`torchpcct.Scan.from_counts`; ``gain`` by default from the noise.
+
+    Raises:
+        FileNotFoundError: no such file, or no images.
+        ValueError: a value that is missing or none, another number of images than ``Projections``, damaged images.
+    """
+    text = read_text(path, "a Nikon scan")
+    with reading(path, "a Nikon scan"):
+        file = configparser.ConfigParser(interpolation=None, strict=False)
+        file.read_string(text)
+        if not file.has_section("XTekCT"):
+            raise ValueError("it has no section [XTekCT]")
+        about = file["XTekCT"]
+        missing = [name for name in _NEEDED if not about.get(name, "").strip()]
+        if missing:
+            raise ValueError(f"it has no {', '.join(missing)}")
+        values = {name: number(name, about[name], positive=name != "AngularStep") for name in _NEEDED}
+        views, columns, rows = (int(values[k]) for k in ("Projections", "DetectorPixelsX", "DetectorPixelsY"))
+        magnification = values["SrcToDetector"] / values["SrcToObject"]
+        top, bottom = (_optional(about, f"CentreOfRotation{end}") for end in ("Top", "Bottom"))
+        moved = about.get("ObjectOffsetX", "").strip()
+        offset = number("ObjectOffsetX", moved) * magnification if moved else (top + bottom) / 2
+        height = rows * values["DetectorPixelSizeY"]
+        roll = _optional(about, "ObjectRoll") or float(np.rad2deg(np.arctan2(bottom - top, height)))
+        tilts = {"ObjectRoll": roll, "ObjectTilt": _optional(about, "ObjectTilt")}
+        for name, degrees in tilts.items():
+            if abs(degrees) > _STRAIGHT_DEG:
+                warnings.warn(
+                    f"{path}: the rotation axis is inclined ({name} {degrees:.3g}°), which is left out: give a "
+                    "VectorGeometry for it",
+                    UserWarning,
+                    stacklevel=2,
+                )
+        angles = np.deg2rad(90.0 + _optional(about, "InitialAngle") + values["AngularStep"] * np.arange(views))
+        geometry = ConeBeam(
+            angles,
+            values["SrcToObject"],
+            values["SrcToDetector"],
+            columns,
+            rows,
+            (values["DetectorPixelSizeY"], values["DetectorPixelSizeX"]),
+            (0.0, offset),
+        )
+        names = _images(Path(path), about, views)
+        info: dict[str, Any] = {"file": str(path), "format": "Nikon"}
+        pick = None
+        if slices is not None:
+            geometry, info["slices"] = sliced(geometry, slices, rows)
+            first, stop, _ = info["slices"]
+
+            def pick(shape: tuple[int, ...]) -> tuple[slice, ...]:
+                return (slice(None), slice(rows - stop, rows - first), slice(None))
+
+    readings = read_array([os.fspath(name) for name in names], Path(), pick)
+    expected = (views, geometry.rows, columns)
+    if readings.shape != expected:
+        raise ValueError(f"{path}: its images have the shape {readings.shape}, it says {expected}")
+    options.setdefault("gain", "noise")
+    white = values["WhiteLevel"] if air is None else given_array(air)
+    held = unwrapped({"readings": readings[:, ::-1, ::-1], "air": white, "dark": given_array(dark)}, str(path))
+    return Scan.from_counts(held.pop("readings"), geometry, mu_water=mu_water, info=info, **held, **options)
+
+
+def _optional(about: Any, name: str) -> float:
+    text = about.get(name, "").strip()
+    return number(name, text) if text else 0.0
+
+
+def _images(path: Path, about: Any, views: int) -> list[Path]:
+    """The projections, in their order."""
+    name, folder = (
+        about.get("Name", "").strip() or path.stem,
+        about.get("InputFolderName", "").strip().replace("\\", "/"),
+    )
+    wanted = re.compile(re.escape(name + about.get("InputSeparator", "_").strip()) + r"\d+\.tiff?", re.IGNORECASE)
+    places = [path.parent / folder, path.parent / Path(folder).name, path.parent]  # moved from where it was written
+    found: list[Path] = []
+    for place in dict.fromkeys(places):
+        if place.is_dir():
+            found = in_number_order([each for each in place.iterdir() if wanted.fullmatch(each.name)])
+        if found:
+            break
+    if len(found) != views:
+        raise ValueError(f"it says {views} Projections, {len(found)} images {name}_….tif are there")
+    return found
