@@ -172,7 +172,7 @@ def test_compensated_pwls_shows_the_inset_at_rest(scans, path):
 def test_refusals(scans, path):
     geometry, grid = SCANS["fan"]
     data, narrow = torch.zeros(geometry.shape), DetectorWindow(np.full(12, 15), 30)
-    whole = replace(scans[0.0], window=None, surround=None, counts=torch.ones(scans[0.0].geometry.shape))
+    whole = replace(scans[0.0], window=None, surround=None, region=None, counts=torch.ones(scans[0.0].geometry.shape))
     refused(
         (r"motion needs the shape \(12, 2\)", lambda: backproject(data, geometry, grid, motion=np.zeros((12, 3)))),
         ("not finite", lambda: backproject(data, geometry, grid, motion=np.full((12, 2), np.inf))),

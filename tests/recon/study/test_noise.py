@@ -72,7 +72,9 @@ def test_adjoint_vectors_of_the_grids_share_one_window(measured):
     assert [tuple(v.shape[:2]) for v in adjoints.vectors] == [(2, 2), (2, 2)]
     assert adjoints.matrix.shape[0] == 8
     assert adjoints.window.rows < scanned.clean.window.rows
-    whole = replace(scanned.clean, counts=torch.ones(scanned.clean.geometry.shape), window=None, surround=None)
+    whole = replace(
+        scanned.clean, counts=torch.ones(scanned.clean.geometry.shape), window=None, surround=None, region=None
+    )
     with pytest.raises(ValueError, match="windowed"):
         whole.crop(adjoints.window)
     with pytest.raises(ValueError, match="windowed"):
