@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,6 +27,10 @@ __all__ = [
 ]
 
 Floats = NDArray[np.float64]
+
+_SECTORS = 12
+_SEEN, _UNCERTAIN = 5.0, 0.08
+"""Least contrast of an edge in standard errors, largest standard error of its transfer at f50."""
 
 
 @checked
@@ -120,8 +125,17 @@ def task_transfer(image: ArrayLike, distance: ArrayLike, reach: tuple[float, flo
         image, distance, reach, bin_mm: as in :func:`edge_profile`.
 
     Raises:
-        ValueError: as in :func:`edge_profile`; an edge without contrast.
+        ValueError: as in :func:`edge_profile`; an edge without contrast, or one that noise hides: its contrast is less
+            than 5 standard errors, or the transfer at f50 is uncertain by more than 0.08.
     """
+    positions, profile, frequencies, values = _transfer(image, distance, reach, bin_mm)
+    found = TransferFunction(frequencies, values, positions, profile)
+    _require_seen(found, as_array(image), as_array(distance), reach, bin_mm)
+    return found
+
+
+def _transfer(image: ArrayLike, distance: ArrayLike, reach: tuple[float, float], bin_mm: float) -> tuple[Floats, ...]:
+    """Positions, edge-spread function, frequencies, transfer."""
     positions, profile = edge_profile(image, distance, reach, bin_mm)
     spread = np.diff(profile)
     total = float(spread.sum())
@@ -131,4 +145,62 @@ def task_transfer(image: ArrayLike, distance: ArrayLike, reach: tuple[float, flo
     values = np.abs(np.fft.rfft(spread, 8 * spread.size)) / abs(total)
     keep = frequencies <= 0.25 / bin_mm
     frequencies, values = frequencies[keep], values[keep]
-    return TransferFunction(frequencies, values / np.sinc(frequencies * bin_mm) ** 2, positions, profile)
+    return positions, profile, frequencies, values / np.sinc(frequencies * bin_mm) ** 2
+
+
+def _require_seen(
+    found: TransferFunction, image: NDArray[np.float64], distance: NDArray[np.float64], reach: tuple[float, float],
+    bin_mm: float,
+) -> None:  # fmt: skip
+    """Refuse an edge that noise hides (ValueError): by a jackknife over sectors, so that correlated noise counts."""
+    use = (distance >= -reach[0]) & (distance < reach[1])
+    sector = _sectors(use)
+    steps, transfers = [], []
+    for k in range(_SECTORS):
+        rest = np.where(use & (sector == k), np.inf, distance)
+        try:
+            _, profile, _, values = _transfer(image, rest, reach, bin_mm)
+        except ValueError:  # bins that this sector alone fills
+            continue
+        steps.append(_step(profile))
+        transfers.append(values)
+    n = len(steps)
+    if n < _SECTORS // 2:
+        return
+    step, error = _step(found.profile), _spread_of(np.array(steps))
+    if abs(step) < _SEEN * error:
+        raise ValueError(
+            f"the edge is lost in noise: its contrast is {step:.3g} ± {error:.2g} (standard error over sectors): take "
+            "the mean of more realisations, or a noise-free image"
+        )
+    at = found.f50 if math.isfinite(found.f50) else float(found.frequencies[-1])
+    uncertain = float(np.interp(at, found.frequencies, _spread_of(np.array(transfers))))
+    if uncertain > _UNCERTAIN:
+        raise ValueError(
+            f"noise hides the sharpness of the edge: at {at:.3g}/mm its transfer is uncertain by {uncertain:.2g} of "
+            f"the contrast (standard error over sectors, {_UNCERTAIN} at most): take the mean of more realisations, "
+            "or a noise-free image"
+        )
+
+
+def _sectors(use: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Number of the sector of every voxel, about the middle of those that are used; of a line its parts."""
+    if use.ndim < 2:
+        return np.broadcast_to(np.arange(use.size) * _SECTORS // max(use.size, 1), use.shape)
+    at = np.nonzero(use)
+    y, x = (np.arange(n) - (np.mean(i) if i.size else 0.0) for n, i in zip(use.shape[-2:], at[-2:], strict=True))
+    angle = np.arctan2(y[:, None], x)
+    found = np.minimum(((angle + np.pi) / (2 * np.pi) * _SECTORS).astype(np.int64), _SECTORS - 1)
+    return np.broadcast_to(found, use.shape)
+
+
+def _step(profile: Floats) -> float:
+    """Contrast of an edge: the difference of its ends, a quarter of the reach each."""
+    n = max(1, profile.size // 4)
+    return float(profile[-n:].mean() - profile[:n].mean())
+
+
+def _spread_of(left_out: Any) -> Any:
+    """Jackknife standard error of figures with one sector left out each."""
+    n = len(left_out)
+    return np.sqrt((n - 1) / n * np.square(left_out - left_out.mean(0)).sum(0))

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from scipy import ndimage
 from scipy.special import erf
 
 from torchpcct import VolumeGrid
@@ -54,3 +55,28 @@ def test_bins_do_not_blur():
 def test_refusals(call, match):
     with pytest.raises(ValueError, match=match):
         call()
+
+
+@pytest.fixture(scope="module")
+def faint():
+    """A disc of 60 HU on voxels of 0.25 mm, with the distance from its edge."""
+    axes = [(np.arange(80) - 39.5) / 4] * 2
+    y, x = np.meshgrid(*axes, indexing="ij")
+    distance = np.hypot(y - 0.07, x + 0.13) - 5.0
+    return blurred(distance, 0.5, -60.0, 0.0), distance
+
+
+@pytest.mark.parametrize("correlated", [0.0, 1.0])
+def test_noise_has_no_resolution(faint, correlated):
+    """An edge that is not there, or as faint as the noise, is refused; what is not refused is near the truth."""
+    disc, distance = faint
+    true = task_transfer(disc, distance, (2.0, 2.0), 0.125).f50
+    for seed in range(6):
+        noise = np.random.default_rng(seed).normal(size=disc.shape)
+        noise = ndimage.gaussian_filter(noise, correlated) if correlated else noise
+        noise /= noise.std()
+        with pytest.raises(ValueError, match="noise"):
+            task_transfer(60.0 * noise, distance, (2.0, 2.0), 0.125)
+        with pytest.raises(ValueError, match="noise"):
+            task_transfer(disc + 60.0 * noise, distance, (2.0, 2.0), 0.125)
+        assert task_transfer(disc + 3.0 * noise, distance, (2.0, 2.0), 0.125).f50 == pytest.approx(true, rel=0.15)
