@@ -33,6 +33,7 @@ from torchpcct.validate import choice
 
 if TYPE_CHECKING:
     from recon.study.study import ProgressBars
+    from torchpcct.geometry import VolumeGrid
 
 __all__ = [
     "add_compare",
@@ -55,8 +56,6 @@ _STUDY_METHODS = (
 )  # fmt: skip
 """Of ``dose-factor``: every method of the package, and each filter on the kernel on which it has the least error."""
 
-_MEASURED = ("noise", "noise_reference", "dose_factor", "f50", "resolution")
-
 
 def _evaluate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     from recon.evaluate.names import check_method, check_task
@@ -73,33 +72,40 @@ def _evaluate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     if out.is_file():
         raise ValueError(f"{out} is a file: --out names a folder")
     check_results(arguments, out, lambda report: "records" in report, "report.*", "*.png")
-    if getattr(arguments, "volumes", None):
-        _volumes(arguments.volumes[0], arguments.volumes[1], arguments.reference)
+    if getattr(arguments, "scans", None) or getattr(arguments, "volumes", None):
+        _measured(arguments, out)
         return
+    for name in ("region", "reference", "voxel", "extent", "center"):
+        if getattr(arguments, name, None) is not None:
+            raise ValueError(f"--{name} is of measured scans and volumes: give it with --scans or --volumes")
+    n = arguments.realisations if arguments.n is None else arguments.n
     methods = [*(arguments.method or []), *map(_denoiser, arguments.denoiser or [])]
     if any(map(names_module, methods)):
         sys.path.append(os.getcwd())  # the user's own modules lie where the command is run; none hides another one
     if not methods:
         methods = list(arguments.methods)
     tasks = arguments.task or list(arguments.tasks)
-    if arguments.scans:
-        _scans(arguments, methods)
-        return
     if arguments.export is not None:
+        if arguments.dry_run:
+            print(_planned_export(tasks, arguments.exposures_s, n, arguments.export))
+            return
         written = export_scans(
-            tasks, arguments.export, exposures_s=arguments.exposures_s, n=arguments.n,
+            tasks, arguments.export, exposures_s=arguments.exposures_s, n=n,
             seed=arguments.seed, progress=progress,
         )  # fmt: skip
         progress.close()
         print(
-            f"{len(written)} scans in {arguments.export}: reconstruct each on the grid of its folder's grid.json, save "
-            "the volumes under the same names in another folder, and evaluate --method files:FOLDER"
+            f"{len(written)} scans in {arguments.export}. Save their volumes in HU, on the grid of each folder's "
+            "grid.json, under the same names in OTHER/TASK, as this does:\n"
+            f"  torchpcct reconstruct {arguments.export}/{written[0].parent.name}/*.h5 --out OTHER/"
+            f"{written[0].parent.name}\n"
+            f"  torchpcct evaluate --task {tasks[0]} --method files:OTHER --n {n}"
         )
         return
     found = None
     with executing(arguments, out):
         found = evaluate(
-            tasks, methods, exposures_s=arguments.exposures_s, n=arguments.n, seed=arguments.seed,
+            tasks, methods, exposures_s=arguments.exposures_s, n=n, seed=arguments.seed,
             folder=out / "pieces", progress=progress,
         )  # fmt: skip
     progress.close()
@@ -110,26 +116,78 @@ def _evaluate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     print(f"all figures, pictures and the page: {', '.join(str(f) for f in files)}")
 
 
-def _scans(arguments: argparse.Namespace, methods: list[str]) -> None:
-    """Measured scans, of which nobody knows the truth."""
-    from recon.cli.scans import grid_of_scan
+def _planned_export(tasks: list[str], exposures_s: Any, n: int, folder: Path) -> str:
+    """What ``--export`` would write."""
+    from recon.evaluate.tasks import read_task
+
+    lines = []
+    for task in map(read_task, tasks):
+        exposures = exposures_s or task.exposures_s
+        times = ", ".join(f"{e:g}" for e in exposures)
+        lines.append(f"{folder / task.name}: {2 * (n + 1) * len(exposures)} scans at {times} s, and grid.json")
+    return "\n".join(lines)
+
+
+def _measured(arguments: argparse.Namespace, out: Path) -> None:
+    """Measured scans or volumes, of which nobody knows the truth: table, page and files."""
+    from recon.evaluate.report import measured_text, save_measured
+
+    of_tasks = {
+        "--task": arguments.task, "--exposure": arguments.exposures_s, "--export": arguments.export,
+        "--workers": arguments.workers, "--dry-run": arguments.dry_run,
+    }  # fmt: skip
+    for flag, value in of_tasks.items():
+        if value:
+            raise ValueError(f"{flag} is of simulated tasks: leave it out with --scans and --volumes")
+    if arguments.scans and arguments.volumes:
+        raise ValueError("give --scans or --volumes, not both")
+    rows, unit, reference = _scans(arguments) if arguments.scans else _volumes(arguments)
+    files = save_measured(rows, unit, reference, out, f"torchpcct {shlex.join(arguments.command_line)}")
+    print(measured_text(rows, unit, reference))
+    print(f"all figures and the page: {', '.join(map(str, files))}")
+
+
+def _scans(arguments: argparse.Namespace) -> tuple[list[dict[str, Any]], str, str]:
+    """Rows, unit and name of the reference."""
+    from recon.evaluate.methods import names_module
     from recon.evaluate.without_truth import evaluate_scans
+    from torchpcct import VolumeGrid
     from torchpcct.formats.scans import open_scan
 
+    if arguments.reference is not None:
+        raise ValueError("--reference names one of the --volumes; of --scans it is FBP with the kernel ram-lak")
+    methods = [*(arguments.method or []), *map(_denoiser, arguments.denoiser or [])] or list(arguments.methods)
+    if any(map(names_module, methods)):
+        sys.path.append(os.getcwd())
     scans = [open_scan(path) for path in arguments.scans]
-    grid = grid_of_scan(scans[0], arguments)
-    _print_measured(evaluate_scans(scans, grid, methods), scans[0].unit, "FBP", "FBP as sharp: kernel ram-lak")
+    grid = VolumeGrid.of(scans[0], voxel=arguments.voxel, extent=arguments.extent, center=arguments.center)
+    region = _region(arguments.region, grid)
+    found = evaluate_scans(
+        scans, grid, methods, region, n=1 if arguments.n is None else arguments.n, seed=arguments.seed
+    )
+    return found, scans[0].unit, "fbp:ram-lak"
 
 
-def _volumes(first: Path, second: Path, reference: str) -> None:
-    """Volumes of two scans of one object that other programs made, one folder a scan."""
+def _volumes(arguments: argparse.Namespace) -> tuple[list[dict[str, Any]], str, str]:
+    """The same of volumes of two scans of one object that other programs made, one folder a scan."""
+    from recon.evaluate.methods import same_grid, volume_files
     from recon.evaluate.without_truth import evaluate_volumes
     from torchpcct.volume import Volume
 
+    for flag, value in (("--method", arguments.method), ("--denoiser", arguments.denoiser)):
+        if value:
+            raise ValueError(f"{flag} is of --scans: --volumes takes what lies in the two folders, a file a method")
+    if arguments.n is not None:
+        raise ValueError("--n is of --scans: two folders of volumes hold one pair of noise realisations")
+    for name in ("voxel", "extent", "center"):
+        if getattr(arguments, name) is not None:
+            raise ValueError(f"--{name} is of --scans: volumes say themselves where they lie")
+    first, second = arguments.volumes
+    reference = arguments.reference or "fbp"
     for folder in (first, second):
         if not folder.is_dir():
             raise ValueError(f"{folder} is no folder: --volumes takes two, with one volume a method in each")
-    stems = [{p.name.partition(".")[0]: p for p in sorted(f.iterdir()) if p.is_file()} for f in (first, second)]
+    stems = [volume_files(folder) for folder in (first, second)]
     names = [name for name in stems[0] if name in stems[1]]
     if reference not in names:
         raise ValueError(
@@ -139,26 +197,43 @@ def _volumes(first: Path, second: Path, reference: str) -> None:
     pairs = {name: [Volume.load(s[name]) for s in stems] for name in names}
     grid, unit = pairs[reference][0].grid, pairs[reference][0].unit
     for name, both in pairs.items():
-        if any(v.grid != grid or v.unit != unit for v in both):
+        if any(not same_grid(v.grid, grid) or v.unit != unit for v in both):
             raise ValueError(
                 f"{name} lies on another grid or has another unit than {reference}: {both[0].grid}, {grid}"
             )
     data = {name: [v.data for v in both] for name, both in pairs.items()}
     base = data.pop(reference)
-    found = evaluate_volumes(data, base, grid.spacing[-1])
-    _print_measured(found, unit, reference, f"{reference} as sharp: that volume")
+    return evaluate_volumes(data, base, grid.spacing, _region(arguments.region, grid)), unit, reference
 
 
-def _print_measured(found: list[dict[str, Any]], unit: str, reference: str, meaning: str) -> None:
-    """Table of noise at equal resolution."""
-    rows = [("method", "noise", f"of {reference} as sharp", "dose factor", "f50, lp/mm", "agree up to, lp/mm")]
-    rows += [(r["method"], *(f"{r[k]:.3g}".replace("nan", "–") for k in _MEASURED)) for r in found]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        print("  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip())
-    if any(r["f50"] == float("inf") for r in found):
-        print("no dose factor where the scans show nothing fine enough to tell how sharp a method is (f50 inf)")
-    print(f"noise of one scan in {unit}; {meaning} with a Gaussian that gives it the same f50")
+def _region(text: str | None, grid: VolumeGrid) -> Any:
+    """A mask from a volume's file, or from ranges of voxels, ``Z0:Z1,Y0:Y1,X0:X1``."""
+    import numpy as np
+
+    from recon.evaluate.methods import same_grid
+    from torchpcct.volume import Volume
+
+    if text is None:
+        return None
+    mask: Any = np.zeros(grid.shape, bool)
+    if not Path(text).exists():
+        try:
+            parts = [slice(*(int(end) if end else None for end in part.split(":"))) for part in text.split(",")]
+        except (ValueError, TypeError):
+            parts = []
+        if len(parts) != len(grid.shape):
+            raise ValueError(
+                f"--region {text}: neither a file nor ranges of voxels, Z0:Z1,Y0:Y1,X0:X1, of {grid.shape} voxels"
+            )
+        mask[tuple(parts)] = True
+    else:
+        volume = Volume.load(text)
+        if not same_grid(volume.grid, grid):
+            raise ValueError(f"--region {text} lies on {volume.grid}, the volumes on {grid}")
+        mask = np.asarray(volume.data) != 0
+    if mask.sum() < 2:
+        raise ValueError(f"--region {text} holds {int(mask.sum())} voxels: two or more are needed")
+    return mask
 
 
 def _denoiser(text: str) -> str:
@@ -287,8 +362,9 @@ def add_evaluate(commands: Commands) -> None:
          "at equal resolution", {"nargs": "+", "read": True}),
         ("--volumes", Path, "FOLDER", "volumes of two scans of one object instead of tasks: in each folder one file "
          "per method, of the same name", {"nargs": 2, "read": True}),
-        ("--reference", str, "NAME", "with --volumes: the one by a linear method that smoothed nothing (default fbp)",
-         {"default": "fbp"}),
+        ("--reference", str, "NAME", "with --volumes: the one by a linear method that smoothed nothing (default fbp)"),
+        ("--region", str, "MASK", "where noise is measured: a volume that is not 0 there, or voxels "
+         "Z0:Z1,Y0:Y1,X0:X1 (default: everywhere)"),
         ("--voxel", float, "MM", "with --scans: voxel size (default: the detector's)", {"limits": LENGTH}),
         ("--extent", float, "MM", "with --scans: of the volume, Z Y X", {"nargs": "+", "limits": LENGTH}),
         ("--center", float, "MM", "with --scans: of the volume, Z Y X", {"nargs": "+", "limits": PLACE}),
@@ -307,7 +383,7 @@ def add_dose_factor(commands: Commands) -> None:
         before=_METHODS_TEXT,
         out="folder for report.md, .json, .csv, .html and pictures (default out/dose-factor)",
     )  # fmt: skip
-    parser.set_defaults(tasks=_STUDY_TASKS, methods=_STUDY_METHODS, scans=None, export=None)
+    parser.set_defaults(tasks=_STUDY_TASKS, methods=_STUDY_METHODS, scans=None, volumes=None, export=None)
     _add_common(parser, n=200)
 
 
@@ -322,10 +398,8 @@ def _add_common(parser: Parser, n: int) -> None:
         ("--exposure", float, "S", "in s (default: those of each task)", exposures),
     )
     add_execution(parser)
-    add_options(
-        parser,
-        ("--n", int, None, f"noise realisations, at least 8 (default {n})", {"default": n, "limits": REALISATIONS}),
-    )
+    parser.set_defaults(realisations=n)
+    add_options(parser, ("--n", int, None, f"noise realisations, at least 8 (default {n})", {"limits": REALISATIONS}))
 
 
 def add_show_task(commands: Commands) -> None:

@@ -26,8 +26,8 @@ from recon.evaluate.response import response, statistic_covariance
 from recon.evaluate.store import Store
 from recon.evaluate.task import Facts, Task
 from recon.least_squares.inset_problem import InsetProblem
-from recon.least_squares.pwls import solve_normal
 from recon.least_squares.qggmrf import DEFAULT_PRIOR
+from recon.least_squares.reconstruct import TOLERANCE_HU
 from recon.mbir.mbir import Mbir
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
@@ -35,7 +35,6 @@ from torchpcct.volume import to_hu
 
 __all__ = ["Draws", "Simulated"]
 
-_PWLS_TOLERANCE_HU = 1.0
 _SIGMA_SEEDS = (900_001, 900_002)
 """Draws that a denoiser's noise level is measured on; none of them is evaluated."""
 
@@ -209,14 +208,12 @@ class Simulated:
         return self.problem.statistic(self.scan).b
 
     def pwls(self) -> Tensor:
-        """HU ``(z, y, x)``, with the default prior."""
+        """HU ``(z, y, x)``, as :func:`recon.reconstruct` gives it: exact projection pairs, its prior and tolerance."""
         problem = self.problem
-        gram = problem.gram.scaled(self.exposure_s)
         with torch.no_grad():
-            found = solve_normal(
-                self.statistic[None], gram.apply, gram, DEFAULT_PRIOR, mu_per_hu=problem.mu_ref / 1000.0,
-                spacing=problem.grid.spacing, tolerance=_PWLS_TOLERANCE_HU,
-            )  # fmt: skip
+            found = problem.solve_statistic(
+                self.statistic[None], self.exposure_s, DEFAULT_PRIOR, tolerance=TOLERANCE_HU
+            )
         return to_hu(found.x + problem.level, problem.mu_ref)[0]
 
     def mbir(self, network: Mbir) -> Tensor:

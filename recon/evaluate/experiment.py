@@ -314,8 +314,9 @@ def export_scans(
     """Write the scans that :func:`evaluate` with the same arguments draws, for a program that cannot be called.
 
     ``FOLDER/TASK/EXPOSUREs_NUMBER_present.h5`` and ``…_absent.h5``, noise free with ``clean`` for the number, and
-    ``grid.json`` with the inset's shape, spacing and centre ``(z, y, x)`` mm. Give the volumes in HU the scans' names
-    (``.nii.gz``, ``.mha``, ``.h5``) in another folder, and evaluate the method ``files:FOLDER``.
+    ``grid.json`` with the inset's shape, spacing and centre ``(z, y, x)`` mm. Save the volumes in HU under the scans'
+    names (``.nii.gz``, ``.mha``, ``.h5``, ``.zarr`` or DICOM folders) in ``OTHER/TASK``, and evaluate the method
+    ``files:OTHER``. ``torchpcct reconstruct FOLDER/TASK/*.h5 --out OTHER/TASK`` does so; its ``_METHOD`` may stay.
 
     Returns:
         The files of the scans.

@@ -6,6 +6,7 @@ observer, errors, and some flat voxels.
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -36,6 +37,8 @@ _CHANNELS, _LOWEST = 4, 0.15
 """Difference-of-Gaussians channels of an observer beside the signal's own shape; frequency of the first, lp/mm."""
 _SEEN_MM = 0.3
 """Standard deviation of the blur through which the observer expects the signal."""
+_LONGEST = 120
+"""Bytes of a folder's name that is a method's."""
 _SHIFT_VOXELS = 0.5
 """A volume that lies so much off is on another grid."""
 
@@ -184,6 +187,8 @@ def check_volume(volume: Tensor, method: Method, reader: Reader, fbp: Tensor) ->
 def kept_as(method: Method, exposure_s: float, task: Task, seed: int) -> tuple[str, str]:
     """Where the pieces of a method at an exposure lie in the task's store, and their key."""
     name = "".join(c if c.isalnum() or c in "-_." else "_" for c in method.name)
+    if name.startswith(".") or len(name.encode()) > _LONGEST:
+        name = f"{name.strip('.')[:40]}-{hashlib.sha256(method.name.encode()).hexdigest()[:12]}"
     return f"{name}/{exposure_s:g}s", f"5 {method.name} {method.key} {seed} {task.fingerprint}"
 
 

@@ -8,8 +8,8 @@ A method's name says all:
 * ``FILTER@BASE``: a filter of :mod:`recon.evaluate.rivals` after a linear method, ``bilateral@fbp:detail``;
 * ``package.module:function``: a function of ``(scan, grid)`` that gives a volume in HU; with ``@BASE`` a denoiser, a
   function of ``(volume)`` or ``(volume, sigma)`` in HU, tensors ``(z, y, x)`` float32;
-* ``files:FOLDER``: volumes that another program has made of scans that
-  :func:`recon.evaluate.export_scans` wrote.
+* ``files:FOLDER``: volumes that another program has made of scans that :func:`recon.evaluate.export_scans` wrote, files
+  or DICOM folders in ``FOLDER/TASK`` with the scans' names, as ``torchpcct reconstruct`` gives them, too.
 
 Whatever it is, it becomes a :class:`Method`, a function of one realisation of a scan (:class:`Draw`).
 """
@@ -38,7 +38,16 @@ from torchpcct.scan import Scan
 from torchpcct.validate import checked, number
 from torchpcct.volume import Volume
 
-__all__ = ["Draw", "Method", "deepinv_denoiser", "denoiser", "method_of", "names_module"]
+__all__ = [
+    "Draw",
+    "Method",
+    "deepinv_denoiser",
+    "denoiser",
+    "method_of",
+    "names_module",
+    "same_grid",
+    "volume_files",
+]
 
 
 class Draw(Protocol):
@@ -235,19 +244,59 @@ def _of_function(name: str, function: Callable[..., Any]) -> Method:
 
 def _of_files(spec: str, folder: Path) -> Method:
     def run(draw: Draw) -> Tensor:
-        found = sorted(folder.glob(f"{draw.label}.*"))
+        task, name = draw.label.split("/")
+        wanted = (name, *(f"{name}_{method}" for method in ("fbp", "pwls", "mbir")))
+        there = volume_files(folder / task) or volume_files(folder)
+        found = [there[n] for n in wanted if n in there]
+        if len(found) > 1:
+            raise ValueError(f"{', '.join(map(str, found))} are volumes of one scan: leave one of them in the folder")
         if not found:
             raise FileNotFoundError(
-                f"{folder} holds no volume {draw.label}.*: reconstruct the exported scan of that name"
+                f"{folder} holds no volume {draw.label}, by itself or with _fbp, _pwls or _mbir behind: reconstruct "
+                "the exported scan of that name"
             )
         volume = Volume.load(found[0])
-        if volume.grid != draw.grid:
+        if not same_grid(volume.grid, draw.grid):
             raise ValueError(f"{found[0]} lies on {volume.grid}, the task on {draw.grid}")
         if volume.unit != "HU":
             raise ValueError(f"{found[0]} is in {volume.unit}, not in HU")
         return volume.data
 
-    return Method(spec, run, key=str(folder.resolve()))
+    return Method(spec, run, key=f"{folder.resolve()} {_content(folder)}")
+
+
+def _content(folder: Path) -> str:
+    """Of the files in a folder: names, sizes and times, so that volumes that are made again are read again."""
+    seen = [(str(p.relative_to(folder)), p.stat().st_size, p.stat().st_mtime_ns) for p in folder.rglob("*")
+            if p.is_file()]  # fmt: skip
+    return hashlib.sha256(repr(sorted(seen)).encode()).hexdigest()[:16]
+
+
+_VOLUMES = (".nii.gz", ".nii", ".mha", ".mhd", ".h5", ".hdf5", ".zarr")
+
+
+def volume_files(folder: Path) -> dict[str, Path]:
+    """Name without ending → a volume in a folder: files of :meth:`torchpcct.Volume.save`, stores, folders of DICOM.
+
+    What lies beside them (summaries, hidden files) is left out. Names may hold dots.
+    """
+    found: dict[str, Path] = {}
+    for path in sorted(folder.iterdir()) if folder.is_dir() else []:
+        ending = next((e for e in _VOLUMES if path.name.lower().endswith(e)), "")
+        if path.name.startswith(".") or not (ending or path.is_dir()):
+            continue
+        found[path.name[: len(path.name) - len(ending)]] = path
+    return found
+
+
+def same_grid(first: VolumeGrid, second: VolumeGrid) -> bool:
+    """Whether two grids are the same within a thousandth of a voxel: files keep places and lengths in float32."""
+    if first.shape != second.shape:
+        return False
+    pairs = zip(first.spacing, second.spacing, first.center, second.center, first.shape, strict=True)
+    return all(
+        abs(a - b) * n <= 1e-3 * b and abs(c - d) <= 1e-3 * b for a, b, c, d, n in pairs
+    )  # fmt: skip
 
 
 def _loaded(spec: str) -> Callable[..., Any]:

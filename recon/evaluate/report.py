@@ -24,7 +24,8 @@ from recon.evaluate.experiment import Evaluation, TaskResult
 from torchpcct.files import atomic_write
 from torchpcct.viz import base64_text
 
-__all__ = ["filled", "page", "plain", "save", "task_sections", "templates", "text_of", "write_report"]
+__all__ = ["filled", "measured_text", "page", "plain", "save", "save_measured", "task_sections", "templates", "text_of",
+           "write_report"]  # fmt: skip
 
 COLUMNS = ("task", "method", "exposure_s", "figure", "where", "value", "low", "high", "unit", "n")
 _WINDOW_HU = (-160.0, 240.0)
@@ -134,6 +135,33 @@ def save(evaluation: Evaluation, folder: str | os.PathLike[str], command: str = 
     pictures = {f"{s.task.name}.png": _picture(s) for s in evaluation.results}
     more = {"report.csv": table.getvalue().encode()}
     return write_report(folder, "Evaluation", text, json.dumps(data, indent=1), pictures, more)
+
+
+def measured_text(rows: list[Record], unit: str, reference: str) -> str:
+    """Markdown of noise at equal resolution.
+
+    Args:
+        rows: of :func:`recon.evaluate.without_truth.evaluate_volumes`.
+        unit: of the volumes.
+        reference: name of the method that the others are compared with.
+    """
+    given = {"rows": rows, "unit": unit, "reference": reference}
+    return filled(Path(__file__).parent / "templates" / "measured.md.j2", given)
+
+
+def save_measured(
+    rows: list[Record], unit: str, reference: str, folder: str | os.PathLike[str], command: str = ""
+) -> list[Path]:
+    """Write ``report.md``, ``.json``, ``.csv`` and ``.html`` of :func:`measured_text`; the files written."""
+    text = measured_text(rows, unit, reference) + (f"\nCommand: `{command}`.\n" if command else "")
+    finite = [{k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in r.items()} for r in rows]
+    data = {"command": command, "unit": unit, "reference": reference, "records": finite}
+    table = io.StringIO()
+    writer = csv.DictWriter(table, list(rows[0]) if rows else ["method"], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows([{k: "" if v is None else v for k, v in r.items()} for r in finite])
+    title = "Noise at equal resolution"
+    return write_report(folder, title, text, json.dumps(data, indent=1), {}, {"report.csv": table.getvalue().encode()})
 
 
 def write_report(

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cached_property
@@ -86,7 +87,7 @@ class Task:
     """See the module.
 
     Args:
-        name: short, for tables and files.
+        name: for tables and files: letters, digits, ``._-``, at most 64, not beginning with a dot.
         title: one line on what is asked.
         scene: with the signal, standing still.
         signal: name of its body, or names.
@@ -115,6 +116,11 @@ class Task:
     tolerance_hu: float = 0.5
 
     def __post_init__(self) -> None:
+        if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,63}", str(self.name)):
+            raise ValueError(
+                "the name of a task is that of its files: letters, digits, '.', '_' and '-', at most 64, no '.' at the "
+                f"start; got {str(self.name)[:80]!r}"
+            )
         signal = (self.signal,) if isinstance(self.signal, str) else tuple(self.signal)
         if not signal:
             raise ValueError(f"task {self.name}: signal names no body of the scene")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -77,7 +78,7 @@ def _task(values: Any, name: str, folder: Path) -> Task:
     for key in ("scene", "signal", "inset"):
         if key not in values:
             raise ValueError(f"task {name} needs {key}; see torchpcct show-task plaque")
-    name = str(values.get("name", name))
+    name = str(values["name"]) if "name" in values else re.sub(r"[^A-Za-z0-9._-]", "_", name).lstrip(".")[:64] or "task"
     config = configured({k: values[k] for k in ("scene", "scanner", "tolerance_hu") if k in values}, folder)
     scene = config.scene
     if not isinstance(scene, Scene):

@@ -1,15 +1,16 @@
 """Methods on measured data, where nobody knows the truth: two scans of one object, or one scan in two halves.
 
-What two independent scans agree on is signal, what they do not is noise (:mod:`torchpcct.metrics.half_split`). A blur
-buys low noise with resolution, so the reference is blurred in the plane to each method's resolution before noise is
-compared: the dose factor is the ratio of the variances then, in a region that the user knows to be flat, or over all.
+What two independent scans agree on is signal, what they do not is noise. A blur buys low noise with resolution, so the
+reference is filtered to each method's resolution, in the plane and along z, before noise is compared
+(:mod:`torchpcct.metrics.equal_resolution`): the dose factor is the ratio of the variances then, in a region that the
+user knows to be flat, or over all.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,12 +21,14 @@ from recon.api import reconstruct
 from recon.evaluate.measure import volume_of
 from recon.evaluate.methods import Method, method_of, noise_of
 from torchpcct.geometry import VolumeGrid
+from torchpcct.metrics.equal_resolution import noise_at_equal_resolution
 from torchpcct.metrics.half_split import HalfSplit, halves
 from torchpcct.scan import Scan
-from torchpcct.validate import checked
+from torchpcct.validate import checked, whole
 
 __all__ = ["MeasuredDraw", "evaluate_scans", "evaluate_volumes"]
 
+Record = dict[str, Any]
 _REFERENCE = "fbp:ram-lak"
 
 
@@ -73,7 +76,9 @@ class MeasuredDraw:
 
 
 @checked
-def evaluate_scans(scans: Any, grid: VolumeGrid, methods: Any, region: Any = None) -> list[dict[str, Any]]:
+def evaluate_scans(
+    scans: Any, grid: VolumeGrid, methods: Any, region: Any = None, *, n: int = 1, seed: int = 0
+) -> list[Record]:
     """Methods on two scans of one object, or on one scan of the whole detector in two halves of its views.
 
     Args:
@@ -81,15 +86,22 @@ def evaluate_scans(scans: Any, grid: VolumeGrid, methods: Any, region: Any = Non
         grid: of the volumes.
         methods: as for :func:`recon.evaluate.experiment`, without files.
         region: bool mask ``grid.shape`` where noise is measured; None: everywhere.
+        n: pairs of noise realisations that are measured. The first is the two scans as they are; for each further one
+            views drawn at random are exchanged between them, which makes two other scans with independent noise.
+        seed: of that draw.
 
     Returns:
-        What :func:`evaluate_volumes` gives, for a dose of ONE of the scans.
+        What :func:`evaluate_volumes` gives, for a dose of ONE of the scans; of ``n`` pairs the geometric means.
 
     Raises:
-        ValueError, TypeError: no two scans of one kind; what the methods refuse.
+        ValueError, TypeError: no two scans of one kind; ``n`` > 1 of one scan, whose halves have no views in common;
+            what the methods refuse.
     """
     given: Sequence[Scan] = [scans] if isinstance(scans, Scan) else list(scans)
+    n, seed = whole("n", n, 1), whole("seed", seed, 0)
     if len(given) == 1:
+        if n > 1:
+            raise ValueError(f"n = {n} pairs are made of two scans by exchanging views: one scan makes one pair")
         given = halves(given[0])
     if len(given) != 2 or any(not isinstance(s, Scan) for s in given):
         raise ValueError(f"give one scan, or two of the same object, got {len(given)}")
@@ -98,42 +110,80 @@ def evaluate_scans(scans: Any, grid: VolumeGrid, methods: Any, region: Any = Non
             f"the scans have {tuple(given[0].counts.shape)} and {tuple(given[1].counts.shape)} readings: two scans of "
             "one object by one scanner are needed"
         )
+    if n > 1 and given[0].geometry != given[1].geometry:
+        raise ValueError("views can be exchanged between scans of one geometry only: these have two; leave out n")
+    names = [method_of(m) for m in (methods if isinstance(methods, list | tuple) else [methods])]
+    draw = np.random.default_rng(seed)
+    rows = []
+    for k in range(n):
+        pair = given if k == 0 else _exchanged(given, draw)
+        found, reference = _reconstructed(pair, grid, names)
+        rows.append(evaluate_volumes(found, reference, grid.spacing, region))
+    return rows[0] if n == 1 else [_mean(list(same)) for same in zip(*rows, strict=True)]
+
+
+def _exchanged(pair: Sequence[Scan], draw: np.random.Generator) -> list[Scan]:
+    """Two scans whose views are those of the two that are given, each of either."""
+    first, second = pair
+    views = torch.from_numpy(draw.random(first.counts.shape[0]) < 0.5).to(first.counts.device)
+    other = views.reshape(-1, *(1,) * (first.counts.ndim - 1))
+    return [
+        replace(a, counts=torch.where(other, b.counts, a.counts)) for a, b in ((first, second), (second, first))
+    ]  # fmt: skip
+
+
+def _reconstructed(
+    pair: Sequence[Scan], grid: VolumeGrid, methods: Sequence[Method]
+) -> tuple[dict[str, list[Tensor]], list[Tensor]]:
+    """Method → its two volumes; and those of the reference."""
     kept: dict[str, list[Tensor]] = {}
 
     def volumes(method: Method) -> list[Tensor]:
         if method.name not in kept:
-            kept[method.name] = [volume_of(method, MeasuredDraw(scan, grid, noise)) for scan in given]
+            kept[method.name] = [volume_of(method, MeasuredDraw(scan, grid, noise)) for scan in pair]
         return kept[method.name]
 
     def noise(method: Method, smooths: float) -> float:
         first, second = volumes(method)
         return noise_of((first - second) / math.sqrt(2.0), torch.arange(first.numel()), smooths)
 
-    names = methods if isinstance(methods, list | tuple) else [methods]
-    found = {m.name: volumes(m) for m in map(method_of, names)}
-    return evaluate_volumes(found, volumes(method_of(_REFERENCE)), grid.spacing[-1], region)
+    return {m.name: volumes(m) for m in methods}, volumes(method_of(_REFERENCE))
+
+
+def _mean(rows: list[Record]) -> Record:
+    """Of one method on several pairs: geometric means, without those of which nothing can be said."""
+    sound = [r for r in rows if not r["why"]]
+    if not sound:
+        return rows[0]
+    keys = ("noise", "noise_shared", "noise_reference", "dose_factor", "low", "high")
+    return {**sound[0], **{k: math.exp(float(np.mean([math.log(r[k]) for r in sound]))) for k in keys}}
 
 
 @checked
-def evaluate_volumes(volumes: Any, reference: Any, voxel_mm: float, region: Any = None) -> list[dict[str, Any]]:
+def evaluate_volumes(volumes: Any, reference: Any, voxel_mm: Any, region: Any = None) -> list[Record]:
     """Noise, resolution and the dose factor of noise at equal resolution of pairs of volumes.
 
     Args:
-        volumes: method → its two volumes ``(z, y, x)`` in one unit.
+        volumes: method → its two volumes ``(z, y, x)`` or ``(y, x)`` in one unit.
         reference: the two of a linear method that has smoothed nothing (FBP, kernel "ram-lak").
-        voxel_mm: in the plane.
-        region: bool mask of a volume; None: everywhere.
+        voxel_mm: edge length of the voxels, one or ``(z, y, x)``.
+        region: bool mask of a volume where noise is measured; resolution is that of the whole volume. None: everywhere.
 
     Returns:
-        For each method: ``method``; ``noise`` of one volume; ``f50``, line pairs per mm at which half of the
-        reference's signal is left; ``resolution``, up to which both volumes agree; ``noise_reference``: of the
-        reference, as sharp; ``dose_factor``: the ratio of the variances. Where the volumes have no structure fine
-        enough to tell how sharp the method is, f50 is inf, and the last two are NaN.
+        For each method: ``method``; ``noise`` of a voxel of one volume; ``noise_shared``, the same at the frequencies
+        that the reference's two volumes agree on; ``noise_reference``: of the reference there, as sharp as the method;
+        ``dose_factor``: the ratio of the last two variances, ``low`` and ``high`` its 95 % interval; ``f50`` and
+        ``f50_z``, line pairs per mm in the plane and along z at which half of the reference's signal is left (inf: it
+        does not fall so far as the object shows); ``resolution`` and ``resolution_z``, up to which the reference's
+        volumes agree; ``why`` there is no factor, which then is NaN (else empty).
 
     Raises:
-        ValueError: volumes of other shapes, NaN.
+        ValueError: volumes of other shapes, NaN; constant ones, or two that are the same.
     """
     base = _split("reference", reference)
+    spacing = np.ravel(voxel_mm).astype(np.float64)
+    spacing = np.array([spacing[0], *spacing]) if spacing.size == 2 else np.broadcast_to(spacing, 3)
+    mask = None if region is None else np.asarray(region, bool).reshape(base.first.shape)
     found = []
     for name, pair in dict(volumes).items():
         split = _split(name, pair)
@@ -141,22 +191,25 @@ def evaluate_volumes(volumes: Any, reference: Any, voxel_mm: float, region: Any 
             raise ValueError(
                 f"{name} has volumes of shape {tuple(split.first.shape)}, the reference {tuple(base.first.shape)}"
             )
-        f50 = split.f50(base, voxel_mm)
-        # Of one volume, not of the mean of both.
-        noise = math.sqrt(2.0) * split.noise(region)
-        other = math.sqrt(2.0) * base.blurred(f50, voxel_mm).noise(region) if math.isfinite(f50) else math.nan
-        factor = (other / noise) ** 2 if noise > 0 else math.inf
+        try:
+            seen = noise_at_equal_resolution(split, base, tuple(spacing), mask)
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from error
+        factor = seen.dose_factor
         found.append({
-            "method": name, "noise": noise, "f50": f50, "resolution": split.resolution(voxel_mm),
-            "noise_reference": other, "dose_factor": factor,
+            "method": name, "noise": seen.noise, "noise_shared": seen.noise_shared,
+            "noise_reference": seen.noise_reference, "dose_factor": factor.value, "low": factor.low,
+            "high": factor.high, "f50": seen.f50_plane, "f50_z": seen.f50_z, "resolution": seen.shown_plane,
+            "resolution_z": seen.shown_z, "why": seen.why,
         })  # fmt: skip
     return found
 
 
 def _split(name: str, pair: Any) -> HalfSplit:
     first, second = (torch.as_tensor(np.asarray(v)).double() for v in pair)
-    if first.shape != second.shape or first.ndim != 3:
+    if first.shape != second.shape or first.ndim not in (2, 3):
         raise ValueError(f"{name}: two volumes (z, y, x) of one shape are needed, got {first.shape} and {second.shape}")
     if not (torch.isfinite(first).all() and torch.isfinite(second).all()):
         raise ValueError(f"{name}: a volume holds NaN or Inf")
-    return HalfSplit(first, second)
+    shape = (1, *first.shape)[-3:]
+    return HalfSplit(first.reshape(shape), second.reshape(shape))

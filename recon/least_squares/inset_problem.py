@@ -16,7 +16,7 @@ from recon.analytic.inset import require_inside, require_same_surround, static_f
 from recon.gram.gram import Gram
 from recon.least_squares.field_model import FieldModel
 from recon.least_squares.field_problem import is_whole_field
-from recon.least_squares.pwls import PwlsOptions, data_model, pwls
+from recon.least_squares.pwls import PwlsOptions, PwlsResult, data_model, pwls, solve_normal
 from recon.least_squares.qggmrf import DEFAULT_PRIOR, QGGMRF
 from recon.least_squares.surround import UnknownSurround, length_unit
 from recon.solution import RESIDUAL_TEST, Solution, tested
@@ -226,6 +226,26 @@ class InsetProblem:
         if len(exposures) != 1:
             raise ValueError(f"the scans of one batch must have one exposure, got {sorted(exposures)} s")
         return float(exposures.pop())
+
+    def solve_statistic(
+        self, b: Tensor, exposure_s: float, prior: QGGMRF, **options: Unpack[PwlsOptions]
+    ) -> PwlsResult:
+        """PWLS of what :meth:`statistic` gives alone: the volumes of :meth:`solve`, in mm⁻¹ above ``level``.
+
+        Args:
+            b: AᵀW y ``(..., *grid.shape)`` with the weights of the exposure.
+            exposure_s: of the readings.
+            prior, options: as of :func:`recon.least_squares.pwls.pwls`.
+        """
+        weights = self.weights * exposure_s
+
+        def exact(x: Tensor) -> Tensor:
+            return self.projector.T(weights * self.projector(x))
+
+        return solve_normal(
+            b, exact, self.model.scaled(exposure_s), prior, mu_per_hu=self.mu_ref / 1000.0, spacing=self.grid.spacing,
+            **options,
+        )  # fmt: skip
 
     def solve(
         self, scans: Sequence[Scan], prior: QGGMRF, data: Sequence[Tensor] | None = None, **options: Unpack[PwlsOptions]

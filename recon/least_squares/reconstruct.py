@@ -15,7 +15,10 @@ from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
 from torchpcct.volume import in_words
 
-__all__ = ["reconstruct_pwls"]
+__all__ = ["TOLERANCE_HU", "reconstruct_pwls"]
+
+TOLERANCE_HU = 1.0
+"""Root mean square distance to the minimum at which PWLS of a scan ends, unless another is asked for."""
 
 
 def reconstruct_pwls(
@@ -40,7 +43,7 @@ def reconstruct_pwls(
             :func:`recon.least_squares.field_problem.field_prior`. Neither depends on the unit of length.
         problem: kept from an earlier call with the same scan and grid; None: made here.
         batch: volumes of an inset solved at a time; they iterate until the slowest has converged.
-        options: of :func:`recon.least_squares.pwls.pwls`; ``tolerance`` is 1 HU unless given.
+        options: of :func:`recon.least_squares.pwls.pwls`; ``tolerance`` is :data:`TOLERANCE_HU` unless given.
 
     Yields:
         Volumes in HU, batch by batch, with the solver's report; of several slices with the sum of ``exact_pairs`` and
@@ -53,7 +56,7 @@ def reconstruct_pwls(
         ValueError, TypeError: see :class:`recon.least_squares.inset_problem.InsetProblem`,
             :class:`recon.least_squares.field_problem.FieldProblem` and :func:`recon.least_squares.pwls.pwls`.
     """
-    wanted: PwlsOptions = {"tolerance": 1.0, **options}
+    wanted: PwlsOptions = {"tolerance": TOLERANCE_HU, **options}
     if problem is None:
         problem = FieldProblem(scans[0], grid) if is_whole_field(scans[0], grid) else InsetProblem(scans[0], grid)
     for i in range(0, len(scans), batch):

@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 
 import numpy as np
 import pytest
@@ -10,8 +11,10 @@ import yaml
 from scipy import ndimage
 from tiny_studies import INSERT
 
+from recon.evaluate.draws import Draws
 from recon.evaluate.estimates import pivot
-from recon.evaluate.experiment import evaluate, export_scans
+from recon.evaluate.experiment import evaluate
+from recon.evaluate.measure import kept_as
 from recon.evaluate.methods import Method, deepinv_denoiser, denoiser, method_of
 from recon.evaluate.names import TASKS
 from recon.evaluate.report import COLUMNS, save, text_of
@@ -185,6 +188,13 @@ def test_what_a_method_gives_is_checked(task, folder, run, expected_text):
         ({"inset": {"size": [6, 8, 8], "voxel_mm": 0.4, "center": [0, 0, 0]}}, "wholly|lie in"),
         ({"inset": {"size": [6, 8, 8], "voxels": 0.4}}, "unknown voxels"),
         ({"colour": "red"}, "unknown colour"),
+        ({"name": "../../evil"}, "name of a task"),
+        ({"name": "/tmp/evil"}, "name of a task"),
+        ({"name": ".hidden"}, "name of a task"),
+        ({"name": ""}, "name of a task"),
+        ({"name": "a" * 65}, "name of a task"),
+        ({"name": "two words"}, "name of a task"),
+        ({"name": "new\nline"}, "name of a task"),
         ({"exposures_s": -1}, "exposures_s"),
         ({"scene": {"kind": "volume", "file": "a.nii"}}, "a.nii"),
     ],
@@ -194,6 +204,20 @@ def test_bad_tasks_are_named(tmp_path, folder, changes, expected_text):
     path.write_text(yaml.safe_dump({**yaml.safe_load(INSERT), **changes}), encoding="utf-8")
     with pytest.raises((ValueError, TypeError, OSError), match=expected_text):
         assert read_task(path).regions
+
+
+def test_names_that_are_paths_stay_within(task, tmp_path):
+    """A file's name makes a task's, whatever it is; a method's never leaves the folder of the task."""
+    path = tmp_path / ".my task (2).yaml"
+    path.write_text(INSERT, encoding="utf-8")
+    assert read_task(path).name == "my_task__2_"
+    for name in ("..", "../..", "/tmp/evil", "x" * 500, "ä" * 100):
+        place = kept_as(Method(name, run_half), 1.0, task, 0)[0]
+        folder, rest = place.split("/")
+        assert rest == "1s"
+        assert not folder.startswith(".")
+        assert 0 < len(folder.encode()) <= 120
+    assert kept_as(Method("fbp:soft", run_half), 1.0, task, 0)[0] == "fbp_soft/1s"
 
 
 @pytest.mark.parametrize(
@@ -211,24 +235,33 @@ def test_bad_methods_are_named(spec, expected_text):
 
 
 @pytest.mark.extended
-def test_volumes_of_another_program(task, folder, tmp_path, found):
-    files = export_scans(task, tmp_path / "scans", n=8)
-    assert len(files) == 2 * (8 + 1)
-    from recon import reconstruct
-    from torchpcct import Scan
-
-    for path in files:
-        volume = reconstruct(Scan.load(path), task.grid, "fbp", kernel="soft")
-        out = tmp_path / "volumes" / path.parent.name / path.name
-        out.parent.mkdir(parents=True, exist_ok=True)
-        volume.save(out)
-    theirs = evaluate(task, f"files:{tmp_path / 'volumes'}", n=8, folder=folder)
-    slope = value(theirs, "slope", f"files:{tmp_path / 'volumes'}", "lesion")
+def test_volumes_of_another_program(here, cli, found):
+    """From --export to a report without renaming a file, by the commands of the how-to."""
+    (here / "insert.yaml").write_text(INSERT, encoding="utf-8")
+    planned = cli("evaluate --task insert.yaml --export scans --n 8 --dry-run")
+    assert "18 scans" in planned
+    assert not (here / "scans").exists()
+    cli("evaluate --task insert.yaml --export scans --n 8 --no-progress")
+    names = " ".join(str(p) for p in sorted((here / "scans" / "insert").glob("*.h5")))
+    cli(f"reconstruct {names} --kernel soft --out volumes/insert --no-progress")
+    command = "evaluate --task insert.yaml --method files:volumes --n 8 --no-progress"
+    assert "files:volumes" in cli(f"{command} --out o")
+    report = json.loads((here / "o" / "report.json").read_text(encoding="utf-8"))
+    (slope,) = [r for r in report["records"] if (r["figure"], r["method"], r["where"]) == (
+        "slope", "files:volumes", "lesion")]  # fmt: skip
     assert slope["value"] == pytest.approx(value(found, "slope", "fbp:soft", "lesion")["value"], abs=0.01)
-    files[3].unlink()
-    (tmp_path / "volumes" / "insert" / files[3].name).unlink()
-    with pytest.raises(FileNotFoundError, match="holds no volume"):
-        evaluate(task, f"files:{tmp_path / 'volumes'}", n=8)
+    # A DICOM folder in place of a file, the scan's own name, and summaries beside.
+    first = here / "volumes" / "insert" / "20s_000_present_fbp.nii.gz"
+    volume = Volume.load(first)
+    volume.save(here / "volumes" / "insert" / "20s_000_present")
+    assert "are volumes of one scan" in cli(f"{command} --out p", 2)
+    first.unlink()
+    cli(f"{command} --out p")
+    Volume(volume.data, VolumeGrid(volume.grid.shape, 0.4)).save(first)
+    shutil.rmtree(here / "volumes" / "insert" / "20s_000_present")
+    assert "lies on" in cli(f"{command} --out q", 2)
+    first.unlink()
+    assert "holds no volume" in cli(f"{command} --out q", 2)
 
 
 @pytest.mark.parametrize("slices", [False, True])
@@ -267,47 +300,78 @@ def test_commands(here, cli):
     assert "is a file" in cli(f"{command} --out f", 2)
 
 
-def test_two_measured_scans(tmp_path):
-    text = INSERT.replace(", rows: 24, energy_bin_kev: 4}\ntolerance_hu: 1000", "}")  # with all effects
-    (tmp_path / "insert.yaml").write_text(text, encoding="utf-8")
-    task = read_task(tmp_path / "insert.yaml")
-    present, _ = task.scans(Store(tmp_path))
-    scans = [present.with_noise(5000.0, k) for k in range(2)]
-    soft, bone = evaluate_scans(scans, task.grid, ["fbp:soft", "fbp:bone"])
-    assert soft["noise"] < bone["noise"]
-    # One smooth ball does not tell how sharp they are: no factor that a blur would win.
-    assert math.isinf(soft["f50"])
-    assert math.isnan(soft["dose_factor"])
+def test_pwls_is_that_of_a_user(task, folder):
+    """What is measured is what recon.reconstruct gives for the same scan, with the signal and without."""
+    from recon import reconstruct
+
+    for draw in Draws(task, Store(folder / task.name)).draw(20.0, 3):
+        theirs, ours = reconstruct(draw.scan, task.grid, "pwls").data, draw.pwls()
+        assert float((ours - theirs).square().mean().sqrt()) < 0.1
+        assert float((ours - theirs).abs().max()) < 1.0
+
+
+def test_two_measured_scans(task, folder):
+    present, _ = task.scans(Store(folder / task.name))
+    scans = [present.with_noise(200.0, k) for k in range(2)]
+    names = ["fbp:soft", "gaussian@fbp:ram-lak"]
+    for rows in (evaluate_scans(scans, task.grid, names), evaluate_scans(scans, task.grid, names, n=2, seed=1)):
+        soft, blurred = rows
+        assert blurred["dose_factor"] == pytest.approx(1.0, abs=0.1)
+        assert blurred["low"] < 1.02
+        assert blurred["high"] > 0.98
+        assert blurred["noise"] < soft["noise"]
+        assert not soft["why"]
     with pytest.raises(ValueError, match="two of the same object"):
         evaluate_scans([scans[0], object()], task.grid, "fbp:soft")
+    with pytest.raises(ValueError, match="one scan makes one pair"):
+        evaluate_scans(scans[0], task.grid, "fbp:soft", n=2)
 
 
 def test_volumes_in_two_folders(here, cli):
-    """Of other programs: noise at equal resolution, a row a method. A blur saves nothing; half of its noise is four
-    times the dose."""
-    generator, grid = torch.Generator().manual_seed(0), VolumeGrid((4, 64, 64), 0.5)
+    """Of other programs: noise at equal resolution, a row a method. A blur saves nothing, in no direction; half of its
+    noise is four times the dose."""
+    generator, grid = torch.Generator().manual_seed(0), VolumeGrid((4, 64, 64), (1.0, 0.5, 0.5), (3.7, -30.38, 29.63))
     object_ = torch.zeros(grid.shape)
     object_[:, 20:44, 20:44] = 100.0
-    pairs = {"fbp": [], "mine": [], "half": []}
+    pairs = {"fbp": [], "mine.v2": [], "half": []}
     for folder in ("one", "two"):
         (here / folder).mkdir()
         plain = object_ + torch.randn(grid.shape, generator=generator) * 10
-        soft, clean = (torch.from_numpy(ndimage.gaussian_filter(v.numpy(), [0, 1.5, 1.5])) for v in (plain, object_))
-        for name, data in (("fbp", plain), ("mine", soft), ("half", (clean + soft) / 2)):
+        soft, clean = (torch.from_numpy(ndimage.gaussian_filter(v.numpy(), [0.6, 1.5, 1.5])) for v in (plain, object_))
+        for name, data in (("fbp", plain), ("mine.v2", soft), ("half", (clean + soft) / 2)):
             Volume(data, grid).save(here / folder / f"{name}.nii.gz")
+            (here / folder / f"{name}.nii.gz.json").write_text("{}", encoding="utf-8")
             pairs[name].append(data)
-    rows = {r[0]: r for line in cli("evaluate --volumes one two").splitlines() if (r := line.split())}
-    assert float(rows["mine"][3]) == pytest.approx(1.0, rel=0.2)
-    assert float(rows["half"][3]) == pytest.approx(4.0 * float(rows["mine"][3]), rel=0.1)
-    assert "hold fbp, half, mine" in cli("evaluate --volumes one two --reference other", 2)
-    assert "is no folder" in cli("evaluate --volumes one no", 2)
+    said = cli("evaluate --volumes one two --out measured")
+    assert "report.html" in said
+    report = json.loads((here / "measured" / "report.json").read_text(encoding="utf-8"))
+    factors = {r["method"]: r for r in report["records"]}
+    assert set(factors) == {"mine.v2", "half"}
+    assert factors["mine.v2"]["low"] < 1.0 < factors["mine.v2"]["high"]
+    assert factors["half"]["dose_factor"] == pytest.approx(4.0, rel=0.1)
+    page = (here / "measured" / "report.html").read_text(encoding="utf-8")
+    assert "mine.v2" in page
+    assert "along z" in page
+    cli("evaluate --volumes one two --region :,4:60,4:60 --out part")
+    part = json.loads((here / "part" / "report.json").read_text(encoding="utf-8"))["records"]
+    assert part[0]["noise"] != report["records"][0]["noise"]
+    Volume(torch.zeros(grid.shape).index_put([torch.tensor(1)], torch.tensor(1.0)), grid).save(here / "mask.nii.gz")
+    cli("evaluate --volumes one two --region mask.nii.gz --out masked")
+    for options, expected in (
+        ("--reference other", "hold fbp, half, mine"), ("--n 9", "--n is of --scans"), ("--task rod", "simulated"),
+        ("--region 9:,:,:", "0 voxels"), ("--region nowhere", "neither a file nor ranges"),
+        ("--method pwls", "--scans"),
+    ):  # fmt: skip
+        assert expected in cli(f"evaluate --volumes one two {options} --out m", 2)
+    assert not (here / "m").exists()
+    assert "no such file: no" in cli("evaluate --volumes one no", 2)
+    assert "is no folder" in cli("evaluate --volumes one mask.nii.gz", 2)
+    assert "with --scans or --volumes" in cli("evaluate --task rod --region 1:2,3:4,5:6", 2)
     reference = pairs.pop("fbp")
-    (soft, half) = evaluate_volumes(pairs, reference, 0.5)
-    assert 0.1 < soft["f50"] < 0.4
-    assert half["dose_factor"] == pytest.approx(4.0 * soft["dose_factor"], rel=0.05)
-    assert soft["noise"] < 5.0
     with pytest.raises(ValueError, match="shape"):
         evaluate_volumes({"other": [np.zeros((4, 64, 32))] * 2}, reference, 0.5)
+    with pytest.raises(ValueError, match="mine: the method has a constant volume"):
+        evaluate_volumes({"mine": [np.ones((4, 64, 64))] * 2}, reference, 0.5)
 
 
 @pytest.fixture(scope="module")
