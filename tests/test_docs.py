@@ -2,20 +2,23 @@
 
 import ast
 import doctest
-import importlib
+import importlib.util
+import json
 import os
 import re
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 from urllib.parse import unquote
 
 import numpy as np
 import pytest
 import torch
+from fresh_python import run_python
 
 import recon
-from torchpcct import ConeBeam, FanBeam, ParallelBeam, Projector, VolumeGrid
+from torchpcct import ConeBeam, Projector, VolumeGrid
 from torchpcct.vector_geometry import VectorGeometry
 
 ROOT = Path(__file__).parents[1]
@@ -29,6 +32,15 @@ def test_the_conversions_run():
     found = doctest.testfile(str(DOCS / "explanation" / "conventions.md"), module_relative=False)
     assert found.attempted > 25
     assert not found.failed
+
+
+@cache
+def _functions_of_the_page():
+    page = (DOCS / "explanation" / "conventions.md").read_text(encoding="utf-8")
+    names = {}
+    for example in doctest.DocTestParser().get_examples(page):
+        exec(compile(example.source, "conventions.md", "exec"), names)
+    return names
 
 
 def _flat(points, source, first, row, column):
@@ -93,10 +105,7 @@ def _ours(points, g):
 @pytest.mark.parametrize("name", ["astra", "rtk", "tigre", "catsim", "dicom_ct_pd"])
 def test_a_point_is_seen_where_the_other_program_sees_it(name):
     """The conversions against formulas that each program publishes, written here once more, with nothing of ours."""
-    page = (DOCS / "explanation" / "conventions.md").read_text(encoding="utf-8")
-    names = {}
-    for example in doctest.DocTestParser().get_examples(page):
-        exec(compile(example.source, "conventions.md", "exec"), names)
+    names = _functions_of_the_page()
     points = np.random.default_rng(1).uniform(-60, 60, (50, 3))
     theirs = {"astra": _astra, "rtk": _rtk, "tigre": _tigre, "catsim": _catsim, "dicom_ct_pd": _dicom_ct_pd}[name]
     convert = names[f"from_{name}"]
@@ -223,14 +232,15 @@ def test_the_site_builds_without_a_warning_and_without_a_network(tmp_path):
 @pytest.mark.peers
 @pytest.mark.parametrize("kind", ["parallel", "fanflat"])
 def test_the_angles_of_astra(kind):
-    """What the conventions page says of ASTRA's circular geometries and of its images."""
+    """What the conventions page does with ASTRA's circular geometries and images, against ASTRA's own."""
     astra = pytest.importorskip("astra")
+    page = _functions_of_the_page()
     theta, image = np.linspace(0, 2 * np.pi, 7)[:-1] + 0.1, np.zeros((32, 32), np.float32)
     image[4:10, 18:29] = 1.0
     if kind == "parallel":
-        ours, theirs = ParallelBeam(theta - np.pi / 2, 48, 1.0), (1.0, 48, theta)
+        ours, theirs = page["from_astra_parallel"](theta, 48, 1.0), (1.0, 48, theta)
     else:
-        ours, theirs = FanBeam(theta - np.pi / 2, 100.0, 150.0, 80, 1.0), (1.0, 80, theta, 100.0, 50.0)
+        ours, theirs = page["from_astra"](theta, 100.0, 50.0, 80, 1.0), (1.0, 80, theta, 100.0, 50.0)
     circle = astra.create_proj_geom(kind, *theirs)
     vectors = astra.functions.geom_2vec(circle)["Vectors"]
     parts = slice(2, 6) if kind == "parallel" else slice(0, 6)  # the sign of a parallel ray is free
@@ -242,6 +252,28 @@ def test_the_angles_of_astra(kind):
     mine = Projector(ours, VolumeGrid((32, 32), 1.0))(torch.from_numpy(image)).numpy()
     assert np.abs(mine - sinogram).max() < 0.15 * mine.max()
     assert np.linalg.norm(mine - sinogram) < 0.03 * np.linalg.norm(mine)
+
+
+@pytest.mark.peers
+def test_the_matrices_of_rtk():
+    """What the conventions page makes of RTK's parameters, against RTK's own matrices."""
+    if importlib.util.find_spec("itk") is None:
+        pytest.skip("itk-rtk is not installed")
+    gantry, offset = (0.0, 63.0, 271.8), (10.0, -5.0)
+    # In a process of its own: its libraries do not bear those of others.
+    code = (
+        "import itk, json\ng = itk.RTK.ThreeDCircularProjectionGeometry.New()\n"
+        f"for a in {gantry}: g.AddProjection(1000.0, 1536.0, a, *{offset})\n"
+        f"print(json.dumps([itk.array_from_matrix(g.GetMatrix(k)).tolist() for k in range({len(gantry)})]))"
+    )
+    matrices = json.loads(run_python(code).stdout)
+    points = np.random.default_rng(1).uniform(-60, 60, (50, 3))
+    size, spacing, origin = (512, 256), (0.8, 1.0), (-204.4, -127.5)
+    for degrees, matrix in zip(gantry, matrices, strict=True):
+        u, v, w = np.array(matrix) @ np.vstack([points[:, [1, 2, 0]].T, np.ones(50)])  # its x, y, z: our y, z, x
+        cells = np.array([(v / w - origin[1]) / spacing[1], (u / w - origin[0]) / spacing[0]])
+        ours = _functions_of_the_page()["from_rtk"]([degrees], 1000.0, 1536.0, size, spacing, origin, offset)
+        np.testing.assert_allclose(_ours(points, ours), cells, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", [n for n in recon.__all__ if callable(getattr(recon, n))])

@@ -418,7 +418,7 @@ def add_compare(commands: Commands) -> None:
         "on the same noise realisations at 1× and 5.7× dose, and print what dose each saves. After an interruption the "
         "same command goes on.",
         "torchpcct compare --quick", "torchpcct compare --n 200 --methods fbp:soft pwls mbir:fidelity=1",
-        out="folder for report.html, .md, .json and compare.png (default out/compare)",
+        out="folder for report.html, .md, .json and two pictures (default out/compare)",
     )  # fmt: skip
     add_options(
         parser,

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 
 from recon.evaluate.experiment import Evaluation, evaluate
@@ -26,7 +27,7 @@ from torchpcct.scanner import presets
 from torchpcct.validate import numbers
 from torchpcct.viz import Panel, panels
 
-__all__ = ["SCREEN", "Settings", "figures", "measure"]
+__all__ = ["SCREEN", "Settings", "dose_chart", "figures", "measure"]
 
 SCREEN = "compare_screen"
 """Template of what a terminal shows: the answer, the dose factors of every method, and where the rest is."""
@@ -122,7 +123,63 @@ def figures(measured: Measured) -> dict[str, Any]:
         f"Plaque, deep-silicon PCCT, {dose:g} s, one realisation",
         f"C150 / W600 HU, voxels of {grid.spacing[0]:.2f} mm.",
     )
-    return {"compare.png": figure}
+    return {"compare.png": figure, "dose_factors.png": dose_chart(measured.data["records"], measured.settings)}
+
+
+_QUESTIONS = (
+    ("the paper's CNR", "dose factor: CNR", "small"),
+    ("contrast of the lesion", "dose factor: contrast at slope 1", "lesion"),
+    ("noise of a voxel in fat", "dose factor: noise", "patient"),
+)
+_BEYOND = 1000.0
+"""Intervals are drawn to this factor, and its inverse."""
+
+
+def dose_chart(records: list[dict[str, Any]], settings: Settings) -> Any:
+    """Dose factors with their intervals by question, a colour for each exposure; 1 and what the paper assumes marked.
+
+    Args:
+        records: of an evaluation.
+        settings: what was measured.
+    """
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    methods, exposures = list(settings.methods), sorted(settings.exposures_s)
+    figure = Figure((12.4, 0.9 + 0.24 * len(methods)), dpi=110, layout="constrained")
+    panels: Any = figure.subplots(1, len(_QUESTIONS), sharey=True, squeeze=False)[0]
+    for axes, (title, name, where) in zip(panels, _QUESTIONS, strict=True):
+        axes.axvline(1.0, color="0.4", linewidth=1.0)
+        axes.axvline(paper.DOSES["5.7x"] / paper.DOSES["1x"], color="tab:red", linewidth=1.0, linestyle=":")
+        for k, exposure in enumerate(exposures):
+            place = 0.3 * (k - (len(exposures) - 1) / 2)
+            for row, method in enumerate(methods):
+                wanted = {"method": method, "exposure_s": exposure, "figure": name, "where": where}
+                found = next((r for r in records if wanted.items() <= r.items()), None)
+                if found is None or not found["value"] > 0.0:
+                    continue
+                ends = [found[end] if found[end] is not None and found[end] > 0 else found["value"]
+                        for end in ("low", "high")]  # fmt: skip
+                low, high = np.clip(ends, 1.0 / _BEYOND, _BEYOND)
+                axes.plot([low, high], [row + place] * 2, color=f"C{k}", linewidth=2.0, alpha=0.6)
+                axes.plot(found["value"], row + place, "o", color=f"C{k}", markersize=4.0)
+        axes.set_xscale("log")
+        low, high = axes.get_xlim()
+        axes.set_xlim(min(low, 0.4), max(high, 8.0))
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 20.0 else (1.0,)))
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.set_title(title, fontsize=10)
+        axes.grid(axis="x", color="0.9")
+        axes.tick_params(labelsize=8)
+    panels[0].set_yticks(range(len(methods)), methods)
+    panels[0].set_ylim(len(methods) - 0.5, -0.5)
+    panels[0].set_xlabel("costs dose ←   1   → saves dose", fontsize=8)
+    panels[-1].plot([], [], color="tab:red", linestyle=":", label="the paper assumes 5.7")
+    for k, exposure in enumerate(exposures):
+        panels[-1].plot([], [], "o", color=f"C{k}", markersize=4.0, label=f"{exposure:g} s")
+    panels[-1].legend(fontsize=8, frameon=False, loc="upper right")
+    return figure
 
 
 def _peak_memory_gib() -> float:

@@ -2,18 +2,21 @@
 
 import math
 import re
+from types import SimpleNamespace
 
 import pytest
 from tiny_studies import assert_report_is_whole
 
 from recon.evaluate.report import page
-from recon.study.compare import claim
+from recon.study.compare import claim, dose_chart
 from recon.study.report import aligned, render
 
 
 def test_report(tiny, tmp_path):
     study = tiny("compare")
-    data = assert_report_is_whole(study, tmp_path, {"compare.png"}, ("## plaque", "gaussian@fbp:soft"))
+    data = assert_report_is_whole(
+        study, tmp_path, {"compare.png", "dose_factors.png"}, ("## plaque", "gaussian@fbp:soft")
+    )
     assert data["study"] == "compare"
     assert {r["method"] for r in data["records"]} == {"fbp:soft", "gaussian@fbp:soft"}
     assert data["claim"] is None  # without MBIR
@@ -85,6 +88,48 @@ def test_the_answer_is_one_sentence_made_of_the_results(low, high, expected_text
     data["settings"]["views"] = 246
     assert "says nothing about the question" in answer(data)
     assert data["claim"]["needed"] == pytest.approx(2.0 / 0.35)
+
+
+def test_the_page_begins_with_the_answer_in_three_sentences():
+    """Then the pictures and one table, which is narrow; what follows is for those who ask for more."""
+    data = report_values(2.0, 5.6)
+    data["records"].append(record("mbir", 2.0, "dose factor: noise", "patient", 44.2, 40.0, 48.0))
+    data |= {"tables": "THE REST", "seconds": {}, "peak_memory_gib": 1.0}
+    top, rest = render("compare", data).split("\n---\n")
+    assert "THE REST" in rest
+    question, told, first, second, table, meaning = top.strip().split("\n\n")
+    assert question.endswith("?")
+    sentences = re.split(r"(?<=[a-z0-9]\.)(?:\*\*)?\s+", told)
+    assert len(sentences) == 3
+    assert "5.55 [2.00, 5.60] times the dose of MBIR in a scan of 2 s" in sentences[0]
+    assert "where the paper assumes 5.7" in sentences[0]
+    assert "0.85 [0.80, 0.90] times the dose: there MBIR costs dose." in sentences[1]
+    assert "44 times" in sentences[2]
+    assert (first.count(".png"), second.count(".png")) == (1, 1)
+    assert len(table.splitlines()) == 2 + len(data["settings"]["methods"])
+    assert max(map(len, table.splitlines())) < 110
+    assert "95 %" in meaning
+    data["settings"]["n"] = 8
+    assert "WARNING: 1968 views, 8 realisations" in render("compare", data).split("\n---\n")[0]
+    for low, high, verdict in (
+        (1.1, 2.0, "saves dose."),
+        (0.9, 1.1, "neither saves nor costs"),
+        (0.1, 0.9, "costs dose."),
+    ):
+        for r in data["records"]:
+            if r["figure"].startswith("dose factor: contrast"):
+                r |= {"low": low, "high": high}
+        assert f"there MBIR {verdict}" in render("compare", data)
+
+
+def test_the_chart_draws_every_factor_that_was_measured():
+    data = report_values(2.0, 5.6)
+    settings = SimpleNamespace(**data["settings"])
+    axes = dose_chart(data["records"], settings).axes
+    points = [
+        [line.get_xdata()[0] for line in a.lines if line.get_marker() == "o" and len(line.get_xdata())] for a in axes
+    ]
+    assert points == [[5.55, 5.55], [0.85, 0.85], []]
 
 
 def test_no_claim_without_both_exposures():
