@@ -126,6 +126,48 @@ def _catsim(folder: Path) -> tuple[Path, Callable[[], Any]]:
     return folder / "a.prep", lambda: _scan(open_scan(folder / "a.prep", cone))
 
 
+def _nexus(folder: Path) -> tuple[Path, Callable[[], Any]]:
+    from foreign_files import nexus
+
+    from torchpcct.formats.scans import open_scan
+
+    rng = np.random.default_rng(0)
+    data, white = rng.integers(900, 40000, (12, 3, 24)), rng.integers(39000, 41000, (4, 3, 24))
+    path = nexus(folder / "a.nxs", data, white, np.linspace(0, math.pi, 12), pixel_um=40.0)
+    return path, lambda: _scan(open_scan(path))
+
+
+def _laboratory(name: str) -> Callable[[Path], tuple[Path, Callable[[], Any]]]:
+    def make(folder: Path) -> tuple[Path, Callable[[], Any]]:
+        from foreign_files import txrm, xtekct
+        from scipy.io import savemat
+
+        from torchpcct import ConeBeam, full_turn
+        from torchpcct.formats.scans import open_scan
+
+        cone = ConeBeam(full_turn(12, math.radians(120.0)), 300.0, 500.0, 24, 3, 1.7)
+        readings = 5e4 * np.exp(-0.5 - 0.1 * np.random.default_rng(0).standard_normal(cone.shape))
+        if name == "mat":
+            savemat(folder / "a.mat", {"p": readings}, do_compression=True)
+            return folder / "a.mat", lambda: _scan(open_scan(folder / "a.mat", cone, air=5e4))
+        if name == "txrm":
+            path = txrm(folder / "a.txrm", readings, cone, np.full((3, 24), 5e4))
+        else:
+            path = xtekct(folder / "part", readings, cone, 5e4)
+        return path, lambda: _scan(open_scan(path))
+
+    return make
+
+
+def _zarr(part: str) -> Callable[[Path], tuple[Path, Callable[[], Any]]]:
+    def make(folder: Path) -> tuple[Path, Callable[[], Any]]:
+        target, read = _volume(".zarr")(folder)
+        del target
+        return folder / "v.zarr" / part, read
+
+    return make
+
+
 def _clinical(folder: Path) -> tuple[Path, Callable[[], Any]]:
     from foreign_files import ct_pd
 
@@ -171,10 +213,12 @@ READERS: dict[str, Callable[[Path], tuple[Path, Callable[[], Any]]]] = {
     "scan": _own, "data exchange": _data_exchange, "npy": _stack("npy"), "tiff": _stack("tiff"),
     "tiff zlib": _stack("zlib"), "yaml": _stack("yaml"), "catsim": _catsim, "ct-pd": _clinical, "rtk": _rtk,
     "weights": _weights, "h5": _volume(".h5"), "nii": _volume(".nii"), "nii.gz": _volume(".nii.gz"),
-    "mha": _volume(".mha"), "dicom": _volume(""),
+    "mha": _volume(".mha"), "dicom": _volume(""), "nexus": _nexus, "xtekct": _laboratory("xtekct"),
+    "txrm": _laboratory("txrm"), "mat": _laboratory("mat"), "zarr chunk": _zarr("0/c/0/0/0"),
+    "zarr metadata": _zarr("zarr.json"),
 }  # fmt: skip
 """File to damage and how it is read, made in a folder."""
-SEALED = ("scan", "weights", "h5")
+SEALED = ("scan", "weights", "h5", "zarr chunk", "zarr metadata")
 """Our own formats, which carry a checksum: what they give is what was written, or an error that names the file."""
 
 

@@ -48,6 +48,15 @@ def test_a_page_holds_the_volumes_and_no_address():
         assert about["center"] == list(volume.grid.center)
 
 
+def test_letters_say_where_right_and_front_are():
+    """As every other format has them: x to the right, y to the front, z to the head."""
+    page = viewer_page(_volumes(), "v")
+    assert 'const ENDS = [["I", "S"], ["P", "A"], ["L", "R"]];' in page  # of z, y, x
+    for plane in ('"axial", across: 2, up: 1', '"coronal", across: 2, up: 0', '"sagittal", across: 1, up: 0'):
+        assert plane in page
+    assert page.count("letters(p, c)") == 2
+
+
 @pytest.mark.parametrize("scale", [1e-6, 0.02, 1.0, 3e4])
 def test_any_range_of_values_is_kept_to_its_ten_thousandths(scale):
     data = scale * torch.linspace(-0.3, 1.0, 24).reshape(2, 3, 4)
@@ -128,6 +137,8 @@ def test_the_page_does_what_it_says(page):
     def at(across, down):
         return box["x"] + across * box["width"], box["y"] + down * box["height"]
 
+    ends = [canvas.get_attribute("data-ends") for canvas in page.locator("canvas").all()]
+    assert ends == ["L R A P", "L R S I", "P A S I"] * 2  # left, right, top, bottom of axial, coronal, sagittal
     # Values under the pointer, of both volumes, on different grids.
     checked = 0
     for across, down in ((0.23, 0.31), (0.47, 0.52), (0.81, 0.33), (0.37, 0.77), (0.02, 0.02)):

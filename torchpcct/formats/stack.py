@@ -1,4 +1,4 @@
-"""Projections as TIFF or NumPy files, described by a YAML file beside them: :data:`EXAMPLE`."""
+"""Projections as TIFF, NumPy, Zarr or MATLAB files, described by a YAML file beside them: :data:`EXAMPLE`."""
 
 from __future__ import annotations
 
