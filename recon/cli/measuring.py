@@ -64,7 +64,7 @@ def _evaluate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         check_task(name)
     for name in [*(arguments.method or []), *map(_denoiser, arguments.denoiser or [])]:
         check_method(name)
-    from recon.evaluate.experiment import evaluate, export_scans
+    from recon.evaluate.experiment import evaluate, export_scans, measured_before
     from recon.evaluate.methods import names_module
     from recon.evaluate.report import save, text_of
 
@@ -80,7 +80,7 @@ def _evaluate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
             raise ValueError(f"--{name} is of measured scans and volumes: give it with --scans or --volumes")
     n = arguments.realisations if arguments.n is None else arguments.n
     methods = [*(arguments.method or []), *map(_denoiser, arguments.denoiser or [])]
-    if any(map(names_module, methods)):
+    if any(map(names_module, [*methods, *_reported(out)])):
         sys.path.append(os.getcwd())  # the user's own modules lie where the command is run; none hides another one
     if not methods:
         methods = list(arguments.methods)
@@ -103,6 +103,9 @@ def _evaluate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         )
         return
     found = None
+    settings = {"exposures_s": arguments.exposures_s, "n": n, "seed": arguments.seed}
+    before = measured_before(out / "report.json", tasks, out / "pieces", **settings)
+    methods = [*before, *(name for name in methods if name not in before)]
     with executing(arguments, out):
         found = evaluate(
             tasks, methods, exposures_s=arguments.exposures_s, n=n, seed=arguments.seed,
@@ -114,6 +117,15 @@ def _evaluate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     files = save(found, out, f"torchpcct {shlex.join(arguments.command_line)}")
     print(text_of(found))
     print(f"all figures, pictures and the page: {', '.join(str(f) for f in files)}")
+
+
+def _reported(out: Path) -> list[str]:
+    """Methods of the report in a folder, if there is one."""
+    try:
+        report = json.loads((out / "report.json").read_text(encoding="utf-8"))
+        return [str(name) for name in report["settings"]["methods"]]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
 
 
 def _planned_export(tasks: list[str], exposures_s: Any, n: int, folder: Path) -> str:

@@ -10,7 +10,7 @@ Your denoiser on a lung nodule:
 
     from recon.evaluate import denoiser, evaluate, save
 
-    found = evaluate("nodule", ["mbir", denoiser(mine, "fbp:detail")], exposures_s=1.0, n=20, folder="out/mine/pieces")
+    found = evaluate("nodule", ["mbir", denoiser(mine, "fbp:detail")], n=20, folder="out/mine/pieces")
     save(found, "out/mine")
 """
 

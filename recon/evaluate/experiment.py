@@ -29,7 +29,7 @@ from recon.evaluate.tasks import read_task
 from torchpcct.files import atomic_write
 from torchpcct.validate import checked, numbers, whole
 
-__all__ = ["Evaluation", "TaskResult", "evaluate", "export_scans"]
+__all__ = ["Evaluation", "TaskResult", "evaluate", "export_scans", "measured_before"]
 
 log = logging.getLogger(__name__)
 
@@ -304,6 +304,60 @@ def _task(
             records += records_of(task.name, method.name, exposure, own, base, control, facts, true, reader.rois, exact)
     true_hu = dict(zip(reader.rois, true.tolist(), strict=True))
     return records, TaskResult(task, facts, true_hu, truth[0].numpy(), volumes)
+
+
+def measured_before(
+    report: Path, tasks: Sequence[Any], folder: Path, *, exposures_s: Any = None, n: int = 20, seed: int = 0
+) -> list[str]:
+    """Methods of an earlier report that belong on the page of another call of :func:`evaluate` in the same folder.
+
+    Args:
+        report: JSON of :func:`recon.evaluate.report.save`; there need be none.
+        tasks, exposures_s, n, seed: of the new call.
+        folder: of the pieces.
+
+    Returns:
+        Names of the methods that were measured at these tasks, exposures and realisations, and whose pieces are all
+        there: they cost nothing. Of others the log says why they are left out.
+    """
+    try:
+        settings = json.loads(report.read_text(encoding="utf-8"))["settings"]
+        given, before = (
+            (sorted(names), None if exposures is None else [float(e) for e in _listed(exposures)], runs, first)
+            for names, exposures, runs, first in (
+                ([read_task(t).name for t in tasks], exposures_s, n, seed),
+                (settings["tasks"], settings["exposures_s"], settings["n"], settings["seed"]),
+            )
+        )
+        names = [str(name) for name in settings["methods"]]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
+    if given != before:
+        log.warning("%s was measured at other tasks, exposures or realisations: its methods leave the page", report)
+        return []
+    kept = []
+    for name in names:
+        try:
+            method = method_of(name)
+            there = all(_finished(read_task(t), method, exposures_s, n, seed, folder) for t in tasks)
+        except (ValueError, TypeError, OSError, ImportError, AttributeError):
+            there = False
+        if there:
+            kept.append(name)
+        else:
+            log.warning("%s leaves the page of %s: it, or what computes it, has changed; give it again", name, report)
+    return kept
+
+
+def _finished(task: Task, method: Method, exposures_s: Any, n: int, seed: int, folder: Path) -> bool:
+    """Whether all pieces of a method are there."""
+    store = Store(folder / task.name)
+    blocks = [range(0), *(range(start, min(start + BLOCK, n)) for start in range(0, n, BLOCK))]
+    for exposure in task.exposures_s if exposures_s is None else _listed(exposures_s):
+        place, key = kept_as(method, float(exposure), task, seed)
+        if not all(store.has(f"{place}/{part}", key) for k in blocks for part in _parts(method, k)):
+            return False
+    return True
 
 
 @checked

@@ -3,6 +3,7 @@
 import json
 import math
 import shutil
+import sys
 
 import numpy as np
 import pytest
@@ -295,6 +296,14 @@ def test_commands(here, cli):
     out = cli(f"{command} --out o --no-progress")
     assert "my_own_filter:half@fbp:soft" in out
     assert "o/report.csv" in out
+    sys.path.remove(str(here))  # as in another process
+    del sys.modules["my_own_filter"]
+    # A second run into the same folder keeps the first methods on its page.
+    again = cli("evaluate --task insert.yaml --method fbp:detail --n 8 --out o --no-progress")
+    assert "my_own_filter:half@fbp:soft" in again
+    assert "fbp:detail" in again
+    other = cli("evaluate --task insert.yaml --method fbp:soft --n 9 --out o --no-progress")
+    assert "my_own_filter" not in other
     assert "needs a base" in cli(f"{command} --denoiser my_own_filter:half --out o", 2)
     (here / "f").write_bytes(b"mine")
     assert "is a file" in cli(f"{command} --out f", 2)
