@@ -10,12 +10,11 @@ import numpy as np
 
 from recon.analytic.angular_weights import angular_weights
 from recon.analytic.any_orbit import rebin_to_circle
-from recon.analytic.detector_edges import cut_off
+from recon.analytic.detector_edges import cut_off, reach
 from torchpcct.angles import SAME_VIEW, is_offset
-from torchpcct.checks.defects import BRIGHT, GAIN_ERROR
+from torchpcct.checks.defects import BRIGHT
 from torchpcct.detector_window import footprint
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid, view_step
-from torchpcct.readings import MEDIAN_TO_SD
 from torchpcct.scan import Scan
 from torchpcct.validate import checked
 from torchpcct.vector_geometry import VectorGeometry
@@ -29,7 +28,6 @@ _CENTRE_MARGIN = 8
 """Columns beside a grid's footprint that the test of the rotation centre looks at."""
 
 
-_FEWEST_COLUMNS, _SIGMAS, _ALIKE = 16, 8.0, 0.25
 _FEWEST_VIEWS, _FEWEST_CELLS = 24, 500
 _BLOCKS, _BLOCK_SIGMAS = 12, 2.0
 _MOST_READINGS = 3_000_000
@@ -38,6 +36,10 @@ _EVEN = 0.1
 _SURROUND_TOLERANCE, _GAIN_TOLERANCE = 0.01, 0.004
 """Relative deviation of the readings at a window's borders from its surround, and standard deviation of the gains of
 single cells, that are no finding."""
+_SHADOW, _ALIKE, _SOFT_MM, _BLACK, _OTHER_UNIT = 0.1, 0.7, 0.1, 5.0, (0.02, 0.25)
+"""Share of the highest line integral that is the object's shadow; of a row's that the next rows show, too; attenuation
+of water in mm⁻¹ of photons (18 keV) that pass no patient; line integral from which nothing passes; and share of it that
+a unit's factor of ten leaves."""
 _BORDER = 2
 """Columns at either border of a window that are compared with the surround."""
 _STEADY, _TRAVEL = 0.98, 0.25
@@ -158,9 +160,10 @@ def sampling_warnings(geometry: Geometry) -> list[str]:
 def consistency_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
     """Whether a scan contradicts itself or its description, whatever reconstructs it.
 
-    Opposite rays (:mod:`torchpcct.checks.opposite_rays`); where they agree, the moments of the views
-    (:mod:`torchpcct.checks.moments`) of a whole field; rows that end inside the object; and of a window whether its
-    borders see the surround, and its cells have one gain.
+    Neighbouring views (:mod:`torchpcct.checks.neighbours`: order, missing, stuck, travel) and columns
+    (:mod:`torchpcct.checks.columns`: gains, places); opposite rays (:mod:`torchpcct.checks.opposite_rays`); where they
+    agree, the moments of the views (:mod:`torchpcct.checks.moments`: no line integrals, motion) of a whole field; rows
+    that end inside the object; and of a window whether its borders see the surround, and its cells have one gain.
 
     Args:
         scan: counting or energy integrating, without energy bins; of several slices the middle one is looked at.
@@ -169,7 +172,9 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
     Returns:
         Warnings; empty if nothing is found, or nothing can be compared.
     """
+    from torchpcct.checks.columns import column_test
     from torchpcct.checks.moments import moment_test
+    from torchpcct.checks.neighbours import neighbour_test
     from torchpcct.checks.opposite_rays import geometry_test  # loads scipy.stats
 
     whole, window, about = scan, scan.window, (0.0, 0.0)
@@ -190,18 +195,59 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
     if window is not None:
         lines = lines - window.take(scan.surround_line_integrals())
         return [*_surround_texts(_thinned_out(whole)), *geometry_test(lines, geometry, window, about).findings]
-    found = list(geometry_test(lines, geometry).findings)
+    order = neighbour_test(lines, geometry)
+    columns = list(column_test(lines, geometry).findings)
+    if order.findings and "jump" not in order.sizes:  # in no order at all: opposite rays and moments are, too
+        return [*order.findings, *columns]
+    found = [*_stuck_texts(scan, geometry), *order.findings, *geometry_test(lines, geometry).findings]
     try:
         weights = angular_weights(geometry)
     except ValueError:  # FBP refuses these views, other methods need not
         weights = np.ones((geometry.views, 1))
-    found += _gain_texts(lines)
+    found += columns
     sides = cut_off(lines, geometry, weights)
     if any(sides):
         found.append(_cut_text(lines, sides))
-    elif not found and not is_offset(geometry):
+    elif len(found) == len(columns) and not is_offset(geometry):
         found += moment_test(lines, geometry).findings
+    if scan.unit == "HU":
+        found += _water_texts(lines, geometry, scan.linearisation.mu_ref)
     return found
+
+
+def _water_texts(lines: Any, geometry: Any, mu_water: float) -> list[str]:
+    """Water that would be black as thick as the object is, which lets ten times less than its line integrals through:
+    ``mu_water`` is of another unit. Of other errors of ``mu_water`` no data can tell."""
+    p = lines.reshape(geometry.views, -1, geometry.columns).double().numpy()
+    densest = p.max((0, 2))
+    # Of what is thinner than a row no thickness is known.
+    beside = np.minimum(densest[:-2], densest[2:]) if len(densest) > 2 else densest[:0]
+    alike = np.flatnonzero(beside > _ALIKE * densest[1:-1]) + 1 if len(densest) > 1 else np.zeros(1, np.int64)
+    if mu_water < _SOFT_MM or not alike.size:
+        return []
+    row = int(alike[np.argmax(densest[alike])])
+    at = np.abs(np.gradient(reach(geometry)))
+    seen = p[:, row] > _SHADOW * densest[row]
+    # No object is thinner along all rays than it is wide in its narrowest view.
+    across = float((seen * at).sum(1).min())
+    black, found = mu_water * across, float(np.quantile(p[:, row].max(1), 0.9))
+    if black < _BLACK or not _OTHER_UNIT[0] * black < found < _OTHER_UNIT[1] * black:
+        return []
+    return [
+        f"water of mu_water = {mu_water:.3g} mm⁻¹ as thick as the object ({across:.3g} mm) would have a line integral "
+        f"of {black:.2g}, the densest here is {found:.2g}: all reads about {1000 * (found / black - 1):.0f} HU; is "
+        f"mu_water given in cm⁻¹? {mu_water:.3g} cm⁻¹ are {mu_water / 10:.3g} mm⁻¹"
+    ]
+
+
+def _stuck_texts(scan: Scan, geometry: Geometry) -> list[str]:
+    """Views that repeat the readings of others, of several slices in the middle one."""
+    from torchpcct.checks.neighbours import stuck_views
+
+    readings = scan.counts
+    if readings.ndim > len(geometry.shape):
+        readings = readings[readings.shape[0] // 2]
+    return stuck_views(readings, geometry) if tuple(readings.shape) == geometry.shape else []
 
 
 def _thinned_out(scan: Scan) -> Scan:
@@ -283,30 +329,6 @@ def _gain_spread(lines: Any, columns: Any) -> float:
     mean = float((weight * product).sum() / weight.sum())
     error = float(np.sqrt((weight**2 * (product - mean) ** 2).sum()) / weight.sum())
     return math.sqrt(max(mean - 4.0 * error, 0.0) / 1.5)
-
-
-def _gain_texts(lines: Any) -> list[str]:
-    """A column that reads too much or too little in all views, beside good ones: rows tell each other's gains
-    (:mod:`torchpcct.checks.defects`), a single row has only its neighbours."""
-    rows = lines.reshape(lines.shape[0], -1, lines.shape[-1])
-    if rows.shape[1] > 1 or rows.shape[-1] < _FEWEST_COLUMNS:
-        return []
-    mean = rows.double().mean((0, 1)).numpy()
-    bend = mean[1:-1] - (mean[:-2] + mean[2:]) / 2
-    usual = MEDIAN_TO_SD * float(np.median(np.abs(bend)))
-    size = np.abs(bend[1:-1])
-    # The neighbours of a wrong gain bend by half as much, the other way; an edge or a wire on the axis does not.
-    beside = np.maximum(np.abs(bend[:-2] + bend[1:-1] / 2), np.abs(bend[2:] + bend[1:-1] / 2))
-    wrong = np.flatnonzero((size > max(GAIN_ERROR, _SIGMAS * usual)) & (beside < _ALIKE * size))
-    if not wrong.size:
-        return []
-    most = int(wrong[np.argmax(size[wrong])])
-    gain = math.exp(-bend[most + 1])
-    more = f" (and {wrong.size - 1} more)" if wrong.size > 1 else ""
-    return [
-        f"column {most + 2}{more} reads {gain:.2g} times what its neighbours do, in all views: a wrong gain, which "
-        "draws a ring; mask it (dead=)"
-    ]
 
 
 def _cut_text(lines: Any, sides: tuple[bool, bool]) -> str:

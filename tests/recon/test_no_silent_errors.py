@@ -191,7 +191,7 @@ def test_wrong_descriptions_and_readings_are_named():
         "first and the last column": (counts[:, 60:140], replace(g, columns=80)),
         "the sum of a view's line integrals": (counts * np.exp(0.1 - 0.1e-5 * counts), g),
         "no row ends in air": (counts / 2, g),
-        "column 70 reads 1.6 times": (counts * np.where(np.arange(200) == 70, 1.6, 1.0), g),
+        "column 70 reads 1.6 ±": (counts * np.where(np.arange(200) == 70, 1.6, 1.0), g),
     }
     assert _warnings_of(counts, g, "fbp") == ""
     for text, wrong in words.items():

@@ -4,6 +4,8 @@ Of parallel rays of the direction θ at the distances t, the sum ∫ p dt is the
 all θ; ∫ t p dt is a sinusoid, that of the centre of mass, and ∫ t² p dt one of twice the frequency and a constant
 (Helgason 1965, Ludwig 1966, Comm. Pure Appl. Math. 19:49). A fan's rays are sorted into parallel ones first.
 
+Of a cone beam the sum of a row over its columns tells, too, whether the object rises or sinks during the turn.
+
 The sum tells what opposite rays cannot, since it happens to both alike: readings that are no logarithm of the
 transmission (pile-up, saturation, scatter, a dark signal, beam hardening) lack more where the path is long, so a body
 that is not round weighs less along its long axis. The frequency of the others tells the range of the angles, of a half
@@ -34,12 +36,21 @@ WEIGHT_TOLERANCE = 0.002
 (pile-up of 10 %), 0.1 % of it come from its bones at 100 kVp."""
 STEP_TOLERANCE = 0.005
 """Relative error of the steps between views that the moments of a sound scan may show."""
+CENTRE_CELLS, CENTRE_RADII = 0.3, 0.005
+"""Deviation of the centre of mass from its sinusoid that is no finding, root mean square: in cells at the axis, and in
+radii of the object (0.2 % from the bones of a thorax)."""
+AXIAL_ROWS = 0.3
+"""Deviation of the height that is no finding, in rows at the axis, beside what the cone's rays part by."""
+_SLOW = 8
+"""Harmonics of a turn that a motion is looked for in."""
 _SIGMAS = 4.0
 _THIN = 0.5
 """Of a view's sum, what ends between the rows that are averaged and the next, from which nothing is said of it: of a
 dense disc thinner than a row the readings tell the shadow, not the attenuation."""
 _LACKING = 0.25
 """Of what cells lack at the ends of the object at most, how much may change with the direction besides."""
+_LARGEST_STEP = 0.2
+"""Relative error of the steps beyond which nothing is linear."""
 _DIRECTIONS, _LEAST_ARC = 24, 0.8 * math.pi
 """Fewest directions, and the smallest arc of them, that are tested."""
 
@@ -54,8 +65,10 @@ def moment_test(lines: Tensor, geometry: Geometry) -> ScanTest:
         geometry: parallel, fan or cone beam.
 
     Returns:
-        The test of ``weight`` (relative change of the sum with the direction, root mean square) and ``step`` (relative
-        size by which the steps between the views are described too small; of less than a full turn).
+        The test of ``weight`` (relative change of the sum with the direction, root mean square), ``step`` (relative
+        size by which the steps between the views are described too small; of less than a full turn), ``centre`` (mm at
+        the axis by which the centre of mass leaves its sinusoid, root mean square) and, of a cone beam, ``axial`` (mm
+        at the axis by which the object's height changes beyond a wave of one turn).
         :data:`~torchpcct.checks.opposite_rays.UNKNOWN` where far less than half a turn of directions was measured.
 
     Raises:
@@ -67,12 +80,13 @@ def moment_test(lines: Tensor, geometry: Geometry) -> ScanTest:
     values = lines.detach().to("cpu", torch.float64)
     if not bool(torch.isfinite(values).all()):
         raise ValueError("lines hold NaN or Inf: bridge dead readings before (torchpcct.readings.bridge)")
-    turned, lacking = 0.0, torch.zeros(g.views, g.columns, dtype=torch.float64)
+    turned, parted, lacking = 0.0, 0.0, torch.zeros(g.views, g.columns, dtype=torch.float64)
     if isinstance(g, ConeBeam):
         plane = orbit_plane(values, g)
         if plane is None or plane.part > _THIN:
             return UNKNOWN
         closed = bool(np.ptp(g.angles) + view_step(g.angles) > 1.9 * math.pi)
+        parted = plane.part
         values, lacking, turned = plane.lines[:, 0], plane.lacking, plane.turned(closed=closed)
     order = np.argsort(g.angles, kind="stable")
     angles, p, lack = g.angles[order], values.numpy()[order], lacking.numpy()[order]
@@ -89,14 +103,35 @@ def moment_test(lines: Tensor, geometry: Geometry) -> ScanTest:
     moments = [(p * width * (t / scale) ** k).sum(1) for k in range(3)]
     weight, weight_error = _weight(theta, moments[0])
     step, step_error = _step(theta, moments[1:])
+    cell = float(np.median(np.abs(width)))
+    mass = float(moments[0].mean())
+    centre, centre_error = (math.nan, math.inf) if mass <= 0 else _beyond(theta, moments[1] * (scale / mass), 1)
+    axial, axial_error, axial_tolerance = _axial(lines, g) if isinstance(g, ConeBeam) else (math.nan, math.inf, 0.0)
+    edge = _radius(t, p)
+    if isinstance(g, ConeBeam):  # what ends near the plane is seen by rays on one side of the object alone
+        parted *= min(2.0 * edge / g.sod, 1.0)
     findings = []
-    if abs(step) - _SIGMAS * step_error > STEP_TOLERANCE + turned:
+    lacks = turned + _edges(theta, p, lack, p.sum(1))
+    if _LARGEST_STEP > abs(step) > STEP_TOLERANCE + turned + _SIGMAS * step_error:
         findings.append(
             "the centre of mass and the width of the views do not turn with them: the steps between the views are "
             f"described about {100 * abs(step):.2g} ± {100 * step_error:.1g} % too {'small' if step > 0 else 'large'}: "
             "the range of the angles is wrong, or the object moved"
         )
-    elif weight - _SIGMAS * weight_error > WEIGHT_TOLERANCE + turned + _edges(theta, p, lack, p.sum(1)):
+    # Readings that are no line integrals shift the centre of mass by their share of the radius, motion keeps the sum.
+    elif centre - _SIGMAS * centre_error > max(CENTRE_CELLS * cell, max(CENTRE_RADII + lacks + parted, weight) * edge):
+        findings.append(
+            f"the centre of mass of the views leaves the sinusoid of an object at rest by {centre:.2g} ± "
+            f"{centre_error:.1g} mm (root mean square): the object moved (breathing, a table), or the angles of the "
+            "views are wrong; edges are double or smeared; gate the views, or give the motion"
+        )
+    elif axial - _SIGMAS * axial_error > axial_tolerance:
+        findings.append(
+            f"the object lies about {axial:.2g} mm higher or lower in the course of the turn (root mean square, "
+            f"{axial / axial_error:.0f} standard errors): it moved along the axis, or the table did (a helix told as a "
+            "circle); give the motion"
+        )
+    elif weight - _SIGMAS * weight_error > WEIGHT_TOLERANCE + lacks:
         findings.append(
             f"the sum of a view's line integrals changes with its direction, by {100 * weight:.2g} ± "
             f"{100 * weight_error:.1g} % (root mean square), that of any object does not: the readings lack most where "
@@ -104,7 +139,12 @@ def moment_test(lines: Tensor, geometry: Geometry) -> ScanTest:
             "saturation, or too few photons for a logarithm), or the object moved; values are wrong by tens of HU, in "
             "long shades"
         )
-    found = {"weight": (weight, weight_error), "step": (step, step_error)}
+    found = {
+        "weight": (weight, weight_error),
+        "step": (step, step_error),
+        "centre": (centre, centre_error),
+        "axial": (axial, axial_error),
+    }
     sizes, errors = ({k: v[i] for k, v in found.items() if math.isfinite(v[0])} for i in (0, 1))
     return ScanTest(sizes, errors, tuple(findings))
 
@@ -163,6 +203,61 @@ def _weight(theta: Floats, sums: Floats) -> tuple[float, float]:
     found, error = _fit(_waves(theta, (2, 4)), sums)
     size = math.sqrt(float((found[1:] ** 2).sum()) / 2)
     return size / float(found[0]), float(np.sqrt((error[1:] ** 2).mean())) / float(abs(found[0]))
+
+
+def _radius(t: Floats, p: Floats) -> float:
+    """Where the object's shadow ends, by distance from the axis, mm."""
+    highest = p.max(0)
+    return float(np.abs(t[highest > 0.05 * highest.max()]).max(initial=0.0))
+
+
+def _beyond(theta: Floats, y: Floats, order: int) -> tuple[float, float]:
+    """Root mean square of the slow changes of ``y`` beyond a constant and waves up to ``order``, and its error."""
+    own = _waves(theta, tuple(range(1, order + 1)))
+    more: Any
+    if theta.size * view_step(theta) > 1.9 * math.pi:
+        more = _waves(theta, tuple(range(order + 1, _SLOW + 1)))[:, 1:]
+    else:
+        x = np.linspace(-1.0, 1.0, theta.size)
+        more = np.polynomial.legendre.legvander(x, _SLOW)[:, 2 * order + 1 :]
+    design = np.linalg.qr(np.column_stack([own, more]))[0]
+    found = design.T @ y
+    left = y - design @ found
+    extra = found[own.shape[1] :]
+    free = max(y.size - design.shape[1], 1)
+    # As in _fit, a third of the directions counts.
+    noise = 3.0 * float((left**2).sum()) / free
+    size = math.sqrt(max(float((extra**2).sum()) - noise * extra.size, 0.0) / y.size)
+    return size, math.sqrt(noise * math.sqrt(2.0 * extra.size) / y.size)
+
+
+def _axial(lines: Tensor, g: ConeBeam) -> tuple[float, float, float]:
+    """Height of the object over the views beyond a wave of one turn, root mean square; its error; what the divergence
+    of the rays may feign. All mm at the axis.
+
+    The sum of a row over its columns changes with the views by a factor, by its own slope if the object is higher, and
+    by its slope times the row's height if it is nearer to the source.
+    """
+    if g.rows < 4:
+        return math.nan, math.inf, 0.0
+    order = np.argsort(g.angles, kind="stable")
+    sums = lines.detach().to("cpu").sum(-1, dtype=torch.float64).numpy()[order]
+    zoom = g.sdd / g.sod
+    v = np.asarray(g.row_positions) / zoom
+    mean = sums.mean(0)
+    slope = np.asarray(np.gradient(mean, v), np.float64)
+    others = np.linalg.qr(np.stack([mean, v * slope], 1))[0]
+    own = slope - others @ (others.T @ slope)
+    power = float(own @ own)
+    if power <= 1e-6 * float(mean @ mean) / float(np.ptp(v)) ** 2:
+        return math.nan, math.inf, 0.0
+    height = -(sums - mean) @ own / power
+    size, error = _beyond(g.angles[order], height, 1)
+    reach = g.sod * np.sin(np.abs(g.fan_angles))
+    highest = lines.detach().amax(tuple(range(lines.ndim - 1))).to("cpu").double().numpy()
+    radius = float(reach[highest > 0.05 * highest.max()].max(initial=0.0))
+    parted = float(np.abs(v).max()) * min((radius / g.sod) ** 2, 1.0)
+    return size, error, AXIAL_ROWS * g.pitch[0] / zoom + parted
 
 
 def _step(theta: Floats, moments: list[Floats]) -> tuple[float, float]:

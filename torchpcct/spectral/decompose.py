@@ -147,9 +147,7 @@ def _check_bins(counts: Any, model: SpectralModel, column: Any) -> None:
     share = float(one_bin(counts).mean()) if counts.shape[1] else 0.0
     if share < NAMED:
         return
-    text = (
-        f"{100 * share:.3g} % of the rays are counted by one energy bin alone, which cannot tell two materials apart"
-    )
+    text = f"{100 * share:.3g} % of the rays are counted by one energy bin alone, which cannot tell two materials apart"
     if share > REFUSED:
         raise ValueError(f"{text}: set lower thresholds, or a higher tube voltage, or sum the bins and reconstruct HU")
     warnings.warn(f"{text}: their line integrals hang on single photons", UserWarning, stacklevel=4)

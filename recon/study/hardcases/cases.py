@@ -397,6 +397,49 @@ def _turned(scan: Scan, angles: Any, counts: Tensor | None = None) -> Scan:
     )
 
 
+def _exchanged(n: Tensor, air: Tensor, rng: np.random.Generator) -> Tensor:
+    """Two views a quarter of a turn apart."""
+    order = torch.arange(len(n))
+    order[[50, 140]] = order[[140, 50]]
+    return n[order]
+
+
+def _stuck(n: Tensor, views: slice, columns: slice = slice(None)) -> Tensor:
+    """The first of these views again and again, noise and all."""
+    n = n.clone()
+    n[views, columns] = n[views.start, columns]
+    return n
+
+
+def _shifted(n: Tensor, air: Tensor, columns: NDArray[np.float64]) -> Tensor:
+    """Every view moved by so many columns."""
+    lines = torch.log(air / n).double().numpy()
+    moved = [ndimage.shift(row, c, order=3, mode="nearest") for row, c in zip(lines, columns, strict=True)]
+    return air * torch.exp(-torch.from_numpy(np.stack(moved))).float()
+
+
+def _swung(amplitude_mm: float, cycles: float) -> Change:
+    """The body swings along y: its columns along with it, as far as it lies across the rays."""
+
+    def change(n: Tensor, air: Tensor, rng: np.random.Generator) -> Tensor:
+        g = GEOMETRY
+        swing = amplitude_mm * np.sin(cycles * (g.angles - g.angles[0]))
+        return _shifted(n, air, swing * np.cos(g.angles) * g.magnification / g.pitch)
+
+    return change
+
+
+def _flying(n: Tensor, air: Tensor, rng: np.random.Generator) -> Tensor:
+    """One column to either side, view by view."""
+    return _shifted(n, air, np.where(np.arange(len(n)) % 2, 1.0, -1.0))
+
+
+def _line_integrals(scan: Scan, base: float) -> Scan:
+    """Logarithms to another base than e, given as line integrals."""
+    lines = torch.log(scan._at_window(scan.air) / scan.counts.clamp_min(0.5)) / base
+    return Scan.from_line_integrals(lines.numpy(), scan.geometry, mu_water=WATER)
+
+
 _TURNED = "the object turned is another object"
 _SIZED = "an object that is larger by as much and attenuates as much less has the same line integrals"
 _SCALED = "line integrals tell attenuation, not what of it is water's"
@@ -438,6 +481,23 @@ _BODY: dict[str, Case] = {
     "order": Case(
         "views in random order, angles not", _read(lambda n, air, rng: n[torch.from_numpy(rng.permutation(VIEWS))])
     ),
+    "text-order": Case(
+        "files in the order of the text of their names",
+        _read(lambda n, air, rng: n[torch.tensor(sorted(range(VIEWS), key=str))]),
+    ),
+    "exchanged": Case("two views exchanged", _read(_exchanged)),
+    "lost-views": Case(
+        "five views lost, the others told evenly",
+        lambda clean, scan, rng: _turned(scan, full_turn(VIEWS - 5), torch.cat([scan.counts[:70], scan.counts[75:]])),
+    ),
+    "stuck": Case("twenty views stuck", _read(lambda n, air, rng: _stuck(n, slice(100, 120)))),
+    "stuck-module": Case(
+        "32 columns stuck for 60 views", _read(lambda n, air, rng: _stuck(n, slice(100, 160), slice(96, 128)))
+    ),
+    "pairs": Case(
+        "neighbouring columns exchanged",
+        _read(lambda n, air, rng: n[:, torch.arange(n.shape[1]).reshape(-1, 2).flip(-1).flatten()]),
+    ),
     "half-as-full": Case(
         "half a turn given as a whole one",
         lambda clean, scan, rng: _turned(scan, full_turn(VIEWS // 2), scan.counts[: VIEWS // 2]),
@@ -447,6 +507,15 @@ _BODY: dict[str, Case] = {
     "water": Case(
         "water's attenuation 5 % wrong",
         lambda clean, scan, rng: replace(scan, linearisation=_water(scan.geometry.columns, 1.05 * WATER)),
+        unseen=_SCALED,
+    ),
+    "water-cm": Case(
+        "water's attenuation given in cm⁻¹",
+        lambda clean, scan, rng: replace(scan, linearisation=_water(scan.geometry.columns, 10.0 * WATER)),
+    ),
+    "log10": Case(
+        "logarithms to base 10",
+        lambda clean, scan, rng: _line_integrals(scan, math.log(10.0)),
         unseen=_SCALED,
     ),
     # Which part of it there is.
@@ -506,6 +575,13 @@ _BODY: dict[str, Case] = {
         "a column that reads 1.6 times too much",
         _expected(lambda n, air, rng: n * torch.where(torch.arange(n.shape[1]) == 112, 1.6, 1.0)),
     ),
+    "column-95": Case(
+        "the middle column reads 5 % too little",
+        _expected(lambda n, air, rng: n * torch.where(torch.arange(n.shape[1]) == 120, 0.95, 1.0)),
+    ),
+    "breathing": Case("breathing of 6 mm, 2.3 times a turn", _expected(_swung(6.0, 2.3))),
+    "breathing-twice": Case("breathing of 6 mm, twice a turn", _expected(_swung(6.0, 2.0))),
+    "flying": Case("a focal spot that flies by two columns, ignored", _expected(_flying)),
     "moved": Case(
         "moved by two columns after half a turn",
         _read(lambda n, air, rng: torch.cat([n[:180], n[180:].roll(2, -1)])),
