@@ -17,6 +17,7 @@ import stat
 import tempfile
 import threading
 import time
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -31,6 +32,7 @@ __all__ = [
     "abandoned",
     "atomic_write",
     "fingerprint",
+    "is_foreign",
     "is_own_hdf5",
     "marker",
     "read_hdf5",
@@ -387,3 +389,25 @@ def _sync(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
+
+
+_FIRST_MEMBER = (30, b"key.npy")
+"""Where the name of a ZIP archive's first file stands, and which it is in a piece: by it a damaged one is known."""
+
+
+def is_foreign(path: Path) -> bool:
+    """Whether something is there that is no piece (:mod:`recon.evaluate.store`), not even a damaged or older one."""
+    try:
+        if path.is_symlink() or not path.is_file():
+            return path.is_symlink() or path.exists()
+        with path.open("rb") as raw:
+            try:
+                with zipfile.ZipFile(raw) as file:
+                    return not {"key.npy", "sum.npy", "tree.npy"} <= set(file.namelist())
+            except Exception:  # a damaged archive can fail in any way
+                at, name = _FIRST_MEMBER
+                raw.seek(0)
+                head = raw.read(at + len(name))
+                return not (head.startswith(b"PK") and head[at:] == name)
+    except FileNotFoundError:  # cleared by others meanwhile
+        return False

@@ -41,7 +41,7 @@ from tempfile import gettempdir
 from typing import Any
 
 from recon.evaluate.sources import source_digest
-from torchpcct.files import VERSION, WriteError, atomic_write, marker
+from torchpcct.files import VERSION, WriteError, atomic_write, is_foreign, marker
 from torchpcct.kernel_cache import compiled_once
 from torchpcct.validate import whole
 
@@ -681,8 +681,6 @@ def _run(
 
 def _keep(folder: Path, files: dict[str, bytes]) -> None:
     """Write what came back from another disk; a file that is no piece is not replaced by one."""
-    from recon.evaluate.store import is_foreign  # which imports this module
-
     for name, data in files.items():
         path = folder / name
         if path.suffix == ".npz" and is_foreign(path):

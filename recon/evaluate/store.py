@@ -10,7 +10,6 @@ import json
 import logging
 import os
 import re
-import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
@@ -21,12 +20,12 @@ import torch
 
 from recon.evaluate import execute
 from recon.evaluate.sources import source_digest
-from torchpcct.files import LEFTOVER, abandoned, atomic_write, read_hdf5
+from torchpcct.files import LEFTOVER, abandoned, atomic_write, is_foreign, read_hdf5
 
 if TYPE_CHECKING:
     from torchpcct.scan import Scan
 
-__all__ = ["Pieces", "Store", "is_foreign", "packed", "unpacked", "was_kept"]
+__all__ = ["Pieces", "Store", "packed", "unpacked", "was_kept"]
 
 log = logging.getLogger(__name__)
 
@@ -37,8 +36,6 @@ _TRIES = 100
 _MARK = "piece"
 """What the store wrote carries its own file name under this name: a file is removed, or replaced by another piece, only
 if it says so itself. A folder of pieces may be the user's, or a link to one."""
-_FIRST_MEMBER = (30, b"key.npy")
-"""Where the name of a ZIP archive's first file stands, and which it is in a piece: by it a damaged one is known."""
 _SCAN = re.compile(r"-[0-9a-f]{16}\.h5$")
 """Names of kept scans end so, with a task's fingerprint."""
 
@@ -162,24 +159,6 @@ def was_kept(path: Path) -> bool:
     except Exception:  # damaged, or of others
         return False
     return False
-
-
-def is_foreign(path: Path) -> bool:
-    """Whether something is there that is no piece, not even a damaged one or one of an earlier version."""
-    try:
-        if path.is_symlink() or not path.is_file():
-            return path.is_symlink() or path.exists()
-        with path.open("rb") as raw:
-            try:
-                with zipfile.ZipFile(raw) as file:
-                    return not {"key.npy", "sum.npy", "tree.npy"} <= set(file.namelist())
-            except Exception:  # a damaged archive can fail in any way
-                at, name = _FIRST_MEMBER
-                raw.seek(0)
-                head = raw.read(at + len(name))
-                return not (head.startswith(b"PK") and head[at:] == name)
-    except FileNotFoundError:  # cleared by others meanwhile
-        return False
 
 
 T = TypeVar("T")

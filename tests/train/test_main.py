@@ -30,7 +30,7 @@ def test_command_line(tmp_path, objective, capsys):
     message = capsys.readouterr().out
     assert f"torchpcct train --out {out} --resume" in message
     assert "stopped at step 8 of 12" in message
-    assert command_line.main([*start, *common]) == 1
+    assert command_line.main([*start, *common]) == 2
     assert "--resume" in capsys.readouterr().err
     assert command_line.main(["--resume", "--seed", "5", *common]) == 2
     assert "seed" in capsys.readouterr().err

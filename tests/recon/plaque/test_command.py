@@ -28,7 +28,7 @@ def test_refuses_a_point_outside(here, cli):
 
 @pytest.mark.parametrize(
     ("option", "why"),
-    [("--wall 50 0", "standard deviation of wall"), ("--beside zzz", "invalid choice: 'zzz'"),
+    [("--wall 50 0", "--wall SD must be greater than 0"), ("--beside zzz", "invalid choice: 'zzz'"),
      ("--particles 3", "--particles must be at least 50"), ("--point-sd 0", "--point-sd must be greater than 0"),
      ("--point 1 nan 2", "--point[1] must be finite"), ("--extent 1 -2 3", "--extent[1] must be greater than 0"),
      ("--seed -1", "--seed must be at least 0"), ("--out scan.h5", "is a file")],
