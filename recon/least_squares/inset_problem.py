@@ -227,15 +227,13 @@ class InsetProblem:
             raise ValueError(f"the scans of one batch must have one exposure, got {sorted(exposures)} s")
         return float(exposures.pop())
 
-    def solve_statistic(
-        self, b: Tensor, exposure_s: float, prior: QGGMRF, **options: Unpack[PwlsOptions]
-    ) -> PwlsResult:
+    def solve_statistic(self, b: Tensor, exposure_s: float, prior: QGGMRF, tolerance: float) -> PwlsResult:
         """PWLS of what :meth:`statistic` gives alone: the volumes of :meth:`solve`, in mm⁻¹ above ``level``.
 
         Args:
             b: AᵀW y ``(..., *grid.shape)`` with the weights of the exposure.
             exposure_s: of the readings.
-            prior, options: as of :func:`recon.least_squares.pwls.pwls`.
+            prior, tolerance: as of :func:`recon.least_squares.pwls.pwls`.
         """
         weights = self.weights * exposure_s
 
@@ -244,7 +242,7 @@ class InsetProblem:
 
         return solve_normal(
             b, exact, self.model.scaled(exposure_s), prior, mu_per_hu=self.mu_ref / 1000.0, spacing=self.grid.spacing,
-            **options,
+            tolerance=tolerance,
         )  # fmt: skip
 
     def solve(
