@@ -58,6 +58,8 @@ _NEAR_MM, _RIM_MM = 0.4, 0.8
 """The error is that of bodies and of what lies so close to them; a rim is looked for so far from them."""
 _FLAT_MM, _FLAT_VOXELS, _KEPT_VOXELS = 1.0, 150, 2000
 """Noise is that of voxels so far from any edge; of tissues with so many; of so many at most."""
+_LINES = 32
+"""Lines per voxel edge of the true shares: to 0.1 HU rms, 9 HU beside metal of 110 000."""
 _VIEWS, _SUB_RAYS = 246, 16
 """Views that values and limit are summed over (path lengths change slowly from view to view), beam samples."""
 
@@ -226,7 +228,7 @@ class Task:
     @cached_property
     def _fractions(self) -> dict[str, Floats]:
         """Body → its share of every voxel."""
-        return dict(zip(self.scene.names, self.scene.volume_fractions(self.grid), strict=True))
+        return dict(zip(self.scene.names, self.scene.volume_fractions(self.grid, _LINES), strict=True))
 
     @property
     def _beside(self) -> Floats:

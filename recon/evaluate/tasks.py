@@ -205,10 +205,8 @@ class VesselTask(Task):
     @cached_property
     def shares(self) -> dict[str, Floats]:
         """See :attr:`Task.shares`."""
-        tissues = list(self._groups)
-        own = {"core" if t == "signal" else t: row for t, row in zip(tissues, np.eye(len(tissues)), strict=True)}
-        found = np.ascontiguousarray(np.moveaxis(self._vessel.painted(self.grid, own, samples=3), -1, 0))
-        return dict(zip(tissues, found, strict=True))
+        own, none = self._vessel.shares(self.grid), np.zeros(self.grid.shape)
+        return {t: sum((own[n] for n in names if n in own), none) for t, names in self._groups.items()}
 
     @property
     def _beside(self) -> Floats:

@@ -289,7 +289,7 @@ class Scene:
             labels[(labels == parent) & body.shape.contains(points)] = k
         return labels
 
-    def volume_fractions(self, grid: VolumeGrid, oversample: int = 4) -> Floats:
+    def volume_fractions(self, grid: VolumeGrid, oversample: int = 16) -> Floats:
         """Share of each voxel that each body fills itself, without the bodies inside it; at rest.
 
         See :func:`torchpcct.scene.raster.volume_fractions`; ``(B, *grid.shape)`` float64.
@@ -299,7 +299,7 @@ class Scene:
         return volume_fractions(self.shapes, self.parents.tolist(), grid, oversample)
 
     def render(
-        self, grid: VolumeGrid, values: Mapping[str, float], outside: float = 0.0, oversample: int = 4
+        self, grid: VolumeGrid, values: Mapping[str, float], outside: float = 0.0, oversample: int = 16
     ) -> Floats:
         """Reference image: volume-weighted mean of one value per body (HU, mm⁻¹, …) in each voxel, at rest.
 
@@ -319,7 +319,7 @@ class Scene:
         levels = np.array([values[name] - outside for name in self.names], dtype=np.float64)
         return np.tensordot(levels, fractions, axes=1) + outside
 
-    def material_map(self, grid: VolumeGrid, energy_kev: float, oversample: int = 4) -> Floats:
+    def material_map(self, grid: VolumeGrid, energy_kev: float, oversample: int = 16) -> Floats:
         """Linear attenuation coefficient of each voxel at one photon energy, mm⁻¹, ``grid.shape`` float64; at rest."""
         energy = np.atleast_1d(np.asarray(energy_kev, dtype=np.float64))
         if energy.size != 1 or not energy[0] > 0:
