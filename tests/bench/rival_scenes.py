@@ -106,10 +106,19 @@ class Bench:
 
     def painted(self, vessel: Vessel, values: dict[str, float]) -> tuple[Tensor, Tensor]:
         """FBP and b of a vessel in any direction, on 0.1 mm voxels."""
-        p, window, g = self.problem, self.clean.window, self.grid
-        fine = VolumeGrid(tuple(2 * n for n in g.shape), g.spacing[0] / 2, g.center)
-        x = vessel.painted(fine, {k: h - values["patient"] for k, h in values.items()})
-        lines = Projector(p.geometry, fine, window)(torch.from_numpy(x * (p.mu_ref / 1000.0)).float())
+        return self.projected(vessel.painted(self.fine, {k: h - values["patient"] for k, h in values.items()}))
+
+    @property
+    def fine(self) -> VolumeGrid:
+        """Of what is painted: half the inset's voxels."""
+        g = self.grid
+        return VolumeGrid(tuple(2 * n for n in g.shape), g.spacing[0] / 2, g.center)
+
+    def projected(self, above_fat: Any) -> tuple[Tensor, Tensor]:
+        """FBP ``(kernels, z, y, x)`` in HU and b of the patient with so many HU added on the fine grid."""
+        p, window = self.problem, self.clean.window
+        added = torch.from_numpy(above_fat * (p.mu_ref / 1000.0)).float()
+        lines = Projector(p.geometry, self.fine, window)(added)
         images = self.fbp.images(lines + window.take(self.clean.surround_line_integrals()))[0]
         b = p.projector.T(p.weights * p.outer.crop(lines, p.window))
         return to_hu(images, p.mu_ref), b
