@@ -253,7 +253,7 @@ def _alone(deviation: NDArray[np.float64], found: NDArray[np.bool_], known: NDAr
         about = np.abs(deviation[max(r - 1, 0) : r + 2, max(c - _ABOUT, 0) : c + _ABOUT + 1])
         if np.quantile(about, 0.8) > _BENT * abs(deviation[r, c]):
             continue
-        best: tuple[float, int, NDArray[np.float64]] | None = None
+        best: tuple[float, int, NDArray[np.floating[Any]]] | None = None
         for count in range(1, _TOGETHER + 1):
             bends = np.eye(count) - 0.5 * (np.eye(count, k=1) + np.eye(count, k=-1))
             for start in range(max(c - count + 1, 1), min(c, columns - 1 - count) + 1):

@@ -112,7 +112,8 @@ def noise_at_equal_resolution(
     for name, pair in zip(("method", "reference"), pairs, strict=True):
         if any(np.ptp(v) <= 1e-6 * np.abs(v).max() for v in pair):
             raise ValueError(f"the {name} has a constant volume: it shows nothing, so nothing can be said of its noise")
-        if np.array_equal(pair[0], pair[1]):
+        one, other = pair
+        if np.array_equal(one, other):
             raise ValueError(f"the {name} has two volumes that are the same: they must be of two scans, or two halves")
     mask = np.ones(shape, bool) if region is None else np.asarray(region, bool)
     if mask.shape != shape or mask.sum() < 2:
@@ -120,7 +121,7 @@ def noise_at_equal_resolution(
                          f"{int(mask.sum())} voxels")  # fmt: skip
     part = _part(mask)
     pairs = [[v[part] for v in pair] for pair in pairs]
-    first, second = pairs
+    first, second = (list(pair) for pair in pairs)
     matches = (_Match(first, second, tuple(float(s) for s in spacing), orders) for orders in range(_ORDERS, 0, -1))
     found = [next(matches).compared(mask[part])]
     while found[-1].why == _ROUGH and len(found) < _ORDERS:
@@ -255,7 +256,7 @@ class _Match:
 
     def _of_bricks(self, values: Floats, weight: Floats) -> Floats:
         found = np.bincount(self._brick.ravel(), (values * weight).ravel(), self._brick.max() + 1)
-        return found.astype(np.float64)
+        return np.asarray(found, dtype=np.float64)
 
     def _fitted(self, theta: Floats) -> tuple[Floats, Floats, Floats] | None:
         """Parameters and the last equations; None: no transfer of this form explains what the method shows."""

@@ -382,6 +382,7 @@ def test_modules_are_looked_for_in_the_current_folder_only_for_a_method_of_one(
 ):
     monkeypatch.setattr(sys, "path", [p for p in sys.path if p not in ("", str(here))])
     before, seen = list(sys.path), []
+    Path("a/b").mkdir(parents=True)
     monkeypatch.setattr("recon.evaluate.experiment.evaluate", lambda *_, **__: seen.append(list(sys.path)))
     assert main(["evaluate", "--task", "nodule", "--method", method, "--out", "out"]) == 0
     assert seen == [[*before, os.getcwd()] if is_of_a_module else before]
@@ -490,7 +491,7 @@ def test_an_unreachable_scheduler_is_told_in_one_sentence(here, cli):
     assert time.monotonic() - start < 10.0
     (output,) = [line for line in said.splitlines() if line]
     assert "no Dask scheduler answers at tcp://127.0.0.1:9" in output
-    assert "dask scheduler --scheduler-file writes it" in cli("evaluate --out out --scheduler none.json", 2)
+    assert "neither an address, tcp://HOST:PORT, nor a scheduler's file" in cli("evaluate --out out --scheduler none.json", 2)
 
 
 @pytest.mark.cluster
