@@ -491,7 +491,8 @@ def test_an_unreachable_scheduler_is_told_in_one_sentence(here, cli):
     assert time.monotonic() - start < 10.0
     (output,) = [line for line in said.splitlines() if line]
     assert "no Dask scheduler answers at tcp://127.0.0.1:9" in output
-    assert "neither an address, tcp://HOST:PORT, nor a scheduler's file" in cli("evaluate --out out --scheduler none.json", 2)
+    said = cli("evaluate --out out --scheduler none.json", 2)
+    assert "neither an address, tcp://HOST:PORT, nor a scheduler's file" in said
 
 
 @pytest.mark.cluster
