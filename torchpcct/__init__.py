@@ -13,8 +13,11 @@ from typing import TYPE_CHECKING, Any
 # core from the others: several times slower. OpenMP reads it when torch loads, so it stands before anything else.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
+from torchpcct.cache_folder import ensure_cache
 from torchpcct.files import VERSION
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
+
+ensure_cache()  # nothing above compiles kernels
 
 if TYPE_CHECKING:
     from torchpcct.acquisition.acquire import acquire

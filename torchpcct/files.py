@@ -14,6 +14,7 @@ import secrets
 import shutil
 import signal
 import stat
+import sys
 import tempfile
 import threading
 import time
@@ -40,6 +41,7 @@ __all__ = [
     "require_ordinary",
     "require_writable",
     "seal",
+    "speak_any_encoding",
     "write_hdf5",
 ]
 
@@ -52,6 +54,17 @@ _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
 VERSION = "0.2.0"
 """Version of this software. pyproject.toml reads it from here; files carry it."""
+
+
+def speak_any_encoding() -> None:
+    """Let standard output and error replace what the terminal's encoding lacks, instead of ending the program.
+
+    Containers and cron speak ASCII, Windows code pages: a line with µ, ± or an ellipsis must not cost the result.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        encoding = (getattr(stream, "encoding", None) or "utf-8").lower().replace("-", "")
+        if encoding != "utf8" and isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
 
 
 def require_folder(path: str | os.PathLike[str]) -> None:

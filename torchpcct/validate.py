@@ -12,6 +12,8 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
+from torchpcct.switches import unswitched
+
 __all__ = [
     "UNITS",
     "broadcast",
@@ -263,7 +265,8 @@ def checked(function: F) -> F:
     Checked are ``int``, ``float``, ``str``, ``bool``, ``Tensor``, ``ArrayLike`` (real numbers of any shape),
     ``Callable``, ``Sequence``, ``Mapping``, ``tuple[float, ...]`` (of a fixed length, too), classes, and what ``|``
     joins; every other annotation lets everything pass. Values are handed on as they are: shapes and ranges are the
-    function's own business.
+    function's own business. It runs :func:`torchpcct.switches.unswitched`: what a program has switched in torch and
+    numpy does not change its result.
 
     Raises:
         TypeError: of the function that is made, for such an argument.
@@ -286,7 +289,8 @@ def checked(function: F) -> F:
                 remedy = ": torch.from_numpy makes one" if "Tensor" in kinds and isinstance(value, np.ndarray) else ""
                 wanted = " or ".join(dict.fromkeys(_in_words(kind) for kind in kinds))
                 raise TypeError(f"{name} must be {wanted}, got {_short(value)}{remedy}")
-        return function(*args, **kwargs)
+        with unswitched():
+            return function(*args, **kwargs)
 
     return cast(F, call)
 

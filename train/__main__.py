@@ -194,6 +194,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     from recon.cli.parsing import check_limits
 
     words = list(sys.argv[1:] if argv is None else argv)
+    from torchpcct.files import speak_any_encoding
+
+    speak_any_encoding()
     parser = _parser()
     arguments = parser.parse_args(words)
     try:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
 import warnings
+import weakref
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import torch
@@ -246,13 +249,77 @@ class Fbp(nn.Module):
     def __init__(self, geometry: Geometry, grid: VolumeGrid, kernel: str = "standard") -> None:
         super().__init__()
         self.geometry, self.grid, self.kernel = geometry, grid, kernel
+        self._enter()
+
+    def _enter(self) -> None:
+        self._handle = next(_HANDLES)
+        _LAYERS[self._handle] = self
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Of a copy, or in another process: a handle of its own."""
+        super().__setstate__(state)
+        self._enter()
 
     def forward(self, sinogram: Tensor) -> Tensor:
+        if torch.compiler.is_compiling():
+            return cast(Tensor, _traced(sinogram, self._handle))
+        return self._computed(sinogram)
+
+    def _computed(self, sinogram: Tensor) -> Tensor:
         narrow = isinstance(sinogram, Tensor) and sinogram.dtype in (torch.float16, torch.bfloat16)
         return fbp(sinogram.float() if narrow else sinogram, self.geometry, self.grid, self.kernel)
 
     def extra_repr(self) -> str:
         return f"{type(self.geometry).__name__}, {self.geometry.shape} -> {self.grid.shape}, {self.kernel}"
+
+
+# To torch.compile and torch.export a layer is one operation, as a pass of the projector is: they cannot look into
+# numba kernels. A traced graph holds the handle of its layer.
+_LAYERS: weakref.WeakValueDictionary[int, Fbp] = weakref.WeakValueDictionary()
+_HANDLES = itertools.count()
+
+
+@torch.library.custom_op("torchpcct::fbp", mutates_args=(), schema="(Tensor sinogram, int layer) -> Tensor")
+def _traced(sinogram: Tensor, layer: int) -> Tensor:
+    return _LAYERS[layer]._computed(sinogram)
+
+
+@_traced.register_fake
+def _shape(sinogram: Tensor, layer: int) -> Tensor:
+    of = _LAYERS[layer]
+    narrow = sinogram.dtype in (torch.float16, torch.bfloat16)
+    lead = sinogram.shape[: sinogram.dim() - len(of.geometry.shape)]
+    return sinogram.new_empty((*lead, *of.grid.shape), dtype=torch.float32 if narrow else sinogram.dtype)
+
+
+@torch.library.custom_op(
+    "torchpcct::fbp_gradient", mutates_args=(), schema="(Tensor sinogram, Tensor gradient, int layer) -> Tensor"
+)
+def _traced_gradient(sinogram: Tensor, gradient: Tensor, layer: int) -> Tensor:
+    def found() -> Tensor:
+        given = sinogram.detach().requires_grad_()
+        return torch.autograd.grad(_LAYERS[layer]._computed(given), given, gradient)[0]
+
+    # Inside of an operation torch records no graph; another thread knows nothing of it.
+    with ThreadPoolExecutor(1) as other:
+        return other.submit(found).result()
+
+
+@_traced_gradient.register_fake
+def _gradient_shape(sinogram: Tensor, gradient: Tensor, layer: int) -> Tensor:
+    return torch.empty_like(sinogram)
+
+
+def _keep(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    sinogram, ctx.layer = inputs
+    ctx.save_for_backward(sinogram)
+
+
+def _back(ctx: Any, gradient: Tensor) -> Any:
+    return _traced_gradient(*ctx.saved_tensors, gradient, ctx.layer), None
+
+
+_traced.register_autograd(_back, setup_context=_keep)
 
 
 _SIDES = ("first", "last")

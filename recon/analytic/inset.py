@@ -25,6 +25,7 @@ from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import ConeBeam, Geometry, VolumeGrid
 from torchpcct.scan import Scan
 from torchpcct.scene.motion import SinusoidalMotion
+from torchpcct.switches import undisturbed
 from torchpcct.validate import checked, number
 from torchpcct.vector_geometry import VectorGeometry
 from torchpcct.volume import to_hu
@@ -196,6 +197,7 @@ class InsetFbp:
         """The surround on every grid, per mm."""
         return [backproject(self._surround, self.geometry, grid, self.footprint) for grid in self.grids]
 
+    @undisturbed
     def images(self, lines: Tensor, outside: float | None = None) -> list[Tensor]:
         """Images of line integrals on the window.
 
@@ -231,6 +233,7 @@ class InsetFbp:
         """``(kernels, *rest)`` with axes of length 1 where ``like`` has its batch, after the kernels."""
         return surround.reshape(len(surround), *[1] * (like.ndim - surround.ndim), *surround.shape[1:])
 
+    @undisturbed
     def __call__(self, scan: Scan) -> list[Tensor]:
         """Volumes in HU, one ``(kernels, *grid.shape)`` float32 tensor per grid."""
         if scan.geometry != self.geometry:

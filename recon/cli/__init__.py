@@ -36,7 +36,7 @@ from recon.cli.plaque import add_plaque
 from recon.cli.scans import add_lower_dose, add_reconstruct, add_show_config, add_simulate
 from recon.cli.starting import add_demo, add_doctor, add_train, demo_steps, train
 from torchpcct import __version__
-from torchpcct.files import WriteError
+from torchpcct.files import WriteError, speak_any_encoding
 
 __all__ = ["main"]
 
@@ -136,6 +136,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     which is no error."""
     _speak_plainly()
     words = list(sys.argv[1:] if arguments is None else arguments)
+    speak_any_encoding()
     if words[:1] == ["train"]:
         return train(words[1:])
     parser, commands, begin = _parser()

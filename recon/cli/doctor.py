@@ -145,6 +145,7 @@ def _gpu() -> str:
 
 
 def _cache() -> str:
+    from torchpcct.cache_folder import is_temporary
     from torchpcct.kernel_cache import folders
     from torchpcct.projector.cpu import cone_kernels
 
@@ -153,7 +154,8 @@ def _cache() -> str:
         require_writable(folder)
     except OSError as error:
         raise ValueError(f"{error.__cause__ or error}: set NUMBA_CACHE_DIR to a folder that you can write") from None
-    return f"{folder}, writable, {len(list(folder.glob('*.nbc')))} compiled kernels"
+    brief = " (while this process lives: set NUMBA_CACHE_DIR to a folder that lasts)" if is_temporary(folder) else ""
+    return f"{folder}, writable, {len(list(folder.glob('*.nbc')))} compiled kernels{brief}"
 
 
 def _weights() -> str:

@@ -30,6 +30,7 @@ from torch import Tensor
 
 from recon.gram.impulse_response import Nodes, kernel_at, node_positions, slice_reach
 from torchpcct.projector.operator import apply_linear
+from torchpcct.switches import undisturbed
 from torchpcct.threads import run
 from torchpcct.validate import number
 
@@ -131,6 +132,7 @@ class Gram:
         TypeError: weights that are not a float tensor.
     """
 
+    @undisturbed
     def __init__(self, projector: Any, weights: Tensor, nodes: int = 9) -> None:
         check_weights(weights, projector.range_shape)
         self.dtype = weights.dtype
@@ -236,6 +238,7 @@ class Gram:
         spectrum = self._periodic * self.factor
         return spectrum[0] if self._flat else spectrum
 
+    @undisturbed
     def lag_kernels(self) -> Tensor:
         """The K_c in space, factor included: ``(terms, reach + 1, nz, py, px)``, lags (y, x) on the padded ring.
 
@@ -249,6 +252,7 @@ class Gram:
         """The b_c on the in-plane grid, ``(terms, ny, nx)``; the first is 1."""
         return self._basis
 
+    @undisturbed
     def information(self, mu_per_hu: float, frequency: float = REFERENCE_FREQUENCY) -> float:
         """The data's information on an in-plane wave, in 1/(HU² mm³) (2-D: 1/(HU² mm²)).
 
@@ -279,12 +283,14 @@ class Gram:
         """
         return self.coloured(self.white(batch, generator=generator))
 
+    @undisturbed
     def white(self, batch: tuple[int, ...] = (), *, generator: torch.Generator) -> Tensor:
         """White noise for :meth:`coloured`, ``(*batch, slices, *padded)``; arguments of :meth:`noise`."""
         nz = 1 if self._flat else self.grid.shape[0]
         device = self._of_noise.device
         return torch.randn((*batch, nz, *self.padded), generator=generator, dtype=self.dtype, device=device)
 
+    @undisturbed
     def coloured(self, white: Tensor) -> Tensor:
         """Noise of covariance G (stationary part) from that of :meth:`white`, ``(*batch, *grid.shape)``."""
         if self._factor is None:

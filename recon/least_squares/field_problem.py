@@ -24,6 +24,7 @@ from recon.solution import RESIDUAL_TEST, Solution, tested
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid
 from torchpcct.projector import Projector
 from torchpcct.scan import Scan
+from torchpcct.switches import undisturbed
 from torchpcct.vector_geometry import VectorGeometry
 from torchpcct.volume import in_words, to_hu
 
@@ -81,6 +82,7 @@ class FieldProblem:
         ValueError: a spectral scan, a grid that does not fit the scan.
     """
 
+    @undisturbed
     def __init__(self, scan: Scan, grid: VolumeGrid) -> None:
         geometry = scan.geometry
         self.plane = len(geometry.shape) == 2

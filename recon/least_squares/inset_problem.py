@@ -24,6 +24,7 @@ from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import VolumeGrid
 from torchpcct.projector import Projector
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
+from torchpcct.switches import undisturbed
 from torchpcct.volume import to_hu
 
 __all__ = ["InsetProblem", "Statistic"]
@@ -72,6 +73,7 @@ class InsetProblem:
         ValueError: a grid outside the field of view or the scan's region; a spectral or energy-integrating scan.
     """
 
+    @undisturbed
     def __init__(self, scan: Scan, grid: VolumeGrid, nodes: int = 5) -> None:
         if scan.counts.ndim != 3:
             raise ValueError("PWLS in HU needs a counting-mode scan; decompose or sum the energy bins before")
@@ -151,6 +153,7 @@ class InsetProblem:
             )
         return self.model
 
+    @undisturbed
     def with_motion(self, motion: Any) -> InsetProblem:
         """The same problem for an inset that moves.
 
@@ -171,6 +174,7 @@ class InsetProblem:
         other._place(motion)
         return other
 
+    @undisturbed
     def data(self, scan: Scan) -> Tensor:
         """Line integrals of a scan on the grid's footprint, background taken off, ``(views, rows, columns)``."""
         if (scan.window or DetectorWindow.full(scan.geometry)) != self.outer or scan.geometry != self.geometry:
@@ -187,6 +191,7 @@ class InsetProblem:
             lines = self.outer.crop(lines, self.window)
         return lines - self.window.take(self._background)
 
+    @undisturbed
     def statistic(self, scan: Scan, data: Tensor | None = None) -> Statistic:
         """What the solvers need of a scan, with the weights of its exposure (noise free: of 1 s).
 
@@ -199,6 +204,7 @@ class InsetProblem:
         energy = float((weighted * y).sum((-1, -2), dtype=torch.float64).sum())
         return Statistic(self.projector.T(weighted), energy, y.numel())
 
+    @undisturbed
     def residual_test(self, scan: Scan, volume: Tensor, data: Tensor | None = None) -> ResidualTest:
         """Whether a volume ``(z, y, x)`` in HU explains a noisy scan, by one projection of it.
 
@@ -227,6 +233,7 @@ class InsetProblem:
             raise ValueError(f"the scans of one batch must have one exposure, got {sorted(exposures)} s")
         return float(exposures.pop())
 
+    @undisturbed
     def solve_statistic(self, b: Tensor, exposure_s: float, prior: QGGMRF, tolerance: float) -> PwlsResult:
         """PWLS of what :meth:`statistic` gives alone: the volumes of :meth:`solve`, in mm⁻¹ above ``level``.
 
@@ -245,6 +252,7 @@ class InsetProblem:
             tolerance=tolerance,
         )  # fmt: skip
 
+    @undisturbed
     def solve(
         self, scans: Sequence[Scan], prior: QGGMRF, data: Sequence[Tensor] | None = None, **options: Unpack[PwlsOptions]
     ) -> tuple[Tensor, dict[str, Any]]:

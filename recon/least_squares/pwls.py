@@ -339,9 +339,10 @@ def solve_normal(
     whole("max_exact", max_exact)
     if start is not None and tuple(start.shape[-axes:]) != tuple(shape):
         raise ValueError(f"start must have shape (..., {', '.join(map(str, shape))}), got {tuple(start.shape)}")
-    bound = prior
     if isinstance(prior, QGGMRF):
         bound = prior.bind(gram.information(mu_per_hu, prior.frequency), spacing, mu_per_hu, channels)
+    else:
+        bound = prior
     lead = b.shape[:-axes]
     b = b.reshape(-1, *shape)
     proposer: ModelSolver | GradientStep

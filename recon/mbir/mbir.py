@@ -26,6 +26,7 @@ from recon.mbir.problem import NormalisedProblem
 from recon.mbir.unrolled import DEFAULT_FIDELITY, Unrolled, fidelity_frequency
 from recon.mbir.weights_io import digest, read_tensors
 from torchpcct.geometry import VolumeGrid
+from torchpcct.switches import undisturbed
 from torchpcct.volume import from_hu, in_words, to_hu
 
 __all__ = ["Mbir", "Reconstructed", "average_onto", "overlap", "working_grid"]
@@ -76,6 +77,7 @@ class Mbir:
         self.voxel_mm = model.network.config.voxel_mm
 
     @classmethod
+    @undisturbed
     def load(cls, path: str | Path | None = None, fidelity: float = DEFAULT_FIDELITY) -> Mbir:
         """From a weights file; None: the weights that ship with the package.
 
@@ -117,6 +119,7 @@ class Mbir:
         exposure = torch.full((b.shape[0],), float(exposure_s))
         return NormalisedProblem.from_statistic(problem.gram, b, exposure, problem.mu_ref / 1000.0, self.voxel_mm)
 
+    @undisturbed
     def __call__(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> Tensor:
         """Volumes in HU, ``(batch, z, y, x)``, differentiable in ``b``.
 
@@ -128,6 +131,7 @@ class Mbir:
         found = self.solved(problem, b, exposure_s)
         return self.in_hu(problem, found.u, found.normal)
 
+    @undisturbed
     def solved(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> Reconstructed:
         """The same with what it was made of."""
         normal = self.problem(problem, b, exposure_s)
@@ -156,6 +160,7 @@ class Mbir:
         other.fidelity = fidelity
         return other
 
+    @undisturbed
     @torch.no_grad()
     def noise_map(self, problem: InsetProblem, b: Tensor, exposure_s: float, draws: int = 8, seed: int = 0) -> Tensor:
         """Standard deviation of each voxel in HU, ``(z, y, x)``, of one statistic ``b`` ``(z, y, x)``.

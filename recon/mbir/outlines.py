@@ -35,6 +35,7 @@ from recon.plaque.quality import STRIKING, scores_of
 from recon.plaque.start import find_vessel
 from recon.plaque.vessel import Vessel
 from recon.plaque.vessel_prior import VesselPrior
+from torchpcct.switches import undisturbed
 
 __all__ = ["Drawn", "OutlineMbir"]
 
@@ -78,6 +79,7 @@ class OutlineMbir(Mbir):
         super().__init__(network.model, network.fidelity, **network.parts)
         self.vessel_prior = vessel_prior
 
+    @undisturbed
     def solved(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> Reconstructed:
         """See :meth:`recon.mbir.mbir.Mbir.solved`; the notes hold ``outlines``: whether they were drawn, or why not."""
         found = [self.drawn(problem, own, exposure_s) for own in b]

@@ -31,6 +31,7 @@ from recon.conjugate_gradient import conjugate_gradient
 from recon.mbir.network import GUIDE_VOXELS, Network, NetworkConfig, edge_preserved
 from recon.mbir.problem import NormalisedProblem, filtered, squared_frequencies
 from recon.mbir.residual import significant_residual
+from torchpcct.switches import undisturbed
 from torchpcct.validate import number, whole
 
 __all__ = [
@@ -101,6 +102,7 @@ class Unrolled(nn.Module):
         # What the training has seen, so that the weights know themselves where they may be trusted.
         self.register_buffer("seen_scale_hu", torch.zeros(2))
 
+    @undisturbed
     def forward(
         self,
         problem: NormalisedProblem,

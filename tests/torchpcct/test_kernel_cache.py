@@ -3,6 +3,7 @@
 import importlib
 import os
 import pkgutil
+import subprocess
 import sys
 import textwrap
 import time
@@ -18,6 +19,7 @@ import recon
 import torchpcct
 import train
 from torchpcct import kernel_cache
+from torchpcct.cache_folder import ensure_cache
 from torchpcct.kernel_cache import compiled_once, sources
 
 HELPER = """
@@ -219,3 +221,23 @@ def test_locks_need_nothing_that_windows_lacks(kernels, tmp_path, monkeypatch):
     with compiled_once():
         assert kernels.outer(1) == 4
     assert len(locks(tmp_path)) == 2
+
+
+def test_where_nothing_can_be_kept_a_temporary_folder_is(tmp_path):
+    """A read-only installation of a user without a home: numba refused to load the kernels."""
+    code = (
+        "import os; from pathlib import Path; import torchpcct.cache_folder as k; "
+        "os.access = lambda *_: False; k._writable = lambda _: False; k.ensure_cache(); "
+        "f = Path(os.environ['NUMBA_CACHE_DIR']); print(f.is_dir() and k.is_temporary(f), f)"
+    )
+    environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"} | {"TMPDIR": str(tmp_path)}
+    run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    kept, folder = run.stdout.split()
+    assert kept == "True"
+    assert not Path(folder).exists()  # gone with the process
+
+
+def test_a_folder_that_can_be_written_is_left_to_numba(monkeypatch):
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    ensure_cache()
+    assert "NUMBA_CACHE_DIR" not in os.environ

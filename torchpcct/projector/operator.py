@@ -15,6 +15,7 @@ from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import Geometry, VolumeGrid
 from torchpcct.projector.engine import ENGINES, Engine
 from torchpcct.projector.tables import Tables, VectorTables
+from torchpcct.switches import undisturbed, unswitched
 from torchpcct.vector_geometry import VectorGeometry
 
 if TYPE_CHECKING:
@@ -69,6 +70,7 @@ class Operator(nn.Module):
     def extra_repr(self) -> str:
         return f"{type(self._engine.tables.geometry).__name__}, {self.domain_shape} -> {self.range_shape}"
 
+    @undisturbed
     def norm(self, tolerance: float = 1e-4, most: int = 200) -> float:
         """Largest singular value, by power iteration on AᵀA in float32; kept after the first call.
 
@@ -149,7 +151,8 @@ class _Linear(torch.autograd.Function):
 
     @staticmethod
     def forward(x: Tensor, forward: Linear, transpose: Linear) -> Tensor:
-        return forward(x)
+        with unswitched():  # of the backward pass, too
+            return forward(x)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
