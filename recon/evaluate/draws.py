@@ -26,7 +26,6 @@ from recon.evaluate.response import response, statistic_covariance
 from recon.evaluate.store import Store
 from recon.evaluate.task import Facts, Task
 from recon.least_squares.inset_problem import InsetProblem
-from recon.least_squares.qggmrf import DEFAULT_PRIOR
 from recon.least_squares.reconstruct import TOLERANCE_HU
 from recon.mbir.mbir import Mbir
 from torchpcct.geometry import VolumeGrid
@@ -212,7 +211,7 @@ class Simulated:
         problem = self.problem
         with torch.no_grad():
             found = problem.solve_statistic(
-                self.statistic[None], self.exposure_s, DEFAULT_PRIOR, tolerance=TOLERANCE_HU
+                self.statistic[None], self.exposure_s, problem.prior, tolerance=TOLERANCE_HU
             )
         return to_hu(found.x + problem.level, problem.mu_ref)[0]
 
