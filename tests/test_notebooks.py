@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+from importlib import util
 from pathlib import Path
 
 import nbformat
@@ -115,6 +116,45 @@ def test_stored_notebook_is_of_the_shipped_weights(name):
     if "mbir" in "".join(c.source for c in notebook.cells if c.cell_type == "code"):
         stored = notebook.metadata.get("torchpcct", {}).get("weights_sha256")
         assert stored == Mbir.load().weights_sha256, f"execute it again: python notebooks/execute.py notebooks/{name}"
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize("name", NAMES)
+def test_stored_notebook_is_of_the_sources_as_they_are(name):
+    """A picture of an older program, 47 of 255 grey levels off, once stood there under weights that were right."""
+    stored = nbformat.read(FOLDER / name, as_version=4).metadata.get("torchpcct", {}).get("sources_sha256")
+    again = f"execute it again: python notebooks/execute.py notebooks/{name}"
+    if stored is None:
+        pytest.skip(f"stored before digests of sources were kept; {again}")
+    assert stored == _execute().sources_digest(name), again
+
+
+def test_the_digest_of_a_notebook_sees_code_alone(tmp_path, monkeypatch):
+    script = _execute()
+    assert set(script.MADE_BY) == set(NAMES)
+    assert all((script.ROOT / entry).exists() for entries in script.MADE_BY.values() for entry in entries)
+    monkeypatch.setattr(script, "ROOT", tmp_path)
+    monkeypatch.setattr(script, "MADE_BY", {"n": ("a.py", "folder")})
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "b.yaml").write_text("x: 1", encoding="utf-8")
+
+    def digest(text):
+        (tmp_path / "a.py").write_text(text, encoding="utf-8")
+        return script.sources_digest("n")
+
+    first = digest('"""Doc."""\ndef f(x):\n    """What."""\n    return x + 1\n')
+    assert digest('"""Other."""\n# a comment\ndef f(x):\n    """Else."""\n    return (x + 1)\n') == first
+    assert digest('"""Doc."""\ndef f(x):\n    """What."""\n    return x + 2\n') != first
+    last = digest("x = 1")
+    (tmp_path / "folder" / "b.yaml").write_text("x: 2", encoding="utf-8")
+    assert script.sources_digest("n") != last
+
+
+def _execute():
+    spec = util.spec_from_file_location("execute", FOLDER / "execute.py")
+    script = util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    return script
 
 
 def test_first_scan_is_short():

@@ -1,4 +1,4 @@
-"""The site: ``sphinx-build -W -n -b html notebooks/docs out/site``; with ``-D plot_gallery=1`` it runs the gallery.
+"""The site: ``sphinx-build -W -n -b html notebooks/docs out/site``; ``-D plot_gallery=0`` leaves out the gallery's pictures.
 
 Nothing is downloaded: formulas become MathML (docutils), which browsers draw themselves. The pages of the API and of
 the command line are written from the package each time, into ``reference/generated``.
@@ -60,7 +60,7 @@ napoleon_use_rtype = False
 napoleon_custom_sections = [("Attributes", "params_style")]
 
 sphinx_gallery_conf = {
-    "examples_dirs": "../gallery", "gallery_dirs": "gallery", "filename_pattern": r"\d\d_", "plot_gallery": False,
+    "examples_dirs": "../gallery", "gallery_dirs": "gallery", "filename_pattern": r"\d\d_", "plot_gallery": True,
     "download_all_examples": False, "remove_config_comments": True, "show_memory": False, "copyfile_regex": r"$^",
     "within_subsection_order": "FileNameSortKey", "write_computation_times": False, "image_scrapers": ("matplotlib",),
     "reset_modules": ("matplotlib",), "notebook_images": False, "show_signature": False,

@@ -23,6 +23,7 @@ _MODULES = {
     "pyyaml": "yaml",
     "markdown-it-py": "markdown_it",
     "astra-toolbox": "astra",
+    "itk-rtk": "itk",
 }
 """Modules of packages with another name."""
 _FOR_DEVELOPERS = ("test", "docs", "notebooks")
