@@ -9,13 +9,10 @@ files, :mod:`~recon.cli.plaque` reads tissues,
 from __future__ import annotations
 
 import argparse
-import codecs
-import io
 import itertools
 import shutil
 import sys
 import textwrap
-import unicodedata
 from collections.abc import Sequence
 from typing import Any
 
@@ -108,33 +105,10 @@ class _Completion(argparse.Action):
         parser.exit()
 
 
-def _plain(error: UnicodeError) -> tuple[str, int]:
-    """What a terminal shows that does not know a character: the nearest ASCII."""
-    assert isinstance(error, UnicodeEncodeError)
-    given = error.object[error.start : error.end]
-    text = unicodedata.normalize("NFKD", "".join(_ASCII.get(c, c) for c in given))
-    return "".join(c if c.isascii() else "?" for c in text if not unicodedata.combining(c)), error.end
-
-
-_ASCII = {"×": "x", "·": "*", "−": "-", "–": "-", "…": "...", "±": "+/-", "≥": ">=", "≤": "<=", "→": "->", "←": "<-",
-          "°": " deg", "µ": "u", "μ": "mu", "⟨": "<", "⟩": ">", "⁻": "^-", "²": "^2", "³": "^3", "ᵀ": "^T", "≈": "~",
-          "α": "alpha", "β": "beta", "γ": "gamma", "σ": "sigma", "χ": "chi", "Δ": "Delta", "√": "sqrt",
-          "“": '"', "”": '"', "’": "'"}  # fmt: skip
-
-
-def _speak_plainly() -> None:
-    """Let no character end a command on terminals of few characters (ASCII, cp1252)."""
-    codecs.register_error("torchpcct.plain", _plain)
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="torchpcct.plain")
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit status: 0 done, 1 not written (a full disk) or, of ``doctor``, something is
     broken, 2 refused input, 130 interrupted, 128 + N ended by signal N. Without a command it says where to begin,
     which is no error."""
-    _speak_plainly()
     words = list(sys.argv[1:] if arguments is None else arguments)
     speak_any_encoding()
     if words[:1] == ["train"]:

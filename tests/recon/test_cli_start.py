@@ -165,22 +165,6 @@ def test_the_module_is_the_command(tmp_path):
         assert done.stderr == "torchpcct reconstruct: --voxel must be greater than 0 mm, got 0\n"
 
 
-@pytest.mark.parametrize("encoding", ["ascii", "cp1252"])
-def test_terminals_of_few_characters_get_the_nearest(encoding, tmp_path):
-    code = "from recon.cli import main\nmain([])\nprint('8 × 8 voxels, ⟨Aᵀy⟩ ± 3°, Ängström, ☃')\n"
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, cwd=tmp_path,
-        env={"PYTHONPATH": str(ROOT), "PYTHONIOENCODING": encoding},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    last = done.stdout.decode(encoding).splitlines()[-1]
-    expected = {
-        "ascii": "8 x 8 voxels, <A^Ty> +/- 3 deg, Angstrom, ?",
-        "cp1252": "8 × 8 voxels, <A^Ty> ± 3°, Ängström, ?",
-    }
-    assert last == expected[encoding]
-
-
 def test_train_is_ours_whatever_lies_in_the_folder(tmp_path):
     (tmp_path / "train").mkdir()
     for name in ("__init__", "__main__"):
