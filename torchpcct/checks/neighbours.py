@@ -44,7 +44,7 @@ __all__ = ["neighbour_test", "stuck_views"]
 
 Floats = NDArray[np.float64]
 
-JUMP_STEPS, OTHER_STEPS, JUMP_CELLS = 0.9, 6.0, 0.5
+JUMP_STEPS, OTHER_STEPS, JUMP_CELLS = 0.9, 10.0, 0.5
 """Steps by which two views may lie farther apart than described, by which they may differ otherwise (plane faces that
 the rays pass along do), and cells at the border of the object that are no finding."""
 ALTERNATION = 0.25
@@ -52,9 +52,10 @@ ALTERNATION = 0.25
 _SIGMAS, _JUMP_SIGMAS = 8.0, 10.0
 _BURST, _BURST_AT_THE_END = 25.0, 9.0
 """How many times larger than beside it a squared residual must be; where a turn closes, the one pair of its kind."""
-_SHARE, _SHARE_AT_THE_END, _FEW_WINDOWS = 0.4, 0.25, 5
+_SHARE, _SHARE_AT_THE_END, _SHARE_OF_MANY, _FEW_WINDOWS = 0.4, 0.25, 0.15, 5
 """Share of the windows on the object that a view at a wrong place changes, that a travel changes which only shows where
-the object has an upper or lower end; and windows below which nearly all must."""
+the object has an upper or lower end, that many steps forward change beyond the noise; and windows below which nearly
+all must."""
 _REACH = 4
 """Views on either side that foretell a change, and one more."""
 _STEADY = 1.5
@@ -72,6 +73,8 @@ _STUCK_COLUMNS = 16
 _POPULAR = 0.02
 """Share of all readings from which a value is a limit of the detector or one of few, and its repetition no surprise."""
 _CHANCE = 1e-9
+_DARK_VIEWS, _DARK_WIDTH = 8, 3
+"""Views for which, and columns side by side that, a module of the detector is off; narrower ones are bridged."""
 _MOST = 4_000_000
 """Readings that are looked at; more only cost time."""
 
@@ -109,8 +112,8 @@ def neighbour_test(lines: Tensor, geometry: Geometry) -> ScanTest:
         sizes["order"] = order
         if order > limit:
             findings.append(
-                f"neighbouring views differ as much as {100 * min(order, 1.0):.2g} % of what any two views do, of an "
-                f"object that turns by {math.degrees(views.step):.2g}° at most {100 * limit:.2g} %: the views are not "
+                f"neighbouring views differ as much as {100 * min(order, 1.0):.0f} % of what any two views do, of an "
+                f"object that turns by {math.degrees(views.step):.2g}° at most {100 * limit:.0f} %: the views are not "
                 "in the order of their angles (files sorted by the text of their names: 1, 10, 100, 2?), or the angles "
                 "are wrong; everything in the volume is"
             )
@@ -273,9 +276,10 @@ class _Views:
         # Pair k is of the views k + 2 and k + 3 of the longer sequence.
         first = (np.arange(pairs) + 2 - (_REACH if self.closes else 0)) % n
         burst = np.where(self.closes & (first == n - 1), _BURST_AT_THE_END, _BURST)
+        share = np.where(burst < _BURST, _SHARE_AT_THE_END, np.where(along_it & (steps > 3.0), _SHARE_OF_MANY, _SHARE))
         found = (
             steady
-            & (self._share(left, change, columns, first) > np.where(burst < _BURST, _SHARE_AT_THE_END, _SHARE))
+            & (self._share(left, change, columns, first) > share)
             & (steps > np.where(along_it | (burst < _BURST), JUMP_STEPS, OTHER_STEPS))
             & (steps > JUMP_CELLS / self.way)
             & (square > burst * near)
@@ -423,10 +427,11 @@ def stuck_views(readings: Tensor, geometry: Geometry) -> list[str]:
     rows = readings.detach().to("cpu").reshape(g.views, -1, g.columns)
     order = np.argsort(g.angles, kind="stable")
     n, angles = rows[:, :: max(1, math.ceil(rows.numel() / _MOST))].numpy()[order], g.angles[order]
+    dark = _dark_columns(n, order)
     apart = np.diff(angles) > 1e-9
     values, counts = np.unique(n[:: max(1, g.views // 64)], return_counts=True)
     popular = values[counts > _POPULAR * counts.sum()]
-    told = np.isfinite(n) & ~np.isin(n, popular)
+    told = np.isfinite(n) & (n != 0.0) & ~np.isin(n, popular)
     both = told[1:] & told[:-1]
     equal = both & (n[1:] == n[:-1])
     edges = np.arange(0, g.columns - _STUCK_COLUMNS + 1, _STUCK_COLUMNS)
@@ -442,15 +447,53 @@ def stuck_views(readings: Tensor, geometry: Geometry) -> list[str]:
     later = _copies(n, told, angles)
     # Readings without noise repeat where nothing moves: noise of neighbouring columns has nothing in common.
     if not (stuck.any() or later) or not _noisy(n, edges, stuck):
-        return []
+        return dark
     pairs = np.flatnonzero(stuck.any(1))
     views = sorted({int(order[k + 1]) for k in pairs} | {int(order[k]) for k in later})
     whole = stuck.sum(1) >= 0.5 * np.maximum((enough & few).sum(1), 1)
     where = "" if later or whole[pairs].mean() > 0.5 else _columns_text(edges, stuck)
     which = ", ".join(map(str, views)) if len(views) <= 4 else f"{views[0]} … {views[-1]}"
     return [
+        *dark,
         f"{len(views)} views{where} hold the same readings as views at other angles, noise and all (views {which}): "
-        "the detector was stuck, or files were copied; leave them out (Scan.select), or mask them (dead=)"
+        "the detector was stuck, or files were copied; leave them out (Scan.select), or mask them (dead=)",
+    ]
+
+
+def _dark_columns(n: NDArray[Any], order: NDArray[np.int64]) -> list[str]:
+    """Columns side by side that go dark at once, stay so, and are bright again at once: no shadow does that.
+
+    Args:
+        n: ``(views, rows, columns)``.
+        order: number of each view.
+    """
+    dark = n <= 0.0
+    if not dark.any():
+        return []
+    found: dict[tuple[int, int, int], int] = {}
+    for row in np.flatnonzero(dark.any((0, 2))).tolist():
+        change = np.diff(np.pad(dark[:, row].astype(np.int8), ((1, 1), (0, 0))), axis=0)
+        begins, ends = change.T == 1, change.T == -1  # (columns, views + 1)
+        columns = np.nonzero(begins)[0]
+        spans = list(zip(columns.tolist(), np.nonzero(begins)[1].tolist(), np.nonzero(ends)[1].tolist(), strict=True))
+        known = set(spans)
+        for column, first, end in spans:
+            long = end - first >= _DARK_VIEWS and (first > 0 or end < len(n))
+            if not long or (column - 1, first, end) in known:
+                continue
+            width = 1
+            while (column + width, first, end) in known:
+                width += 1
+            sides = [c for c in (column - 1, column + width) if 0 <= c < n.shape[2]]
+            if width >= _DARK_WIDTH and not dark[first:end, row][:, sides].any():
+                found[column, width, first] = end - first
+    if not found:
+        return []
+    (column, width, first), views = max(found.items(), key=lambda item: item[0][1] * item[1])
+    return [
+        f"the columns {column} … {column + width - 1} read nothing in {views} views from number {order[first]} on, and "
+        "go dark and bright again all at once, which no shadow does: a module of the detector was off; mask it "
+        "(dead=), or leave the views out (Scan.select)"
     ]
 
 

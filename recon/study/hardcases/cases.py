@@ -4,8 +4,9 @@ Some change the scan, others what is scanned (metal, a calcification, a large pa
 information in the data (some dead cells, a short scan) has a right answer: that of the sound scan, up to noise. One
 that makes the scan's description wrong (centre, gain) has none; it must be noticed.
 
-Two sound scans are made hard: the plaque's; and, for what needs a whole field of view, a slice of the thorax in a fan
-beam, 360 views of 240 columns, exact path lengths at 70 keV, Poisson noise.
+Three sound scans are made hard: the plaque's; for what needs a whole field of view, a slice of the thorax in a fan
+beam, 360 views of 240 columns, exact path lengths at 70 keV, Poisson noise; and for what happens along the axis a
+cylinder of water with balls at several heights in a cone beam.
 """
 
 from __future__ import annotations
@@ -27,18 +28,33 @@ from torchpcct.geometry import ConeBeam, FanBeam, VolumeGrid, full_turn
 from torchpcct.scan import Scan
 from torchpcct.scanner.linearisation import WaterLinearisation
 from torchpcct.scene import Body, EllipticCylinder, Scene
+from torchpcct.scene.bodies import Ellipsoid, rotation_matrix
 from torchpcct.scene.materials import material
 from torchpcct.scene.phantoms import thorax
 from torchpcct.scene.plaque import Plaque, plaque_scene
 from torchpcct.scene.plaque.variants import calcification_bodies, stent_bodies
 
-__all__ = ["CASES", "GRID", "Apply", "Case", "body_scan", "body_truth", "untouched"]
+__all__ = [
+    "CASES",
+    "CONE_GRID",
+    "GRID",
+    "Apply",
+    "Case",
+    "balls",
+    "body_scan",
+    "body_truth",
+    "cone_scan",
+    "cone_truth",
+    "untouched",
+]
 
 KEV, PHOTONS, VIEWS = 70.0, 3e3, 360
 GRID = VolumeGrid((116, 158), 2.4, (-34.0, -14.0))
 GEOMETRY = FanBeam(full_turn(VIEWS), 541.0, 949.0, 240, 3.6)
+CONE = ConeBeam(full_turn(120), 541.0, 949.0, 112, 12, (4.0, 3.6))
+CONE_PHOTONS, CONE_GRID = 3e4, VolumeGrid((5, 60, 84), (2.0, 2.4, 2.4))
 WATER = float(np.ravel(material("water").attenuation(KEV))[0])
-"""Of the body's scan."""
+"""Of the body's scan and the cone beam's."""
 
 Apply = Callable[[Scan, Scan, np.random.Generator], Scan]
 """The noise-free scan, its noisy realisation and a random generator, to the scan that is reconstructed."""
@@ -56,7 +72,7 @@ class Case:
         scene: the scene around a plaque, or instead of the body, if it is another one than the sound scan's; ``apply``
             then gets scans of it. What it adds to the sound scan's own bodies, and the voxels beside that, are left out
             of the errors.
-        base: ``"plaque"`` or ``"body"``: whose scan is made hard.
+        base: ``"plaque"``, ``"body"`` or ``"cone"``: whose scan is made hard.
         unseen: why no data can show it; empty: they can.
         other: the scene's own bodies differ from those of the sound scan: what the case adds to the error against its
             own truth counts.
@@ -320,14 +336,18 @@ _PLAQUE: dict[str, Case] = {
 def body_scan(scene: Scene) -> Scan:
     """The noise-free scan of a body, the thorax or another."""
     g = GEOMETRY
-    row = ConeBeam(g.angles, g.sod, g.sdd, g.columns, 1, g.pitch)
+    lines = _lines_of(scene, ConeBeam(g.angles, g.sod, g.sdd, g.columns, 1, g.pitch))[:, 0]
+    air = torch.full((g.columns,), PHOTONS)
+    return Scan((air * torch.exp(-lines)).float(), air, g, _water(g.columns, WATER))
+
+
+def _lines_of(scene: Scene, g: ConeBeam) -> Tensor:
+    """Line integrals ``(views, rows, columns)``."""
     groups: dict[float, list[str]] = {}
     for name, tissue in zip(scene.names, scene.materials, strict=True):
         groups.setdefault(float(np.ravel(tissue.attenuation(KEV))[0]), []).append(name)
-    paths = tissue_path_lengths(scene, list(groups.values()), row)[:, :, 0]
-    lines = torch.tensordot(torch.tensor(list(groups)), paths, dims=1)
-    air = torch.full((g.columns,), PHOTONS)
-    return Scan((air * torch.exp(-lines)).float(), air, g, _water(g.columns, WATER))
+    paths = tissue_path_lengths(scene, list(groups.values()), g)
+    return torch.tensordot(torch.tensor(list(groups)), paths, dims=1)
 
 
 def body_truth(scene: Scene) -> Tensor:
@@ -441,6 +461,7 @@ def _line_integrals(scan: Scan, base: float) -> Scan:
 
 
 _TURNED = "the object turned is another object"
+_MIRRORED = "the object seen in a mirror is another object"
 _SIZED = "an object that is larger by as much and attenuates as much less has the same line integrals"
 _SCALED = "line integrals tell attenuation, not what of it is water's"
 
@@ -589,5 +610,85 @@ _BODY: dict[str, Case] = {
     "metal": Case("two titanium screws of 12 mm", lambda clean, scan, rng: scan, scene=_implants),
 }  # fmt: skip
 
+# --- a cone beam ------------------------------------------------------------------------------------------------------
+
+
+def balls() -> Scene:
+    """An endless cylinder of water with ellipsoids of fat, soft tissue, bone and air at several heights."""
+    inside = (
+        ("fat", (16.0, 20.0, 9.0), (-36.0, 16.0, 3.0), "adipose"),
+        ("muscle", (22.0, 13.0, 8.0), (32.0, -14.0, -4.0), "skeletal_muscle"),
+        ("bone", (9.0, 9.0, 7.0), (8.0, 34.0, -2.0), "spongiosa"),
+        ("vertebra", (12.0, 12.0, 6.0), (0.0, -34.0, 5.0), "cortical_bone"),
+        ("lung", (8.0, 8.0, 6.0), (-46.0, -20.0, -6.0), "lung"),
+    )
+    bodies = [Body(n, Ellipsoid(axes, position=at), material, "water") for n, axes, at, material in inside]
+    return Scene([Body("water", EllipticCylinder((90.0, 65.0)), "water"), *bodies])
+
+
+def cone_scan(scene: Scene, moved: Callable[[float], tuple[float, float, float]] | None = None) -> Scan:
+    """The noise-free scan of a scene in a cone beam.
+
+    Args:
+        scene: at rest.
+        moved: of the angle, how far all of it has moved then: x, y, z in mm.
+    """
+    g = CONE
+    if moved is None:
+        lines = _lines_of(scene, g)
+    else:
+        parts = [(_displaced(scene, moved(angle)), g.select(slice(k, k + 1))) for k, angle in enumerate(g.angles)]
+        lines = torch.cat([_lines_of(*part) for part in parts])
+    air = torch.full(g.shape[1:], CONE_PHOTONS)
+    return Scan((air * torch.exp(-lines)).float(), air, g, _water(g.columns, WATER))
+
+
+def cone_truth(scene: Scene) -> Tensor:
+    """``CONE_GRID.shape`` HU."""
+    return torch.from_numpy(scene.material_map(CONE_GRID, KEV) / WATER * 1000.0 - 1000.0).float()
+
+
+def _displaced(scene: Scene, by: tuple[float, float, float]) -> Scene:
+    def there(body: Body) -> Body:
+        shape: Any = body.shape
+        return replace(body, shape=replace(shape, position=tuple(np.add(shape.position, by))))
+
+    return Scene([there(body) for body in scene.bodies])
+
+
+def _travelled(title: str, height: Callable[[float], float]) -> Case:
+    """The table moves along z during the turn."""
+
+    def apply(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
+        return _redrawn(clean, scan, cone_scan(balls(), lambda angle: (0.0, 0.0, height(angle))).counts)
+
+    return Case(title, apply)
+
+
+def _tilted(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
+    """Gantry and orbit tilted by 12° about x: to them the scene is."""
+    tilt = rotation_matrix((1.0, 0.0, 0.0), math.radians(-12.0))
+
+    def there(body: Body) -> Body:
+        shape: Any = body.shape
+        return replace(body, shape=replace(shape, position=tuple(tilt @ shape.position), rotation=tilt @ shape.matrix))
+
+    return _redrawn(clean, scan, cone_scan(Scene([there(body) for body in balls().bodies])).counts)
+
+
+_CONE: dict[str, Case] = {
+    "sound": Case("nothing", lambda clean, scan, rng: scan),
+    "helix": _travelled("a helix of 20 mm a turn told as a circle", lambda angle: 20.0 * angle / (2 * math.pi)),
+    "wobble": _travelled("a table that wobbles by 3 mm along z", lambda angle: 3.0 * math.sin(3.0 * angle)),
+    "tilt": Case("the gantry tilted by 12°", _tilted, unseen=_TURNED),
+    "rows-reversed": Case("rows reversed", _read(lambda n, air, rng: n.flip(1)), unseen=_MIRRORED),
+    "order": Case(
+        "files in the order of the text of their names",
+        _read(lambda n, air, rng: n[torch.tensor(sorted(range(len(n)), key=str))]),
+    ),
+    "stuck": Case("twelve views stuck", _read(lambda n, air, rng: _stuck(n, slice(40, 52)))),
+}
+
 CASES: dict[str, Case] = _PLAQUE | {f"body-{name}": replace(case, base="body") for name, case in _BODY.items()}
-"""Name → case. A new one needs nothing but its entry in one of the two tables."""
+CASES |= {f"cone-{name}": replace(case, base="cone") for name, case in _CONE.items()}
+"""Name → case. A new one needs nothing but its entry in one of the three tables."""

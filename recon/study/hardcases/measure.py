@@ -21,7 +21,18 @@ import torch
 from recon import reconstruct
 from recon.evaluate.execute import heard
 from recon.evaluate.store import Pieces
-from recon.study.hardcases.cases import CASES, GRID, Case, body_scan, body_truth, untouched
+from recon.study.hardcases.cases import (
+    CASES,
+    CONE_GRID,
+    GRID,
+    Case,
+    balls,
+    body_scan,
+    body_truth,
+    cone_scan,
+    cone_truth,
+    untouched,
+)
 from recon.study.paper.plaque_scan import rod_values
 from recon.study.study import Measured, Progress, StudySettings, silent
 from torchpcct.acquisition.acquire import acquire
@@ -193,7 +204,14 @@ def _body_base(settings: Settings, pieces: Pieces, progress: Progress) -> _Base:
     return _Base(scene, clean, noisy, GRID, body_truth(scene), body_scan, body_truth, None, pieces)
 
 
-_BASES = {"plaque": _plaque_base, "body": _body_base}
+def _cone_base(settings: Settings, pieces: Pieces, progress: Progress) -> _Base:
+    scene = balls()
+    clean = pieces("scan", partial(cone_scan, scene))
+    noisy = clean.with_noise(NOISE_FREE_EXPOSURE_S, settings.seed)
+    return _Base(scene, clean, noisy, CONE_GRID, cone_truth(scene), cone_scan, cone_truth, None, pieces)
+
+
+_BASES = {"plaque": _plaque_base, "body": _body_base, "cone": _cone_base}
 
 
 def _reconstruct(scan: Scan, grid: VolumeGrid, method: str) -> Volume:

@@ -99,6 +99,18 @@ def test_readings_that_repeat_are_named(kind):
     assert stuck_views(torch.from_numpy(few), g) == []
 
 
+@pytest.mark.parametrize("kind", GEOMETRIES)
+def test_a_module_that_was_off_is_named_and_a_shadow_is_not(kind):
+    g, p = GEOMETRIES[kind], _sinogram(kind)
+    off = _counts(p)
+    off[60:90, ..., 70:78] = 0.0
+    assert "the columns 70 … 77 read nothing in 30 views from number 60" in stuck_views(off, g)[0]
+    dense = [*BODIES, Ellipsoid((-30.0, -20.0), (2.0, 9.0), value=2.0), Ellipsoid((1.0, 2.0), 5.0, value=2.0)]
+    shadows = _counts(line_integrals(g, dense, sub=1))
+    assert (shadows == 0).any()
+    assert stuck_views(shadows, g) == []
+
+
 def test_a_focal_spot_that_flies_is_named_and_measured():
     g, p = GEOMETRIES["parallel"], _sinogram("parallel")
     for columns in (1.0, 2.0):
