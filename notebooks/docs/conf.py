@@ -51,7 +51,7 @@ copybutton_prompt_is_regexp = True
 nitpick_ignore_regex = [  # what other packages and private bases are; no inventory of theirs is downloaded
     ("py:.*", r"(numpy|torch|jinja2|collections|concurrent|typing|matplotlib|argparse|pathlib|enum|np|nn)\..*"),
     ("py:.*", r"(.*\.)?_\w+"),
-    ("py:(class|exc)", r"(optional|Module|Exception|Tensor|ndarray|\w+Error|(nbclient|scipy)\..*)"),
+    ("py:(class|exc)", r"(optional|Module|Exception|Tensor|ndarray|\w+Error|(nbclient|scipy|pydicom)\..*)"),
 ]  # fmt: skip
 autodoc_typehints = "none"  # the docstrings say shapes, units and kinds, in words
 autodoc_class_signature = "mixed"

@@ -3,7 +3,7 @@
 Rows beside the plane are read, too, since cells have a height and noise is averaged. A ray at the height v of the
 detector passes the object at z = v (1 + s / sod) / M, s behind the axis, its opposite at v (1 - s / sod) / M. Over rows
 that lie evenly about the plane all that is odd in v cancels, a slope of the object along z first of all. Of what is
-even, e(v), the opposite rays of the mean over |v| ≤ V differ, to first order in s / sod, by
+even, e(v), the opposite rays of the mean over −V … V differ, to first order in s / sod, by
 
     2 (s / sod) · (e(V) - mean of e),
 
