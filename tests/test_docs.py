@@ -211,7 +211,7 @@ def test_a_script_of_the_gallery_runs(path, tmp_path):
 def test_the_site_builds_without_a_warning_and_without_a_network(tmp_path):
     """No reference leads nowhere, and no page loads anything from elsewhere."""
     pytest.importorskip("sphinx_gallery")
-    options = ["-W", "-n", "-q", "-D", "plot_gallery=0", "-b", "html"]
+    options = ["-W", "-n", "-q", "-D", "sphinx_gallery_conf.filename_pattern=none", "-b", "html"]
     command = [sys.executable, "-m", "sphinx", *options, str(DOCS), str(tmp_path)]
     done = subprocess.run(command, text=True, check=False, capture_output=True, timeout=1200)
     assert done.returncode == 0, done.stderr[-3000:]
