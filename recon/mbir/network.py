@@ -22,12 +22,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from recon.mbir.bilateral import joint_bilateral
+from torchpcct.projector.operator import apply_linear
 from torchpcct.validate import number, whole
 
 __all__ = ["GUIDE_VOXELS", "Network", "NetworkConfig", "bilateral_prior", "edge_preserved"]
@@ -203,8 +205,15 @@ def local_mean(v: Tensor, sigma: float) -> Tensor:
     for axis in (-3, -2, -1):
         at = torch.arange(v.shape[axis], dtype=v.dtype, device=v.device)
         weights = torch.exp(-0.5 * ((at[:, None] - at) / sigma).square())
-        v = torch.movedim(torch.movedim(v, axis, -1) @ (weights / weights.sum(1, keepdim=True)).T, -1, axis)
+        weights = weights / weights.sum(1, keepdim=True)
+        # A linear map with its transpose: autocast would have products, of gradients too, in 8 bits.
+        v = apply_linear(v, partial(_along, matrix=weights, axis=axis), partial(_along, matrix=weights.T, axis=axis))
     return v
+
+
+def _along(v: Tensor, matrix: Tensor, axis: int) -> Tensor:
+    """A matrix times ``v`` along one axis, counted from the end."""
+    return torch.movedim(torch.movedim(v, axis, -1) @ matrix.T, -1, axis)
 
 
 def _turn(quarters: int, mirrored: bool) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]:

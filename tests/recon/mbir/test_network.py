@@ -156,3 +156,16 @@ def test_turns_of_what_is_not_square(network):
     """The mean over turns changes no shape."""
     u, towards = volumes((2, 3, 7, 10))
     assert with_config(network, turns=True, local_mm=1.0)(u, towards, CONDITION).shape == u.shape
+
+
+def test_gradients_of_the_local_mean_under_autocast():
+    """The backward pass, too, where a plain product of matrices is computed in 8 bits."""
+    v, seen = (torch.randn(1, 6, 7, 8, generator=torch.Generator().manual_seed(k)) for k in (0, 1))
+
+    def gradient():
+        x = v.clone().requires_grad_()
+        return torch.autograd.grad((local_mean(x, 1.5) * seen).sum(), x)[0]
+
+    plain = gradient()
+    with torch.autocast("cpu", torch.bfloat16):
+        torch.testing.assert_close(gradient(), plain)
