@@ -76,6 +76,17 @@ def test_thinned_readings_that_are_no_counts_have_the_right_moments():
     assert -0.03 * variance < low.var() - variance < 0.03 * variance + 0.25 * (quantum * fraction) ** 2
 
 
+@pytest.mark.parametrize("fraction", [0.2, 0.7])
+def test_electronic_noise_is_the_same_at_any_dose(fraction):
+    """A fraction f of it is left: √(1 − f²) of it is to be added, not √(1 − f)."""
+    n, mean, quantum, electronic = 100_000, 4000.0, 0.5, 40.0
+    signal = quantum * poisson(torch.full((1, n), mean, dtype=torch.float64), [0], seed=1)
+    signal += electronic * normal((1, n), [0], 1, torch.float64, purpose=1)
+    low = thinned(signal, [0], 1, fraction, torch.full_like(signal, quantum), electronic).numpy().ravel()
+    variance = fraction * quantum**2 * mean + electronic**2
+    assert abs(low.var() / variance - 1.0) < 4.5 * np.sqrt(2.0 / n) + 0.25 * (quantum * fraction) ** 2 / variance
+
+
 def test_a_window_is_thinned_as_the_whole():
     counts = poisson(torch.full((6, 50), 80.0), np.arange(6) * 50, seed=11)
     full = thinned(counts, np.arange(6) * 50, 4, 0.6)

@@ -151,14 +151,15 @@ def _place(lines: Tensor, g: Any) -> tuple[float, float]:
     rows = rows[:, :: max(1, rows.shape[1] // 8)]
     rows = rows[:: max(1, rows.numel() // 4_000_000)]
     p = rows.to("cpu", torch.float64).numpy()
-    slope = (p[..., 2:] - p[..., :-2]) / 2.0
-    bend = p[..., 1:-1] - (p[..., 2:] + p[..., :-2]) / 2.0
-    sign = 1.0 - 2.0 * (np.arange(1, g.columns - 1) % 2)
-    # Slopes of close columns share no noise three apart; these have the size of the slope without it.
+    p = p - p.mean(0)  # edges of what is round stay in their columns, and say nothing of these
+    # Over an even distance, which an exchange of neighbours keeps; of readings that the bend does not hold.
+    slope = (p[..., 8:] - p[..., :-8]) / 8.0
+    bend = p[..., 4:-4] - (p[..., 5:-3] + p[..., 3:-5]) / 2.0
+    sign = 1.0 - 2.0 * (np.arange(bend.shape[-1]) % 2)
     score = (sign * bend * slope).sum((1, 2))
-    power = (slope[..., 3:] * slope[..., :-3]).sum((1, 2))
+    power = (slope[..., 1:] * slope[..., :-1]).sum((1, 2))  # next to each other they share no reading
     total = float(power.sum())
-    if len(p) < _BLOCKS or total <= 0.0:
+    if len(p) < _BLOCKS or total <= 0.0 or g.columns < 2 * _FEWEST_COLUMNS:
         return 0.0, math.inf
     parts = np.array([score[b].sum() for b in np.array_split(np.arange(len(p)), _BLOCKS)])
     # A shift by ε to either side bends by 2 ε slopes.

@@ -221,6 +221,20 @@ def test_names_that_are_paths_stay_within(task, tmp_path):
     assert kept_as(Method("fbp:soft", run_half), 1.0, task, 0)[0] == "fbp_soft/1s"
 
 
+def test_pieces_of_another_seed_method_or_exposure_are_not_taken(task, tmp_path):
+    """A second call with another --seed must compute: its realisations are other ones."""
+    first = kept_as(Method("half", run_half), 1.0, task, 0)
+    others = [
+        kept_as(Method("half", run_half), 1.0, task, 1),
+        kept_as(Method("half", run_half), 2.0, task, 0),
+        kept_as(Method("other", run_half), 1.0, task, 0),
+    ]
+    store = Store(tmp_path)
+    assert store.piece(first[0], first[1], lambda: {"of": 0}) == {"of": 0}
+    for k, (place, key) in enumerate(others, start=1):
+        assert store.piece(place, key, lambda k=k: {"of": k}) == {"of": k}
+
+
 @pytest.mark.parametrize(
     ("spec", "expected_text"),
     [

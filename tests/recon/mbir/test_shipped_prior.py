@@ -3,6 +3,8 @@
 A tilted vessel with a core (not the paper's), painted on 0.1 mm, projected and drawn at two noise levels.
 """
 
+import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import drawn_vessel
@@ -18,7 +20,8 @@ from recon.gram.gram import Gram
 from recon.mbir.mbir import Mbir
 from recon.mbir.network import NetworkConfig
 from recon.mbir.problem import filtered
-from recon.mbir.unrolled import REFERENCE_SCALE_HU, Unrolled, low_residual, start
+from recon.mbir.residual import significant_residual
+from recon.mbir.unrolled import REFERENCE_SCALE_HU, Unrolled, guide_noise, limited, low_residual, start
 
 FAT = drawn_vessel.VALUES["fat"]
 LEVEL = 1.0 + FAT / 1000.0
@@ -124,3 +127,62 @@ def test_the_network_is_given_a_step_towards_the_data_and_where_it_is(found):
         level = torch.log(normal.scale_hu / REFERENCE_SCALE_HU)
         torch.testing.assert_close(condition, torch.stack([level, 0.25 + 0 * level, k + 0 * level], 1))
         before = 0.9 * u
+
+
+@pytest.fixture(scope="module")
+def striped(drawn):
+    """The shipped network, a problem that holds fine stripes beyond all noise, the volumes of its steps, and what the
+    network alone, with the data, without overshoot, and with what the data still hold makes of it."""
+    network, exposure, generator = Mbir.load(), 40.0, torch.Generator().manual_seed(0)
+    noise = torch.randn(drawn.readings.shape, generator=generator)
+    y = drawn.readings + noise / (drawn.w * exposure).sqrt()
+    normal = network.problem(drawn.scan, drawn.A.T(drawn.w * exposure * y)[None], exposure)
+    stripes = 8.0 * torch.sin(2.0 * math.pi * torch.arange(normal.beta.shape[-1]) / 5.0)
+    normal = replace(normal, beta=normal.beta + normal.apply(stripes.expand(normal.beta.shape).contiguous()))
+    steps = []
+
+    def run(callback=None, **options):
+        with torch.no_grad():
+            return network.model(normal, network.fidelity, callback, **options)
+
+    plain = {"cut_overshoot": False, "restore": False}
+    made = {"alone": run(lambda k, v: steps.append(v), final_data_consistency=False, **plain), "data": run(**plain),
+            "cut": run(restore=False), "all": run()}  # fmt: skip
+    return SimpleNamespace(model=network.model, normal=normal, steps=steps, run=run, plain=plain, **made)
+
+
+def test_steps_and_prior_are_what_is_asked_for(striped):
+    count = striped.model.steps
+    assert len(striped.steps) == count + 1
+    torch.testing.assert_close(striped.steps[-1], striped.alone)
+    for steps in (1, count + 1):
+        seen, asked = [], []
+        found = striped.run(lambda k, v, seen=seen: seen.append(v), steps=steps, final_data_consistency=False,
+                            **striped.plain)  # fmt: skip
+        assert len(seen) == steps + 1
+        torch.testing.assert_close(seen[1], striped.steps[1])
+        torch.testing.assert_close(seen[-1], found)
+        kept = striped.run(prior=lambda v, *_, asked=asked: asked.append(v) or v, steps=steps,
+                           final_data_consistency=False, **striped.plain)  # fmt: skip
+        assert len(asked) == steps
+        torch.testing.assert_close(kept, striped.steps[0])
+    assert float((striped.alone - striped.steps[0]).abs().max()) > 0.5
+
+
+def test_every_switch_takes_its_part_out_and_nothing_else(striped):
+    """Each part is tested by itself elsewhere: here that it is there, in its place, in what ships."""
+    normal, spectrum = striped.normal, striped.normal.spectrum()
+    assert energy(normal, striped.data) < energy(normal, striped.alone) - 1.0
+    given = []
+
+    def listening(*seen):
+        given.append(seen)
+        return striped.model.network(*seen)
+
+    torch.testing.assert_close(striped.run(prior=listening), striped.all)
+    noise = guide_noise(spectrum, normal.beta.shape[-3:], normal.voxel_mm)
+    torch.testing.assert_close(striped.cut, limited(striped.data, given[-1][3], noise))
+    assert float((striped.cut - striped.data).abs().max()) > 0.5
+    back = significant_residual(normal, spectrum, striped.cut, 0.1)
+    torch.testing.assert_close(striped.all, striped.cut + back)
+    assert float(back.abs().max()) > 0.5

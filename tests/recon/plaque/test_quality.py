@@ -1,6 +1,8 @@
 """What the model lacks: texture is measured, a calcification becomes a body, a foreign body is warned of."""
 
+from copy import copy
 from dataclasses import replace
+from types import SimpleNamespace
 
 import drawn_vessel
 import numpy as np
@@ -9,7 +11,7 @@ import torch
 from scipy import ndimage
 
 from recon.plaque import read_plaque, reading
-from recon.plaque.quality import LENGTH_MM, STRIKING, Leftover, misfit, texture
+from recon.plaque.quality import LENGTH_MM, PRIOR_VARIANCE_HU2, STRIKING, Leftover, misfit, texture
 from recon.plaque.report import save, table
 from recon.plaque.start import find_vessel
 from recon.plaque.vessel import Vessel
@@ -31,13 +33,27 @@ def test_texture_is_told_from_none(gram):
     rough *= 60.0 / rough.std()
     soft = (plain > -20) & (plain < 250)
     rng = np.random.default_rng(0)
-    smooth, textured = (
-        texture(*fitted(gram, v, 4), rng) for v in (plain, plain + torch.from_numpy(rough).float() * soft)
-    )
+    fits = [fitted(gram, v, 4) for v in (plain, plain + torch.from_numpy(rough).float() * soft)]
+    smooth, textured = (texture(*f, rng) for f in fits)
     assert textured.sd_hu > 2 * smooth.sd_hu
     assert textured.sd_hu > 25
     assert smooth.high_hu < 25
     assert textured.sd_of("contrast") >= 0
+    # Data that say next to nothing leave the prior: the variance's mean, and its 95 % limit, ln 20 times as much.
+    vessel, fit = copy(fits[0][0]), fits[0][1]
+    whole = vessel.gram
+    vessel.gram = SimpleNamespace(apply=lambda v: 1e-6 * whole.apply(v))
+    faint = SimpleNamespace(
+        drawing=fit.drawing,
+        bodies=fit.bodies,
+        parameters=fit.parameters,
+        covariance=fit.covariance,
+        curved=1e-6 * fit.curved,
+        residual=1e-3 * fit.residual,
+    )
+    unknown = texture(vessel, faint, rng)
+    assert unknown.sd_hu**2 == pytest.approx(PRIOR_VARIANCE_HU2, rel=0.02)
+    assert unknown.high_hu**2 == pytest.approx(3.0 * PRIOR_VARIANCE_HU2, rel=0.02)
 
 
 def test_a_calcification_becomes_a_body_and_not_a_core(gram, tmp_path):

@@ -1,5 +1,7 @@
 """The vessel's model: its drawing and derivatives, and the fit to noise-free data of known tissues."""
 
+from types import SimpleNamespace
+
 import drawn_vessel
 import numpy as np
 import pytest
@@ -67,6 +69,37 @@ def test_fit_goes_to_the_mode_from_afar(gram, seed):
     afar[vessel.outer_part] *= 0.8
     found, mode = vessel.fit(afar, expected=True), vessel.fit(afar, expected=True, steps=60, tolerance=1e-5)
     assert found.energy - mode.energy < 0.6
+
+
+class Scripted(Vessel):
+    """A model of one direction: its energy is a function of how far a step went."""
+
+    def __init__(self, energy):
+        self.index, self.ones, self.b = np.zeros(1), np.ones(1), np.zeros(1)
+        self.along, self.tried = energy, []
+
+    def _prior_with(self, bodies, expected):
+        return np.eye(FAT + 1)
+
+    def draw(self, theta, bodies, **_):
+        return SimpleNamespace(image=np.zeros(1), jacobian=np.ones((1, FAT + 1)))
+
+    def energy(self, theta, image, precision):
+        self.tried.append(float(theta[0]))
+        return self.along(theta[0]), np.zeros(1)
+
+    def hessian(self, drawing, precision, seen=None):
+        return np.eye(FAT + 1)
+
+    def _gradient(self, *_):
+        return np.eye(FAT + 1)[0]
+
+
+def test_a_step_that_leads_up_is_shortened_to_a_tenth_at_most():
+    """The parabola through a wall of energy has its top next to where the step began: nothing is gained there."""
+    model = Scripted(lambda x: 1e9 if x > 0.02 else -x)
+    model.fit(np.zeros(FAT + 1), steps=1)
+    assert model.tried == pytest.approx([0.0, 1.0, 0.1, 0.01])
 
 
 def test_fit_is_a_mode(vessel, fit):
