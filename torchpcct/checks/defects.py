@@ -267,8 +267,13 @@ def _alone(deviation: NDArray[np.float64], found: NDArray[np.bool_], known: NDAr
                     for at, own in ((start - 1, excess[0]), (start + count, excess[-1]))
                     if known[r, at]
                 ]
-                left = max((abs(end) for end in ends), default=0.0) / max(size, 1e-300)
-                if left < _BENT and size > GAIN_ERROR and (best is None or left < best[0]):
+                left = max((abs(end) for end in ends), default=math.inf) / max(size, 1e-300)
+                # At the detector's border one side has to tell it all.
+                if (
+                    left < (_BENT if len(ends) == 2 else _BENT / 3)
+                    and size > GAIN_ERROR
+                    and (best is None or left < best[0])
+                ):
                     best = left, start, excess
         if best is not None:
             hot[r, best[1] : best[1] + best[2].size] = True
@@ -311,19 +316,27 @@ def _isolated(
     values = [[_around(n, at, side * dc) for dc in range(1, reach + 1)] for side in (-1, 1)]
     stacked = np.ma.masked_less_equal(np.stack([np.concatenate(v) for v in values]), 0.0)
     sides = np.ma.filled(np.ma.median(stacked, axis=1), 0.0)
-    good = (sides > light).all(0)
+    good = (sides > light).all(0) & ~_dim_rows(n, at, light)
     onward = []
     for step in (-1, 1):
         there = np.clip(at[:, 0] + step, 0, len(n) - 1)
         column = first[at[:, 0]] - first[there]
         around = np.nan_to_num(_around(n, at, column, step))
         onward.append(around[len(around) // 2])
-    pairs = [np.stack(onward)]
-    if n.shape[1] > 1:
-        pairs.append(_around(n, at, 0)[[0, 2]])
-    for pair in pairs:
-        good &= (pair <= 0).all(0) | (pair > light).any(0)
-    return at[good]
+    return at[good & ~_dim(np.stack(onward), light)]
+
+
+def _dim_rows(n: NDArray[Any], at: NDArray[np.int64], light: float) -> NDArray[np.bool_]:
+    """Whether the zeros ``at`` have only dim neighbours in the rows beside, as an upright detail has."""
+    if n.shape[1] == 1:
+        return np.zeros(len(at), bool)
+    return _dim(_around(n, at, 0)[[0, 2]], light)
+
+
+def _dim(pair: NDArray[Any], light: float) -> NDArray[np.bool_]:
+    """Whether there is a reading in ``(2, k)`` pairs, and none that is bright."""
+    dim: NDArray[np.bool_] = (pair > 0).any(0) & ~(pair > light).any(0)
+    return dim
 
 
 def _around(n: NDArray[Any], at: NDArray[np.int64], column: Any, view: Any = 0) -> NDArray[Any]:
@@ -395,7 +408,8 @@ def _unshadowed(
     # A footprint that walks has its edges in other columns while it stays on a cell.
     still = (distance == distance[:, middle[which]]).all(0)
     narrow = distance[:, middle].sum(0) - 1 <= _WIDTH
-    good = narrow & (share(lit) >= 0.75) & (share(still) >= 0.75) & (share(dip) <= _DIP)
+    upright = share(_dim_rows(n, at, light)) >= 0.5
+    good = narrow & ~upright & (share(lit) >= 0.75) & (share(still) >= 0.75) & (share(dip) <= _DIP)
     # Before and after: as bright as its neighbours then, and no footprint has come from elsewhere and gone elsewhere.
     moved, tested = np.ones(len(starts), bool), np.zeros(len(starts), bool)
     for step, place in ((-1, starts), (1, starts + lengths - 1)):

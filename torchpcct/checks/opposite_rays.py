@@ -232,7 +232,7 @@ def _centre(pairs: _Pairs, false_alarms: float) -> tuple[ScanTest, float]:
             waves = [_blocks(power * wave(turn), pairs.used(columns)) for wave in (np.cos, np.sin)]
             score, power = (_blocks(v, pairs.used(columns)) for v in sums)
             design = np.stack([power, *waves], 1)
-            test = _tested(score, power, design, false_alarms / len(_COLUMNS), pairs.unexplained)
+            test = _tested(score, power, design, false_alarms / len(_COLUMNS), pairs)
             found.append((test, test.sizes.get("centre", 0.0) ** 2 * float(power.sum())))
     return next((f for f in found if f[0].findings), found[0] if found else (UNKNOWN, 0.0))
 
@@ -267,12 +267,16 @@ def _above(blocks: Floats) -> float:
     return float(stats.t.sf(float(blocks.sum()) / _spread(blocks), blocks.size - 1))
 
 
-def _fitted(score: Floats, power: Floats, tolerance: float) -> _Fit:
-    """Regression of the blocks' scores on their powers, and Student's test of a size beyond ``tolerance``."""
+def _fitted(score: Floats, power: Floats, tolerance: float, stray: float) -> _Fit:
+    """Regression of the blocks' scores on their powers, and Student's test of a size beyond ``tolerance``.
+
+    ``stray``: square of the difference that is neither noise nor the cause's, and pulls the size aside.
+    """
     total = float(power.sum())
     size = float(score.sum()) / total
     beyond = math.copysign(1.0, size) * (score - math.copysign(tolerance, size) * power)
-    return _Fit(size, _spread(score - size * power) / total, min(1.0, 2.0 * _above(beyond)), size**2 * total)
+    error = math.hypot(_spread(score - size * power) / total, math.sqrt(stray / max(total, 1e-300)))
+    return _Fit(size, error, min(1.0, 2.0 * _above(beyond)), size**2 * total)
 
 
 Pattern = tuple[Tensor, str]
@@ -412,7 +416,7 @@ class _Pairs:
         if sums is None:
             return None
         score, power = (_blocks(v, self.used(columns)) for v in sums)
-        return _fitted(score, power, tolerance) if power.sum() > 0 else None
+        return _fitted(score, power, tolerance, self.stray) if power.sum() > 0 else None
 
     def _between_views(self) -> Tensor:
         """How far readings lie from the mean of those in the views before and behind."""
@@ -438,6 +442,11 @@ class _Pairs:
     def unexplained(self) -> float:
         """Of the squared difference, what a cause must explain more than to be one."""
         return _INTERPOLATED * self.interpolated + self.parted
+
+    @cached_property
+    def stray(self) -> float:
+        """Of the squared difference, what pulls sizes aside, as a variance: little of it looks like a cause."""
+        return self.parted / 4.0 + self.interpolated / 16.0
 
     @property
     def disagreement(self) -> float:
@@ -543,11 +552,10 @@ def _joined_rows(geometry: ConeBeam, window: DetectorWindow, values: Tensor) -> 
     return wider, window.with_rows(0, rows), values
 
 
-def _tested(score: Floats, power: Floats, waves: Floats, false_alarms: float, least: float) -> ScanTest:
-    """``least``: of the squared difference, what may be there without an error."""
+def _tested(score: Floats, power: Floats, waves: Floats, false_alarms: float, pairs: _Pairs) -> ScanTest:
     if power.sum() <= 0.0:
         return UNKNOWN
-    fit = _fitted(score, power, CENTRE_TOLERANCE)
+    fit, least = _fitted(score, power, CENTRE_TOLERANCE, pairs.stray), pairs.unexplained
     swing, swinging = _swing(score, waves)
     findings = []
     if fit.found(false_alarms / 2, CENTRE_TOLERANCE) and fit.explained > least:

@@ -42,7 +42,7 @@ class OrbitPlane:
     Attributes:
         lines: ``(views, 1, columns)``.
         parted: mean square by which opposite rays of a sound scan may differ, since they part along z.
-        part: of the sum of a view, what changes between the rows and their border.
+        part: of the sum of a view, what changes between the rows and their border, or from row to row.
         away: root mean square distance of the object from the axis, over sod.
         rows: how many were averaged.
         lacking: ``(views, columns)``, what they may lack because cells average transmissions (:func:`lack_of_cells`).
@@ -85,6 +85,7 @@ def orbit_plane(lines: Tensor, geometry: ConeBeam) -> OrbitPlane | None:
     noise: float | None = None
     best: tuple[float, OrbitPlane] | None = None
     total, lacking, rows = torch.zeros_like(even[0]), torch.zeros_like(even[0]), 0
+    stepping = 0.0
     for k, level in enumerate(even):
         if k and heights[k] > flat:
             break
@@ -92,8 +93,10 @@ def orbit_plane(lines: Tensor, geometry: ConeBeam) -> OrbitPlane | None:
         mean = total / rows
         beside = [_row(lines, geometry, side * v) for v in (heights[k] - row, heights[k] + row) for side in (-1, 1)]
         ends = [beside[2] - beside[0], beside[3] - beside[1]] if k + 1 < len(even) else [level]
-        lack = torch.stack([torch.from_numpy(lack_of_cells(e.double().numpy())) for e in ends]).mean(0)
-        lacking += float(counts[k]) * lack
+        steps = [e.double().numpy() for e in ends]
+        lacking += float(counts[k]) * torch.from_numpy(np.mean([lack_of_cells(step) for step in steps], axis=0))
+        step = np.mean([_without_noise(step) for step in steps], axis=0)
+        stepping += float(counts[k]) * float(np.minimum(step, np.abs(level.numpy())).mean())
         # Without a row beside them nobody knows where the object ends: all of it may.
         border = even[k + 1] if k + 1 < len(even) else torch.zeros_like(mean)
         change = border - mean
@@ -101,11 +104,14 @@ def orbit_plane(lines: Tensor, geometry: ConeBeam) -> OrbitPlane | None:
         away = _spread(change, off_axis) if square > 0 else 0.0
         parted = PARTED * 4.0 * square * away / geometry.sod**2
         if noise is None:
-            noise = _noise(mean) * rows
+            # Of one row: the border is the mean of two, the first level of one or two.
+            noise = max(float(change.double().square().mean()) - shared_square(change), 0.0) / (0.5 + 1.0 / rows)
         cost = _NEEDED * 2.0 * noise / rows + parted * mean.numel() / 2
         if best is None or cost < best[0]:
             sums, all_of_it = change.mean(1), float(mean.mean())
-            share = float(sums.abs().mean()) / all_of_it if all_of_it > 0 else 1.0
+            # Of a body thinner than a row every row steps, and the means may be alike.
+            ends_within = max(float(sums.abs().mean()), stepping / rows)
+            share = ends_within / all_of_it if all_of_it > 0 else 1.0
             far = math.sqrt(_spread(mean, off_axis)) / geometry.sod
             best = cost, OrbitPlane(mean[:, None], parted, min(share, 1.0), far, rows, lacking / rows)
     return None if best is None else best[1]
@@ -137,15 +143,23 @@ def _row(lines: Tensor, geometry: ConeBeam, height: float) -> Tensor:
 def lack_of_cells(steps: NDArray[np.float64]) -> NDArray[np.float64]:
     """What line integrals may lack in cells in which the object ends, ``(views, columns)``.
 
-    The logarithm of a mean of transmissions lies below the mean of the line integrals, by half their variance in the
-    cell: where they step by J from one neighbour to the other, by J² / 8 at most, and by less than J / 2.
+    The logarithm of a mean of transmissions lies below the mean of the line integrals: where they step by J from one
+    neighbour to the other, and the step covers the part q of the cell, by q J + ln(1 - q (1 - exp(-J))). Its maximum
+    over q is taken, J² / 8 of small steps.
 
     Args:
         steps: J, with noise that is independent from view to view.
     """
-    square = np.maximum(steps * np.roll(steps, 1, 0), 0.0)
-    lack: NDArray[np.float64] = np.minimum(square / 8.0, np.sqrt(square) / 2.0)
-    return lack
+    step = np.maximum(_without_noise(steps), 1e-3)
+    passing = -np.expm1(-step)
+    lack: NDArray[np.float64] = step * (1.0 - passing / step) / passing + np.log(passing / step)
+    return np.maximum(lack, 0.0)
+
+
+def _without_noise(steps: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Sizes of steps that the next view has, too."""
+    size: NDArray[np.float64] = np.sqrt(np.maximum(steps * np.roll(steps, 1, 0), 0.0))
+    return size
 
 
 def shared_square(values: Tensor) -> float:
@@ -155,7 +169,7 @@ def shared_square(values: Tensor) -> float:
     """
     if min(values.shape) < 2:
         return float(values.double().square().mean())
-    across = float((values[:, 1:] * values[:, :-1]).double().mean())
+    across = float((values[:, 1:] * values[:, :-1]).double().sum()) / values.numel()
     onward = float((values * values.roll(1, 0)).double().mean())
     return max(across, onward, 0.0)
 
@@ -167,8 +181,3 @@ def _spread(values: Tensor, away: Tensor) -> float:
         return float(away.square().max())
     square = ((away[1:] + away[:-1]) / 2).square().double()
     return 2.0 * float((weight * square).sum() / weight.sum())
-
-
-def _noise(values: Tensor) -> float:
-    """Variance of the noise of ``(views, columns)``: what neighbours do not share."""
-    return max(float(values.double().square().mean()) - shared_square(values), 1e-300)

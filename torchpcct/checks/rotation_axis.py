@@ -22,6 +22,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from torchpcct.checks.opposite_rays import OppositeRays, centre_test
+from torchpcct.checks.orbit_plane import orbit_plane
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, view_step
 from torchpcct.readings import MEDIAN_TO_SD
@@ -35,6 +36,15 @@ _COARSE_VIEWS, _COARSE_STEPS = 48, 64
 _REACH = 0.45
 """Part of the detector's width, to either side of its middle, where the axis is looked for."""
 _COMPARED = 0.1
+_LIKE_SIGMAS, _PART = 5.0, 8
+"""How much more than noise opposite rays must resemble each other at the axis (of a hundred columns that are tried one
+shows three by chance), and over how many columns products are summed."""
+_UNLIKE = 0.3
+"""Squared difference of a half turn's ends over what they show, above which they have nothing in common but noise."""
+_NOTHING = (
+    "the readings do not tell the axis: where it might be they are no more alike than elsewhere (nothing but noise, or "
+    "an object that is round about the axis)"
+)
 _BLOCKS = 16
 _TIED = 1.7
 """Both ends compare the same readings, which counts them twice (√2), and smoothing ties neighbouring blocks: measured
@@ -101,10 +111,10 @@ def rotation_axis(lines: Tensor, geometry: Geometry) -> RotationAxis:
         # Of a part of a turn what single cells have wrong stays, and is alike in all views.
         return _stated(found[0], found[1] * (1.0 if shares is not None else 2.0), LEAST, "opposite rays")
     if not isinstance(g, ParallelBeam):
-        raise ValueError(
-            "hardly any line was measured twice, which tells the axis of a fan or cone beam: a full turn does"
-        )
-    turn = np.mod(g.angles - g.angles[0], 2 * math.pi)
+        few = "hardly any line was measured twice, which tells the axis of a fan or cone beam: a full turn does"
+        raise ValueError(few if shares is None else _NOTHING)
+    # What all views of a full turn share may tell it, too: an object that is round about the axis has edges.
+    turn = _turned(g.angles)
     half = np.flatnonzero(turn <= math.pi + 1e-4)
     order = half[np.argsort(turn[half], kind="stable")]
     ends = math.pi - float(turn[order[-1]])
@@ -124,7 +134,7 @@ def rotation_axis(lines: Tensor, geometry: Geometry) -> RotationAxis:
 
 def _stated(column: float, error: float, least: float, how: str) -> RotationAxis:
     if not (math.isfinite(column) and math.isfinite(error)):
-        raise ValueError("the readings do not tell the axis: there is nothing in them but noise")
+        raise ValueError(_NOTHING)
     return RotationAxis(column, max(_SIGMAS * error, least), how)
 
 
@@ -140,8 +150,18 @@ def _shares(angles: Floats) -> Floats | None:
     return shares
 
 
+def _turned(angles: Floats) -> Floats:
+    """The angle of every view from the end of the widest gap on, rad, whatever their order and direction."""
+    turn = np.mod(angles, 2 * math.pi)
+    ordered = np.sort(turn)
+    gaps = np.diff(ordered, append=ordered[0] + 2 * math.pi)
+    begin = ordered[(int(np.argmax(gaps)) + 1) % ordered.size]
+    # Rounding puts what equals the beginning at 0, not at a whole turn.
+    return np.mod(turn - begin + 1e-9, 2 * math.pi) - 1e-9
+
+
 def _by_opposites(lines: Tensor, geometry: Any) -> tuple[float, float] | None:
-    """Column and its standard error; None where hardly any ray has an opposite."""
+    """Column and its standard error; None where hardly any ray has an opposite, or they are alike by chance."""
     column = _coarse(lines, geometry)
     if column is None:
         return None
@@ -149,13 +169,36 @@ def _by_opposites(lines: Tensor, geometry: Any) -> tuple[float, float] | None:
     for _ in range(12):
         test = centre_test(lines, at_axis(geometry, column))
         if "centre" not in test.sizes:
-            return None if math.isinf(error) else (column, error)
+            break
         error = test.errors["centre"]
         step = min(max(test.sizes["centre"], -2.0), 2.0)
         column += step  # described too high by so much: the axis lies at a higher column
         if abs(step) < max(0.05 * error, 1e-3):
             break
-    return column, error
+    alike = math.isfinite(error) and _likeness(lines, at_axis(geometry, column)) >= _LIKE_SIGMAS
+    return (column, error) if alike else None
+
+
+def _likeness(lines: Tensor, geometry: Any) -> float:
+    """By how many standard deviations opposite rays resemble each other more than noise does.
+
+    Of noise alone the products of the two are as often below 0 as above: the sums over parts of the views, a few
+    columns wide, tell how far their sum may lie from 0.
+    """
+    values = lines.detach().to("cpu", torch.float32)
+    if isinstance(geometry, ConeBeam):
+        plane = orbit_plane(values, geometry)
+        if plane is None:
+            return 0.0
+        values, geometry = plane.lines, geometry.central_fan
+    values = values.reshape(geometry.views, 1, geometry.columns)
+    window = DetectorWindow.full(geometry)
+    base = np.arange(geometry.views)
+    opposite, known = OppositeRays(geometry, window, (0.0, 0.0)).opposite(values, base)
+    products = torch.where(known, values * opposite, 0.0)[:, 0].double()
+    parts = F.pad(products, (0, -products.shape[1] % _PART)).unflatten(1, (-1, _PART)).sum(2)
+    spread = float(parts.square().sum().sqrt())
+    return float(parts.sum()) / spread if spread > 0 else 0.0
 
 
 def _coarse(lines: Tensor, geometry: Any) -> float | None:
@@ -226,6 +269,8 @@ def _by_ends(lines: Floats, turn: Floats) -> tuple[float, float]:
 
     reach = int(_REACH * columns)
     column = min((columns - 1) / 2 + np.arange(-reach, reach + 1), key=unlike)
+    if unlike(column) > _UNLIKE:
+        return math.nan, math.inf
     for _ in range(12):
         differences, slopes, power, _ = compared(column)
         total = float(power.sum())

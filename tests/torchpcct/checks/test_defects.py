@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.ndimage import gaussian_filter1d
+from sound_scans import BALL, Solid, transmissions
 
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, full_turn
 from torchpcct.checks.defects import dead_readings, find_defects, repair_defects
@@ -164,3 +165,37 @@ def test_shadows_of_opaque_pins_and_plates_are_no_defects(blur):
     n = np.random.default_rng(0).poisson(2e4 * shone).astype(np.float32)
     assert (n == 0).mean() > 0.05
     assert not find_defects(torch.from_numpy(n[:, None]), torch.full((1, columns), 2e4)).mask.any()
+
+
+def test_cells_of_a_wrong_gain_side_by_side_are_found(counts):
+    broken, bad = counts.clone(), torch.zeros(counts.shape, dtype=torch.bool)
+    broken[:, 1, 20:22] *= 1.6
+    broken[:, 3, 50] *= 0.7
+    bad[:, 1, 20:22] = bad[:, 3, 50] = True
+    found = find_defects(broken, AIR)
+    assert torch.equal(found.mask, bad)
+    assert found.hot_cells == 3
+
+
+@pytest.mark.parametrize("radii", [(13.0, 62.0, 62.0), (9.0, 20.0, 20.0), (4.0, 48.0, 48.0)])
+@pytest.mark.parametrize("cell", [3.0, 8.0])
+def test_outlines_of_round_bodies_are_no_gains(radii, cell):
+    """An ellipsoid about the axis in coarse cells: its outline stays on its cells, in every row on others."""
+    columns = round(180.0 / cell)
+    g = ConeBeam(full_turn(40), 500.0, 800.0, columns, 9, (4.0, cell))
+    body = Solid(BALL, (0.0, 0.0, 0.0), radii[::-1], 5.0 / (2.0 * radii[1]))
+    shone = transmissions(g, [body], subs=(4, 4, 1))
+    for seed in range(2):
+        n = np.random.default_rng(seed).poisson(4e4 * shone).astype(np.float32)
+        assert find_defects(torch.from_numpy(n), torch.full(g.shape[1:], 4e4)).text == ""
+
+
+def test_a_detail_as_narrow_as_a_cell_is_no_lost_reading():
+    """A thin dense post along the rows' axis, dim in every row: a reading of it that is 0 is noise."""
+    columns = (30 + 12 * np.sin(full_turn(VIEWS))).astype(int)
+    n = np.array(expected())
+    for view, column in enumerate(columns):
+        n[view, :, column] = 4.0
+    n = np.random.default_rng(0).poisson(n).astype(np.float32)
+    assert float((n == 0).sum()) > 3
+    assert find_defects(torch.from_numpy(n), AIR).text == ""
