@@ -442,7 +442,11 @@ def draw(seed: int, *, kind: str | None = None, readings: int = 600_000) -> Draw
     ]
     name, solids = _object(rng, fov * (rng.uniform(1.2, 1.6) if cut else 1.0), height, water)
     if cut:
-        rightly += ["the rows end inside the object", "no row ends in air"]
+        rightly += [
+            "the rows end inside the object",
+            "no row ends in air",
+            "or it reaches beyond the rows in some views",
+        ]
         name += ", cut off"
     photons = _log_uniform(rng, 1e3, 1e6)
     few = g.select(slice(None, None, max(1, views // 12)))

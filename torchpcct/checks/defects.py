@@ -253,7 +253,7 @@ def _alone(deviation: NDArray[np.float64], found: NDArray[np.bool_], known: NDAr
         about = np.abs(deviation[max(r - 1, 0) : r + 2, max(c - _ABOUT, 0) : c + _ABOUT + 1])
         if np.quantile(about, 0.8) > _BENT * abs(deviation[r, c]):
             continue
-        best: tuple[float, int, NDArray[np.floating[Any]]] | None = None
+        least, start_of, alone = math.inf, 0, 0
         for count in range(1, _TOGETHER + 1):
             bends = np.eye(count) - 0.5 * (np.eye(count, k=1) + np.eye(count, k=-1))
             for start in range(max(c - count + 1, 1), min(c, columns - 1 - count) + 1):
@@ -267,16 +267,11 @@ def _alone(deviation: NDArray[np.float64], found: NDArray[np.bool_], known: NDAr
                     for at, own in ((start - 1, excess[0]), (start + count, excess[-1]))
                     if known[r, at]
                 ]
-                left = max((abs(end) for end in ends), default=math.inf) / max(size, 1e-300)
+                left = max((abs(float(end)) for end in ends), default=math.inf) / max(size, 1e-300)
                 # At the detector's border one side has to tell it all.
-                if (
-                    left < (_BENT if len(ends) == 2 else _BENT / 3)
-                    and size > GAIN_ERROR
-                    and (best is None or left < best[0])
-                ):
-                    best = left, start, excess
-        if best is not None:
-            hot[r, best[1] : best[1] + best[2].size] = True
+                if left < min(least, _BENT if len(ends) == 2 else _BENT / 3) and size > GAIN_ERROR:
+                    least, start_of, alone = left, start, count
+        hot[r, start_of : start_of + alone] = True
     return hot
 
 
@@ -335,8 +330,7 @@ def _dim_rows(n: NDArray[Any], at: NDArray[np.int64], light: float) -> NDArray[n
 
 def _dim(pair: NDArray[Any], light: float) -> NDArray[np.bool_]:
     """Whether there is a reading in ``(2, k)`` pairs, and none that is bright."""
-    dim: NDArray[np.bool_] = (pair > 0).any(0) & ~(pair > light).any(0)
-    return dim
+    return np.asarray((pair > 0).any(0) & ~(pair > light).any(0))
 
 
 def _around(n: NDArray[Any], at: NDArray[np.int64], column: Any, view: Any = 0) -> NDArray[Any]:

@@ -136,8 +136,8 @@ def moment_test(lines: Tensor, geometry: Geometry) -> ScanTest:
             f"the sum of a view's line integrals changes with its direction, by {100 * weight:.2g} ± "
             f"{100 * weight_error:.1g} % (root mean square), that of any object does not: the readings lack most where "
             "the object is thickest (beam hardening by bone or metal, scatter, a dark signal left in, pile-up, "
-            "saturation, or too few photons for a logarithm), or the object moved; values are wrong by tens of HU, in "
-            "long shades"
+            "saturation, or too few photons for a logarithm), the object moved, or it reaches beyond the rows in some "
+            "views; values are wrong by tens of HU, in long shades"
         )
     found = {
         "weight": (weight, weight_error),

@@ -91,16 +91,18 @@ def orbit_plane(lines: Tensor, geometry: ConeBeam) -> OrbitPlane | None:
             break
         total, rows = total + float(counts[k]) * level, rows + int(counts[k])
         mean = total / rows
+        border, guarded = _border(lines, geometry, heights[k] + row)
         beside = [_row(lines, geometry, side * v) for v in (heights[k] - row, heights[k] + row) for side in (-1, 1)]
-        ends = [beside[2] - beside[0], beside[3] - beside[1]] if k + 1 < len(even) else [level]
+        ends = [level] if border is None else [beside[2] - beside[0], beside[3] - beside[1]]
         steps = [e.double().numpy() for e in ends]
         lacking += float(counts[k]) * torch.from_numpy(np.mean([lack_of_cells(step) for step in steps], axis=0))
         step = np.mean([_without_noise(step) for step in steps], axis=0)
         stepping += float(counts[k]) * float(np.minimum(step, np.abs(level.numpy())).mean())
-        # Without a row beside them nobody knows where the object ends: all of it may.
-        border = even[k + 1] if k + 1 < len(even) else torch.zeros_like(mean)
-        change = border - mean
-        square = max(shared_square(change), shared_square((level - even[k + 1]) / 2) if k + 1 < len(even) else 0.0)
+        # Without rows beside them nobody knows where the object ends: all of it may.
+        change = mean if border is None else border - mean
+        square = shared_square(change)
+        if border is not None:
+            square = max(square, shared_square((level - border) / 2), 0.0 if guarded else shared_square(mean))
         away = _spread(change, off_axis) if square > 0 else 0.0
         parted = PARTED * 4.0 * square * away / geometry.sod**2
         if noise is None:
@@ -128,6 +130,14 @@ def _levels(geometry: ConeBeam) -> list[float]:
         # A plane in the outer half of the outermost row, or nowhere.
         return [0.0] if min(-low, high) >= -0.5 * row * (1 + 1e-9) else []
     return list(np.arange(first, ends, row))
+
+
+def _border(lines: Tensor, geometry: ConeBeam, height: float) -> tuple[Tensor | None, bool]:
+    """What lies beside the rows up to a height, and whether it does on both sides; None: no row is there."""
+    low, high = geometry.row_positions[0], geometry.row_positions[-1]
+    reach = height - (0.5 + 1e-6) * geometry.pitch[0]
+    sides = [_row(lines, geometry, side * height) for side, end in ((-1, -low), (1, high)) if end >= reach]
+    return (sum(sides[1:], sides[0]) / len(sides) if sides else None), len(sides) == 2
 
 
 def _row(lines: Tensor, geometry: ConeBeam, height: float) -> Tensor:
