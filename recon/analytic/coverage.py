@@ -182,6 +182,7 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
         window, about = footprint(scan.geometry, grid, margin=_CENTRE_MARGIN).within(window), tuple(grid.center[-2:])
         scan = scan.crop(window)
     lines, geometry = scan.line_integrals(), scan.geometry
+    rebinned = isinstance(geometry, VectorGeometry)
     if isinstance(geometry, VectorGeometry):
         try:
             lines, circle = rebin_to_circle(lines, geometry)
@@ -194,12 +195,12 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
         lines = lines[lines.shape[0] // 2]
     if window is not None:
         lines = lines - window.take(scan.surround_line_integrals())
-        return [*_surround_texts(_thinned_out(whole)), *geometry_test(lines, geometry, window, about).findings]
+        return [*_surround_texts(_thinned_out(whole)), *geometry_test(lines, geometry, window, about, rebinned).findings]
     order = neighbour_test(lines, geometry)
     columns = list(column_test(lines, geometry).findings)
     if order.findings and "jump" not in order.sizes:  # in no order at all: opposite rays and moments are, too
         return [*order.findings, *columns]
-    found = [*_stuck_texts(scan, geometry), *order.findings, *geometry_test(lines, geometry).findings]
+    found = [*_stuck_texts(scan, geometry), *order.findings, *geometry_test(lines, geometry, rebinned=rebinned).findings]
     try:
         weights = angular_weights(geometry)
     except ValueError:  # FBP refuses these views, other methods need not

@@ -74,6 +74,8 @@ _EXPLAINED = 0.1
 _LARGEST = 0.3
 """Relative errors and angles in rad beyond which nothing is linear: no cause is named for what is larger."""
 _FINE_STEP_RAD = math.radians(2.5)
+_REBINNED = 15.0
+"""Factor on the tolerances of readings that are interpolated from another orbit."""
 
 Floats = NDArray[np.float64]
 
@@ -131,11 +133,14 @@ def geometry_test(
     geometry: Geometry,
     window: DetectorWindow | None = None,
     about: tuple[float, float] = (0.0, 0.0),
+    rebinned: bool = False,
 ) -> ScanTest:
     """Test the description of a scan by its opposite rays: centre, fan angles, steps between views, roll.
 
     Args:
         lines, geometry, window, about: see :func:`centre_test`.
+        rebinned: the readings are interpolated from another orbit, so causes beside the centre are told from larger ones
+            on only (:data:`_REBINNED`).
 
     Returns:
         The test of ``centre`` (see :func:`centre_test`), ``scale`` (fan angles described too small, relative), ``step``
@@ -159,6 +164,7 @@ def geometry_test(
         if of is None or cause is None:
             continue
         pattern, tolerance = cause
+        tolerance *= _REBINNED if rebinned else 1.0
         tried = [of.fit(pattern, tolerance, columns) for columns in _COLUMNS]
         fits = [f for f in tried if f is not None]
         if not fits:
