@@ -195,12 +195,14 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
         lines = lines[lines.shape[0] // 2]
     if window is not None:
         lines = lines - window.take(scan.surround_line_integrals())
-        return [*_surround_texts(_thinned_out(whole)), *geometry_test(lines, geometry, window, about, rebinned).findings]
+        opposite = geometry_test(lines, geometry, window, about, rebinned)
+        return [*_surround_texts(_thinned_out(whole)), *opposite.findings]
     order = neighbour_test(lines, geometry)
     columns = list(column_test(lines, geometry).findings)
     if order.findings and "jump" not in order.sizes:  # in no order at all: opposite rays and moments are, too
         return [*order.findings, *columns]
-    found = [*_stuck_texts(scan, geometry), *order.findings, *geometry_test(lines, geometry, rebinned=rebinned).findings]
+    opposite = geometry_test(lines, geometry, rebinned=rebinned)
+    found = [*_stuck_texts(scan, geometry), *order.findings, *opposite.findings]
     try:
         weights = angular_weights(geometry)
     except ValueError:  # FBP refuses these views, other methods need not
