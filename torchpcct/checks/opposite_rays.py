@@ -139,8 +139,8 @@ def geometry_test(
 
     Args:
         lines, geometry, window, about: see :func:`centre_test`.
-        rebinned: the readings are interpolated from another orbit, so causes beside the centre must be larger to be told
-            (:data:`_REBINNED`).
+        rebinned: the readings are interpolated from another orbit, so causes beside the centre must be larger to be
+            told (:data:`_REBINNED`).
 
     Returns:
         The test of ``centre`` (see :func:`centre_test`), ``scale`` (fan angles described too small, relative), ``step``
