@@ -157,7 +157,10 @@ class Objective:
             scale = problem.scale_hu.reshape(-1, 1, 1, 1)
 
             def volume(prior: Prior | None, problem: NormalisedProblem = problem, views: object = views) -> Tensor:
-                made: Tensor = model(problem, DEFAULT_FIDELITY, views=views, prior=prior)
+                # The filter has the views that are kept: those of one step.
+                made: Tensor = model(
+                    problem, DEFAULT_FIDELITY, steps=None if prior is None else 1, views=views, prior=prior
+                )
                 return made
 
             if step not in self._filtered:

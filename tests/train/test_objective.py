@@ -1,5 +1,6 @@
 """The loss and the validation, on models whose errors are known."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -143,6 +144,7 @@ def test_validation_is_relative_to_the_filter(data):
     """The filter in the network's place has ratios of 1; half of its error has half of them, whatever the scene."""
     held_out = Data(replace(CONFIG, scenes_kept=8), 9, data.views.folder.parent)
     held_out._grams = data._grams
+    assert math.isfinite(Objective().validate(Unrolled(NetworkConfig((4, 4, 4), 0.4)).eval(), held_out).score)
     model = Unrolled(NetworkConfig((4, 4, 4), 0.4, bilateral=True), steps=1).eval()
     with torch.no_grad():
         model.network.leave.weight.zero_()
