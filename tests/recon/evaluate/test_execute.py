@@ -330,7 +330,7 @@ def wait_until(condition, seconds=120.0):
         time.sleep(0.02)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="signals")
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
 def test_a_signal_ends_evaluate(tmp_path, name):
