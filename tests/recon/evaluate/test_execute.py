@@ -252,6 +252,7 @@ def test_a_job_whose_process_dies_is_repeated_and_left_out_after_three(processes
 
 
 @pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.cluster
 def test_a_job_that_kills_workers_of_a_cluster_is_left_out_alone(cluster, tmp_path):
     """Dask counts every job that a dead worker had been given: the others must not be among them."""
