@@ -120,6 +120,13 @@ class Batch:
         """Number of scenes."""
         return self.truth.shape[0]
 
+    def volumes(self, rows: Tensor) -> tuple[NormalisedProblem, NetworkViews]:
+        """Problem and views of some of the ``3 · size`` volumes."""
+        first, towards, smoothed = (None if v is None else v[rows] for v in self.views)
+        assert first is not None
+        assert towards is not None
+        return self.problem.part(rows), (first, towards, smoothed)
+
 
 class Views:
     """A file of samples: each is written when it has been computed, and says so.
@@ -213,6 +220,7 @@ class Data:
         self.seed = seed
         self.device = torch.device(device)
         self.views = Views(folder, config, seed)
+        self._epoch: tuple[tuple[int, int], list[list[int]]] = (-1, 0), []
         self._grams: dict[int, tuple[Gram, float]] = {}
 
     def gram(self, situation: int) -> tuple[Gram, float]:
@@ -265,13 +273,15 @@ class Data:
     def numbers(self, step: int, batch: int) -> list[int]:
         """The scenes of a step, all of one situation; an epoch takes every scene once, in an order of its own."""
         epoch, index = divmod(step, self.batches_in_epoch(batch))
-        rng = np.random.default_rng(seed_of("epoch", self.seed, epoch))
-        kinds = len(self.config.situations)
-        found = []
-        for kind in range(kinds):
-            order = rng.permutation(np.arange(kind, len(self.views), kinds))
-            found += [order[k : k + batch] for k in range(0, len(order) - batch + 1, batch)]
-        return [int(n) for n in found[rng.permutation(len(found))[index]]]
+        if self._epoch[0] != (epoch, batch):
+            rng = np.random.default_rng(seed_of("epoch", self.seed, epoch))
+            kinds = len(self.config.situations)
+            found = []
+            for kind in range(kinds):
+                order = rng.permutation(np.arange(kind, len(self.views), kinds)).tolist()
+                found += [order[k : k + batch] for k in range(0, len(order) - batch + 1, batch)]
+            self._epoch = (epoch, batch), [found[k] for k in rng.permutation(len(found))]
+        return self._epoch[1][index]
 
     def batch(self, step: int, batch: int, indices: Sequence[int]) -> Batch:
         """Scenes ``indices`` of a step.

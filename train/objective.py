@@ -27,7 +27,7 @@ from torch import Tensor, nn
 
 from recon.mbir.network import bilateral_prior
 from recon.mbir.problem import NormalisedProblem
-from recon.mbir.unrolled import DEFAULT_FIDELITY, Prior
+from recon.mbir.unrolled import DEFAULT_FIDELITY, Prior, Views
 from train.config import ObjectiveConfig
 from train.data import Batch, Data
 
@@ -103,13 +103,12 @@ class Objective:
             made: Tensor = prior(seen[0], seen[1], condition, seen[2])
             return batch.unturned(made)
 
-        problem = batch.problem.part(rows)
-        first, towards, smoothed = batch.views
+        problem, views = batch.volumes(rows)
         made: Tensor = model(
             problem,
             fidelity[scene],
             steps=1 if progress < self.single else None,
-            views=(first[rows], towards[rows], None if smoothed is None else smoothed[rows]),
+            views=views,
             prior=network,
         )
         error = made - batch.truth[scene] / problem.scale_hu.reshape(-1, 1, 1, 1)
@@ -151,12 +150,10 @@ class Objective:
         pictures: dict[str, NDArray[np.float32]] = {}
         for step in range(held_out.batches_in_epoch(_AT_ONCE)):
             batch = held_out.batch(step, _AT_ONCE, range(_AT_ONCE))
-            problem = batch.problem.part(torch.arange(batch.size))
-            views = (batch.views[0][: batch.size], batch.views[1][: batch.size], batch.views[2])
-            views = (*views[:2], None if views[2] is None else views[2][: batch.size])
+            problem, views = batch.volumes(torch.arange(batch.size))
             scale = problem.scale_hu.reshape(-1, 1, 1, 1)
 
-            def volume(prior: Prior | None, problem: NormalisedProblem = problem, views: object = views) -> Tensor:
+            def volume(prior: Prior | None, problem: NormalisedProblem = problem, views: Views = views) -> Tensor:
                 # The filter has the views that are kept: those of one step.
                 made: Tensor = model(
                     problem, DEFAULT_FIDELITY, steps=None if prior is None else 1, views=views, prior=prior
@@ -170,7 +167,7 @@ class Objective:
             for i in range(batch.size):
                 inside, weights = bodies[i] > 0, batch.contrast[i, -1]
                 errors = [(v[i] - batch.truth[i]).square() for v in (made, simple)]
-                row = {"exposure": float(problem.factor[i]), "scale": float(problem.scale_hu[i])}
+                row = {"scale": float(problem.scale_hu[i])}
                 for name, error in zip(("made", "simple"), errors, strict=True):
                     row[f"{name}_inside"] = float(error[inside].mean()) if inside.any() else math.nan
                     row[f"{name}_all"] = float(error.mean())

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -269,16 +269,7 @@ def _bulging(s: Floats) -> Floats:
 
 
 _BRANCH = (0.0, math.sin(0.85), math.cos(0.85))
-_THIN = Plaque(
-    position=(0.0, 0.0, 0.0),
-    vessel_diameter=3.5,
-    wall_thickness=_WALL,
-    vessel_length=2 * _HALF,
-    bulge=0.5,
-    bulge_length=6.4,
-    cap_thickness=0.12,
-    core_semi_axes=(0.5, 0.9, 1.1),
-)
+_THIN = replace(_PLAQUE, cap_thickness=0.12)
 _BENT = Centreline((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), 3.5)
 
 _HEALTHY, _WITH_PLAQUE = tuple(_vessel()), tuple(_plaque())

@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchpcct.checks.opposite_rays import UNKNOWN, ScanTest
+from torchpcct.checks.opposite_rays import UNKNOWN, ScanTest, check_lines
 from torchpcct.geometry import ConeBeam, Geometry
 from torchpcct.readings import MEDIAN_TO_SD
 from torchpcct.validate import checked
@@ -59,10 +59,7 @@ def column_test(lines: Tensor, geometry: Geometry) -> ScanTest:
         ValueError: a wrong shape, NaN or Inf.
     """
     g: Any = geometry
-    if tuple(lines.shape) != g.shape:
-        raise ValueError(f"lines must have the shape {g.shape}, got {tuple(lines.shape)}")
-    if not bool(torch.isfinite(lines).all()):
-        raise ValueError("lines hold NaN or Inf: bridge dead readings before (torchpcct.readings.bridge)")
+    check_lines(lines, g.shape)
     if g.columns < _FEWEST_COLUMNS or g.views < _FEWEST_VIEWS:
         return UNKNOWN
     order = torch.from_numpy(np.argsort(g.angles, kind="stable"))

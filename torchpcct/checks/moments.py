@@ -25,7 +25,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchpcct.checks.opposite_rays import UNKNOWN, ScanTest
+from torchpcct.checks.opposite_rays import UNKNOWN, ScanTest, check_lines
 from torchpcct.checks.orbit_plane import lack_of_cells, orbit_plane
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, view_step
 
@@ -75,11 +75,8 @@ def moment_test(lines: Tensor, geometry: Geometry) -> ScanTest:
         ValueError: a wrong shape, NaN or Inf.
     """
     g: Any = geometry
-    if tuple(lines.shape) != g.shape:
-        raise ValueError(f"lines must have the shape {g.shape}, got {tuple(lines.shape)}")
+    check_lines(lines, g.shape)
     values = lines.detach().to("cpu", torch.float64)
-    if not bool(torch.isfinite(values).all()):
-        raise ValueError("lines hold NaN or Inf: bridge dead readings before (torchpcct.readings.bridge)")
     turned, parted, lacking = 0.0, 0.0, torch.zeros(g.views, g.columns, dtype=torch.float64)
     if isinstance(g, ConeBeam):
         plane = orbit_plane(values, g)

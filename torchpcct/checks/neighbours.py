@@ -35,7 +35,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchpcct.checks.opposite_rays import UNKNOWN, ScanTest
+from torchpcct.checks.opposite_rays import UNKNOWN, ScanTest, check_lines
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, view_step
 from torchpcct.readings import MEDIAN_TO_SD
 from torchpcct.validate import checked
@@ -97,10 +97,7 @@ def neighbour_test(lines: Tensor, geometry: Geometry) -> ScanTest:
         ValueError: a wrong shape, NaN or Inf.
     """
     g: Any = geometry
-    if tuple(lines.shape) != g.shape:
-        raise ValueError(f"lines must have the shape {g.shape}, got {tuple(lines.shape)}")
-    if not bool(torch.isfinite(lines).all()):
-        raise ValueError("lines hold NaN or Inf: bridge dead readings before (torchpcct.readings.bridge)")
+    check_lines(lines, g.shape)
     views = _Views.of(lines, g)
     if views is None:
         return UNKNOWN

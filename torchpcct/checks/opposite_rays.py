@@ -47,7 +47,7 @@ from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, view_step
 from torchpcct.validate import checked
 
-__all__ = ["CENTRE_TOLERANCE", "UNKNOWN", "OppositeRays", "ScanTest", "centre_test", "geometry_test"]
+__all__ = ["CENTRE_TOLERANCE", "UNKNOWN", "OppositeRays", "ScanTest", "centre_test", "check_lines", "geometry_test"]
 
 CENTRE_TOLERANCE = 0.1
 """Error of the centre in columns that is no finding: alignment, and what interpolation between the views leaves."""
@@ -501,12 +501,25 @@ class _Pairs:
         return bool(difference < most * 2.0 * _product(here - here.mean(0), known).sum())
 
 
-def _check(lines: Tensor, geometry: Geometry, window: DetectorWindow) -> None:
-    expected = window.shape if isinstance(geometry, ConeBeam) else (window.views, window.columns)
-    if tuple(lines.shape) != expected or window.views != geometry.views:
-        raise ValueError(f"lines must have the shape {expected}, got {tuple(lines.shape)}")
+def check_lines(lines: Tensor, shape: tuple[int, ...], fits: bool = True) -> None:
+    """Refuse line integrals that no test can take.
+
+    Args:
+        lines: of a scan.
+        shape: that they must have; fits: false where none would do.
+
+    Raises:
+        ValueError: another shape, NaN or Inf.
+    """
+    if tuple(lines.shape) != shape or not fits:
+        raise ValueError(f"lines must have the shape {shape}, got {tuple(lines.shape)}")
     if not bool(torch.isfinite(lines).all()):
         raise ValueError("lines hold NaN or Inf: bridge dead readings before (torchpcct.readings.bridge)")
+
+
+def _check(lines: Tensor, geometry: Geometry, window: DetectorWindow) -> None:
+    expected = window.shape if isinstance(geometry, ConeBeam) else (window.views, window.columns)
+    check_lines(lines, expected, window.views == geometry.views)
 
 
 def _product(values: Tensor, known: Tensor) -> Floats:

@@ -130,9 +130,14 @@ def _second_tissue(draw: Draw, extent: Triple, config: SceneConfig, hu: float, v
         rotation = _towards(draw, -normal)
     x, y, z = on - axes[0] * rotation[0]
     return Solid(
-        Tissue.BESIDE, hu, (float(x), float(y), float(z)), axes, (Tissue.BACKGROUND,),
-        rotation=tuple(map(float, rotation.ravel())), kind="beside",
-    )  # fmt: skip
+        Tissue.BESIDE,
+        hu,
+        (float(x), float(y), float(z)),
+        axes,
+        (Tissue.BACKGROUND,),
+        rotation=tuple(map(float, rotation.ravel())),
+        kind="beside",
+    )
 
 
 def _towards(draw: Draw, first: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -155,11 +160,16 @@ def _free_bodies(draw: Draw, extent: Triple, config: SceneConfig, background: fl
         x, y, z = (draw((-0.5 * e, 0.5 * e)) for e in extent[::-1])
         bodies.append(
             Solid(
-                Tissue.INSERT, background + draw(contrast), (x, y, z), axes, tuple(Tissue),
+                Tissue.INSERT,
+                background + draw(contrast),
+                (x, y, z),
+                axes,
+                tuple(Tissue),
                 exponent=draw.log(config.exponent) if shape == "superquadric" else 2.0,
-                rotation=draw.rotation(), kind="free",
+                rotation=draw.rotation(),
+                kind="free",
             )
-        )  # fmt: skip
+        )
     return TrainingScene(background, solids=tuple(bodies), signal=Tissue.INSERT, around=Tissue.BACKGROUND)
 
 
@@ -478,12 +488,16 @@ class _Anatomy:
             r = inner + draw((-0.3, 0.15)) if spotty else r
             found.append(
                 Solid(
-                    Tissue.HARD, draw(c.calcification_hu), (r * math.cos(direction), r * math.sin(direction), s),
+                    Tissue.HARD,
+                    draw(c.calcification_hu),
+                    (r * math.cos(direction), r * math.sin(direction), s),
                     draw.axes(c.spotty_size if spotty else c.calcification_size),
                     IN_WALL if draw.chance(0.5) else (*IN_WALL, *OUTSIDE, Tissue.LUMEN),
-                    rotation=draw.rotation(), vessel=0, kind="spotty" if spotty else "calcification",
+                    rotation=draw.rotation(),
+                    vessel=0,
+                    kind="spotty" if spotty else "calcification",
                 )
-            )  # fmt: skip
+            )
         return found
 
     def _ulcer(self, first: _Drawn) -> list[Solid]:
@@ -494,12 +508,17 @@ class _Anatomy:
         r = edge - 0.1 + draw((0.0, 0.3)) * depth
         return [
             Solid(
-                Tissue.LUMEN, first.vessel.lumen_hu, (r * math.cos(direction), r * math.sin(direction), s),
-                (depth, draw.log(c.ulcer_size), draw.log(c.ulcer_size)), (*IN_LAYER, Tissue.CORE),
+                Tissue.LUMEN,
+                first.vessel.lumen_hu,
+                (r * math.cos(direction), r * math.sin(direction), s),
+                (depth, draw.log(c.ulcer_size), draw.log(c.ulcer_size)),
+                (*IN_LAYER, Tissue.CORE),
                 exponent=2.0 if draw.chance(0.6) else draw.log(c.exponent),
-                rotation=self._radial(direction), vessel=0, kind="ulcer",
+                rotation=self._radial(direction),
+                vessel=0,
+                kind="ulcer",
             )
-        ]  # fmt: skip
+        ]
 
     def _thrombus(self, first: _Drawn) -> list[Solid]:
         draw, c = self.draw, self.config
@@ -512,12 +531,17 @@ class _Anatomy:
             u, w = u + at[17], w + at[18]
         return [
             Solid(
-                Tissue.INSERT, draw(c.thrombus_hu), (float(u), float(w), s), draw.axes(c.thrombus_size),
-                (Tissue.LUMEN,), exponent=2.0 if draw.chance(0.6) else draw.log(c.exponent),
-                rotation=self._radial(direction) if draw.chance(0.5) else draw.rotation(), vessel=0,
+                Tissue.INSERT,
+                draw(c.thrombus_hu),
+                (float(u), float(w), s),
+                draw.axes(c.thrombus_size),
+                (Tissue.LUMEN,),
+                exponent=2.0 if draw.chance(0.6) else draw.log(c.exponent),
+                rotation=self._radial(direction) if draw.chance(0.5) else draw.rotation(),
+                vessel=0,
                 kind="free thrombus" if free else "mural thrombus",
             )
-        ]  # fmt: skip
+        ]
 
     def _flap(self, first: _Drawn) -> list[Solid]:
         """A thin sheet through the lumen; a false lumen may have less contrast agent."""
@@ -533,19 +557,33 @@ class _Anatomy:
         centre = (float(at[17] + r * c_), float(at[18] + r * s_), s)
         found = [
             Solid(
-                Tissue.INSERT, draw(c.thrombus_hu), centre, (0.5 * thickness, 4.0, length), (Tissue.LUMEN,),
-                exponent=8.0, rotation=rotation, vessel=0, kind="flap",
+                Tissue.INSERT,
+                draw(c.thrombus_hu),
+                centre,
+                (0.5 * thickness, 4.0, length),
+                (Tissue.LUMEN,),
+                exponent=8.0,
+                rotation=rotation,
+                vessel=0,
+                kind="flap",
             )
-        ]  # fmt: skip
+        ]
         if draw.chance(0.4):
             beyond = (centre[0] + 2.0 * c_, centre[1] + 2.0 * s_, s)
             found.insert(
                 0,
                 Solid(
-                    Tissue.LUMEN, draw((0.3, 0.95)) * first.vessel.lumen_hu, beyond, (2.0, 4.0, length),
-                    (Tissue.LUMEN,), exponent=8.0, rotation=rotation, vessel=0, kind="false lumen",
+                    Tissue.LUMEN,
+                    draw((0.3, 0.95)) * first.vessel.lumen_hu,
+                    beyond,
+                    (2.0, 4.0, length),
+                    (Tissue.LUMEN,),
+                    exponent=8.0,
+                    rotation=rotation,
+                    vessel=0,
+                    kind="false lumen",
                 ),
-            )  # fmt: skip
+            )
         return found
 
     def _occlusion(self, first: _Drawn) -> list[Solid]:
@@ -555,10 +593,16 @@ class _Anatomy:
         end = draw((-0.6, 0.6)) * self.reach
         return [
             Solid(
-                Tissue.INSERT, draw(c.thrombus_hu), (0.0, 0.0, end + sign * length), (60.0, 60.0, length),
-                (Tissue.LUMEN,), exponent=8.0 if draw.chance(0.7) else 2.0, vessel=0, kind="occlusion",
+                Tissue.INSERT,
+                draw(c.thrombus_hu),
+                (0.0, 0.0, end + sign * length),
+                (60.0, 60.0, length),
+                (Tissue.LUMEN,),
+                exponent=8.0 if draw.chance(0.7) else 2.0,
+                vessel=0,
+                kind="occlusion",
             )
-        ]  # fmt: skip
+        ]
 
     def _stent(self, first: _Drawn) -> Stent:
         draw, c = self.draw, self.config
@@ -568,9 +612,16 @@ class _Anatomy:
         # Cells of about a millimetre, whatever the lumen's width.
         waves = 2 * max(1, round(math.pi * math.sqrt(at[19] * at[20]) / draw((0.8, 1.6))))
         return Stent(
-            0, draw(c.stent_hu), draw(c.stent_wire), draw((-0.1, 0.15)), pitch, waves,
-            draw((0.1, 0.4)) * pitch, middle - half, middle + half,
-        )  # fmt: skip
+            0,
+            draw(c.stent_hu),
+            draw(c.stent_wire),
+            draw((-0.1, 0.15)),
+            pitch,
+            waves,
+            draw((0.1, 0.4)) * pitch,
+            middle - half,
+            middle + half,
+        )
 
     def _halo(self, first: _Drawn) -> Halo:
         draw, c = self.draw, self.config
@@ -586,10 +637,15 @@ class _Anatomy:
             axes = (width, width * draw.log((1.0, 6.0)), draw((2.0, 12.0)))
             found.append(
                 Solid(
-                    Tissue.INSERT, background + draw(c.strand_hu), (x, y, z), axes, (Tissue.BACKGROUND,),
-                    rotation=draw.rotation(), kind="strand",
+                    Tissue.INSERT,
+                    background + draw(c.strand_hu),
+                    (x, y, z),
+                    axes,
+                    (Tissue.BACKGROUND,),
+                    rotation=draw.rotation(),
+                    kind="strand",
                 )
-            )  # fmt: skip
+            )
         return found
 
     def _nodules(self, first: _Drawn) -> list[Solid]:
@@ -602,8 +658,13 @@ class _Anatomy:
             x, y, z = at[:3] + far * (math.cos(angle) * at[6:9] + math.sin(angle) * at[9:12])
             found.append(
                 Solid(
-                    Tissue.INSERT, draw(c.nodule_hu), (float(x), float(y), float(z)), axes, OUTSIDE,
-                    rotation=draw.rotation(), kind="nodule",
+                    Tissue.INSERT,
+                    draw(c.nodule_hu),
+                    (float(x), float(y), float(z)),
+                    axes,
+                    OUTSIDE,
+                    rotation=draw.rotation(),
+                    kind="nodule",
                 )
-            )  # fmt: skip
+            )
         return found

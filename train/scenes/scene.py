@@ -290,8 +290,29 @@ class Halo:
     one_sided: float = 0.0
 
 
-COLUMNS = ("x", "y", "z", "tx", "ty", "tz", "ux", "uy", "uz", "wx", "wy", "wz", "s",
-           "outer_u", "outer_w", "outer_a", "outer_b", "lumen_u", "lumen_w", "lumen_a", "lumen_b")  # fmt: skip
+COLUMNS = (
+    "x",
+    "y",
+    "z",
+    "tx",
+    "ty",
+    "tz",
+    "ux",
+    "uy",
+    "uz",
+    "wx",
+    "wy",
+    "wz",
+    "s",
+    "outer_u",
+    "outer_w",
+    "outer_a",
+    "outer_b",
+    "lumen_u",
+    "lumen_w",
+    "lumen_a",
+    "lumen_b",
+)
 """Rows of a vessel's table over the nodes of its centreline: position, unit tangent, two unit normals u and w that do
 not twist, way along the curve; centre and semi-axes of the outer section and of the lumen in the frame (u, w)."""
 
