@@ -58,7 +58,8 @@ def conjugate_gradient(
         x, left = x + alpha * step, left - alpha * curved
         z = precondition(left)
         before, size = size, dot(left, z, axes)
-        if bool((size <= goal).all()):
+        # Asked only where it may happen: on a GPU the question waits for all that was asked before.
+        if tolerance and bool((size <= goal).all()):
             break
         step = z + per_volume(size / before.clamp_min(1e-300), x) * step
     return x

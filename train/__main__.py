@@ -153,6 +153,7 @@ def _run(arguments: argparse.Namespace, command: str) -> int:
             if arguments.weights is not None:
                 start_from(model, read_tensors(arguments.weights, WEIGHTS_FORMAT)[0])
             if arguments.painters is not None:
+                held_out.prepare(arguments.painters)
                 data.prepare(arguments.painters)
             state, number = train(
                 config,

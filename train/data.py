@@ -65,6 +65,10 @@ _DRAWS_OF_ROI = 6
 """Random numbers that a small ROI takes."""
 _SIGNAL, _AROUND, _EDGE, _BODY = 1, 2, 4, 8
 """Bits of a scene's labels: wholly in the signal, wholly in the tissue around it, near an edge, in or near a body."""
+_PIECE = 64
+"""Scenes that a process paints before it gives them back."""
+_LEFT_FREE = 0.4
+"""Of a GPU's memory: where less is free, no more scenes are held there."""
 _TURNS = 16
 """Mirror images along three axes, with y and x exchanged or not."""
 
@@ -85,6 +89,10 @@ class Sample:
     truth: Tensor
     labels: Tensor
     exposure: float
+
+    def to(self, device: torch.device | str) -> Sample:
+        """The same on a device."""
+        return Sample(self.views.to(device), self.truth.to(device), self.labels.to(device), self.exposure)
 
 
 @dataclass(frozen=True)
@@ -219,9 +227,11 @@ class Data:
         self.config = config
         self.seed = seed
         self.device = torch.device(device)
+        self._accelerated = self.device.type != "cpu"
         self.views = Views(folder, config, seed)
         self._epoch: tuple[tuple[int, int], list[list[int]]] = (-1, 0), []
         self._grams: dict[int, tuple[Gram, float]] = {}
+        self._on_device: dict[int, Sample] = {}
 
     def gram(self, situation: int) -> tuple[Gram, float]:
         """Gram operator per second of exposure, and 1 HU in mm⁻¹."""
@@ -231,39 +241,65 @@ class Data:
         return self._grams[situation]
 
     def prepare(self, processes: int) -> None:
-        """Compute all views beforehand, by so many processes; else they are computed when a scene is first used."""
+        """Compute all views beforehand; else they are computed when a scene is first used.
+
+        Args:
+            processes: that paint the scenes. Without a GPU they compute the views, too; a GPU does that by itself.
+        """
         numbers = [n for n in range(len(self.views)) if n not in self.views]
         # All scenes of a situation in one process: each makes its Gram operator once.
         numbers.sort(key=self._situation)
-        make = partial(_keep, self.config, self.seed, self.views.folder.parent)
+        pieces = [numbers[k : k + _PIECE] for k in range(0, len(numbers), _PIECE)]
         with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as workers:
-            for _ in workers.map(make, [numbers[k : k + 64] for k in range(0, len(numbers), 64)]):
-                pass
+            if not self._accelerated:
+                make = partial(_keep, self.config, self.seed, self.views.folder.parent)
+                for _ in workers.map(make, pieces):
+                    pass
+                return
+            paintings = workers.map(partial(_paint, self.config, self.seed), pieces)
+            for piece, painting in zip(pieces, paintings, strict=True):
+                for number, scene in zip(piece, painting, strict=True):
+                    self._keep(number, self._seen(number, *(torch.from_numpy(v) for v in scene)))
 
     def _situation(self, number: int) -> int:
         return number % len(self.config.situations)
 
     def sample(self, number: int) -> Sample:
-        """A scene of the pool, from the file or computed and kept there."""
+        """A scene of the pool, from the file or computed and kept there; on a GPU it stays while there is room."""
+        if number in self._on_device:
+            return self._on_device[number]
         if number not in self.views:
-            self.views[number] = self._computed(number)
-        return self.views[number]
+            return self._keep(number, self._seen(number, *painted(self.config, seed_of("scene", self.seed, number))))
+        sample = self.views[number]
+        return sample if not self._accelerated else self._hold(number, sample.to(self.device))
+
+    def _keep(self, number: int, sample: Sample) -> Sample:
+        self.views[number] = sample.to("cpu")
+        # What comes out of the file is what every later epoch sees.
+        return self.views[number] if not self._accelerated else self._hold(number, sample)
+
+    def _hold(self, number: int, sample: Sample) -> Sample:
+        free, total = torch.cuda.mem_get_info(self.device)
+        if free > _LEFT_FREE * total:
+            self._on_device[number] = sample
+        return sample
 
     @torch.no_grad()
-    def _computed(self, number: int) -> Sample:
+    def _seen(self, number: int, data: Tensor, truth: Tensor, labels: Tensor) -> Sample:
+        """The views of a scene as :func:`painted` gives it."""
         c = self.config
         gram, hu = self.gram(self._situation(number))
         generator = torch.Generator().manual_seed(seed_of("sample", self.seed, number))
         low, high = (math.log(v) for v in c.exposure_s)
         exposure = math.exp(low + (high - low) * float(torch.rand((), generator=generator)))
-        data, truth, labels = painted(c, seed_of("scene", self.seed, number))
         noise = gram.noise((2,), generator=generator) * math.sqrt(exposure)
-        signal = gram.apply(data)[None] * (hu * exposure)
+        signal = gram.apply(data.to(self.device))[None] * (hu * exposure)
         b = torch.cat([signal + noise, signal])
-        problem = NormalisedProblem.from_statistic(gram, b, torch.full((VOLUMES,), exposure), hu, c.voxel_mm)
+        exposures = torch.full((VOLUMES,), exposure, device=self.device)
+        problem = NormalisedProblem.from_statistic(gram, b, exposures, hu, c.voxel_mm)
         found = first_views(problem, bilateral=True)
         views = torch.stack([*(v for v in found if v is not None), problem.beta], 1)
-        return Sample(views.to(torch.float16), truth.to(torch.float16), labels, exposure)
+        return Sample(views.to(torch.float16), truth.to(torch.float16), labels, exposure).to(self.device)
 
     def batches_in_epoch(self, batch: int) -> int:
         """Batches of an epoch; scenes that fill none are left out of it."""
@@ -299,9 +335,9 @@ class Data:
         random = torch.stack([torch.rand(2 + (ROIS - 1) * _DRAWS_OF_ROI, generator=g) for g in generators])
         random = random.to(self.device)
         # ``(volume, scene)`` is the order of a batch: the first draws of all scenes, the second ones, no noise.
-        views = torch.stack([s.views for s in samples], 1).to(self.device).float().flatten(0, 1)
-        truth = torch.stack([s.truth for s in samples]).to(self.device).float()
-        labels = torch.stack([s.labels for s in samples]).to(self.device)
+        views = torch.stack([s.views for s in samples], 1).float().flatten(0, 1)
+        truth = torch.stack([s.truth for s in samples]).float()
+        labels = torch.stack([s.labels for s in samples])
         exposure = torch.tensor([s.exposure for s in samples], device=self.device).repeat(VOLUMES)
         problem = NormalisedProblem.with_beta(gram, views[:, 3], exposure, hu, c.voxel_mm)
         signal, around = labels & _SIGNAL > 0, labels & _AROUND > 0
@@ -322,9 +358,15 @@ class Data:
 
 
 def _keep(config: DataConfig, seed: int, folder: Path, numbers: Sequence[int]) -> None:
+    """Paint scenes and keep their views, in a process of its own."""
     data = Data(config, seed, folder)
     for number in numbers:
         data.sample(number)
+
+
+def _paint(config: DataConfig, seed: int, numbers: Sequence[int]) -> list[list[NDArray[Any]]]:
+    """Scenes for another process, which computes their views."""
+    return [[v.numpy() for v in painted(config, seed_of("scene", seed, number))] for number in numbers]
 
 
 def turn(number: int, square: bool) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]:

@@ -136,7 +136,9 @@ class Objective:
             total = total + c.noise_free / _NOISE_FREE_SHARE * image[2 * n :].sum()
         if c.noise_free:
             parts["noise_free"] = image[2 * n :].sum() / c.data
-        return Loss(total, {k: float(v.detach()) for k, v in parts.items()})
+        # All at once: on a GPU each number that is asked for waits for all that was asked before.
+        values = torch.stack([v.detach() for v in parts.values()]).tolist()
+        return Loss(total, dict(zip(parts, values, strict=True)))
 
     @torch.no_grad()
     def validate(self, model: nn.Module, held_out: Data) -> Validation:

@@ -87,12 +87,14 @@ def rate_factor(config: TrainConfig, update: int) -> float:
 def _averaged(model: nn.Module, ema: float) -> AveragedModel:
     """Moving average of parameters and buffers; it starts at the weights of now."""
 
-    def mix(average: Tensor, fresh: Tensor, count: Tensor | int) -> Tensor:
-        if not average.is_floating_point():
-            return fresh
-        return average.lerp(fresh, 1 - min(ema, int(count) / (9 + int(count))))
+    @torch.no_grad()
+    def mix(averages: Any, fresh: Any, count: Tensor | int) -> None:
+        if not averages[0].is_floating_point():
+            torch._foreach_copy_(averages, fresh)
+            return
+        torch._foreach_lerp_(averages, fresh, 1 - min(ema, int(count) / (9 + int(count))))
 
-    average = AveragedModel(model, avg_fn=mix, use_buffers=True).requires_grad_(False).eval()
+    average = AveragedModel(model, multi_avg_fn=mix, use_buffers=True).requires_grad_(False).eval()
     average.update_parameters(model)
     return average
 

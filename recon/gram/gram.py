@@ -150,6 +150,7 @@ class Gram:
         self._of_noise = definite[0]
         self._basis = self._polynomials(len(self._spectra)).to(self.dtype)
         self._factor: Tensor | None = None
+        self._information: dict[tuple[float, float], float] = {}
 
     # -- construction ---------------------------------------------------------------------------------------------
 
@@ -263,11 +264,13 @@ class Gram:
             mu_per_hu: 1 HU in mm⁻¹ (μ_ref / 1000).
             frequency: of the wave, lp/mm.
         """
-        kernel = self._spectra[0]
-        # A wave that is constant along z sees the sum over the bands.
-        summed = (kernel[:1].real + 2 * kernel[1:].real.sum(0, keepdim=True)).sum(0)
-        found = information_at(frequency, summed, self.padded, self.grid.spacing, mu_per_hu)
-        return found * self.factor
+        key = (mu_per_hu, frequency)
+        if key not in self._information:
+            kernel = self._spectra[0]
+            # A wave that is constant along z sees the sum over the bands.
+            summed = (kernel[:1].real + 2 * kernel[1:].real.sum(0, keepdim=True)).sum(0)
+            self._information[key] = information_at(frequency, summed, self.padded, self.grid.spacing, mu_per_hu)
+        return self._information[key] * self.factor
 
     def noise(self, batch: tuple[int, ...] = (), *, generator: torch.Generator) -> Tensor:
         """Draw AᵀW n for counting noise n ~ N(0, W⁻¹) without a projector: covariance G (stationary part).
@@ -276,10 +279,10 @@ class Gram:
 
         Args:
             batch: leading shape of the result.
-            generator: source of randomness, on the device of the kernels.
+            generator: source of randomness, on any device: one on the CPU gives the same noise everywhere.
 
         Returns:
-            ``(*batch, *grid.shape)`` in the dtype of the weights.
+            ``(*batch, *grid.shape)`` in the dtype of the weights, on the device of the kernels.
         """
         return self.coloured(self.white(batch, generator=generator))
 
@@ -287,8 +290,8 @@ class Gram:
     def white(self, batch: tuple[int, ...] = (), *, generator: torch.Generator) -> Tensor:
         """White noise for :meth:`coloured`, ``(*batch, slices, *padded)``; arguments of :meth:`noise`."""
         nz = 1 if self._flat else self.grid.shape[0]
-        device = self._of_noise.device
-        return torch.randn((*batch, nz, *self.padded), generator=generator, dtype=self.dtype, device=device)
+        drawn = torch.randn((*batch, nz, *self.padded), generator=generator, dtype=self.dtype, device=generator.device)
+        return drawn.to(self._of_noise.device)
 
     @undisturbed
     def coloured(self, white: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -78,15 +79,28 @@ class NormalisedProblem:
         return self.gram.periodic_spectrum().to(self.beta) * self.factor.reshape(-1, 1, 1, 1)
 
 
-def squared_frequencies(shape: tuple[int, ...], voxel_mm: float, along: float = 1.0) -> Tensor:
-    """f_xy² + ``along`` · f_z² in (line pairs per mm)² on the frequencies of ``rfftn`` of ``(z, y, x)`` volumes."""
+def squared_frequencies(shape: Sequence[int], voxel_mm: float, like: Tensor | None = None) -> Tensor:
+    """f² in (line pairs per mm)² on the frequencies of ``rfftn`` of volumes, ``(z, y, x//2 + 1)``; not to be changed.
+
+    Args:
+        shape: ``(z, y, x)`` of the volumes; voxel_mm: their voxels.
+        like: whose dtype and device they get; None: float32 on the CPU.
+    """
+    dtype, device = (torch.float32, torch.device("cpu")) if like is None else (like.dtype, like.device)
+    return _squared_frequencies(tuple(shape), voxel_mm, dtype, device)
+
+
+@lru_cache(maxsize=32)
+def _squared_frequencies(shape: tuple[int, ...], voxel_mm: float, dtype: torch.dtype, device: torch.device) -> Tensor:
     z, y, x = shape
-    total: Tensor = (
-        along * torch.fft.fftfreq(z, voxel_mm)[:, None, None] ** 2
-        + torch.fft.fftfreq(y, voxel_mm)[:, None] ** 2
-        + torch.fft.rfftfreq(x, voxel_mm) ** 2
-    )
-    return total
+    # Not of inference mode: they are kept, and a training may come after.
+    with torch.inference_mode(False):
+        total: Tensor = (
+            torch.fft.fftfreq(z, voxel_mm)[:, None, None] ** 2
+            + torch.fft.fftfreq(y, voxel_mm)[:, None] ** 2
+            + torch.fft.rfftfreq(x, voxel_mm) ** 2
+        )
+        return total.to(device, dtype)
 
 
 def to_frequencies(v: Tensor) -> Tensor:

@@ -135,7 +135,7 @@ class Unrolled(nn.Module):
         scale = problem.scale_hu
         if self.training:
             low, high = self.seen_scale_hu.unbind()
-            least = scale.min() if not low else torch.minimum(low, scale.min())
+            least = torch.minimum(torch.where(low > 0, low, math.inf), scale.min())
             self.seen_scale_hu = torch.stack([least, torch.maximum(high, scale.max())])
         fidelities = torch.as_tensor(fidelity, dtype=scale.dtype, device=scale.device).expand(scale.shape)
         level = torch.log(scale / REFERENCE_SCALE_HU).clamp(-3.0, 3.0)
@@ -177,7 +177,7 @@ def _views(problem: NormalisedProblem, spectrum: Tensor, v: Tensor, noise: Tenso
 
 def start(problem: NormalisedProblem, spectrum: Tensor, iterations: int = _SOLVES[0]) -> Tensor:
     """The Wiener filter of the data, ``(batch, z, y, x)``; ``spectrum`` is that of the problem."""
-    prior = _START[0] + _START[1] * squared_frequencies(problem.beta.shape[-3:], problem.voxel_mm).to(problem.beta)
+    prior = _START[0] + _START[1] * squared_frequencies(problem.beta.shape[-3:], problem.voxel_mm, problem.beta)
     inverse = 1.0 / (spectrum + prior)
     return conjugate_gradient(
         lambda w: problem.apply(w) + filtered(w, prior), problem.beta, lambda w: filtered(w, inverse),
@@ -194,7 +194,7 @@ def guide_noise(spectrum: Tensor, shape: Sequence[int], voxel_mm: float) -> Tens
         spectrum: of H, ``(batch, z, y, x//2 + 1)``.
         shape: of the volume; voxel_mm: its voxels.
     """
-    f2 = squared_frequencies(tuple(shape), voxel_mm).to(spectrum)
+    f2 = squared_frequencies(shape, voxel_mm, spectrum)
     prior = _START[0] + _START[1] * f2
     passed = (1.0 + prior / (spectrum + _TOWARDS)) / (spectrum + prior)
     blur = torch.exp(-2.0 * (math.pi * GUIDE_VOXELS * voxel_mm) ** 2 * f2)
@@ -210,7 +210,7 @@ def guide_noise(spectrum: Tensor, shape: Sequence[int], voxel_mm: float) -> Tens
 def _low_pass(problem: NormalisedProblem, fidelities: Tensor) -> Tensor:
     """L on the frequencies of ``rfftn``, ``(batch, z, y, x//2 + 1)``."""
     cut = _CUTOFFS[0] + (_CUTOFFS[1] - _CUTOFFS[0]) * fidelities.reshape(-1, 1, 1, 1)
-    f2 = squared_frequencies(problem.beta.shape[-3:], problem.voxel_mm).to(problem.beta)
+    f2 = squared_frequencies(problem.beta.shape[-3:], problem.voxel_mm, problem.beta)
     return torch.exp(-math.log(2.0) * f2 / cut.square())
 
 

@@ -127,7 +127,7 @@ def test_views_are_computed_once(data, tmp_path, monkeypatch):
     used = Data(few, 3, tmp_path / "other")
     used._grams = data._grams
     with monkeypatch.context() as patch:
-        patch.setattr(Data, "_computed", lambda *a: pytest.fail("computed again"))
+        patch.setattr(Data, "_seen", lambda *a: pytest.fail("computed again"))
         again = Data(few, 3, tmp_path)
         for number in range(2):
             assert number in again.views
@@ -138,6 +138,28 @@ def test_views_are_computed_once(data, tmp_path, monkeypatch):
         assert torch.equal(one.labels, other.labels)
         torch.testing.assert_close(one.views, other.views, rtol=2e-3, atol=2e-3)
         assert one.exposure == other.exposure
+
+
+@pytest.mark.extended
+def test_a_gpu_computes_the_views_that_the_cpu_would(data, tmp_path, monkeypatch):
+    """Processes paint, the device that trains computes, and holds the scenes while there is room."""
+    few = replace(CONFIG, scenes_kept=3, situations=CONFIG.situations[:1])
+    free = [90, 90, 10]
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (free.pop(0), 100))
+    ahead = Data(few, 3, tmp_path)
+    ahead._accelerated, ahead._grams = True, data._grams
+    ahead.prepare(1)
+    assert sorted(ahead._on_device) == [0, 1]
+    plain = Data(few, 3, tmp_path / "other")
+    plain._grams = data._grams
+    for number in range(2):
+        one, other = ahead.sample(number), plain.sample(number)
+        assert one is ahead._on_device[number]
+        for name in ("views", "truth", "labels", "exposure"):
+            assert torch.equal(*(torch.as_tensor(getattr(v, name)) for v in (one, other)))
+    free.append(10)
+    assert torch.equal(ahead.sample(2).views, plain.sample(2).views)
+    assert 2 not in ahead._on_device
 
 
 def test_folders_of_other_data_are_not_mixed_up(tmp_path):
