@@ -161,7 +161,7 @@ class Run:
         other = set(differences(self.config.as_dict(), before.as_dict())) - FREE_TO_CHANGE
         alike = self.config.unroll == 1 or self.config.single == 0.0
         if alike and metadata["state"]["step"] <= min(self.config.decay_begins, before.decay_begins):
-            other -= {"steps"}  # nothing has depended on it yet
+            other -= {"steps", "decay", "final_fraction"}  # nothing has depended on them yet
         if other:
             raise ValueError(
                 f"the run in {self.out} has another configuration ({', '.join(sorted(other))}): resume it unchanged, "
