@@ -50,11 +50,12 @@ class MethodOptions(PwlsOptions, total=False):
     network: Mbir | None
     fidelity: float | None
     noise_map: bool
-    outlines: bool
+    vessel: bool
     tissues: bool
     point: Any
     vessel_prior: VesselPrior | None
     look: float | None
+    outlines: bool | None
 
 
 def require_light(zero_fraction: float) -> None:

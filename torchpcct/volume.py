@@ -122,8 +122,11 @@ class Volume:
             file.attrs["unit"] = self.unit
             file.attrs["spacing_mm"] = self.grid.spacing
             file.attrs["center_mm"] = self.grid.center
-            file.attrs["report"] = json.dumps(dict(self.report), default=str)
+            maps = {k: v for k, v in self.report.items() if isinstance(v, Tensor)}
+            file.attrs["report"] = json.dumps({k: v for k, v in self.report.items() if k not in maps}, default=str)
             file.create_dataset("data", data=self.data.detach().cpu().numpy())
+            for name, values in maps.items():
+                file.create_dataset(f"maps/{name}", data=values.detach().cpu().numpy())
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], unit: str | None = None) -> Volume:
@@ -160,4 +163,6 @@ class Volume:
             said = str(file.attrs["unit"])
             if unit not in (None, said):
                 raise ValueError(f"it gives the unit {said!r}, not {unit!r}")
-            return cls(data, grid, json.loads(file.attrs["report"]), said)
+            report = json.loads(file.attrs["report"])
+            report |= {name: torch.from_numpy(values[()]) for name, values in file.get("maps", {}).items()}
+            return cls(data, grid, report, said)

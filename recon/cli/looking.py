@@ -19,6 +19,7 @@ from recon.cli.parsing import (
     command,
     is_picture,
     length_of,
+    map_beside,
     without_ending,
 )
 from torchpcct.files import atomic_write
@@ -31,6 +32,8 @@ __all__ = ["add_info", "add_view"]
 
 _PICTURE_ENDINGS = (".png", ".pdf", ".svg")
 _LEAST_HU = 20.0
+_SCALE_OF_CHANGES = 0.0, 200.0
+"""Level and window in HU of what a drawn vessel has changed."""
 """A volume whose values lie closer together is not in HU, whatever its file says (most do not say)."""
 
 
@@ -124,8 +127,13 @@ def _view(arguments: argparse.Namespace, progress: ProgressBars) -> None:
             raise ValueError(f"{file} is a scan, no volume: torchpcct reconstruct it first, info says what it holds")
     from torchpcct.volume import Volume
 
+    changes = [map_beside(file) for file in files] if page else []
+    files = [*files, *(path for path in changes if path.exists() and path not in files)]
     volumes = [Volume.load(file) for file in files]
-    scales = [_grey_scale(v.data, arguments.level, arguments.window) for v in volumes]
+    scales = [
+        _SCALE_OF_CHANGES if file in changes else _grey_scale(v.data, arguments.level, arguments.window)
+        for file, v in zip(files, volumes, strict=True)
+    ]
     if page:
         from torchpcct.viz import viewer_page
 

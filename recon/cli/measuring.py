@@ -51,8 +51,8 @@ _STUDY_TASKS = (
 )  # fmt: skip
 _STUDY_METHODS = (
     "fbp:soft", "fbp:standard", "fbp:detail", "gaussian@fbp:standard", "perona_malik@fbp:standard",
-    "nlm@fbp:standard", "tv@fbp:standard", "bilateral@fbp:detail", "pwls", "mbir:outlines=no,prior=bilateral",
-    "mbir:outlines=no", "mbir:fidelity=0", "mbir", "mbir:fidelity=1", "mbir:tissues",
+    "nlm@fbp:standard", "tv@fbp:standard", "bilateral@fbp:detail", "pwls", "mbir:prior=bilateral",
+    "mbir:fidelity=0", "mbir", "mbir:fidelity=1", "mbir:vessel", "mbir:tissues",
 )  # fmt: skip
 """Of ``dose-factor``: every method of the package, and each filter on the kernel on which it has the least error."""
 
@@ -343,8 +343,8 @@ def _verify(arguments: argparse.Namespace, progress: ProgressBars) -> None:
 
 
 _METHODS_TEXT = """\
-methods: fbp:KERNEL, pwls, mbir, mbir:fidelity=1, mbir:weights=FILE, mbir:tissues,
-         mbir:outlines=no, mbir:outlines=no,prior=bilateral,
+methods: fbp:KERNEL, pwls, mbir, mbir:fidelity=1, mbir:weights=FILE, mbir:vessel, mbir:tissues,
+         mbir:prior=bilateral,
          FILTER@fbp:KERNEL (gaussian, perona_malik, bilateral, nlm, tv, bm4d),
          package.module:function of (scan, grid), files:FOLDER
 

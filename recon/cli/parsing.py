@@ -46,6 +46,7 @@ __all__ = [
     "is_path",
     "is_picture",
     "length_of",
+    "map_beside",
     "saying",
     "tell",
     "without_ending",
@@ -500,6 +501,12 @@ def check_ending(path: Path, endings: tuple[str, ...]) -> None:
 def length_of(unit: str) -> str:
     """Unit of the lengths of a scan or volume in ``unit``."""
     return "pixels" if unit == "pixel^-1" else "mm"
+
+
+def map_beside(volume: Path) -> Path:
+    """File of what a drawn vessel has changed in a volume, HU, beside it."""
+    name = without_ending(volume)
+    return volume.with_name(f"{name}_drawn_minus_plain{volume.name[len(name) :]}")
 
 
 def without_ending(path: Path) -> str:

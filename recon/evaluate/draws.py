@@ -144,6 +144,7 @@ class Simulated:
 
     Attributes:
         exposure_s: of the scan; grid: of the volume; label: for files.
+        drawn: whether MBIR has drawn a vessel; None: it does not draw.
     """
 
     def __init__(
@@ -157,6 +158,7 @@ class Simulated:
     ) -> None:
         self._draws, self._scan, self._with_signal = draws, scan, with_signal
         self.exposure_s, self.k, self.present = exposure_s, k, present
+        self.drawn: bool | None = None
 
     @property
     def grid(self) -> VolumeGrid:
@@ -218,7 +220,9 @@ class Simulated:
     def mbir(self, network: Mbir) -> Tensor:
         """HU ``(z, y, x)``."""
         with torch.no_grad():
-            return network(self.problem, self.statistic[None], self.exposure_s)[0]
+            found = network.solved(self.problem, self.statistic[None], self.exposure_s)
+        self.drawn = found.notes[0].get("vessel", {}).get("drawn")
+        return network.in_hu(self.problem, found.u, found.normal)[0]
 
     def sigma(self, method: Method, smooths: float = 0.0) -> float:
         """Noise in HU of a linear method at this exposure in the largest tissue."""

@@ -209,6 +209,8 @@ def records_of(
         if d is not None and e is not None and d.value > 0 and e.value > 0:
             factor("d'", observer, _log_square(d), _log_square(e))
     add("seconds", "a volume", readings.seconds, "s")
+    if not math.isnan(readings.drawn):
+        add("share drawn", "vessels", readings.drawn)
     return found
 
 

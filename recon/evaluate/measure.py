@@ -7,6 +7,7 @@ observer, errors, and some flat voxels.
 from __future__ import annotations
 
 import hashlib
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -58,6 +59,7 @@ class Readings:
             ``(2, rois, 2)`` and covariance ``(rois, 2, rois, 2)``; None: the reference's ROI means serve.
         first: first volume with the signal, float16, and that of noise-free data.
         seconds: of a volume.
+        drawn: share of volumes in which MBIR drew a vessel; NaN: the method draws none.
     """
 
     rois: Floats
@@ -71,6 +73,7 @@ class Readings:
     first: NDArray[np.float16]
     first_clean: NDArray[np.float16]
     seconds: float
+    drawn: float
 
     @property
     def n(self) -> int:
@@ -189,7 +192,7 @@ def kept_as(method: Method, exposure_s: float, task: Task, seed: int) -> tuple[s
     name = "".join(c if c.isalnum() or c in "-_." else "_" for c in method.name)
     if name.startswith(".") or len(name.encode()) > _LONGEST:
         name = f"{name.strip('.')[:40]}-{hashlib.sha256(method.name.encode()).hexdigest()[:12]}"
-    return f"{name}/{exposure_s:g}s", f"5 {method.name} {method.key} {seed} {task.fingerprint}"
+    return f"{name}/{exposure_s:g}s", f"6 {method.name} {method.key} {seed} {task.fingerprint}"
 
 
 class Measurement:
@@ -237,6 +240,7 @@ class Measurement:
             {t: joined[f"flat_{t}"] for t in self.reader.task.flat}, clean["rois"][0], float(clean["square"][0]),
             float(clean["rim"][0]), None if known is None else (joined["control"], known["mean"], known["covariance"]),
             pieces[0]["first"], clean["first"], float(np.mean([p["seconds"] for p in pieces])),
+            float(np.mean(joined["drawn"])),
         )  # fmt: skip
 
 
@@ -245,7 +249,7 @@ def _of(
     fbp: Tensor | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """A piece of pairs; with ``fbp``, which then is that of the first draw, the first volume is checked against it."""
-    rois, square, rim, seconds, control = [], [], [], [], []
+    rois, square, rim, seconds, control, drawn = [], [], [], [], [], []
     channels: dict[str, list[Any]] = {o: [] for o in OBSERVERS}
     flat: dict[str, list[Any]] = {t: [] for t in reader.task.flat}
     first = None
@@ -255,6 +259,8 @@ def _of(
             began = time.perf_counter()
             volumes.append(volume_of(method, draw))
             seconds.append(time.perf_counter() - began)
+            seen = getattr(draw, "drawn", None)
+            drawn.append(math.nan if seen is None else float(seen))
             if fbp is not None and len(seconds) == 1:
                 check_volume(volumes[0], method, reader, fbp)
         rois.append([reader.pair(v) for v in volumes])
@@ -273,6 +279,7 @@ def _of(
         "square": np.array(square),
         "rim": np.array(rim),
         "seconds": np.array(np.median(seconds)),
+        "drawn": np.array(drawn),
     }
     found |= {"control": np.array(control)} if control else {}
     found |= {f"channels_{o}": np.array(v) for o, v in channels.items()}

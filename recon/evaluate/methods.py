@@ -2,9 +2,9 @@
 
 A method's name says all:
 
-* ``fbp:KERNEL``, ``pwls``, ``mbir``; ``mbir:fidelity=1``, ``mbir:weights=mine.safetensors``, ``mbir:tissues``,
-  ``mbir:outlines=no`` without a vessel's outlines, and ``mbir:prior=bilateral``, the same data steps with the bilateral
-  filter that the network is given and no network; options are separated by commas;
+* ``fbp:KERNEL``, ``pwls``, ``mbir``; ``mbir:fidelity=1``, ``mbir:weights=mine.safetensors``, ``mbir:vessel`` around the
+  drawn outlines of a vessel, ``mbir:tissues`` around its tissues, and ``mbir:prior=bilateral``, the same data steps
+  with the bilateral filter that the network is given and no network; options are separated by commas;
 * ``FILTER@BASE``: a filter of :mod:`recon.evaluate.rivals` after a linear method, ``bilateral@fbp:detail``;
 * ``package.module:function``: a function of ``(scan, grid)`` that gives a volume in HU; with ``@BASE`` a denoiser, a
   function of ``(volume)`` or ``(volume, sigma)`` in HU, tensors ``(z, y, x)`` float32;
@@ -232,7 +232,7 @@ def _mbir(spec: str, rest: str) -> Method:
     if "tissues" in given:
         fitted = TissueMbir(network)
         return Method(spec, lambda draw: draw.mbir(fitted), key=network.weights_sha256)
-    if given.get("outlines") != "no":
+    if "vessel" in given:
         network = OutlineMbir(network)
     return Method(spec, lambda draw: draw.mbir(network), key=network.weights_sha256, network=network)
 

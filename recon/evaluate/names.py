@@ -68,7 +68,7 @@ def check_method(spec: str) -> None:
 
 
 def mbir_options(text: str) -> dict[str, str]:
-    """Options of ``mbir:fidelity=1,outlines=no`` by name.
+    """Options of ``mbir:fidelity=1,vessel`` by name.
 
     Raises:
         ValueError, TypeError: an unknown option, or a value that it does not take.
@@ -78,14 +78,14 @@ def mbir_options(text: str) -> dict[str, str]:
     for part in filter(None, text.split(",")):
         key, _, value = part.partition("=")
         key = renamed("mbir:look", "mbir:fidelity", "fidelity") if key == "look" else key
-        given[choice("option of mbir", key, ("weights", "fidelity", "tissues", "outlines", "prior"))] = value
+        given[choice("option of mbir", key, ("weights", "fidelity", "vessel", "tissues", "prior"))] = value
     if "fidelity" in given:
         number("fidelity", given["fidelity"], low=0.0, high=1.0)
     if "prior" in given:
         choice("prior of mbir", given["prior"], ("bilateral",))
-    outlines = choice("outlines of mbir", given.get("outlines", "yes"), ("yes", "no")) == "yes"
-    if "tissues" in given and not outlines:
-        raise ValueError("tissues of mbir are drawn within outlines: leave out outlines=no")
+    for name in ("vessel", "tissues"):
+        if given.get(name):
+            raise ValueError(f"{name} of mbir takes no value, got {given[name]!r}: mbir:{name}")
     if "weights" in given and not Path(given["weights"]).is_file():
         raise FileNotFoundError(f"no such file: {given['weights'] or 'weights= without a name'}")
     return given

@@ -12,6 +12,10 @@ there to bleed into it.
 
 Where no vessel is found, or a drawn one does not explain the data outside of its fibrous layer, the result is the plain
 reconstruction MBIR(β).
+
+A drawing shows smooth outlines and nothing else. On disease that has others (a flap, an ulcer, a thrombus at the wall,
+inflamed fat, a stent) it may be wrong and explain the data all the same. So it is drawn only where somebody asks for
+it, the volume's warnings say so, and :meth:`OutlineMbir.plain` is there to be compared with.
 """
 
 from __future__ import annotations
@@ -41,6 +45,10 @@ __all__ = ["Drawn", "OutlineMbir"]
 
 _SHIFT_HU = 200.0
 """Where the zero lies does not matter to an image: 150 HU added to everything change it by 1 HU rms instead of 9."""
+_DRAWN = (
+    "a vessel with smooth outlines was drawn, and disease that has others (flap, ulcer, thrombus, inflamed fat, stent, "
+    "calcifications below 1 mm) may be missing: compare with the reconstruction that draws nothing"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,8 +88,13 @@ class OutlineMbir(Mbir):
         self.vessel_prior = vessel_prior
 
     @undisturbed
+    def plain(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> Reconstructed:
+        """:meth:`recon.mbir.mbir.Mbir.solved`, nothing drawn."""
+        return super().solved(problem, b, exposure_s)
+
+    @undisturbed
     def solved(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> Reconstructed:
-        """See :meth:`recon.mbir.mbir.Mbir.solved`; the notes hold ``outlines``: whether they were drawn, or why not."""
+        """See :meth:`recon.mbir.mbir.Mbir.solved`; the notes hold ``vessel``: whether it was drawn, or why not."""
         found = [self.drawn(problem, own, exposure_s) for own in b]
         notes = [one.note for one in found]
         normal = self.problem(problem, b, exposure_s)
@@ -96,15 +109,19 @@ class OutlineMbir(Mbir):
             for k, own, volume in zip(around, u, self.in_hu(problem, u.detach(), part), strict=True):
                 highest = found[k].unexplained(volume)
                 if highest > STRIKING:
-                    notes[k] |= _unused(
+                    notes[k] |= _not_drawn(
                         f"its outlines leave {highest:.0f} standard deviations of the noise unexplained"
                     )
                 else:
                     volumes[k] = own
+                    notes[k] |= {"vessel": {"drawn": True}}
         plain = [k for k in range(len(found)) if k not in volumes]
         if plain:
-            without = super().solved(problem, b[plain], exposure_s)
-            volumes |= dict(zip(plain, without.u, strict=True))
+            volumes |= dict(zip(plain, self.plain(problem, b[plain], exposure_s).u, strict=True))
+        for note in notes:
+            vessel = note["vessel"]
+            text = _DRAWN if vessel["drawn"] else f"no vessel was drawn: {vessel['why']}"
+            note["warnings"] = [*note.get("warnings", []), text]
         return Reconstructed(normal, torch.stack([volumes[k] for k in range(len(found))]), notes)
 
     def drawn(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> Drawn:
@@ -123,7 +140,7 @@ class OutlineMbir(Mbir):
                 vessel = Vessel(data, find_vessel(data.pilot(), data.grid, None), prior)
                 estimate = LayerEstimate(vessel.fit(vessel.first_guess(), expected=True), layer_sd_hu(self.fidelity))
         except (ValueError, np.linalg.LinAlgError) as error:
-            return Drawn(None, _unused(str(error)))
+            return Drawn(None, _not_drawn(str(error)))
         fit = estimate.fit
         outlines, layer = (torch.from_numpy(v).to(b) for v in (fit.image, vessel.on_grid(estimate.share)))
 
@@ -133,7 +150,7 @@ class OutlineMbir(Mbir):
             return float(np.abs(scores_of(vessel, fit, there)).max())
 
         image = _Linear.apply(b, estimate, problem.mu_ref / 1000.0)
-        return Drawn(image, {"outlines": {"used": True}}, unexplained)
+        return Drawn(image, {}, unexplained)
 
 
 class _Linear(torch.autograd.Function):
@@ -152,5 +169,5 @@ class _Linear(torch.autograd.Function):
         return torch.from_numpy(change).to(grad) * mu_per_hu, None, None
 
 
-def _unused(why: str) -> dict[str, Any]:
-    return {"outlines": {"used": False, "why": why}}
+def _not_drawn(why: str) -> dict[str, Any]:
+    return {"vessel": {"drawn": False, "why": why}}

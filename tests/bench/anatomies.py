@@ -32,8 +32,8 @@ from recon.evaluate.anatomies import ANATOMIES, Regions, coarsened
 from recon.evaluate.rivals import FILTERS, SMOOTHED_BY, flat_noise
 from recon.evaluate.rivals import __file__ as _RIVALS
 from recon.evaluate.sources import source_digest
-from recon.least_squares.pwls import solve_normal
 from recon.least_squares.qggmrf import DEFAULT_PRIOR
+from recon.least_squares.reconstruct import TOLERANCE_HU
 from recon.mbir.mbir import Mbir
 from recon.mbir.outlines import OutlineMbir
 from torchpcct.volume import to_hu
@@ -152,10 +152,8 @@ class Scenes:
 
     def _pwls(self, b: Tensor, dose: float) -> Shown:
         p = self.bench.problem
-        gram = p.gram.scaled(dose)
         with torch.no_grad():
-            found = solve_normal(b[None], gram.apply, gram, DEFAULT_PRIOR, mu_per_hu=p.mu_ref / 1000.0,
-                                 spacing=p.grid.spacing, tolerance=2.0)  # fmt: skip
+            found = p.solve_statistic(b[None], dose, DEFAULT_PRIOR, tolerance=TOLERANCE_HU)
         return Shown(to_hu(found.x + p.level, p.mu_ref)[0])
 
     @torch.no_grad()
@@ -163,7 +161,7 @@ class Scenes:
         network = self.networks[name]
         found = network.solved(self.bench.problem, b[None], dose)
         note = found.notes[0]
-        drawn = bool(note.get("outlines", {}).get("used", False))
+        drawn = bool(note.get("vessel", {}).get("drawn", False))
         volume = network.in_hu(self.bench.problem, found.u, found.normal)[0]
         return Shown(volume, drawn, tuple(note.get("warnings", ())))
 

@@ -28,8 +28,8 @@ import recon.evaluate
 from recon.analytic.exact_noise import voxel_covariance
 from recon.analytic.inset import InsetFbp
 from recon.evaluate.rivals import FILTERS, flat_noise
-from recon.least_squares.pwls import solve_normal
 from recon.least_squares.qggmrf import DEFAULT_PRIOR
+from recon.least_squares.reconstruct import TOLERANCE_HU
 from torchpcct.volume import to_hu
 
 HERE = Path(__file__).parent
@@ -78,10 +78,8 @@ class Methods:
             k = KERNELS.index(name)
             return place.fbp[k] + (0.0 if noise is None else noise[0][k])
         b, p = place.b * dose + (0.0 if noise is None else noise[1]), self.bench.problem
-        gram = p.gram.scaled(dose)
         with torch.no_grad():
-            found = solve_normal(b[None], gram.apply, gram, DEFAULT_PRIOR, mu_per_hu=p.mu_ref / 1000.0,
-                                 spacing=p.grid.spacing, tolerance=2.0)  # fmt: skip
+            found = p.solve_statistic(b[None], dose, DEFAULT_PRIOR, tolerance=TOLERANCE_HU)
         return to_hu(found.x + p.level, p.mu_ref)[0]
 
     @lru_cache(maxsize=8)  # noqa: B019

@@ -12,8 +12,9 @@ from recon import reconstruct
 from recon.least_squares.inset_problem import InsetProblem
 from recon.mbir.mbir import Mbir, average_onto, working_grid
 from recon.mbir.network import NetworkConfig
+from recon.mbir.outlines import Drawn, OutlineMbir
 from recon.mbir.unrolled import Unrolled, low_residual
-from torchpcct import VolumeGrid
+from torchpcct import Volume, VolumeGrid
 
 
 @pytest.fixture(scope="module")
@@ -175,3 +176,39 @@ def test_former_names_still_work(clean, problem, network):
     assert torch.equal(now.data, before.data)
     with pytest.warns(DeprecationWarning, match="mbir:look is now called mbir:fidelity"):
         assert method_of("mbir:look=0.8").network.fidelity == 0.8
+
+
+@pytest.fixture
+def always_drawn(monkeypatch):
+    """Something is drawn of every scan."""
+
+    def drawn(self, problem, b, exposure_s):
+        image = torch.full(tuple(b.shape), -90.0)
+        image[2:6, 6:10, 6:10] = 60.0
+        return Drawn(image, {})
+
+    monkeypatch.setattr(OutlineMbir, "drawn", drawn)
+
+
+def test_a_volume_says_what_was_drawn_and_what_that_changed(clean, problem, network, always_drawn, tmp_path):
+    scan = clean.with_noise(2.0, 1)
+    given = {"network": network, "problem": problem}
+    plain = reconstruct(scan, GRID, "mbir", **given)
+    assert "vessel" not in plain.report
+    volume = reconstruct(scan, GRID, "mbir", vessel=True, **given)
+    assert volume.report["vessel"] == {"drawn": True}
+    assert any("may be missing" in text for text in volume.report["warnings"])
+    changed = volume.report["drawn_minus_plain_hu"]
+    assert float(changed.abs().max()) > 1.0
+    torch.testing.assert_close(volume.data - changed, plain.data, rtol=0, atol=1e-3)
+    volume.save(tmp_path / "v.h5")
+    again = Volume.load(tmp_path / "v.h5").report
+    assert torch.equal(again["drawn_minus_plain_hu"], changed)
+    assert again["vessel"] == {"drawn": True}
+
+
+def test_the_former_name_of_vessel(clean, problem, network, always_drawn):
+    scan = clean.with_noise(2.0, 1)
+    with pytest.warns(DeprecationWarning, match="outlines is now called vessel"):
+        volume = reconstruct(scan, GRID, "mbir", network=network, problem=problem, outlines=True)
+    assert volume.report["vessel"] == {"drawn": True}

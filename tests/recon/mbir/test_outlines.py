@@ -26,7 +26,7 @@ def test_outlines_are_sharper_and_the_layer_keeps_what_the_data_show(drawn, netw
     truth = drawn_vessel.image(drawn.grid, 100.0)
     vessel = statistic(drawn, drawn_vessel.image(drawn.gram.finer, 100.0, samples=3), None)
     found = OutlineMbir(network).solved(drawn, vessel, EXPOSURE_S)
-    assert found.notes[0]["outlines"]["used"]
+    assert found.notes[0]["vessel"]["drawn"]
     plain, around = (
         network.in_hu(drawn, s.u, s.normal)[0].detach() for s in (network.solved(drawn, vessel, EXPOSURE_S), found)
     )
@@ -42,7 +42,8 @@ def test_without_a_vessel_it_is_the_plain_reconstruction(drawn, network):
     b = statistic(drawn, torch.full(drawn.gram.finer.shape, -90.0), 2)
     found = OutlineMbir(network).solved(drawn, b, EXPOSURE_S)
     assert torch.equal(found.u, network.solved(drawn, b, EXPOSURE_S).u)
-    assert "nothing stands out" in found.notes[0]["outlines"]["why"]
+    assert "nothing stands out" in found.notes[0]["vessel"]["why"]
+    assert found.notes[0]["warnings"] == [f"no vessel was drawn: {found.notes[0]['vessel']['why']}"]
 
 
 def test_outlines_that_leave_something_unexplained_are_not_drawn(drawn, network):
@@ -53,7 +54,7 @@ def test_outlines_that_leave_something_unexplained_are_not_drawn(drawn, network)
     near = (z - bright[0]) ** 2 + (y - bright[1] - 12) ** 2 + (x - bright[2]) ** 2 < 36
     b = statistic(drawn, torch.where(near, torch.tensor(900.0), image), 3)
     found = OutlineMbir(network).solved(drawn, b, EXPOSURE_S)
-    assert not found.notes[0]["outlines"]["used"]
+    assert not found.notes[0]["vessel"]["drawn"]
     assert torch.equal(found.u, network.solved(drawn, b, EXPOSURE_S).u)
 
 
@@ -63,7 +64,10 @@ def test_scenes_of_a_batch_are_what_they_are_alone(drawn, network, vessel):
     both = method.solved(drawn, torch.cat([empty, vessel]), EXPOSURE_S)
     for k, alone in enumerate((empty, vessel)):
         assert torch.allclose(both.u[k], method.solved(drawn, alone, EXPOSURE_S).u[0], atol=2e-3)
-    assert [n["outlines"]["used"] for n in both.notes] == [False, True]
+    assert [n["vessel"]["drawn"] for n in both.notes] == [False, True]
+    assert ["no vessel" in n["warnings"][0] for n in both.notes] == [True, False]
+    assert "may be missing: compare" in both.notes[1]["warnings"][0]
+    assert torch.equal(method.plain(drawn, vessel, EXPOSURE_S).u, network.solved(drawn, vessel, EXPOSURE_S).u)
 
 
 def test_it_is_differentiable_with_the_fit(drawn, network, vessel):
@@ -114,7 +118,7 @@ def test_all_values_moved_move_the_volume(drawn, network, vessel):
     changes = []
     for believed in (None, VesselPrior()):
         found = [OutlineMbir(network, believed).solved(drawn, b, EXPOSURE_S) for b in (vessel, moved)]
-        assert all(f.notes[0]["outlines"]["used"] for f in found)
+        assert all(f.notes[0]["vessel"]["drawn"] for f in found)
         still, other = (network.in_hu(drawn, f.u, f.normal)[0].detach() for f in found)
         changes.append(float((other - still - 150.0)[still > -40].square().mean().sqrt()))
     assert changes[0] < min(5.0, 0.5 * changes[1]), changes

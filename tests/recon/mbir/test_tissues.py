@@ -149,6 +149,6 @@ def test_another_fidelity_keeps_the_tissues_and_noise_units_are_the_inverse_of_h
 def test_refusals(clean, problem):
     refused(
         ("tissues=True", lambda: reconstruct(clean, GRID, "mbir", point=(0, 0, 0))),
-        ("vessel_prior says", lambda: reconstruct(clean, GRID, "mbir", vessel_prior=VesselPrior(), outlines=False)),
+        ("vessel_prior says", lambda: reconstruct(clean, GRID, "mbir", vessel_prior=VesselPrior(), vessel=False)),
         ("point must be 3 numbers", lambda: reconstruct(clean, GRID, "mbir", tissues=True, point=(0, 0))),
     )
