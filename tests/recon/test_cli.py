@@ -17,6 +17,7 @@ from small_scan import GRID
 
 from recon.cli import main
 from recon.cli.parsing import as_options, saying
+from recon.mbir.outlines import Drawn, OutlineMbir
 from recon.study.results import README_MARKS
 from torchpcct import ConeBeam, ParallelBeam, Scan, Volume, VolumeGrid, __version__, full_turn
 from torchpcct.acquisition.config import read_config
@@ -322,6 +323,20 @@ def test_a_scan_of_a_region_is_reconstructed_there(here, cli, clean):
     assert "mine.h5 can only be read as a whole: leave out --memory SIZE" in said
     assert "damaged" not in said
     assert "--slices A:B" in cli("reconstruct mine.h5 --slices 1:2 --out other.nii", 2)
+
+
+def test_what_a_drawn_vessel_has_changed_is_written_and_shown(here, cli, clean, monkeypatch):
+    monkeypatch.setattr(OutlineMbir, "drawn", lambda self, problem, b, exposure_s: Drawn(torch.zeros(b.shape), {}))
+    clean.with_noise(1.0, 0).save("mine.h5")
+    cli("reconstruct mine.h5 --method mbir --vessel --out a.nii.gz")
+    report = json.loads((here / "a.nii.gz.json").read_text(encoding="utf-8"))
+    assert any("a vessel with smooth outlines was drawn" in text for text in report["warnings"])
+    assert report["drawn_minus_plain_hu"] == "a_drawn_minus_plain.nii.gz"
+    changed = Volume.load("a_drawn_minus_plain.nii.gz").data
+    cli("reconstruct mine.h5 --method mbir --out b.nii.gz")
+    difference = Volume.load("a.nii.gz").data - Volume.load("b.nii.gz").data
+    torch.testing.assert_close(changed, difference, rtol=0, atol=1e-3)
+    assert "a, b, a_drawn_minus_plain" in cli("view a.nii.gz b.nii.gz --html both.html")
 
 
 def test_a_vessel_is_read_where_the_scan_was_taken_or_said(here, cli):
