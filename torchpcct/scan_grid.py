@@ -15,7 +15,7 @@ from torchpcct.geometry import ConeBeam, ParallelBeam, VolumeGrid
 from torchpcct.validate import number, numbers
 from torchpcct.vector_geometry import VectorGeometry
 
-__all__ = ["grid_of"]
+__all__ = ["cells_at_axis", "grid_of"]
 
 Floats = NDArray[np.float64]
 
@@ -97,6 +97,20 @@ def _field_of_view(g: Any) -> tuple[float, float]:
 def _cell(g: Any) -> float:
     pitch = g.pitch[1] if isinstance(g, ConeBeam) else g.pitch
     return float(pitch / g.magnification)
+
+
+def cells_at_axis(geometry: Any) -> tuple[float, float, float]:
+    """Size of a detector cell as it is seen at the axis, along z, y and x in mm; along z inf without rows.
+
+    Of a geometry view by view the median over its views.
+    """
+    cell, _ = _field_of_view(geometry)
+    if isinstance(geometry, ConeBeam):
+        return geometry.pitch[0] / geometry.magnification, cell, cell
+    if isinstance(geometry, VectorGeometry) and geometry.rows is not None:
+        columns, rows = (np.linalg.norm(geometry.poses[:, k], axis=1) for k in (2, 3))
+        return cell * float(np.median(rows / columns)), cell, cell
+    return math.inf, cell, cell
 
 
 # --- a part of the detector -----------------------------------------------------------------------------------------

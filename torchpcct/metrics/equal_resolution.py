@@ -15,6 +15,10 @@ two volumes by each, of two scans with independent noise (:mod:`torchpcct.metric
 3. How noisy. The reference's difference is filtered by that transfer, and its variance over that of the method's
    difference is the factor. A linear filter of the reference gives 1, whatever the object and the noise.
 
+The reference must not alias noise either: on voxels coarser than the detector's cells FBP does, the more the sharper
+its kernel, and then every smoother method seems to save dose. Volumes do not tell; see
+:func:`recon.evaluate.evaluate_scans`.
+
 The interval is a jackknife over bricks of the volume, widened by twice what the factor changes where the
 borders of the volume count, and by what the match itself may be off.
 """

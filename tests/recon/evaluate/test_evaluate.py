@@ -374,6 +374,8 @@ def test_volumes_in_two_folders(here, cli):
     assert factors["half"]["dose_factor"] == pytest.approx(4.0, rel=0.1)
     page = (here / "measured" / "report.html").read_text(encoding="utf-8")
     assert "mine.v2" in page
+    for text in (said, page):
+        assert "no smaller than the voxels, 0.5 mm in the plane" in text.replace("&#39;", "'")
     assert "along z" in page
     cli("evaluate --volumes one two --region :,4:60,4:60 --out part")
     part = json.loads((here / "part" / "report.json").read_text(encoding="utf-8"))["records"]

@@ -1,0 +1,86 @@
+"""Measured scans: voxels coarser than the detector's cells credit no kernel, a single slice is a volume, too."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from sound_scans import CYLINDER, Solid, transmissions
+
+from recon import reconstruct
+from recon.evaluate.report import measured_text
+from recon.evaluate.without_truth import evaluate_scans, evaluate_volumes
+from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, VolumeGrid, full_turn
+from torchpcct.scan_grid import cells_at_axis
+from torchpcct.vector_geometry import VectorGeometry
+
+MU = 0.02
+CELLS, VIEWS, PHOTONS = 96, 120, 2e5
+
+
+@pytest.fixture(scope="module")
+def scans():
+    """Two of a disc with many inserts, in one plane; cells of 1 mm."""
+    draw, geometry = np.random.default_rng(3), ParallelBeam(np.arange(VIEWS) * np.pi / VIEWS, CELLS, 1.0)
+    solids = [Solid(CYLINDER, (0.0, 0.0, 0.0), (40.0, 40.0, 1e5), MU)]
+    for _ in range(80):
+        size, turn = draw.uniform(1.0, 5.0), draw.uniform(0.0, 2.0 * math.pi)
+        away = draw.uniform(0.0, 40.0 - size)
+        place, radii = (away * math.cos(turn), away * math.sin(turn), 0.0), (size, size * draw.uniform(0.5, 1.0), 1e5)
+        solids.append(Solid(CYLINDER, place, radii, MU * draw.uniform(-0.5, 0.5), draw.uniform(0.0, 3.0)))
+    shone = PHOTONS * transmissions(geometry, solids, subs=(3, 1, 1))
+    return [
+        Scan.from_counts(
+            np.random.default_rng(k).poisson(shone).astype(np.float64), geometry, air=np.full(CELLS, PHOTONS),
+            mu_water=MU,
+        )
+        for k in range(2)
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("voxel", [1.0, 1.5, 2.0, 3.0])
+def test_a_softer_kernel_saves_no_dose_on_coarse_voxels(scans, voxel):
+    """Where it would seem to: against FBP that aliases noise."""
+    grid = VolumeGrid((round(84 / voxel),) * 2, voxel)
+    methods = ["fbp:soft", "fbp:standard", "gaussian@fbp:ram-lak"]
+    rows = evaluate_scans(scans, grid, methods)
+    for row in rows:
+        assert row["low"] < 1.05, row
+        assert row["high"] > 0.95, row
+        assert row["dose_factor"] == pytest.approx(1.0, abs=0.25), row
+        assert bool(row["note"]) == (voxel > 1.0)
+    if voxel > 1.0:
+        assert f"voxels of {voxel:g} mm are coarser than the detector's cells, 1 mm at the axis" in rows[0]["note"]
+        assert f"Note: {rows[0]['note']}.\n" in measured_text(rows, "HU", "fbp:ram-lak")
+
+
+def test_of_volumes_the_condition_is_stated(scans):
+    """Nothing is known of the detector that they are of."""
+    grid = VolumeGrid((28, 28), 3.0)
+    sharp, soft = ([reconstruct(s, grid, "fbp", kernel=kernel).data for s in scans] for kernel in ("ram-lak", "soft"))
+    (row,) = evaluate_volumes({"theirs": soft}, sharp, 3.0)
+    assert row["dose_factor"] > 2.0
+    assert "no smaller than the voxels, 3 mm in the plane" in row["note"]
+    assert f"Note: {row['note']}.\n" in measured_text([row], "HU", "theirs")
+
+
+def test_views_are_exchanged_with_their_flux(scans):
+    """The second scan's tube gave a third less: its views keep their own flux in the other scan."""
+    first, second = scans
+    dimmer = replace(second, counts=torch.round(second.counts * 0.67), flux=torch.full((VIEWS,), 0.67).double())
+    grid = VolumeGrid((42, 42), 2.0)
+    (row,) = evaluate_scans([first, dimmer], grid, "fbp:ram-lak", n=2, seed=1)
+    (plain,) = evaluate_scans(scans, grid, "fbp:ram-lak")
+    assert row["noise"] == pytest.approx(plain["noise"], rel=0.1)
+    with pytest.raises(ValueError, match="of one exposure only"):
+        evaluate_scans([first, replace(second, air=second.air / 2)], grid, "fbp:soft", n=2)
+
+
+def test_cells_at_the_axis():
+    angles = full_turn(8)
+    assert cells_at_axis(ParallelBeam(angles, 16, 0.7)) == (math.inf, 0.7, 0.7)
+    assert cells_at_axis(FanBeam(angles, 400.0, 800.0, 16, 0.7)) == (math.inf, 0.35, 0.35)
+    cone = ConeBeam(angles, 400.0, 800.0, 16, 8, (1.4, 0.7))
+    assert cells_at_axis(cone) == (0.7, 0.35, 0.35)
+    assert cells_at_axis(VectorGeometry.of(cone)) == pytest.approx((0.7, 0.35, 0.35))
