@@ -58,6 +58,17 @@ def test_outlines_that_leave_something_unexplained_are_not_drawn(drawn, network)
     assert torch.equal(found.u, network.solved(drawn, b, EXPOSURE_S).u)
 
 
+@pytest.mark.parametrize(
+    ("values", "tissue"), [({"wall": -65.0, "fibrous": -60.0}, "wall"), ({"fibrous": 330.0}, "fib")]
+)
+def test_a_vessel_of_what_is_no_tissue_is_not_drawn(drawn, network, values, tissue):
+    """Inflamed fat about a lumen, contrast agent beside a flap: both are fitted, and explain the data."""
+    b = statistic(drawn, drawn_vessel.image(drawn.gram.finer, 0.0, samples=3, **values), 4)
+    found = OutlineMbir(network).solved(drawn, b, EXPOSURE_S)
+    assert f"its {tissue}" in found.notes[0]["vessel"]["why"]
+    assert torch.equal(found.u, network.solved(drawn, b, EXPOSURE_S).u)
+
+
 def test_scenes_of_a_batch_are_what_they_are_alone(drawn, network, vessel):
     empty = statistic(drawn, torch.full(drawn.gram.finer.shape, -90.0), 2)
     method = OutlineMbir(network)
