@@ -46,8 +46,8 @@ __all__ = ["Drawn", "OutlineMbir"]
 _SHIFT_HU = 200.0
 """Where the zero lies does not matter to an image: 150 HU added to everything change it by 1 HU rms instead of 9."""
 _TISSUE_HU = 120.0, 350.0
-"""Wall and fibrous tissue above fat. Ten fits of sound vessels had 148 to 302 HU of fibrous tissue; inflamed fat about a
-healthy vessel was fitted with 29 to 75, a flap with 457 and 473, a stent with 28 and 33 HU."""
+"""Wall and fibrous tissue above fat. Ten fits of sound vessels had 148 to 302 HU of fibrous tissue; inflamed fat about
+a healthy vessel was fitted with 29 to 75, a flap with 457 and 473, a stent with 28 and 33 HU."""
 _DRAWN = (
     "a vessel with smooth outlines was drawn, and disease that has others (flap, ulcer, thrombus, inflamed fat, stent, "
     "calcifications below 1 mm) may be missing: compare with the reconstruction that draws nothing"
@@ -176,7 +176,7 @@ class _Linear(torch.autograd.Function):
 
 
 def _strange_tissue(fit: Fit) -> str:
-    """Which fitted tissue is none, or nothing: inflamed fat, a flap and a stent are fitted as vessels of such tissue."""
+    """Which fitted tissue is none, or nothing: inflamed fat, a flap and a stent are fitted with such values."""
     fat = fit.parameters[FAT]
     least, most = _TISSUE_HU
     for name, value in (("wall", fit.parameters[WALL]), ("fibrous tissue", fit.parameters[FIBROUS])):
