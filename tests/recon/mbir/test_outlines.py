@@ -58,6 +58,20 @@ def test_outlines_that_leave_something_unexplained_are_not_drawn(drawn, network)
     assert torch.equal(found.u, network.solved(drawn, b, EXPOSURE_S).u)
 
 
+def test_what_lies_apart_from_a_vessel_does_not_speak_against_it(drawn, network):
+    """Muscle 1.2 mm from the wall: the network reconstructs it, the vessel is drawn all the same."""
+    image = drawn_vessel.image(drawn.gram.finer, 100.0, samples=3)
+    z, y = (torch.from_numpy(drawn.gram.finer.axes[k] - drawn.gram.finer.center[k]) for k in (0, 1))
+    wall = drawn_vessel.INNER_MM + drawn_vessel.WALL_MM
+    muscle = y - drawn_vessel.TILT * z[:, None] < -(wall + 1.2)
+    beside = torch.where(muscle[:, :, None], torch.tensor(0.0), image)
+    b = statistic(drawn, beside, 3)
+    found = OutlineMbir(network).solved(drawn, b, EXPOSURE_S)
+    assert found.notes[0]["vessel"]["drawn"], found.notes[0]
+    volume = network.in_hu(drawn, found.u, found.normal)[0].detach()
+    assert float(volume[:, 0].mean()) > -30.0
+
+
 @pytest.mark.parametrize(
     ("values", "tissue"), [({"wall": -65.0, "fibrous": -60.0}, "wall"), ({"fibrous": 330.0}, "fib")]
 )
