@@ -28,6 +28,7 @@ from recon.cli.parsing import (
 )
 from recon.names import METHODS
 from recon.study import registry
+from recon.study.names import check_case
 from torchpcct.files import atomic_write, require_writable
 from torchpcct.validate import choice
 
@@ -306,6 +307,8 @@ def _own_study(arguments: argparse.Namespace, progress: ProgressBars) -> None:
             check_method(name)
         else:
             choice("method", name, (*METHODS, "tissues"))
+    for name in getattr(arguments, "cases", None) or []:
+        check_case(name)
     given = {name: value for name, value in vars(arguments).items() if value is not None}
     settings = registry.part(arguments.command).Settings.of(given, arguments.quick)
     _run_study(arguments.command, settings, arguments, progress)

@@ -12,7 +12,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torchpcct.validate import choice, meant
+from recon.study.names import check_setting, setting_names
+from torchpcct.validate import choice
 
 if TYPE_CHECKING:
     from recon.study.report import Report
@@ -68,18 +69,15 @@ def build_settings(name: str, *, quick: bool = False, seed: int | None = None, c
         ValueError: an unknown study or field, a change without ``=``, a value that the settings refuse.
         TypeError: a value of a wrong type.
     """
-    kind = part(name).Settings
-    known = kind.names()
+    known = setting_names(folder(name))
     values: dict[str, Any] = {} if seed is None or "seed" not in known else {"seed": seed}
     for change in changes:
-        key, equals, text = change.partition("=")
-        if not equals or key not in known:
-            fields_known = f"with one of the fields {', '.join(sorted(known))}{meant(key, known)}"
-            raise ValueError(f"--set {change}: give field=value {fields_known}")
+        key, text = check_setting(folder(name), change)
         try:
             values[key] = ast.literal_eval(text)
         except (SyntaxError, ValueError):
             values[key] = text
+    kind = part(name).Settings
     return kind.of(values, quick)
 
 

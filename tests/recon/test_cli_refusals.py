@@ -94,7 +94,11 @@ evaluate --n 7
 dose-factor --exposure 0
 compare --methods mbri
 hardcases --methods art
+hardcases --cases lost-0.2
 study nosie
+study noise --set view=3
+study hardcases --set views
+study spectral --set energy=3
 verify --again nosie
 train --steps 0
 train --weights none

@@ -10,6 +10,8 @@ from tiny_studies import TINY
 
 from recon.evaluate.report import templates
 from recon.study import registry
+from recon.study.hardcases.cases import CASES
+from recon.study.names import case_names, setting_names
 from recon.study.report import TEMPLATES, Check, around
 
 
@@ -138,6 +140,13 @@ def test_bad_settings(name, change, match):
 def test_changes_from_the_command_line():
     settings = registry.build_settings("compare", quick=True, changes=["views=96", "methods=['fbp:bone']"])
     assert (settings.views, settings.methods) == (96, ("fbp:bone",))
+
+
+def test_names_that_are_known_unloaded_are_those_that_there_are():
+    for name in registry.STUDIES:
+        kind = registry.part(name).Settings
+        assert setting_names(registry.folder(name)) == tuple(f.name for f in fields(kind) if f.init)
+    assert case_names() == tuple(CASES)
 
 
 def test_names():
