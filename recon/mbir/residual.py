@@ -6,8 +6,9 @@ step d = (H_c + δ)⁻¹ (β − H u) towards the data is cut into overlapping b
 transformed. A coefficient counts as structure if its size is more than :data:`_STRIKING` times what noise has there. So
 does a weaker one that goes on from it: in a block nearby at the same frequency (:data:`_CONTINUED`), or at the next
 frequency of the block (:data:`_BESIDE`; hysteresis, as for edges: Canny 1986, IEEE Trans. Pattern Anal. Mach. Intell.
-8:679). Their sum is what the volume lacks; all else stays noise (hard thresholds: Donoho, Johnstone 1994, Biometrika
-81:425).
+8:679). Their sum is what the volume lacks; all else stays noise (thresholds: Donoho, Johnstone 1994, Biometrika
+81:425). What is little beyond a threshold counts in part (:data:`_WHOLE`): so the volume is a continuous function of
+the data, and its gradient says what a small change of them does.
 
 Noise alone passes the first threshold in one of six billion coefficients. A pattern that fills a block is found while
 it is far too weak to be seen in a voxel, and from there on followed.
@@ -33,6 +34,8 @@ _STRIKING, _CONTINUED, _BESIDE = 4.75, 2.5, 1.5
 their contrast (6 draws), 0.21 / 0.60 if nothing is put back, 0.52 by soft FBP; into 24 insets of noise nothing is put.
 Without following a pattern the first threshold must be lower for less: with 4.25 they keep 0.38 / 0.78, and 2 of the 24
 insets get stripes at 0.35 s. Followed from 4.25 those would have 110 HU. From 2.0 instead of 2.5: 0.61 / 0.86."""
+_WHOLE = 1.1
+"""What is so many times a threshold counts as a whole."""
 _REACH = 2
 """Blocks on either side that a pattern may go on in."""
 _AXES = (-3, -2, -1)
@@ -40,8 +43,6 @@ _AXES = (-3, -2, -1)
 
 def significant_residual(problem: NormalisedProblem, spectrum: Tensor, u: Tensor, damping: float) -> Tensor:
     """What ``u`` lacks, ``(batch, z, y, x)``: 0 where nothing but noise is left, and in slices smaller than a block.
-
-    It is linear but for the choice of coefficients.
 
     Args:
         problem: normalised problem.
@@ -85,24 +86,31 @@ def _significant(step: Tensor, window: Tensor, noise: Tensor) -> Tensor:
         return row(padded, z, y).unfold(-1, edges[2], hops[2]).movedim(-2, 0)
 
     rows = list(itertools.product(range(counts[0]), range(counts[1])))
-    found = []
+    found, shares = [], [step.new_zeros(0)]
     for z, y in rows:
-        _, power = _transformed(blocks(z, y).detach(), window, noise)
-        of_row = torch.nonzero(power > _STRIKING**2)
+        # Most rows hold nothing striking: gradients go through those alone that do.
+        with torch.no_grad():
+            _, power = _transformed(blocks(z, y), window, noise)
+            of_row = torch.nonzero(power > _STRIKING**2)
         found.append(torch.cat([of_row.new_tensor([z, y]).expand(len(of_row), 2), of_row], 1))
-    striking = torch.cat(found)
+        if len(of_row):
+            which, at = of_row[:, 0].unique(return_inverse=True)
+            _, power = _transformed(blocks(z, y)[which], window, noise)
+            shares.append(_beyond(_STRIKING, power[(at, *of_row[:, 1:].T)]))
+    striking, share = torch.cat(found), torch.cat(shares)
     out = torch.zeros_like(padded)
     for z, y in rows:
-        near = striking[((striking[:, :2] - striking.new_tensor([z, y])).abs() <= _REACH).all(1), 2:]
+        chosen = ((striking[:, :2] - striking.new_tensor([z, y])).abs() <= _REACH).all(1)
+        near, of_near = striking[chosen, 2:], share[chosen]
         apart = torch.arange(counts[2], device=near.device)[:, None] - near[:, 0]
         which, pair = torch.nonzero(apart.abs() <= _REACH).T
         own = which.unique()
         if not len(own):
             continue
         coefficients, power = _transformed(blocks(z, y)[own], window, noise)
-        beside = torch.zeros_like(power)
-        beside[(torch.searchsorted(own, which), *near[pair, 1:].T)] = 1.0
-        kept = coefficients * _structure(beside * (power > _CONTINUED**2), power)
+        place = _flat((torch.searchsorted(own, which), *near[pair, 1:].T), power.shape)
+        beside = torch.zeros_like(power).flatten().scatter_reduce(0, place, of_near[pair], "amax").reshape(power.shape)
+        kept = coefficients * _structure(beside * _beyond(_CONTINUED, power), power)
         made = torch.fft.irfftn(kept, s=edges, dim=_AXES) * window
         for k, block in zip(own.tolist(), made, strict=True):
             row(out, z, y)[..., k * hops[2] : k * hops[2] + edges[2]] += block
@@ -114,21 +122,35 @@ def _significant(step: Tensor, window: Tensor, noise: Tensor) -> Tensor:
 def _transformed(blocks: Tensor, window: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
     """Coefficients of windowed blocks ``(count, z, y, x // 2 + 1)``, and their squares over those of noise."""
     coefficients = torch.fft.rfftn(blocks * window, dim=_AXES)
-    return coefficients, torch.view_as_real(coefficients.detach()).square().sum(-1) / noise
+    return coefficients, torch.view_as_real(coefficients).square().sum(-1) / noise
+
+
+def _beyond(threshold: float, power: Tensor) -> Tensor:
+    """How much coefficients of such a power count: 0 up to a threshold, 1 from :data:`_WHOLE` times it on."""
+    share: Tensor = ((power / threshold**2 - 1.0) / (_WHOLE**2 - 1.0)).clamp(0.0, 1.0)
+    return share
+
+
+def _flat(place: tuple[Tensor, ...], shape: torch.Size) -> Tensor:
+    """Positions in a flattened array of ``shape``."""
+    at = torch.zeros_like(place[0])
+    for index, n in zip(place, shape, strict=True):
+        at = at * n + index
+    return at
 
 
 def _structure(striking: Tensor, power: Tensor) -> Tensor:
-    """Which coefficients count: striking ones (1, else 0), and neighbours in frequency that are not small.
+    """How much coefficients count: striking ones, and neighbours in frequency that are not small.
 
     Args:
-        striking, power: ``(count, z, y, x // 2 + 1)``, power over that of noise.
+        striking: ``(count, z, y, x // 2 + 1)``, 0 to 1; power: likewise, over that of noise.
     """
     # Frequencies are periodic, and those that rfftn leaves out are mirror images.
     mirrored = striking.flip((-3, -2)).roll((1, 1), (-3, -2))
     around = torch.cat([mirrored[..., 1:2], striking, mirrored[..., -2:-1]], -1)
     around = torch.cat([around[..., -1:, :], around, around[..., :1, :]], -2)
     around = torch.cat([around[..., -1:, :, :], around, around[..., :1, :, :]], -3)
-    return (F.max_pool3d(around[None], 3, 1)[0] > 0) & (power > _BESIDE**2)
+    return F.max_pool3d(around[None], 3, 1)[0] * _beyond(_BESIDE, power)
 
 
 def _noise(correlation: Tensor, window: Tensor) -> Tensor:
