@@ -1,9 +1,116 @@
-"""Names of methods and of kernels, which can be checked before anything that computes is loaded."""
+"""Names of methods, kernels, filters and priors, which can be checked before anything that computes is loaded."""
 
-__all__ = ["KERNELS", "METHODS"]
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from torchpcct.validate import choice, meant, number, renamed
+
+__all__ = [
+    "FILTERS",
+    "KERNELS",
+    "METHODS",
+    "check_prior",
+    "filter_name",
+    "is_module_name",
+    "loaded",
+    "mbir_options",
+    "meant_method",
+]
 
 METHODS: tuple[str, ...] = ("fbp", "pwls", "mbir")
 """Of :func:`recon.reconstruct`."""
 
 KERNELS: tuple[str, ...] = ("soft", "standard", "detail", "bone", "ram-lak")
 """Reconstruction kernels of filtered backprojection, from smooth to sharp (:mod:`recon.analytic.ramp`)."""
+
+FILTERS: tuple[str, ...] = ("gaussian", "perona_malik", "bilateral", "nlm", "tv", "bm4d")
+"""Of :mod:`recon.filters`; a hyphen is as good as the underscore."""
+
+_MBIR = ("weights", "network", "fidelity", "vessel", "tissues", "prior")
+
+
+def filter_name(text: str) -> str:
+    """A filter's name with the underscore that it has in :data:`FILTERS`."""
+    return text.replace("-", "_")
+
+
+def mbir_options(text: str) -> dict[str, str]:
+    """Options of ``mbir:fidelity=1,vessel`` by name.
+
+    Raises:
+        ValueError, TypeError: an unknown option, or a value that it does not take.
+        FileNotFoundError: weights that do not exist.
+    """
+    given: dict[str, str] = {}
+    for part in filter(None, text.split(",")):
+        key, _, value = part.partition("=")
+        key = renamed("mbir:look", "mbir:fidelity", "fidelity") if key == "look" else key
+        given[choice("option of mbir", key, _MBIR)] = value
+    if "fidelity" in given:
+        number("fidelity", given["fidelity"], low=0.0, high=1.0)
+    if "prior" in given:
+        check_prior(given["prior"])
+    for name in ("vessel", "tissues"):
+        if given.get(name):
+            raise ValueError(f"{name} of mbir takes no value, got {given[name]!r}: mbir:{name}")
+    if "weights" in given and not Path(given["weights"]).is_file():
+        raise FileNotFoundError(f"no such file: {given['weights'] or 'weights= without a name'}")
+    if "network" in given:
+        if "weights" not in given:
+            raise ValueError("network of mbir is the class of weights of yours: give it with weights=FILE")
+        if not is_module_name(given["network"]):
+            raise ValueError(f"network of mbir must be package.module:Class, got {given['network']!r}")
+    return given
+
+
+def check_prior(text: str) -> None:
+    """Refuse what names no prior of MBIR, as far as its text tells: a filter, or ``package.module:function``.
+
+    Raises:
+        ValueError: neither; the message lists the filters.
+    """
+    if is_module_name(text):
+        return
+    if filter_name(text) not in FILTERS:
+        raise ValueError(
+            f"unknown prior of mbir {text!r}: use one of {', '.join(FILTERS)}, or package.module:function"
+            f"{meant(filter_name(text), FILTERS)}"
+        )
+
+
+def is_module_name(text: str) -> bool:
+    """Whether a text has the form ``package.module:name``."""
+    module, _, name = text.partition(":")
+    return bool(module and name) and all(part.isidentifier() for part in [*module.split("."), *name.split(".")])
+
+
+def loaded(spec: str) -> Callable[..., Any]:
+    """The function or class that ``package.module:name`` names; its module is imported.
+
+    Raises:
+        ValueError: it cannot be imported, or the module has no such name.
+        TypeError: it cannot be called.
+    """
+    module, _, name = spec.partition(":")
+    try:
+        found: Any = importlib.import_module(module)
+        for part in name.split("."):
+            found = getattr(found, part)
+    except Exception as error:  # whatever a foreign module does when it is imported
+        said = str(error) if isinstance(error, ImportError | AttributeError) else f"{type(error).__name__}: {error}"
+        raise ValueError(
+            f"cannot load {spec!r}: {said} (is its folder on PYTHONPATH?){meant_method(module)}"
+        ) from error
+    if not callable(found):
+        raise TypeError(f"{spec} is no function")
+    function: Callable[..., Any] = found
+    return function
+
+
+def meant_method(head: str) -> str:
+    """`` (did you mean 'mbir'?)`` where the first part of a name is like that of a method of the package."""
+    return meant(head, ("fbp", "pwls", "mbir", "files", *FILTERS))

@@ -9,7 +9,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 UPWARDS = ("torchpcct", "recon", "recon.study", "recon.cli", "train")
-LONGEST, MOST_AT_THE_TOP = 800, 6
+LONGEST = 800
 
 
 def _modules():
@@ -57,8 +57,3 @@ def test_no_import_points_up():
 def test_no_module_is_long():
     lengths = {module: len(path.read_text(encoding="utf-8").splitlines()) for module, path in MODULES.items()}
     assert not {module: n for module, n in lengths.items() if n > LONGEST}
-
-
-def test_few_modules_at_the_top_of_recon():
-    top = [path.stem for path in (ROOT / "recon").glob("*.py") if path.name != "__init__.py"]
-    assert len(top) <= MOST_AT_THE_TOP, top

@@ -5,7 +5,7 @@ A method's name says all:
 * ``fbp:KERNEL``, ``pwls``, ``mbir``; ``mbir:fidelity=1``, ``mbir:weights=mine.safetensors``, ``mbir:vessel`` around the
   drawn outlines of a vessel, ``mbir:tissues`` around its tissues, and ``mbir:prior=bilateral``, the same data steps
   with the bilateral filter that the network is given and no network; options are separated by commas;
-* ``FILTER@BASE``: a filter of :mod:`recon.evaluate.rivals` after a linear method, ``bilateral@fbp:detail``;
+* ``FILTER@BASE``: a filter of :mod:`recon.filters` after a linear method, ``bilateral@fbp:detail``;
 * ``package.module:function``: a function of ``(scan, grid)`` that gives a volume in HU; with ``@BASE`` a denoiser, a
   function of ``(volume)`` or ``(volume, sigma)`` in HU, tensors ``(z, y, x)`` float32;
 * ``files:FOLDER``: volumes that another program has made of scans that :func:`recon.evaluate.export_scans` wrote, files
@@ -17,7 +17,6 @@ Whatever it is, it becomes a :class:`Method`, a function of one realisation of a
 from __future__ import annotations
 
 import hashlib
-import importlib
 import inspect
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
@@ -25,17 +24,19 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from recon.evaluate.names import check_method, mbir_options, meant_method
-from recon.evaluate.rivals import FILTERS, SMOOTHED_BY, flat_noise, tuned
+from recon.evaluate.names import check_method
+from recon.evaluate.rivals import tuned
+from recon.filters import FILTERS, SMOOTHED_BY, deepinv_denoiser, denoiser_of, flat_noise
 from recon.mbir.mbir import Mbir
 from recon.mbir.network import bilateral_prior
 from recon.mbir.outlines import OutlineMbir
 from recon.mbir.tissues import TissueMbir
+from recon.mbir.weights_io import digest
+from recon.names import filter_name, is_module_name, loaded, mbir_options
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
-from torchpcct.validate import checked, number
 from torchpcct.volume import Volume
 
 __all__ = [
@@ -138,16 +139,19 @@ def names_module(spec: str) -> bool:
     """Whether a method's name is that of a function of a module, which is imported."""
     head, _, base = spec.partition("@")
     if base:
-        return head not in FILTERS
+        return filter_name(head) not in FILTERS
     name, _, rest = spec.partition(":")
-    return bool(rest) and name not in ("fbp", "mbir", "files")
+    if name == "mbir":
+        given = [part.partition("=") for part in rest.split(",")]
+        return any(key in ("prior", "network") and is_module_name(value) for key, _, value in given)
+    return bool(rest) and name not in ("fbp", "files")
 
 
 def _named(spec: str) -> Method:
     check_method(spec)
     head, _, base = spec.partition("@")
     if base:
-        return _filtered(head, base, spec) if head in FILTERS else denoiser(_loaded(head), base, spec)
+        return _filtered(head, base, spec) if filter_name(head) in FILTERS else denoiser(loaded(head), base, spec)
     name, _, rest = spec.partition(":")
     if name == "fbp":
         kernel = rest or "standard"
@@ -158,7 +162,7 @@ def _named(spec: str) -> Method:
         return _mbir(spec, rest)
     if name == "files":
         return _of_files(spec, Path(rest))
-    return _of_function(spec, _loaded(spec))
+    return _of_function(spec, loaded(spec))
 
 
 def denoiser(function: Callable[..., Any], base: Any, name: str = "") -> Method:
@@ -166,7 +170,8 @@ def denoiser(function: Callable[..., Any], base: Any, name: str = "") -> Method:
 
     Args:
         function: of ``(volume)`` or ``(volume, sigma)``: HU ``(z, y, x)`` float32, and the standard deviation of the
-            base's noise in the largest tissue, HU; it gives the same shape.
+            base's noise in the largest tissue, HU; it gives the same shape. Or a denoiser of deepinv
+            (:func:`recon.filters.denoiser_of`).
         base: a linear method.
         name: for tables.
 
@@ -177,41 +182,19 @@ def denoiser(function: Callable[..., Any], base: Any, name: str = "") -> Method:
     if not before.is_fbp:
         raise ValueError(f"a denoiser needs FBP before it, got {before.name!r}: fbp:KERNEL")
     plain = getattr(function, "__name__", "denoiser")
-    with_sigma = len(inspect.signature(function).parameters) > 1
+    denoise = denoiser_of(function)
 
     def run(draw: Draw) -> Any:
-        volume = before.run(draw)
-        return function(volume, draw.sigma(before)) if with_sigma else function(volume)
+        return denoise(before.run(draw), lambda: draw.sigma(before))
 
     name = name or f"{plain}@{before.name}"
     made = denoiser, (function, before, name)
     return Method(name, run, key=_source_of(function), kernels=before.kernels, made=made)
 
 
-@checked
-def deepinv_denoiser(model: Callable[..., Any], *, unit_hu: float = 1000.0, slices: bool = False) -> Any:
-    """A denoiser of deepinv (``model(x, sigma)`` of ``(batch, channel, …)``) as :func:`denoiser` takes it.
-
-    Args:
-        model: of images whose values are about 0 … 1.
-        unit_hu: HU that are 1 to the model; 0 HU stays 0.
-        slices: a 2-D model: the slices are its batch. Otherwise the volume is one 3-D image.
-    """
-    unit = number("unit_hu", unit_hu, positive=True, unit="HU")
-
-    def run(volume: Tensor, sigma: float) -> Tensor:
-        x = (volume[:, None] if slices else volume[None, None]) / unit
-        with torch.no_grad():
-            found: Tensor = model(x, sigma / unit)
-        return found.reshape(volume.shape) * unit
-
-    run.__name__ = type(model).__name__
-    return run
-
-
 def _filtered(name: str, base: str, spec: str) -> Method:
     """A filter of :mod:`recon.evaluate.rivals` with the settings that were tuned for it."""
-    before = method_of(base)
+    before, name = method_of(base), filter_name(name)
 
     def run(draw: Draw) -> Tensor:
         settings = tuned(name, before.kernels[0], draw.exposure_s)
@@ -299,24 +282,22 @@ def same_grid(first: VolumeGrid, second: VolumeGrid) -> bool:
     )  # fmt: skip
 
 
-def _loaded(spec: str) -> Callable[..., Any]:
-    module, _, name = spec.partition(":")
-    try:
-        found = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError) as error:
-        raise ValueError(
-            f"cannot load {spec!r}: {error} (is its folder on PYTHONPATH?){meant_method(module)}"
-        ) from error
-    if not callable(found):
-        raise TypeError(f"{spec} is no function")
-    return found
-
-
 def _source_of(function: Callable[..., Any]) -> str:
+    """SHA-256 of a function's source, and of the networks and plain values that it uses from outside."""
+    kind = type(function) if isinstance(function, nn.Module) else function
     try:
-        text = inspect.getsource(function)
+        text = inspect.getsource(kind)
     except (OSError, TypeError):
-        text = repr(function)
+        text = repr(kind)
+    used: dict[str, Any] = {"": function}
+    if inspect.isfunction(function):
+        outside = inspect.getclosurevars(function)
+        used = {**outside.globals, **outside.nonlocals}
+    for name, value in sorted(used.items()):
+        if isinstance(value, nn.Module):
+            text += f"{name} {value!r} {digest(value.state_dict())}"
+        elif isinstance(value, bool | int | float | str):
+            text += f"{name} {value!r}"
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 

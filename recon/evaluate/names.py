@@ -8,13 +8,10 @@ from __future__ import annotations
 from importlib import resources
 from pathlib import Path
 
-from recon.names import KERNELS
-from torchpcct.validate import choice, meant, number, renamed
+from recon.names import FILTERS, KERNELS, filter_name, is_module_name, mbir_options, meant_method
+from torchpcct.validate import choice
 
-__all__ = ["FILTERS", "TASKS", "check_method", "check_task", "mbir_options", "meant_method"]
-
-FILTERS: tuple[str, ...] = ("gaussian", "perona_malik", "bilateral", "nlm", "tv", "bm4d")
-"""Of :mod:`recon.evaluate.rivals`."""
+__all__ = ["TASKS", "check_method", "check_task"]
 
 _FOLDER = resources.files("recon") / "evaluate" / "tasks"
 TASKS: tuple[str, ...] = tuple(sorted(Path(str(p)).stem for p in _FOLDER.iterdir() if str(p).endswith(".yaml")))
@@ -43,8 +40,8 @@ def check_method(spec: str) -> None:
     head, _, base = spec.partition("@")
     if base:
         check_method(base)
-        kind = "filter" if head in FILTERS else "denoiser"
-        if kind == "denoiser" and not all(head.partition(":")):
+        kind = "filter" if filter_name(head) in FILTERS else "denoiser"
+        if kind == "denoiser" and not is_module_name(head):
             raise ValueError(
                 f"unknown method {head!r}: a function is package.module:function, a filter one of "
                 f"{', '.join(FILTERS)}{meant_method(head)}"
@@ -65,32 +62,3 @@ def check_method(spec: str) -> None:
         raise ValueError(f"unknown method {spec!r}: one of {known}{meant_method(spec)}")
     elif name == "pwls" and rest:
         raise ValueError(f"pwls has no options, got {spec!r}")
-
-
-def mbir_options(text: str) -> dict[str, str]:
-    """Options of ``mbir:fidelity=1,vessel`` by name.
-
-    Raises:
-        ValueError, TypeError: an unknown option, or a value that it does not take.
-        FileNotFoundError: weights that do not exist.
-    """
-    given: dict[str, str] = {}
-    for part in filter(None, text.split(",")):
-        key, _, value = part.partition("=")
-        key = renamed("mbir:look", "mbir:fidelity", "fidelity") if key == "look" else key
-        given[choice("option of mbir", key, ("weights", "fidelity", "vessel", "tissues", "prior"))] = value
-    if "fidelity" in given:
-        number("fidelity", given["fidelity"], low=0.0, high=1.0)
-    if "prior" in given:
-        choice("prior of mbir", given["prior"], ("bilateral",))
-    for name in ("vessel", "tissues"):
-        if given.get(name):
-            raise ValueError(f"{name} of mbir takes no value, got {given[name]!r}: mbir:{name}")
-    if "weights" in given and not Path(given["weights"]).is_file():
-        raise FileNotFoundError(f"no such file: {given['weights'] or 'weights= without a name'}")
-    return given
-
-
-def meant_method(head: str) -> str:
-    """`` (did you mean 'mbir'?)`` where the first part of a name is like that of a method of the package."""
-    return meant(head, ("fbp", "pwls", "mbir", "files", *FILTERS))

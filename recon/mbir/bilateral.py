@@ -5,7 +5,7 @@
 s is a Gaussian in space, ρ(x) = (1 − x²/4)² within ``|x| < 2`` and 0 beyond (Tukey's biweight; about exp(−x²/2), at a
 fraction of its cost). Constants pass through, a turned volume gives the turned result, and a neighbour beyond an edge
 of the guide does not count at all: so edges keep their place and height, and no voxel is pushed beyond its neighbours.
-After FBP it is the strongest simple filter for plaques (:mod:`recon.evaluate.rivals`); here it is one of the network's
+After FBP it is the strongest simple filter for plaques (:mod:`recon.filters`); here it is one of the network's
 views of the data (:mod:`recon.mbir.network`).
 """
 

@@ -29,9 +29,9 @@ from scipy import ndimage
 from torch import Tensor
 
 from recon.evaluate.anatomies import ANATOMIES, Regions, coarsened
-from recon.evaluate.rivals import FILTERS, SMOOTHED_BY, flat_noise
 from recon.evaluate.rivals import __file__ as _RIVALS
 from recon.evaluate.sources import source_digest
+from recon.filters import FILTERS, SMOOTHED_BY, flat_noise
 from recon.least_squares.qggmrf import DEFAULT_PRIOR
 from recon.least_squares.reconstruct import TOLERANCE_HU
 from recon.mbir.mbir import Mbir

@@ -1,4 +1,4 @@
-"""Settings of the simple filters (``recon.evaluate.rivals``): tuned on held-out vessels of four directions.
+"""Settings of the simple filters (``recon.filters``): tuned on held-out vessels of four directions.
 
     python tests/bench/rivals.py [--filters NAME ...] [--bases NAME ...] [--doses S ...]
 
@@ -27,7 +27,7 @@ from torch import Tensor
 import recon.evaluate
 from recon.analytic.exact_noise import voxel_covariance
 from recon.analytic.inset import InsetFbp
-from recon.evaluate.rivals import FILTERS, flat_noise
+from recon.filters import FILTERS, flat_noise
 from recon.least_squares.qggmrf import DEFAULT_PRIOR
 from recon.least_squares.reconstruct import TOLERANCE_HU
 from torchpcct.volume import to_hu

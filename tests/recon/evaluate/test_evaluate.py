@@ -238,7 +238,7 @@ def test_pieces_of_another_seed_method_or_exposure_are_not_taken(task, tmp_path)
 @pytest.mark.parametrize(
     ("spec", "expected_text"),
     [
-        ("fbp:hard", "kernel"), ("mbir:sharp=1", "option of mbir"), ("mbir:prior=tv", "prior of mbir"),
+        ("fbp:hard", "kernel"), ("mbir:sharp=1", "option of mbir"), ("mbir:prior=tw", "prior of mbir"),
         ("nothing", "unknown method"),
         ("bilateral@pwls", "needs FBP"), ("no.such.module:run", "cannot load"), ("files:nowhere", "no folder"),
         ("json:loads@nowhere", "unknown method"), (3, "must be a name"),

@@ -9,8 +9,8 @@ import torch
 from refusals import refused
 from scipy import ndimage
 
-from recon.evaluate import names, rivals
-from recon.evaluate.rivals import FILTERS, denoised, flat_noise, perona_malik
+from recon import filters, names
+from recon.filters import FILTERS, denoised, flat_noise, perona_malik
 
 SHAPE = (10, 12, 14)
 NOISE = 20.0
@@ -132,13 +132,13 @@ def test_the_noise_is_measured_where_the_volume_is_flat(noise):
 
 
 def test_bm4d_is_told_the_noise_and_its_spectrum(fake_bm4d, noise):
-    found = rivals.bm4d(noise + 1000.0, NOISE, strength=0.5)
+    found = filters.bm4d(noise + 1000.0, NOISE, strength=0.5)
     torch.testing.assert_close(found, (noise + 1000.0) / 2 + float((noise + 1000.0).mean()) / 2, rtol=0, atol=1e-2)
     assert fake_bm4d[0][1] == 0.5 * NOISE
     # White noise, smoothed along x: its spectrum falls along x alone, and adds up to the variance.
     covariance = np.zeros((3, 3, 5))
     covariance[1, 1] = np.array([0.0, 0.5, 1.0, 0.5, 0.0]) * 7.0
-    rivals.bm4d(noise.numpy(), NOISE, covariance=covariance)
+    filters.bm4d(noise.numpy(), NOISE, covariance=covariance)
     power = fake_bm4d[1][1]
     assert power.shape == SHAPE
     assert power.sum() / noise.numel() ** 2 == pytest.approx(NOISE**2)
@@ -146,17 +146,17 @@ def test_bm4d_is_told_the_noise_and_its_spectrum(fake_bm4d, noise):
     assert power[0, 0, 0] > 1.9 * power.mean() > 1e9 * power[0, 0, 7]
     for wrong in (covariance[..., :4], np.zeros((3, 3, 3)), np.ones((3, 3)), np.ones((11, 3, 3))):
         with pytest.raises(ValueError, match="covariance"):
-            rivals.bm4d(noise, NOISE, covariance=wrong)
+            filters.bm4d(noise, NOISE, covariance=wrong)
 
 
 def test_bm4d_without_its_package_says_how_to_get_it(monkeypatch, noise):
     monkeypatch.setitem(sys.modules, "bm4d", None)
     with pytest.raises(ImportError, match=r"torchpcct\[rivals\].*non-commercial"):
-        rivals.bm4d(noise, NOISE)
+        filters.bm4d(noise, NOISE)
     # A release that calls what NumPy no longer has.
     monkeypatch.setitem(sys.modules, "bm4d", types.SimpleNamespace(bm4d=lambda z, sigma: np.not_there))
     with pytest.raises(ImportError, match=r"does not run with NumPy.*not_there"):
-        rivals.bm4d(noise, NOISE)
+        filters.bm4d(noise, NOISE)
 
 
 @pytest.mark.parametrize("name", FILTERS)
