@@ -16,19 +16,20 @@ from recon.least_squares.pwls import PwlsOptions
 from recon.least_squares.reconstruct import reconstruct_pwls
 from recon.mbir.reconstruct import reconstruct_mbir
 from recon.metal import metal_warnings
-from recon.names import METHODS
+from recon.names import METHODS, split_method
 from recon.solution import Solution, tested
 from torchpcct.checks.defects import dead_readings, repair_defects
 from torchpcct.checks.readings import reading_warnings
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
-from torchpcct.validate import checked, choice
+from torchpcct.validate import checked
 from torchpcct.volume import Volume, from_hu
 
 if TYPE_CHECKING:
     from recon.least_squares.inset_problem import InsetProblem
     from recon.least_squares.qggmrf import QGGMRF
     from recon.mbir.mbir import Mbir
+    from recon.mbir.priors import Prior
     from recon.plaque.vessel_prior import VesselPrior
 
 __all__ = ["METHODS", "MethodOptions", "reconstruct", "require_light"]
@@ -40,11 +41,11 @@ _STARVED = 0.5
 
 
 class MethodOptions(PwlsOptions, total=False):
-    """Options of :func:`reconstruct`: ``kernel`` of FBP, ``prior`` of PWLS, ``problem`` and ``batch`` of PWLS and MBIR,
-    the rest of MBIR. Each is described where its method is; that of another method is a ``TypeError``."""
+    """Options of :func:`reconstruct`: ``kernel`` of FBP, ``prior``, ``problem`` and ``batch`` of PWLS and MBIR, the
+    rest of MBIR. Each is described where its method is; that of another method is a ``TypeError``."""
 
     kernel: str
-    prior: QGGMRF | None
+    prior: QGGMRF | Prior | str | None
     problem: InsetProblem | None
     batch: int
     network: Mbir | None
@@ -100,6 +101,8 @@ def reconstruct(
             a volume that did not converge carries ``warnings`` in its report) or ``"mbir"`` (unrolled steps with the
             learned prior that ships with the package, of an inset or a whole field; options of
             :func:`recon.mbir.reconstruct.reconstruct_mbir`; what the training has not seen is named in ``warnings``).
+            Options may follow, as an evaluation has them (:mod:`recon.evaluate.methods`): ``"fbp:soft"``,
+            ``"mbir:fidelity=1,prior=perona-malik"``.
         progress: called with the finished fraction, 0…1.
         device: where the returned volumes lie.
         options: of the method (:class:`MethodOptions`).
@@ -140,7 +143,17 @@ def reconstruct(
         raise ValueError(f"grid must be a (z, y, x) VolumeGrid, got {grid!r}")
     for s in scans:
         require_light(s.zero_fraction)
-    choice("method", method, METHODS)
+    name, named = split_method(method)
+    twice = sorted(named.keys() & options.keys())
+    if twice:
+        raise TypeError(f"{', '.join(twice)} stands in the method {method!r} and beside it: leave out one of them")
+    if "weights" in named:
+        from recon.mbir.mbir import Mbir
+
+        if "network" in options:
+            raise TypeError(f"network stands beside the weights of the method {method!r}: leave out one of them")
+        named["network"] = Mbir.load(named.pop("weights"), network=named.pop("network", None))
+    chosen: dict[str, Any] = {**named, **options}
     whole = [(s, [*texts, *reading_warnings(s)]) for s, texts in map(repair_defects, scans)]
     scans = [s for s, _ in whole]
     for text in {text for _, texts in whole for text in texts}:
@@ -149,7 +162,7 @@ def reconstruct(
     volumes: list[Volume] = []
     told: set[str] = set()
     began = time.perf_counter()
-    for batch in methods[method](scans, grid, progress or (lambda _: None), **options):
+    for batch in methods[name](scans, grid, progress or (lambda _: None), **chosen):
         seconds = round((time.perf_counter() - began) / len(batch), 3)
         for solution in batch:
             s, before = whole[len(volumes)]

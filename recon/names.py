@@ -19,6 +19,7 @@ __all__ = [
     "loaded",
     "mbir_options",
     "meant_method",
+    "split_method",
 ]
 
 METHODS: tuple[str, ...] = ("fbp", "pwls", "mbir")
@@ -36,6 +37,31 @@ _MBIR = ("weights", "network", "fidelity", "vessel", "tissues", "prior")
 def filter_name(text: str) -> str:
     """A filter's name with the underscore that it has in :data:`FILTERS`."""
     return text.replace("-", "_")
+
+
+def split_method(spec: Any) -> tuple[str, dict[str, Any]]:
+    """A method of :func:`recon.reconstruct` and its options, from ``fbp:soft`` or ``mbir:prior=perona-malik``.
+
+    Of ``weights`` and ``network`` the texts are given; ``prior`` is a text, too.
+
+    Raises:
+        ValueError, TypeError: an unknown method or option, or a value that it does not take.
+        FileNotFoundError: weights that do not exist.
+    """
+    name, _, rest = spec.partition(":") if isinstance(spec, str) else (spec, "", "")
+    choice("method", name, METHODS)
+    if not rest:
+        return name, {}
+    if name == "fbp":
+        return name, {"kernel": choice("kernel", rest, KERNELS)}
+    if name == "pwls":
+        raise ValueError(f"pwls has no options, got {spec!r}")
+    texts = mbir_options(rest)
+    options: dict[str, Any] = {k: texts[k] for k in ("weights", "network", "prior") if k in texts}
+    if "fidelity" in texts:
+        options["fidelity"] = float(texts["fidelity"])
+    options |= {k: True for k in ("vessel", "tissues") if k in texts}
+    return name, options
 
 
 def mbir_options(text: str) -> dict[str, str]:

@@ -85,12 +85,16 @@ def build(config: TrainConfig, views: Path, device: str = "cpu") -> tuple[Unroll
         views: folder of the views.
         device: where it trains.
 
+    A network of a user's own is imported, as the configuration names it.
+
     Raises:
-        ValueError: a device that torch does not have here.
+        ValueError: a device that torch does not have here; a network that cannot be imported or trained.
+        TypeError: a class that makes no module, or whose modules do not take what a prior is given.
     """
     import torch
 
-    from recon.mbir.network import NetworkConfig
+    from recon.mbir.network import Network
+    from recon.mbir.priors import network_of
     from recon.mbir.unrolled import Unrolled
     from train.data import Data, seed_of
     from train.objective import Objective
@@ -100,9 +104,14 @@ def build(config: TrainConfig, views: Path, device: str = "cpu") -> tuple[Unroll
     except (RuntimeError, AssertionError) as error:
         raise ValueError(f"no device {device!r} here: take cpu, or cuda on a machine with a GPU ({error})") from error
     torch.manual_seed(config.seed)
-    model = Unrolled(NetworkConfig(**config.network), steps=config.unroll).to(where)
+    own = "class" not in config.network
+    network = network_of(config.network, config.network.get("class"))
+    if not any(p.requires_grad for p in network.parameters()):
+        raise ValueError(f"network {config.network['class']} has no parameters that a training could change")
+    model = Unrolled(network, steps=config.unroll, voxel_mm=None if own else config.data.voxel_mm).to(where)
     fast = where.type == "cuda" or torch.ops.mkldnn._is_mkldnn_bf16_supported()
-    model.network.half_precision = config.bfloat16 and fast
+    if isinstance(model.network, Network):
+        model.network.half_precision = config.bfloat16 and fast
     data = Data(config.data, config.seed, views, where)
     few = replace(config.data, scenes_kept=config.objective.held_out)
     held_out = Data(few, seed_of("held out", config.seed), views, where)
@@ -127,6 +136,7 @@ def _processes() -> Iterator[None]:
 def _run(arguments: argparse.Namespace, command: str) -> int:
     import torch
 
+    from recon.cli.parsing import find_modules_here
     from recon.mbir.mbir import WEIGHTS_FORMAT
     from recon.mbir.weights_io import read_tensors
     from torchpcct.files import WriteError
@@ -143,10 +153,17 @@ def _run(arguments: argparse.Namespace, command: str) -> int:
             config = load_config(arguments.config)
         elif arguments.resume and not arguments.quick:
             config = TrainConfig.from_yaml(Store(arguments.out).load()[1]["config"])
+            if "class" in config.network:
+                raise ValueError(
+                    f"the run in {arguments.out} trains {config.network['class']}, which no file alone may import: if "
+                    f"you trust it, name its configuration, --config {shlex.quote(str(arguments.out / 'config.yaml'))}"
+                )
         else:
             config = packaged_config("quick" if arguments.quick else "default")
         changes = {k: v for k, v in (("steps", arguments.steps), ("seed", arguments.seed)) if v is not None}
         config = replace(config, **changes)
+        if "class" in config.network:
+            find_modules_here()
         with _processes():
             views = arguments.views or arguments.out / "views"
             model, data, held_out, objective = build(config, views, arguments.device)
@@ -174,8 +191,10 @@ def _run(arguments: argparse.Namespace, command: str) -> int:
     if not first:
         return 0
     if state.step < config.steps:
-        print(f"stopped at step {state.step} of {config.steps}; continue with: "
-              f"torchpcct train --out {shlex.quote(str(arguments.out))} --resume")  # fmt: skip
+        out = shlex.quote(str(arguments.out))
+        named = f" --config {out}/config.yaml" if "class" in config.network else ""
+        again = f"torchpcct train --out {out}{named} --resume"
+        print(f"stopped at step {state.step} of {config.steps}; continue with: {again}")
         return 128 + number if number else 1
     skipped = f", {state.skipped} steps skipped" if state.skipped else ""
     score = f"{state.best['score']:.5g}" if state.best else "none"

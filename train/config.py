@@ -17,6 +17,7 @@ from typing import Any, Self
 import yaml
 
 from recon.mbir.network import NetworkConfig
+from recon.names import is_module_name
 from torchpcct.formats.damage import yaml_values
 from torchpcct.validate import checked, number, numbers, whole
 from train.scenes.scene import SceneConfig
@@ -50,6 +51,21 @@ def _section(cls: Any, values: Any, where: str) -> Any:
         return cls(**values)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{where}: {error}" if where else str(error)) from error
+
+
+def _network(given: Any) -> dict[str, Any]:
+    """Checked arguments of a network, as a mapping."""
+    values = {"class": given} if isinstance(given, str) else given
+    if not isinstance(values, Mapping) or "class" not in values:
+        _section(NetworkConfig, values, "network")
+        return dict(values)
+    name = values["class"]
+    if not isinstance(name, str) or not is_module_name(name):
+        raise ValueError(f"network.class must be package.module:Class, got {name!r}")
+    for key in values:
+        if not isinstance(key, str) or not key.isidentifier():
+            raise ValueError(f"network: {key!r} names no argument of {name}")
+    return dict(values)
 
 
 @dataclass(frozen=True)
@@ -203,7 +219,9 @@ class TrainConfig:
         checkpoint_seconds: time between checkpoints in s, ≤ 120.
         validate_every: steps between validations; the last step is always validated.
         log_every: steps between rows of the log.
-        network: arguments of :class:`recon.mbir.network.NetworkConfig`.
+        network: arguments of :class:`recon.mbir.network.NetworkConfig`. Or of a network of a user's own: ``class``, its
+            ``package.module:Class``, and the arguments of that; without arguments its name alone. It is imported when
+            the training begins, not here.
         unroll: steps K of :class:`recon.mbir.unrolled.Unrolled`.
         single: share of the training with one step of the K: the network is the same in all, and one is cheaper.
         bfloat16: convolve in that precision where the processor has it, in half the time (others would imitate it, at
@@ -255,7 +273,7 @@ class TrainConfig:
         _set(self, single=number("single", self.single, low=0.0, high=1.0))
         if not isinstance(self.bfloat16, bool):
             raise TypeError(f"bfloat16 must be true or false, got {self.bfloat16!r}")
-        _section(NetworkConfig, self.network, "network")
+        _set(self, network=_network(self.network))
 
     @property
     def decay_begins(self) -> int:

@@ -301,7 +301,7 @@ def finite(value: Any) -> Any:
 
 
 def export(folder: Path, weights: Mapping[str, Tensor], config: TrainConfig, state: Mapping[str, Any]) -> None:
-    """Write ``weights.safetensors`` (float16), ``card.json`` and the same as text, ``training.md``.
+    """Write ``weights.safetensors`` (the package's network in float16), ``card.json`` and the same as ``training.md``.
 
     Args:
         folder: existing.
@@ -310,8 +310,10 @@ def export(folder: Path, weights: Mapping[str, Tensor], config: TrainConfig, sta
         state: fields of :class:`train.run.State` as of now; ``best`` describes the weights.
     """
     best = state["best"]
-    # Half the bytes, and 0.05 % of a weight: no volume changes by a tenth of a HU.
-    stored = {k: w.to(torch.float16) if k.startswith("network.") else w for k, w in weights.items()}
+    # Half the bytes, and 0.05 % of a weight: no volume changes by a tenth of a HU. Another network is kept as it is.
+    foreign = "class" in config.network
+    halved = {} if foreign else {k: w.to(torch.float16) for k, w in weights.items() if k.startswith("network.")}
+    stored = {**weights, **halved}
     versions = {**environment(), "safetensors": safetensors.__version__}
     system = f"{platform.system()} {versions.pop('machine')}"
     card = {
@@ -338,6 +340,7 @@ def export(folder: Path, weights: Mapping[str, Tensor], config: TrainConfig, sta
         "unroll": config.unroll,
         "step": best["step"],
         "score": best["score"],
+        **({"voxel_mm": config.data.voxel_mm} if foreign else {}),
     }
     write_tensors(folder / "weights.safetensors", WEIGHTS_FORMAT, stored, header)
     record = filled(Path(__file__).parent / "templates" / "training.md.j2", {**card, "yaml": config.to_yaml()}) + "\n"

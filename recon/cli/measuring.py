@@ -5,9 +5,7 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import shlex
-import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,6 +23,7 @@ from recon.cli.parsing import (
     check_results,
     command,
     executing,
+    find_modules_here,
 )
 from recon.names import METHODS
 from recon.study import registry
@@ -82,7 +81,7 @@ def _evaluate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     n = arguments.realisations if arguments.n is None else arguments.n
     methods = [*(arguments.method or []), *map(_denoiser, arguments.denoiser or [])]
     if any(map(names_module, [*methods, *_reported(out)])):
-        sys.path.append(os.getcwd())  # the user's own modules lie where the command is run; none hides another one
+        find_modules_here()
     if not methods:
         methods = list(arguments.methods)
     tasks = arguments.task or list(arguments.tasks)
@@ -171,7 +170,7 @@ def _scans(arguments: argparse.Namespace) -> tuple[list[dict[str, Any]], str, st
         raise ValueError("--reference names one of the --volumes; of --scans it is FBP with the kernel ram-lak")
     methods = [*(arguments.method or []), *map(_denoiser, arguments.denoiser or [])] or list(arguments.methods)
     if any(map(names_module, methods)):
-        sys.path.append(os.getcwd())
+        find_modules_here()
     scans = [open_scan(path) for path in arguments.scans]
     grid = VolumeGrid.of(scans[0], voxel=arguments.voxel, extent=arguments.extent, center=arguments.center)
     region = _region(arguments.region, grid)
@@ -347,7 +346,8 @@ def _verify(arguments: argparse.Namespace, progress: ProgressBars) -> None:
 
 _METHODS_TEXT = """\
 methods: fbp:KERNEL, pwls, mbir, mbir:fidelity=1, mbir:weights=FILE, mbir:vessel, mbir:tissues,
-         mbir:prior=bilateral,
+         mbir:prior=PRIOR (a filter below, or package.module:function),
+         mbir:weights=FILE,network=package.module:Class,
          FILTER@fbp:KERNEL (gaussian, perona_malik, bilateral, nlm, tv, bm4d),
          package.module:function of (scan, grid), files:FOLDER
 

@@ -43,6 +43,7 @@ __all__ = [
     "ending_by_signals",
     "examples",
     "executing",
+    "find_modules_here",
     "is_path",
     "is_picture",
     "length_of",
@@ -501,6 +502,13 @@ def check_ending(path: Path, endings: tuple[str, ...]) -> None:
 def length_of(unit: str) -> str:
     """Unit of the lengths of a scan or volume in ``unit``."""
     return "pixels" if unit == "pixel^-1" else "mm"
+
+
+def find_modules_here() -> None:
+    """The user's own modules may lie where the command is run; none hides another one."""
+    here = os.getcwd()
+    if here not in sys.path:
+        sys.path.append(here)
 
 
 def map_beside(volume: Path) -> Path:

@@ -29,12 +29,13 @@ from recon.cli.parsing import (
     check_output,
     command,
     executing,
+    find_modules_here,
     length_of,
     map_beside,
     tell,
     without_ending,
 )
-from recon.names import KERNELS, METHODS
+from recon.names import KERNELS, is_module_name, split_method
 from torchpcct import VolumeGrid
 from torchpcct.files import (
     VERSION,
@@ -320,29 +321,45 @@ def _require_voxels(shape: tuple[int, ...]) -> None:
 
 _MAP = "drawn_minus_plain_hu"
 """What a drawn vessel has changed, in a report of MBIR."""
-_OPTIONS = {"kernel": "fbp", **dict.fromkeys(("fidelity", "vessel", "tissues", "point", "weights"), "mbir")}
+_OPTIONS = {"kernel": "fbp", **dict.fromkeys(("fidelity", "vessel", "tissues", "point", "weights", "network"), "mbir")}
 """Options that one method has."""
 
 
 def _method_options(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Those that were given, for the method.
+    """Those that were given, with the method or beside it.
 
     Raises:
-        ValueError: an option of another method.
+        ValueError: an option of another method, or given twice; a class without weights of it.
     """
-    choice("method", arguments.method, METHODS)
+    method, named = split_method(arguments.method)
     if arguments.kernel is not None:
         choice("kernel", arguments.kernel, KERNELS)
     given = {k: v for k, v in vars(arguments).items() if k in _OPTIONS and v is not None and v is not False}
     for name in given:
-        if arguments.method != _OPTIONS[name]:
+        if method != _OPTIONS[name]:
             option = name.replace("_", "-")
-            raise ValueError(f"--{option} is an option of --method {_OPTIONS[name]}, not of {arguments.method}")
+            raise ValueError(f"--{option} is an option of --method {_OPTIONS[name]}, not of {method}")
+        if name in named:
+            raise ValueError(f"--{name} stands in --method {arguments.method}, too: leave out one of them")
+    given = named | given
+    if "network" in given:
+        if "weights" not in given:
+            raise ValueError("--network is the class of weights of yours: give it with --weights FILE")
+        if not is_module_name(given["network"]):
+            raise ValueError(f"--network must be package.module:Class, got {given['network']!r}")
+    if any(is_module_name(given.get(name, "")) for name in ("network", "prior")):
+        find_modules_here()
     return given
+
+
+def _method(arguments: argparse.Namespace) -> str:
+    """Its name without options."""
+    return split_method(arguments.method)[0]
 
 
 def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     """One scan, or many, each as if it were alone."""
+    _method_options(arguments)
     elsewhere = arguments.workers or arguments.threads or arguments.scheduler
     if len(arguments.scan) == 1:
         arguments.scan = arguments.scan[0]
@@ -361,7 +378,7 @@ def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         raise ValueError(f"{len(arguments.scan)} scans: --out FOLDER says where their volumes go")
     require_writable(folder)
     ending = ".nii.gz" if arguments.memory is None else ".nii"
-    outs = [f"{without_ending(scan)}_{arguments.method}{ending}" for scan in arguments.scan]
+    outs = [f"{without_ending(scan)}_{_method(arguments)}{ending}" for scan in arguments.scan]
     twice = {name for name in outs if outs.count(name) > 1}
     if twice:
         raise ValueError(f"several scans would become {', '.join(sorted(twice))}: give the files other names")
@@ -390,7 +407,7 @@ def _reconstruct_elsewhere(arguments: argparse.Namespace, progress: ProgressBars
     """One scan as a job of the workers that were asked for."""
     from recon.evaluate import execute
 
-    out = arguments.out or Path(f"{without_ending(arguments.scan)}_{arguments.method}.nii.gz")
+    out = arguments.out or Path(f"{without_ending(arguments.scan)}_{_method(arguments)}.nii.gz")
     require_folder(out)
     with executing(arguments, out.parent) as executor:
         job = _job(arguments, arguments.scan, out.name)
@@ -457,10 +474,10 @@ def _note(path: Path) -> dict[str, Any]:
 
 
 def _reconstruct_scan(arguments: argparse.Namespace, progress: ProgressBars) -> None:
-    options = _method_options(arguments)
+    options, method = _method_options(arguments), _method(arguments)
     slabs = arguments.memory is not None
     if arguments.out is None:
-        arguments.out = Path(f"{without_ending(arguments.scan)}_{arguments.method}.nii{'' if slabs else '.gz'}")
+        arguments.out = Path(f"{without_ending(arguments.scan)}_{method}.nii{'' if slabs else '.gz'}")
     check_target(arguments.out)
     check_output(arguments, is_own_volume, arguments.scan, arguments.geometry, beside=True)
     for name in ("extent", "center"):
@@ -511,10 +528,8 @@ def _reconstruct_scan(arguments: argparse.Namespace, progress: ProgressBars) -> 
     if "weights" in options:
         from recon.mbir.mbir import Mbir
 
-        options["network"] = Mbir.load(options.pop("weights"))
-    volume = reconstruct(
-        scan, grid, arguments.method, progress=progress.of(arguments.method), device=arguments.device, **options
-    )
+        options["network"] = Mbir.load(options.pop("weights"), network=options.pop("network", None))
+    volume = reconstruct(scan, grid, method, progress=progress.of(method), device=arguments.device, **options)
     progress.close()
     placed = {"axis": scan.info["axis"]} if arguments.find_axis else {}
     volume = replace(volume, report={**volume.report, **placed, **_made(arguments)}).slices()
@@ -532,7 +547,7 @@ def _config(arguments: argparse.Namespace, scan: Any, grid: VolumeGrid, options:
     from torchpcct.formats.geometry_yaml import geometry_values
 
     return {
-        "scan": str(arguments.scan), "geometry": geometry_values(scan.geometry), "method": arguments.method,
+        "scan": str(arguments.scan), "geometry": geometry_values(scan.geometry), "method": _method(arguments),
         "grid": {"shape": list(grid.shape), "spacing": list(grid.spacing), "center": list(grid.center)},
         "unit": scan.unit, "clean": arguments.clean, **{k: v if k != "weights" else str(v) for k, v in options.items()},
     }  # fmt: skip
@@ -566,7 +581,8 @@ def _reconstruct_slabs(arguments: argparse.Namespace, options: dict[str, Any], p
     grid = grid_of_scan(source, arguments)
     check_target(arguments.out, grid.voxels, source.unit)
     config = {**_config(arguments, source, grid, options), "memory": arguments.memory}
-    plan = plan_slabs(source.geometry, grid, arguments.memory, arguments.method)
+    method = _method(arguments)
+    plan = plan_slabs(source.geometry, grid, arguments.memory, method)
     if arguments.dry_run:
         print(as_json({**config, "estimate": {"file": str(arguments.out), **asdict(plan)}}) if arguments.json else
               f"{yaml.safe_dump(config, sort_keys=False, allow_unicode=True)}\n{arguments.out}: {plan}")  # fmt: skip
@@ -574,8 +590,8 @@ def _reconstruct_slabs(arguments: argparse.Namespace, options: dict[str, Any], p
     if not arguments.json:
         print(plan)
     report = reconstruct_to(
-        source, grid, arguments.out, arguments.method, memory=arguments.memory,
-        progress=progress.of(arguments.method), **options,
+        source, grid, arguments.out, method, memory=arguments.memory,
+        progress=progress.of(method), **options,
     )  # fmt: skip
     progress.close()
     _tell_volume(arguments, config, grid, source.unit, {**report, **_made(arguments)})
@@ -611,7 +627,14 @@ def add_reconstruct(commands: Commands) -> None:
     own = "for separate slices only Y X"
     add_options(
         parser,
-        ("--method", str, None, "fbp, pwls or mbir (default fbp)", {"default": "fbp"}),
+        (
+            "--method",
+            str,
+            None,
+            "fbp, pwls or mbir (default fbp); with options as evaluate has them: mbir:prior=perona-malik, or "
+            "mbir:prior=package.module:function in the network's place",
+            {"default": "fbp"},
+        ),
         ("--kernel", str, None, "of FBP, from quiet to sharp: soft, standard (default), detail, bone, ram-lak"),
         (
             "--fidelity --look",
@@ -629,6 +652,7 @@ def add_reconstruct(commands: Commands) -> None:
         ),
         ("--tissues", bool, None, "MBIR that first fits the tissues of the vessel in the inset"),
         ("--weights", Path, "FILE", "of MBIR, from your own training (default: those that ship)", {"read": True}),
+        ("--network", str, "MODULE:CLASS", "with --weights: the class of a network of your own"),
         (
             "--point",
             float,

@@ -3,8 +3,11 @@
 A method's name says all:
 
 * ``fbp:KERNEL``, ``pwls``, ``mbir``; ``mbir:fidelity=1``, ``mbir:weights=mine.safetensors``, ``mbir:vessel`` around the
-  drawn outlines of a vessel, ``mbir:tissues`` around its tissues, and ``mbir:prior=bilateral``, the same data steps
-  with the bilateral filter that the network is given and no network; options are separated by commas;
+  drawn outlines of a vessel, ``mbir:tissues`` around its tissues; options are separated by commas;
+* ``mbir:prior=PRIOR``: the same data steps with another prior in the network's place (:mod:`recon.mbir.priors`):
+  ``bilateral``, the filter that the network is given, a filter of :mod:`recon.filters` such as ``perona-malik``, or
+  ``package.module:function``, a denoiser as below or a network of a user's own;
+* ``mbir:weights=FILE,network=package.module:Class``: weights of a network of a user's own;
 * ``FILTER@BASE``: a filter of :mod:`recon.filters` after a linear method, ``bilateral@fbp:detail``;
 * ``package.module:function``: a function of ``(scan, grid)`` that gives a volume in HU; with ``@BASE`` a denoiser, a
   function of ``(volume)`` or ``(volume, sigma)`` in HU, tensors ``(z, y, x)`` float32;
@@ -32,6 +35,7 @@ from recon.filters import FILTERS, SMOOTHED_BY, deepinv_denoiser, denoiser_of, f
 from recon.mbir.mbir import Mbir
 from recon.mbir.network import bilateral_prior
 from recon.mbir.outlines import OutlineMbir
+from recon.mbir.priors import PlugAndPlay, prior_of
 from recon.mbir.tissues import TissueMbir
 from recon.mbir.weights_io import digest
 from recon.names import filter_name, is_module_name, loaded, mbir_options
@@ -207,17 +211,24 @@ def _filtered(name: str, base: str, spec: str) -> Method:
 
 def _mbir(spec: str, rest: str) -> Method:
     given = mbir_options(rest)
-    network = Mbir.load(given.get("weights"))
+    prior = prior_of(given["prior"]) if "prior" in given else None
+    if prior is not None and "weights" not in given:
+        network = Mbir(prior=prior)
+    else:
+        network = Mbir.load(given.get("weights"), network=given.get("network"))
+    key = network.weights_sha256
+    if prior is not None:
+        network, key = network.with_prior(prior), f"{key} {_source_of(prior)}"
     if "fidelity" in given:
         network = network.with_fidelity(float(given["fidelity"]))
-    if "prior" in given:
-        network = Mbir(network.model, network.fidelity, prior=bilateral_prior)
     if "tissues" in given:
         fitted = TissueMbir(network)
-        return Method(spec, lambda draw: draw.mbir(fitted), key=network.weights_sha256)
+        return Method(spec, lambda draw: draw.mbir(fitted), key=key)
     if "vessel" in given:
         network = OutlineMbir(network)
-    return Method(spec, lambda draw: draw.mbir(network), key=network.weights_sha256, network=network)
+    # Others need not be differentiable: what is drawn of them is controlled by the reference.
+    differentiable = prior is None or prior is bilateral_prior
+    return Method(spec, lambda draw: draw.mbir(network), key=key, network=network if differentiable else None)
 
 
 def _of_function(name: str, function: Callable[..., Any]) -> Method:
@@ -290,6 +301,8 @@ def _source_of(function: Callable[..., Any]) -> str:
     except (OSError, TypeError):
         text = repr(kind)
     used: dict[str, Any] = {"": function}
+    if isinstance(function, PlugAndPlay):
+        return _source_of(function.denoiser)
     if inspect.isfunction(function):
         outside = inspect.getclosurevars(function)
         used = {**outside.globals, **outside.nonlocals}

@@ -37,8 +37,10 @@ from recon.least_squares.field_problem import FieldProblem, field_prior
 from recon.least_squares.memory import require_memory
 from recon.least_squares.pwls import pwls
 from recon.mbir.mbir import Mbir, average_onto
+from recon.mbir.network import REFERENCE_SCALE_HU
+from recon.mbir.priors import Prior, same_kind
 from recon.mbir.problem import NormalisedProblem
-from recon.mbir.unrolled import REFERENCE_SCALE_HU, Prior, low_residual
+from recon.mbir.unrolled import bound, low_residual
 from recon.solution import RESIDUAL_TEST, Solution, tested
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
@@ -169,11 +171,14 @@ def blockwise(
         return torch.cat([level.reshape(1, 1).to(condition), condition[:, 1:]], 1)
 
     if max(shape) <= block + 2 * halo:
-        return network(estimate, towards, told((slice(None),) * 3), smoothed)
+        return same_kind(network(estimate, towards, told((slice(None),) * 3), smoothed), estimate, network)
     total, weight = torch.zeros_like(estimate), torch.zeros(shape, dtype=estimate.dtype, device=estimate.device)
     for part in _parts(shape, block, halo):
         here: Any = (..., *part)
-        out = network(estimate[here], towards[here], told(part), None if smoothed is None else smoothed[here])
+        seen = estimate[here]
+        out = same_kind(
+            network(seen, towards[here], told(part), None if smoothed is None else smoothed[here]), seen, network
+        )
         fade = torch.ones((), dtype=estimate.dtype, device=estimate.device)
         for axis, (s, n) in enumerate(zip(part, shape, strict=True)):
             fade = fade * _fade(s, n, halo).to(estimate).reshape(-1, *[1] * (2 - axis))
@@ -267,9 +272,8 @@ def _one(
     normal = NormalisedProblem.from_statistic(gram, b[None], torch.ones(1), hu, network.voxel_mm)
     scales = normal.scale_hu * gram.ratio
     # Its noise is known on average over directions only: along a starved one, noise would pass for structure.
-    parts = {"prior": model.network, "restore": False, **network.parts}
-    prior = partial(blockwise, parts.pop("prior"), scales)
-    u = model(normal, network.fidelity, prior=prior, solves=SOLVES, **parts)
+    prior = bound(network.parts.get("prior", model.network), normal, normal.spectrum())
+    u = network.with_prior(partial(blockwise, prior, scales)).solution(normal, restore=False, solves=SOLVES)
     left = normal.beta - normal.apply(u)
     whole = normal.beta + normal.apply(_stacked(problem, around)[None] / (scales * hu))
     rest = (u[0] * scales) * hu
@@ -294,7 +298,7 @@ def _one(
         "method": "mbir", "iterations": model.steps, "fidelity": network.fidelity,
         "residual": float(low_residual(replace(normal, beta=whole), left, network.fidelity)),
         "chi2": float(torch.stack(squares).sum()) / max(readings, 1), "noise_scale_hu": (low, high),
-        "weights_sha256": network.weights_sha256,
+        **network.made_with,
     }  # fmt: skip
     return found, report, warnings
 

@@ -10,8 +10,8 @@ from __future__ import annotations
 import copy
 import logging
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any, Self
@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from recon.least_squares.inset_problem import InsetProblem
-from recon.mbir.network import NetworkConfig
+from recon.mbir.priors import Prior, name_of, network_of, prior_of
 from recon.mbir.problem import NormalisedProblem
 from recon.mbir.unrolled import DEFAULT_FIDELITY, Unrolled, fidelity_frequency
 from recon.mbir.weights_io import digest, read_tensors
@@ -55,53 +55,81 @@ class Reconstructed:
 
 
 class Mbir:
-    """The unrolled reconstruction with trained weights.
+    """The unrolled reconstruction with trained weights, or with another prior.
 
     Args:
-        model: with its weights.
+        model: with its weights; None: the one that ships, or with ``prior`` one step of that.
         fidelity: 0 (viewing) … 1 (measuring), see :mod:`recon.mbir.unrolled`.
-        parts: for ablations, ``steps``, ``final_data_consistency``, ``prior``, ``cut_overshoot`` and ``restore`` of
+        prior: in the place of the model's network: a prior, a denoiser, or a name
+            (:func:`recon.mbir.priors.prior_of`).
+        parts: for ablations, ``steps``, ``final_data_consistency``, ``cut_overshoot`` and ``restore`` of
             :meth:`recon.mbir.unrolled.Unrolled.forward`.
 
     Raises:
-        ValueError: a fidelity outside of 0 … 1.
+        ValueError, TypeError: a fidelity outside of 0 … 1; what is no prior.
+        FileNotFoundError: the package has no weights.
     """
 
     name = "mbir"
+    model: Unrolled
 
-    def __init__(self, model: Unrolled, fidelity: float = DEFAULT_FIDELITY, **parts: Any) -> None:
+    def __init__(
+        self,
+        model: Unrolled | None = None,
+        fidelity: float = DEFAULT_FIDELITY,
+        *,
+        prior: Prior | str | None = None,
+        **parts: Any,
+    ) -> None:
         fidelity_frequency(fidelity)
+        if prior is not None:
+            prior = parts["prior"] = prior_of(prior)
+        if model is None:
+            model = Unrolled(prior, steps=1) if prior is not None else Mbir.load().model
         self.model = model.eval().requires_grad_(False)
         self.fidelity = fidelity
         self.parts = parts
-        self.voxel_mm = model.network.config.voxel_mm
+        self.voxel_mm = model.voxel_mm
 
     @classmethod
     @undisturbed
-    def load(cls, path: str | Path | None = None, fidelity: float = DEFAULT_FIDELITY) -> Mbir:
+    def load(cls, path: str | Path | None = None, fidelity: float = DEFAULT_FIDELITY, network: Any = None) -> Mbir:
         """From a weights file; None: the weights that ship with the package.
 
         Args:
             path: of the file.
             fidelity: as for the class.
+            network: for weights of another network than the package's: its class, ``package.module:Class`` or the class
+                or a module itself (:func:`recon.mbir.priors.network_of`). A file alone imports nothing.
 
         Raises:
             FileNotFoundError: no such file.
-            ValueError: a file that is damaged or holds no weights of this model.
+            ValueError: a file that is damaged or holds no weights of this model; of another network which is not named.
         """
         source = Path(path) if path is not None else Path(str(resources.files("recon") / "mbir" / "weights" / SHIPPED))
         if not source.is_file():
             raise FileNotFoundError(f"no weights at {source}: train them (torchpcct train) or name a file")
         try:
             tensors, config = read_tensors(source, WEIGHTS_FORMAT)
-            model = Unrolled(NetworkConfig(**config["network"]), steps=config["unroll"])
-            model.load_state_dict(tensors)
+            prior = network_of(config["network"], network)
+            model = Unrolled(prior, steps=config["unroll"], voxel_mm=config.get("voxel_mm"))
+            _fill(model, tensors)
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             raise ValueError(
                 f"{source} holds no weights of this unrolled reconstruction: {error} (shipped weights come back with "
                 "a new installation of the package)"
             ) from error
         return cls(model, fidelity)
+
+    @property
+    def prior_name(self) -> str:
+        """Of what stands between the data steps."""
+        return name_of(self.parts.get("prior", self.model.network))
+
+    @property
+    def made_with(self) -> dict[str, str]:
+        """For a report: the weights, or the prior in their place."""
+        return {"prior": self.prior_name} if "prior" in self.parts else {"weights_sha256": self.weights_sha256}
 
     @property
     def weights_sha256(self) -> str:
@@ -117,7 +145,9 @@ class Mbir:
                 "recon.mbir.mbir.working_grid and average the result onto the grid"
             )
         exposure = torch.full((b.shape[0],), float(exposure_s))
-        return NormalisedProblem.from_statistic(problem.gram, b, exposure, problem.mu_ref / 1000.0, self.voxel_mm)
+        made = NormalisedProblem.from_statistic(problem.gram, b, exposure, problem.mu_ref / 1000.0, self.voxel_mm)
+        level = torch.tensor(problem.level, dtype=torch.float64)
+        return replace(made, zero_hu=float(to_hu(level, problem.mu_ref)))
 
     @undisturbed
     def __call__(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> Tensor:
@@ -135,7 +165,32 @@ class Mbir:
     def solved(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> Reconstructed:
         """The same with what it was made of."""
         normal = self.problem(problem, b, exposure_s)
-        return Reconstructed(normal, self.model(normal, self.fidelity, **self.parts), [{} for _ in range(b.shape[0])])
+        return Reconstructed(normal, self.solution(normal), [{} for _ in range(b.shape[0])])
+
+    def solution(self, normal: NormalisedProblem, **parts: Any) -> Tensor:
+        """u of a normalised problem, ``(batch, z, y, x)``.
+
+        Args:
+            normal: the problem.
+            parts: arguments of the model that those of this method go before.
+
+        Raises:
+            ValueError, TypeError: the prior returns NaN, or something else than a volume like the one that it is given.
+        """
+        sound = True
+
+        def watch(step: int, v: Tensor) -> None:
+            nonlocal sound
+            bad = int((~torch.isfinite(v)).sum()) if sound else 0
+            sound = sound and not bad
+            if bad and step:
+                raise ValueError(
+                    f"the prior {self.prior_name} returned NaN or infinite values in {bad} of {v.numel()} voxels: use "
+                    "other weights, or another prior"
+                )
+
+        found: Tensor = self.model(normal, self.fidelity, callback=watch, **{**parts, **self.parts})
+        return found
 
     @staticmethod
     def in_hu(problem: InsetProblem, u: Tensor, normal: NormalisedProblem) -> Tensor:
@@ -148,6 +203,16 @@ class Mbir:
         """The inverse of :meth:`in_hu`."""
         scale = normal.scale_hu.reshape(-1, 1, 1, 1) * (problem.mu_ref / 1000.0)
         return (from_hu(hu, problem.mu_ref) - problem.level) / scale
+
+    def with_prior(self, prior: Prior | str) -> Self:
+        """The same method with another prior.
+
+        Raises:
+            ValueError, TypeError: what is no prior.
+        """
+        other = copy.copy(self)
+        other.parts = {**self.parts, "prior": prior_of(prior)}
+        return other
 
     def with_fidelity(self, fidelity: float) -> Self:
         """The same method with another fidelity.
@@ -179,7 +244,12 @@ class Mbir:
     def noisier_or_quieter(self, scales: Sequence[float]) -> list[float]:
         """Those of the noise scales in HU that the training has not seen."""
         low, high = self.model.seen_scale_hu.tolist()
-        return [s for s in scales if not 0.98 * low <= s <= 1.02 * high]
+        return [s for s in scales if self.trained and not 0.98 * low <= s <= 1.02 * high]
+
+    @property
+    def trained(self) -> bool:
+        """Whether the prior has been trained on scans of some noise: a filter knows any."""
+        return "prior" not in self.parts and float(self.model.seen_scale_hu[1]) > 0
 
     def check(self, scales: Sequence[float], peak: float, unit: str = "HU", mu_water: float = 0.02) -> list[str]:
         """What speaks against trusting the network.
@@ -202,11 +272,26 @@ class Mbir:
         if peak > LARGEST_HU:
             most, largest = (in_words(v, unit, mu_water, difference=False) for v in (peak, LARGEST_HU))
             what = "metal shades the tissue beside it" if unit == "HU" else "what is so dense shades what is beside it"
+            more, learned = f"the volume reaches {most}, more than", ", and the prior has not learned that"
             found.append(
-                f"the volume reaches {most}, more than the {largest} of the training: {what}, and the prior has not "
-                "learned that"
+                f"{more} the {largest} of the training: {what}{learned}"
+                if self.trained
+                else f"{more} {largest}: {what}"
             )
         return found
+
+
+def _fill(model: Unrolled, tensors: Mapping[str, Tensor]) -> None:
+    """Put weights into a model (ValueError: they are of another one)."""
+    state = model.state_dict()
+    for name in [*state, *tensors]:
+        there, here = (tuple(part[name].shape) if name in part else "none" for part in (tensors, state))
+        if there != here:
+            raise ValueError(
+                f"they do not fit {name_of(model.network)}: {name} has the shape {there} in the file, {here} in the "
+                "network"
+            )
+    model.load_state_dict(tensors)
 
 
 def working_grid(grid: VolumeGrid, voxel_mm: float) -> VolumeGrid:

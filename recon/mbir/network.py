@@ -32,10 +32,12 @@ from recon.mbir.bilateral import joint_bilateral
 from torchpcct.projector.operator import apply_linear
 from torchpcct.validate import number, whole
 
-__all__ = ["GUIDE_VOXELS", "Network", "NetworkConfig", "bilateral_prior", "edge_preserved"]
+__all__ = ["GUIDE_VOXELS", "REFERENCE_SCALE_HU", "Network", "NetworkConfig", "bilateral_prior", "edge_preserved"]
 
 CONDITIONS = 3
 """Numbers that steer the gains: logarithm of the noise scale, fidelity, step."""
+REFERENCE_SCALE_HU = 200.0
+"""Noise scale at which its conditioning variable is 0: about 1 s of the paper's scan."""
 GUIDE_VOXELS = 1.4
 """Width of the Gaussian that makes the bilateral filter's guide."""
 _FIRST, _SECOND = (2.8, 2.5, 1), (1.4, 4.0, 2)

@@ -32,6 +32,7 @@ class NormalisedProblem:
         scale_hu: ``(batch,)`` noise scales c.
         factor: ``(batch,)`` so that H = factor · G.
         voxel_mm: voxel size.
+        zero_hu: HU where u is 0, that of the surround.
     """
 
     gram: NormalOperator
@@ -39,6 +40,7 @@ class NormalisedProblem:
     scale_hu: Tensor
     factor: Tensor
     voxel_mm: float
+    zero_hu: float = 0.0
 
     @classmethod
     def from_statistic(

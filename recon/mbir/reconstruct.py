@@ -34,6 +34,7 @@ def reconstruct_mbir(
     progress: Callable[[float], None],
     *,
     network: Mbir | None = None,
+    prior: Any = None,
     problem: InsetProblem | None = None,
     batch: int = 4,
     fidelity: float | None = None,
@@ -52,6 +53,8 @@ def reconstruct_mbir(
         grid: the inset, or the field.
         progress: called with the finished fraction.
         network: with its weights; None: those of the package.
+        prior: in the place of the network, which keeps the data steps: a prior, a denoiser of HU, or a name such as
+            ``perona-malik`` or ``package.module:function`` (:func:`recon.mbir.priors.prior_of`).
         problem: kept from an earlier call with the same scan and (working) grid; None: made here.
         batch: volumes at a time.
         fidelity: from 0 (quiet images for viewing) to 1 (for measuring: more of the contrast and more noise), see
@@ -71,18 +74,21 @@ def reconstruct_mbir(
     Yields:
         Volumes in HU, batch by batch. Report: ``iterations``, ``fidelity``, ``residual`` (what is left of the data at
         the low frequencies that are the data's own, over what there was, :func:`recon.mbir.unrolled.low_residual`),
-        ``chi2`` (weighted squared residual per reading), ``weights_sha256``, of noisy scans ``residual_p``
-        (:mod:`torchpcct.metrics.residual_test`: does the volume explain its data?), ``warnings``; with ``vessel``
-        or ``tissues``, under ``vessel``, whether one was drawn (``drawn``) or ``why`` not, and where it was,
-        ``drawn_minus_plain_hu``, the difference from the volume without drawing, like the volume in HU; with
+        ``chi2`` (weighted squared residual per reading), ``weights_sha256`` or the name of the ``prior``, of noisy
+        scans ``residual_p`` (:mod:`torchpcct.metrics.residual_test`: does the volume explain its data?), ``warnings``;
+        with ``vessel`` or ``tissues``, under ``vessel``, whether one was drawn (``drawn``) or ``why`` not, and where it
+        was, ``drawn_minus_plain_hu``, the difference from the volume without drawing, like the volume in HU; with
         ``tissues`` what was read of them, under that name.
 
     Raises:
         ValueError, TypeError: see :class:`recon.least_squares.inset_problem.InsetProblem`; an inset of a scanner whose
             cells have another size than the network's voxels by far; a problem that was made for another grid; a
-            fidelity outside of 0 … 1; for a whole field see :func:`recon.mbir.field.field_solutions`.
+            fidelity outside of 0 … 1; what is no prior, or returns NaN or another kind of volume; for a whole field see
+            :func:`recon.mbir.field.field_solutions`.
         FileNotFoundError: the package has no weights.
     """
+    if prior is not None:
+        network = network.with_prior(prior) if network is not None else Mbir(prior=prior)
     network = network or Mbir.load()
     if look is not None:
         fidelity = renamed("look", "fidelity", look)
@@ -128,7 +134,7 @@ def reconstruct_mbir(
             report: dict[str, Any] = {
                 "method": "mbir", "iterations": network.model.steps, "fidelity": network.fidelity,
                 "residual": residuals[k], "chi2": (statistic.energy + float(misfit[k])) / statistic.readings,
-                "weights_sha256": network.weights_sha256, **solution.notes[k],
+                **network.made_with, **solution.notes[k],
             }  # fmt: skip
             seen = network.check([float(normal.scale_hu[k])], float(volume.max()), scan.unit, problem.mu_ref)
             warnings = [*report.pop("warnings", []), *seen]

@@ -4,7 +4,8 @@ In the normalised problem (:mod:`recon.mbir.problem`), f in line pairs per mm:
 
 1. Start: the Wiener filter v = (H + λ + μ f²)⁻¹ β; linear, and the same at every dose.
 2. K times: d = v + (H_c + δ)⁻¹ (β − H v), a step towards the data with the circulant H_c for H in its inverse, and
-   v ← N(v, d), the same network N each time (:mod:`recon.mbir.network`).
+   v ← N(v, d), the same prior N each time: the network (:mod:`recon.mbir.network`), or another one
+   (:mod:`recon.mbir.priors`).
 3. Data consistency: the u that minimises ½ uᵀH u − βᵀu + ½ (u − v)ᵀ Q (u − v) with Q = H_c (1/L − 1) and a Gaussian
    low-pass L of half height at f_c. Below f_c the volume is the data's own linear estimate, unbiased whatever the
    network has learned; above, the network decides.
@@ -22,13 +23,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from recon.conjugate_gradient import conjugate_gradient
-from recon.mbir.network import GUIDE_VOXELS, Network, NetworkConfig, edge_preserved
+from recon.mbir.network import GUIDE_VOXELS, REFERENCE_SCALE_HU, Network, NetworkConfig, edge_preserved
+from recon.mbir.priors import PlugAndPlay, Prior, prior_of, same_kind
 from recon.mbir.problem import NormalisedProblem, filtered, squared_frequencies
 from recon.mbir.residual import significant_residual
 from torchpcct.switches import undisturbed
@@ -40,6 +43,7 @@ __all__ = [
     "Prior",
     "Unrolled",
     "Views",
+    "bound",
     "fidelity_frequency",
     "first_views",
     "guide_noise",
@@ -48,11 +52,7 @@ __all__ = [
     "start",
 ]
 
-Prior = Callable[..., Tensor]
-"""A :class:`recon.mbir.network.Network`, or a function with the arguments of its ``forward``."""
 Views = tuple[Tensor, Tensor, Tensor | None]
-REFERENCE_SCALE_HU = 200.0
-"""Noise scale at which its conditioning variable is 0: about 1 s of the paper's scan."""
 DEFAULT_FIDELITY = 0.5
 """Between the least error, at fidelity 0, and contrast, which a higher fidelity gives and noise pays for."""
 
@@ -86,17 +86,36 @@ def fidelity_frequency(fidelity: float) -> float:
 
 
 class Unrolled(nn.Module):
-    """K steps with one network.
+    """K steps with one prior.
 
     Args:
-        config: of the network.
+        network: the package's, or any other prior or denoiser (:func:`recon.mbir.priors.prior_of`); its configuration,
+            or None for the usual one, makes the package's.
         steps: K.
+        voxel_mm: cubic voxels that another prior works on; the package's network knows them.
+        bilateral: whether another prior is given the filtered view of the data; if it is, overshoot is cut off by it.
+
+    Raises:
+        ValueError, TypeError: what is no prior; other voxels than those of the package's network.
     """
 
-    def __init__(self, config: NetworkConfig | None = None, steps: int = 2) -> None:
+    def __init__(
+        self,
+        network: Prior | str | NetworkConfig | None = None,
+        steps: int = 2,
+        *,
+        voxel_mm: float | None = None,
+        bilateral: bool = True,
+    ) -> None:
         super().__init__()
-        self.network = Network(config)
-        self.bilateral = self.network.config.bilateral
+        own = network is None or isinstance(network, NetworkConfig)
+        prior: Any = Network(network) if own else prior_of(network)  # type: ignore[arg-type]
+        config = prior.config if isinstance(prior, Network) else NetworkConfig(bilateral=bilateral)
+        if isinstance(prior, Network) and voxel_mm not in (None, config.voxel_mm):
+            raise ValueError(f"the network is for voxels of {config.voxel_mm:g} mm, got voxel_mm={voxel_mm!r}")
+        self.network = prior
+        self.voxel_mm = number("voxel_mm", config.voxel_mm if voxel_mm is None else voxel_mm, positive=True, unit="mm")
+        self.bilateral = config.bilateral
         self.steps = whole("steps", steps)
         self.seen_scale_hu: Tensor
         # What the training has seen, so that the weights know themselves where they may be trusted.
@@ -125,12 +144,15 @@ class Unrolled(nn.Module):
             steps: fewer than K; None: K. With 0 the reconstruction is linear, and the solves go on until it is.
             views: :func:`first_views` of the problem, where they are known already.
             final_data_consistency: whether that step is taken; without it the network's last volume is the result.
-            prior: in the place of the network: block by block (:mod:`recon.mbir.field`), or for comparisons
-                (:func:`recon.mbir.network.bilateral_prior`).
+            prior: in the place of the network: block by block (:mod:`recon.mbir.field`), or another one
+                (:func:`recon.mbir.priors.prior_of` makes it).
             cut_overshoot: whether :func:`limited` is applied, if the network has a filtered view.
             restore: whether what the data still hold is put back. A training does not, and a linear reconstruction
                 has no need to.
             solves: conjugate gradients of start and data consistency; None: those of an inset's model.
+
+        Raises:
+            ValueError, TypeError: the prior returns something else than a volume like the one that it is given.
         """
         scale = problem.scale_hu
         if self.training:
@@ -145,11 +167,12 @@ class Unrolled(nn.Module):
         v = start(problem, spectrum, solves[0]) if views is None else views[0]
         if callback is not None:
             callback(0, v)
+        used = bound(self.network if prior is None else prior, problem, spectrum)
         smoothed = None
         for k in range(self.steps if steps is None else steps):
             _, towards, smoothed = views if views and k == 0 else _views(problem, spectrum, v, noise, self.bilateral)
             condition = torch.stack([level, fidelities - 0.5, torch.full_like(level, float(k))], 1)
-            v = (prior or self.network)(v, towards, condition, smoothed)
+            v = same_kind(used(v, towards, condition, smoothed), v, used)
             if callback is not None:
                 callback(k + 1, v)
         u = consistent(problem, spectrum, v, fidelities, solves[1]) if final_data_consistency else v
@@ -158,6 +181,14 @@ class Unrolled(nn.Module):
         if steps == 0 or self.training or not restore:
             return u
         return u + significant_residual(problem, spectrum, u, _TOWARDS)
+
+
+def bound(prior: Prior, problem: NormalisedProblem, spectrum: Tensor) -> Prior:
+    """A prior that is told the noise of a problem, if it asks for it; ``spectrum`` is that of the problem."""
+    if not isinstance(prior, PlugAndPlay):
+        return prior
+    noise = guide_noise(spectrum, problem.beta.shape[-3:], problem.voxel_mm, prior.smoothed_by)
+    return prior.told(noise, problem.zero_hu)
 
 
 def first_views(problem: NormalisedProblem, bilateral: bool) -> Views:
@@ -185,7 +216,7 @@ def start(problem: NormalisedProblem, spectrum: Tensor, iterations: int = _SOLVE
     )  # fmt: skip
 
 
-def guide_noise(spectrum: Tensor, shape: Sequence[int], voxel_mm: float) -> Tensor:
+def guide_noise(spectrum: Tensor, shape: Sequence[int], voxel_mm: float, smoothed_by: float = GUIDE_VOXELS) -> Tensor:
     """Standard deviation of the first step towards the data smoothed by a Gaussian, in noise units, ``(batch,)``.
 
     That step is linear in β, whose noise has the spectrum of H.
@@ -193,11 +224,12 @@ def guide_noise(spectrum: Tensor, shape: Sequence[int], voxel_mm: float) -> Tens
     Args:
         spectrum: of H, ``(batch, z, y, x//2 + 1)``.
         shape: of the volume; voxel_mm: its voxels.
+        smoothed_by: standard deviation of the Gaussian in voxels; 0: of the step itself.
     """
     f2 = squared_frequencies(shape, voxel_mm, spectrum)
     prior = _START[0] + _START[1] * f2
     passed = (1.0 + prior / (spectrum + _TOWARDS)) / (spectrum + prior)
-    blur = torch.exp(-2.0 * (math.pi * GUIDE_VOXELS * voxel_mm) ** 2 * f2)
+    blur = torch.exp(-2.0 * (math.pi * smoothed_by * voxel_mm) ** 2 * f2)
     power = (passed * blur).square() * spectrum
     # Frequencies of a real volume come in pairs, but for the first along x and, of an even number, the last.
     pairs = torch.full((spectrum.shape[-1],), 2.0, dtype=spectrum.dtype, device=spectrum.device)
