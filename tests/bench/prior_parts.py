@@ -25,6 +25,7 @@ from torch import Tensor
 from recon.mbir.mbir import Mbir
 from recon.mbir.network import bilateral_prior
 from recon.mbir.outlines import Drawn, OutlineMbir
+from recon.mbir.priors import prior_of
 from recon.plaque.layer import LayerField
 
 HERE = Path(__file__).parent
@@ -47,19 +48,24 @@ class _OneLength(OutlineMbir):
 
 
 USES: dict[str, Callable[[Mbir], Mbir]] = {
-    "as it ships, around a vessel's outlines": OutlineMbir,
-    "outlines, what is in the layer correlated over 0.5 mm in every direction": _OneLength,
-    "outlines, eight turns of the network instead of four": lambda n: OutlineMbir(Mbir(n.model, prior=n.model.network)),
-    "outlines, and the filtered view in place of the network": lambda n: OutlineMbir(
-        Mbir(n.model, prior=bilateral_prior)
-    ),
-    "outlines, nothing put back": lambda n: OutlineMbir(Mbir(n.model, restore=False)),
-    "without outlines": lambda n: n,
-    "without outlines, overshoot beside edges not cut off": lambda n: Mbir(n.model, cut_overshoot=False),
-    "without outlines, one orientation instead of eight": _one_orientation,
-    "without outlines and data consistency at the end": lambda n: Mbir(n.model, final_data_consistency=False),
-    "without outlines, the filtered view alone, no network": lambda n: Mbir(n.model, prior=bilateral_prior),
+    "as it ships": lambda n: n,
+    "overshoot beside edges not cut off": lambda n: Mbir(n.model, cut_overshoot=False),
+    "nothing put back": lambda n: Mbir(n.model, restore=False),
+    "one orientation of the network instead of eight": _one_orientation,
+    "no data consistency at the end": lambda n: Mbir(n.model, final_data_consistency=False),
+    "its filtered view in the network's place": lambda n: Mbir(n.model, prior=bilateral_prior),
+    "Perona and Malik's filter in the network's place": lambda n: Mbir(n.model, prior=prior_of("perona-malik")),
     "the linear start alone": lambda n: Mbir(n.model, steps=0),
+    "around a drawn vessel": OutlineMbir,
+    "drawn, what is in the layer correlated over 0.5 mm in every direction": _OneLength,
+    "drawn, eight turns of the network instead of four": lambda n: OutlineMbir(Mbir(n.model, prior=n.model.network)),
+    "drawn, overshoot not cut off": lambda n: OutlineMbir(Mbir(n.model, cut_overshoot=False)),
+    "drawn, nothing put back": lambda n: OutlineMbir(Mbir(n.model, restore=False)),
+    "drawn, no data consistency at the end": lambda n: OutlineMbir(Mbir(n.model, final_data_consistency=False)),
+    "drawn, the filtered view in the network's place": lambda n: OutlineMbir(Mbir(n.model, prior=bilateral_prior)),
+    "drawn, Perona and Malik's filter in the network's place": lambda n: OutlineMbir(
+        Mbir(n.model, prior=prior_of("perona-malik"))
+    ),
 }
 
 
