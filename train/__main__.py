@@ -109,6 +109,11 @@ def build(config: TrainConfig, views: Path, device: str = "cpu") -> tuple[Unroll
     if not any(p.requires_grad for p in network.parameters()):
         raise ValueError(f"network {config.network['class']} has no parameters that a training could change")
     model = Unrolled(network, steps=config.unroll, voxel_mm=None if own else config.data.voxel_mm).to(where)
+    if model.network is not network:
+        raise TypeError(
+            f"network {config.network['class']} is a denoiser: one to be trained takes (estimate, towards, condition, "
+            "smoothed) as forward of recon.mbir.network.Network does"
+        )
     fast = where.type == "cuda" or torch.ops.mkldnn._is_mkldnn_bf16_supported()
     if isinstance(model.network, Network):
         model.network.half_precision = config.bfloat16 and fast

@@ -217,6 +217,8 @@ def _mbir(spec: str, rest: str) -> Method:
     else:
         network = Mbir.load(given.get("weights"), network=given.get("network"))
     key = network.weights_sha256
+    if "network" in given:
+        key += _source_of(network.model.network)
     if prior is not None:
         network, key = network.with_prior(prior), f"{key} {_source_of(prior)}"
     if "fidelity" in given:
