@@ -307,8 +307,8 @@ def denoiser_of(function: Callable[..., Any]) -> Callable[[Tensor, Callable[[], 
 
     Args:
         function: of ``(volume)`` or ``(volume, sigma)``: HU ``(z, y, x)`` float32, and the standard deviation of a
-            voxel's noise in HU; it gives the same shape. Or a denoiser of deepinv itself, which sees images ``(batch,
-            channel, ...)``: that becomes :func:`deepinv_denoiser`, of slices unless it convolves in 3-D.
+            voxel's noise in HU; it gives the same shape. Or a denoiser of deepinv itself, whose images have axes for
+            batch and channel: that becomes :func:`deepinv_denoiser`, of slices unless it convolves in 3-D.
     """
     if any(kind.__module__.partition(".")[0] == "deepinv" for kind in type(function).__mro__):
         whole_volumes = isinstance(function, nn.Module) and any(isinstance(m, nn.Conv3d) for m in function.modules())

@@ -206,7 +206,7 @@ def test_filters_by_name_and_functions_of_the_volume_alone(normal):
 
 @pytest.mark.parametrize("kind", [nn.Conv2d, nn.Conv3d])
 def test_denoisers_of_deepinv_are_known_by_their_module(kind):
-    """They see images (batch, channel, …) whose values are about 1: slices, or volumes if they convolve in 3-D."""
+    """They see images with batch and channel whose values are about 1: slices, or volumes if they convolve in 3-D."""
     seen = []
 
     class Denoiser(nn.Module):
