@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchpcct.geometry import Geometry
+from torchpcct.scan_grid import cells_at_axis
 from torchpcct.scanner.linearisation import WaterLinearisation
 from torchpcct.validate import number
 
@@ -34,8 +35,9 @@ __all__ = [
     "smoothed",
 ]
 
-_PSEUDO_WATER = 0.02
-"""Attenuation in mm⁻¹ that stands for water where a scan is not in HU: it sets the scale of priors, nothing else."""
+_PSEUDO_DEPTH = 5.0
+"""Line integral through as much water as all columns see at the axis, where a scan is not in HU. The attenuation that
+so stands for water (0.02 mm⁻¹ where they see 25 cm) sets the scale of priors, nothing else; it scales as lengths do."""
 _SILENT_VIEWS = 8
 """Cells that read nothing in so many views, or more, are dead."""
 _DARK = 1e-3
@@ -100,9 +102,13 @@ def _shapes(name: str, readings: Tensor, geometry: Geometry) -> tuple[int, ...]:
     return (*readings.shape[:-axes], *geometry.shape[1:])
 
 
-def _correction(linearisation: Any, columns: int, mu_water: float | None) -> tuple[WaterLinearisation, str]:
+def _correction(linearisation: Any, geometry: Geometry, mu_water: float | None) -> tuple[WaterLinearisation, str]:
     """The map of line integrals, and the unit of volumes."""
-    mu = _PSEUDO_WATER if mu_water is None else number("mu_water", mu_water, positive=True, unit="mm⁻¹")
+    columns = geometry.columns
+    if mu_water is None:
+        mu = _PSEUDO_DEPTH / (columns * cells_at_axis(geometry)[-1])
+    else:
+        mu = number("mu_water", mu_water, positive=True, unit="mm⁻¹")
     unit = "mm^-1" if mu_water is None else "HU"
     if isinstance(linearisation, WaterLinearisation):
         if linearisation.scale.size != columns:
@@ -216,7 +222,7 @@ def counted(
     low = float(counts.min())
     if low < 0 and not offset and not electronic_noise:
         raise ValueError(f"counts must not be negative, the lowest is {low:g}: give dark=, or use from_line_integrals")
-    correction, unit = _correction(linearisation, geometry.columns, mu_water)
+    correction, unit = _correction(linearisation, geometry, mu_water)
     integrating = offset or electronic_noise > 0
     fields: dict[str, Any] = {
         "counts": counts,
@@ -266,7 +272,7 @@ def logged(
     air = air.expand(cells).clone()
     if not bool(((air > 0) & torch.isfinite(air)).all()):
         raise ValueError("photons must be finite and greater than 0 in every cell")
-    correction, unit = _correction(linearisation, geometry.columns, mu_water)
+    correction, unit = _correction(linearisation, geometry, mu_water)
     return {
         "counts": torch.exp(-p).mul_(_views(air, geometry)),
         "air": air,

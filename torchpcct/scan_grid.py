@@ -84,10 +84,10 @@ def _of_axes(scan: Any, extent: Any, center: Any) -> tuple[list[float] | None, l
 def _field_of_view(g: Any) -> tuple[float, float]:
     """Size of a cell at the axis, and radius of what is seen, mm."""
     if isinstance(g, VectorGeometry):
-        return g.cell, float(g.border_rays()[0].max())
+        return _cell(g), float(g.border_rays()[0].max())
     if isinstance(g, ParallelBeam):
         u = g.column_positions
-        return g.pitch, float(max(-u[0], u[-1]))
+        return _cell(g), float(max(-u[0], u[-1]))
     radius = g.sod * math.sin(float(np.abs(g.fan_angles).max()))
     if is_offset(g) and view_steps(g.angles)[2] < 2.0 * math.pi:
         radius = g.fov_radius  # of a short scan the lines that the short side measures, too
@@ -95,6 +95,10 @@ def _field_of_view(g: Any) -> tuple[float, float]:
 
 
 def _cell(g: Any) -> float:
+    if isinstance(g, VectorGeometry):
+        return g.cell
+    if isinstance(g, ParallelBeam):
+        return float(g.pitch)
     pitch = g.pitch[1] if isinstance(g, ConeBeam) else g.pitch
     return float(pitch / g.magnification)
 
@@ -104,7 +108,7 @@ def cells_at_axis(geometry: Any) -> tuple[float, float, float]:
 
     Of a geometry view by view the median over its views.
     """
-    cell, _ = _field_of_view(geometry)
+    cell = _cell(geometry)
     if isinstance(geometry, ConeBeam):
         return geometry.pitch[0] / geometry.magnification, cell, cell
     if isinstance(geometry, VectorGeometry) and geometry.rows is not None:

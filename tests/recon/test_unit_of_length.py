@@ -70,6 +70,23 @@ def test_fbp_and_pwls(name, method):
         assert len(found.report["warnings"]) == len(wanted.report["warnings"])
 
 
+@pytest.mark.parametrize("method", ["fbp", "pwls"])
+@pytest.mark.parametrize("name", ["parallel", "vectors", "cone"])
+def test_scans_that_do_not_know_water(name, method):
+    """Volumes in mm⁻¹: as many times smaller as lengths are larger."""
+    wanted = reconstruct(*without_water(name, 1.0), method)
+    assert wanted.unit == "mm^-1"
+    for k in SCALES:
+        found = reconstruct(*without_water(name, k), method)
+        torch.testing.assert_close(k * found.data, wanted.data, atol=0.02 * 1e-4, rtol=0)
+        assert len(found.report["warnings"]) == len(wanted.report["warnings"])
+
+
+def without_water(name, k):
+    known, grid = scan(name, k)
+    return Scan.from_counts(known.counts, known.geometry, air=2e4), grid
+
+
 def test_mbir_of_a_field():
     wanted = reconstruct(*scan("parallel", 1.0), "mbir")
     torch.testing.assert_close(reconstruct(*scan("parallel", 1e-3), "mbir").data, wanted.data, atol=0.1, rtol=0)

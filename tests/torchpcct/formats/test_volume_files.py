@@ -382,6 +382,25 @@ def test_a_clinical_slice_reads_as_pydicom_says(tmp_path):
     np.testing.assert_array_equal(volume.data[0].numpy(), expected[::-1, ::-1])
 
 
+@pytest.mark.parametrize("turned", [(1, 1), (1, -1), (-1, 1), (-1, -1)])
+def test_a_foreign_series_lies_where_others_see_it(tmp_path, turned):
+    """Rows and columns of any direction: every pixel where its position, orientation and spacing put it, as in ITK."""
+    Volume(DATA, GRID).save(tmp_path / "s")
+    for k, path in enumerate(sorted((tmp_path / "s").iterdir())):
+        d = pydicom.dcmread(path)
+        d.Manufacturer, d.ImageOrientationPatient = "another", [turned[0], 0, 0, 0, turned[1], 0]
+        d.ImagePositionPatient = [41.5, -17.25, 8.0 + 1.5 * k]
+        d.save_as(path)
+    volume, image = Volume.load(tmp_path / "s"), sitk_read(tmp_path / "s")
+    z, y, x = volume.grid.axes
+    assert sorted(z) == list(z)
+    for index in np.ndindex(5, 6, 4):  # column, row, slice
+        right, down, up = image.TransformIndexToPhysicalPoint(index)
+        at = [int(np.abs(axis - v).argmin()) for axis, v in zip((z, y, x), (up, -down, -right), strict=True)]
+        np.testing.assert_allclose([z[at[0]], y[at[1]], x[at[2]]], [up, -down, -right], atol=1e-4)
+        assert float(volume.data[tuple(at)]) == float(image[index])
+
+
 def test_unknown_endings_and_oblique_axes(tmp_path):
     with pytest.raises(ValueError, match=r"unknown volume format 'v\.png': use \.nii"):
         Volume(DATA, GRID).save(tmp_path / "v.png")
