@@ -11,7 +11,8 @@ object that has moved, it is as large as so many steps. Over a full turn the las
 that travels during the turn (a helix), or anything else that does not come back, shows there. Views in random order
 have no smooth functions of the angle at all: the mean squared difference of neighbours is that of any two views (von
 Neumann 1941, Ann. Math. Stat. 12:367). Views that alternate (a focal spot that flies) leave a residual that alternates
-and looks like the slope along the columns or rows.
+and looks like the slope along the columns or rows. Angles that scatter about the described ones leave one in all views
+that looks like the change itself.
 
 Each mean is taken twice, over columns that share no noise; products of the two are squares without noise, and what the
 two differ by is the noise.
@@ -56,6 +57,12 @@ _SHARE, _SHARE_AT_THE_END, _SHARE_OF_MANY, _FEW_WINDOWS = 0.4, 0.25, 0.15, 5
 """Share of the windows on the object that a view at a wrong place changes, that a travel changes which only shows where
 the object has an upper or lower end, that many steps forward change beyond the noise; and windows below which nearly
 all must."""
+_SCATTER, _SCATTER_SIGMAS, _LIKE_THE_CHANGE, _CLEAR = (0.3, 0.8), 5.0, (0.6, 1.6), 0.5
+"""Median residual in steps of angles that scatter (more: the views are in no order), and the standard errors by which
+it is none of noise; share of it that must look like the change; and squared change over its noise below which nothing
+is said. Edges leave up to 0.23 in sound scans."""
+_STEPS_A_RESIDUAL = 0.6745 * math.sqrt(7.0)
+"""Median size of the residual of angles that scatter independently by one step (normal, rms)."""
 _REACH = 4
 """Views on either side that foretell a change, and one more."""
 _STEADY = 1.5
@@ -89,9 +96,9 @@ def neighbour_test(lines: Tensor, geometry: Geometry) -> ScanTest:
 
     Returns:
         The test of ``order`` (mean squared difference of neighbours over that of any two views: 1 in random order),
-        ``jump`` (largest distance of two neighbours beyond the described one, in steps) and ``alternation`` (shift of
-        views that alternate, in cells at the axis). :data:`~torchpcct.checks.opposite_rays.UNKNOWN` of fewer than 24
-        views or 24 columns.
+        ``jump`` (largest distance of two neighbours beyond the described one, in steps), ``alternation`` (shift of
+        views that alternate, in cells at the axis) and ``scatter`` (of the angles about the described ones, in steps).
+        :data:`~torchpcct.checks.opposite_rays.UNKNOWN` of fewer than 24 views or 24 columns.
 
     Raises:
         ValueError: a wrong shape, NaN or Inf.
@@ -115,15 +122,19 @@ def neighbour_test(lines: Tensor, geometry: Geometry) -> ScanTest:
                 "are wrong; everything in the volume is"
             )
             return ScanTest(sizes, errors, tuple(findings))
-    jumps = views.jumps()
+    jumps, alternating, scatter = views.jumps(), views.alternation(), None
     if jumps is not None:
         sizes["jump"], errors["jump"] = jumps.size, jumps.error
         findings += jumps.findings
-    found = views.alternation()
-    if found is not None:
-        sizes["alternation"], errors["alternation"] = found[0], found[1]
-        if found[2] and not findings:
-            findings.append(found[2])
+        scatter = jumps.scatter
+    if alternating is not None:
+        sizes["alternation"], errors["alternation"] = alternating[0], alternating[1]
+        if alternating[2] and not findings:
+            findings.append(alternating[2])
+    if scatter is not None:
+        sizes["scatter"], errors["scatter"] = scatter[0], scatter[1]
+        if scatter[2] and not (alternating and alternating[2]):  # the largest of many jumps is none by itself
+            findings = [scatter[2]]
     return ScanTest(sizes, errors, tuple(findings))
 
 
@@ -132,6 +143,8 @@ class _Jumps:
     size: float
     error: float
     findings: tuple[str, ...]
+    scatter: tuple[float, float, str] | None
+    """Size, error and text."""
 
 
 class _Views:
@@ -264,6 +277,7 @@ class _Views:
         scale = max(float(np.median(usual)), float(np.mean(usual)) / 4.0)
         if scale <= 3.0 * float(np.median(noisy)) / math.sqrt(pairs):
             return None
+        scatter = self._scatter(left, foretold) if scale > _CLEAR * float(apart.mean()) else None
         steps = np.sqrt(np.maximum(square, 0.0) / scale)
         along = (left[0] * foretold[1] + left[1] * foretold[0]).sum(1) / 2.0
         seen = usual > 0.05 * scale
@@ -287,13 +301,40 @@ class _Views:
         # Of the square root of a sum whose noise is that of products with the signal.
         error = math.sqrt(float(noisy[most]) / scale / max(left[0].shape[1] / 2.0, 1.0) ** 0.5)
         if not found.any():
-            return _Jumps(float(steps[most]), error, ())
+            return _Jumps(float(steps[most]), error, (), scatter)
         at = sorted({int(first[k]) for k in np.flatnonzero(found) if _largest(square, int(k))})
         explained = bool(along_it[most])
         size = float(shift[most]) if explained else float(steps[most])
         sigmas = float(square[most] / max(noisy[most], 1e-300))
         text = self._jump_text(at, int(first[most]), size, sigmas, explained)
-        return _Jumps(float(steps[most]), error, (text,))
+        return _Jumps(float(steps[most]), error, (text,), scatter)
+
+    def _scatter(self, left: list[Floats], foretold: list[Floats]) -> tuple[float, float, str]:
+        """Of the angles about the described ones in steps, rms: what the residuals of all pairs have of the change.
+
+        Products of the two sets are squares without noise; the median passes over edges.
+        """
+        square, usual = ((x[0] * x[1]).sum(1) for x in (left, foretold))
+        clear = usual > 0.3 * float(np.median(usual))
+        one, other = ((left[k] * foretold[1 - k]).sum(1)[clear] / usual[clear] for k in range(2))
+        products = one * other
+        n, median = products.size, float(np.median(products))
+        error = math.sqrt(math.pi / 2.0 / n) * MEDIAN_TO_SD * float(np.median(np.abs(products - median)))
+        size = math.sqrt(max(median, 0.0))
+        steps = size / _STEPS_A_RESIDUAL
+        spread = error / (2.0 * max(size, math.sqrt(error), 1e-300)) / _STEPS_A_RESIDUAL
+        alike, whole = float((products * usual[clear]).sum()), float(square[clear].sum())
+        # Noise of the two sets has the same sign by chance.
+        sigmas = (2.0 * float((products > 0.0).mean()) - 1.0) * math.sqrt(n)
+        low, high = _LIKE_THE_CHANGE
+        if not (_SCATTER[0] < size < _SCATTER[1] and sigmas > _SCATTER_SIGMAS and low * whole < alike < high * whole):
+            return steps, spread, ""
+        return (
+            steps,
+            spread,
+            f"the views scatter by about {steps:.1g} of a step about the described angles ({sigmas:.0f} standard "
+            "errors): the gantry does not turn evenly, or the object trembles; give the measured angle of each view",
+        )
 
     def _share(self, left: list[Floats], change: list[Floats], columns: int, first: NDArray[np.int64]) -> Floats:
         """Share of the windows along the columns in which a pair of views is off by half a step or more.

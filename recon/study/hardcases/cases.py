@@ -73,7 +73,7 @@ class Case:
             then gets scans of it. What it adds to the sound scan's own bodies, and the voxels beside that, are left out
             of the errors.
         base: ``"plaque"``, ``"body"`` or ``"cone"``: whose scan is made hard.
-        unseen: why no data can show it; empty: they can.
+        unseen: why no data, or not these, can show it; empty: they can.
         other: the scene's own bodies differ from those of the sound scan: what the case adds to the error against its
             own truth counts.
         tissues: reconstructed by MBIR with tissues, too.
@@ -178,10 +178,15 @@ def _centre(columns: float) -> Case:
     )
 
 
-def _jitter(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
-    g = scan.geometry
-    step = 2 * np.pi / g.views
-    return replace(scan, geometry=replace(g, angles=g.angles + 0.01 * step * rng.standard_normal(g.views)))
+def _jitter(share: float) -> Apply:
+    """Angles that scatter by a share of a step."""
+
+    def apply(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
+        g = scan.geometry
+        step = 2 * np.pi / g.views
+        return replace(scan, geometry=replace(g, angles=g.angles + share * step * rng.standard_normal(g.views)))
+
+    return apply
 
 
 def _per_view(amplitude: float, drift: bool) -> Apply:
@@ -292,7 +297,7 @@ _PLAQUE: dict[str, Case] = {
     "too-short": _views("half a turn", _without(((180, 360),))),
     "60-views": _views("60 views", lambda n: np.linspace(0, n, 60, endpoint=False).astype(int)),
     "three-views": _views("three views", lambda n: np.linspace(0, n, 3, endpoint=False).astype(int)),
-    "jitter": Case("angles jitter by 1 % of a step", _jitter),
+    "jitter": Case("angles jitter by 1 % of a step", _jitter(0.01)),
     "centre-0.25": _centre(0.25),
     "centre-0.5": _centre(0.5),
     "centre-1": _centre(1.0),
@@ -463,6 +468,8 @@ def _line_integrals(scan: Scan, base: float) -> Scan:
 _TURNED = "the object turned is another object"
 _MIRRORED = "the object seen in a mirror is another object"
 _SIZED = "an object that is larger by as much and attenuates as much less has the same line integrals"
+_FAINT = "neighbouring views differ by less than their noise"
+_PLANE = "only the plane of the source has opposite rays, and rows beside it are averaged"
 _SCALED = "line integrals tell attenuation, not what of it is water's"
 
 _BODY: dict[str, Case] = {
@@ -475,6 +482,7 @@ _BODY: dict[str, Case] = {
         lambda g: replace(g, angles=np.linspace(0, 2 * math.pi, g.views)),
     ),
     "direction": _described("turns the other way", lambda g: replace(g, angles=-g.angles)),
+    "jitter": Case("angles jitter by 30 % of a step", _jitter(0.3), unseen=_FAINT),
     "start": _described("first view 10° wrong", lambda g: replace(g, angles=g.angles + math.radians(10)), _TURNED),
     "sdd-large": replace(_PLAQUE["sdd-large"], tissues=False),
     "sdd-small": _PLAQUE["sdd-small"],
@@ -679,6 +687,8 @@ def _tilted(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
 _CONE: dict[str, Case] = {
     "sound": Case("nothing", lambda clean, scan, rng: scan),
     "helix": _travelled("a helix of 20 mm a turn told as a circle", lambda angle: 20.0 * angle / (2 * math.pi)),
+    "sdd": _described("sdd 1 % too large", lambda g: replace(g, sdd=1.01 * g.sdd), _PLANE),
+    "jitter": Case("angles jitter by 30 % of a step", _jitter(0.3)),
     "wobble": _travelled("a table that wobbles by 3 mm along z", lambda angle: 3.0 * math.sin(3.0 * angle)),
     "tilt": Case("the gantry tilted by 12°", _tilted, unseen=_TURNED),
     "rows-reversed": Case("rows reversed", _read(lambda n, air, rng: n.flip(1)), unseen=_MIRRORED),

@@ -1,6 +1,7 @@
 """Neighbouring views: wrong order, missing and stuck views, travel and flying spots are found; sound scans are not."""
 
 import math
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -65,6 +66,20 @@ def test_views_in_random_or_text_order_are_named(kind):
         assert "order" in found[0]
     coarse = slice(None, None, 2)
     assert "not in the order" in _found(p[coarse][np.random.default_rng(1).permutation(90)], g.select(coarse))[0]
+
+
+@pytest.mark.parametrize("kind", GEOMETRIES)
+def test_angles_that_scatter_are_named_unless_they_are_described(kind):
+    g = GEOMETRIES[kind]
+    step = g.angles[1] - g.angles[0]
+    for share in (0.3, 0.4):
+        true = replace(g, angles=g.angles + np.random.default_rng(1).normal(0.0, share * step, VIEWS))
+        p = line_integrals(true, BODIES, sub=1)
+        (text,) = _found(p, g)
+        assert re.search(r"scatter by about 0\.\d of a step", text)
+        assert "scatter" not in str(_found(p, true))
+    test = neighbour_test(_lines(p), g)
+    assert 0.2 < test.sizes["scatter"] < 0.6
 
 
 @pytest.mark.parametrize("kind", GEOMETRIES)
