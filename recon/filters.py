@@ -330,7 +330,7 @@ def places_of(function: Callable[..., Any]) -> list[inspect.Parameter]:
 
 @checked
 def deepinv_denoiser(model: Callable[..., Any], *, unit_hu: float = 1000.0, slices: bool = False) -> Any:
-    """A denoiser of deepinv (``model(x, sigma)`` of ``(batch, channel, …)``) as :func:`denoiser` takes it.
+    """A denoiser of deepinv (``model(x, sigma)`` of images with batch and channel) as :func:`denoiser_of` takes it.
 
     Args:
         model: of images whose values are about 0 … 1.

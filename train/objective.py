@@ -26,8 +26,9 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from recon.mbir.network import bilateral_prior
+from recon.mbir.priors import Prior
 from recon.mbir.problem import NormalisedProblem
-from recon.mbir.unrolled import DEFAULT_FIDELITY, Prior, Views
+from recon.mbir.unrolled import DEFAULT_FIDELITY, Views
 from train.config import ObjectiveConfig
 from train.data import Batch, Data
 

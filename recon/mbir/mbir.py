@@ -18,7 +18,7 @@ from typing import Any, Self
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from recon.least_squares.inset_problem import InsetProblem
 from recon.mbir.priors import Prior, name_of, network_of, prior_of
@@ -61,7 +61,7 @@ class Mbir:
         model: with its weights; None: the one that ships, or with ``prior`` one step of that.
         fidelity: 0 (viewing) … 1 (measuring), see :mod:`recon.mbir.unrolled`.
         prior: in the place of the model's network: a prior, a denoiser, or a name
-            (:func:`recon.mbir.priors.prior_of`).
+            (:func:`recon.mbir.priors.prior_of`); a module goes into evaluation mode.
         parts: for ablations, ``steps``, ``final_data_consistency``, ``cut_overshoot`` and ``restore`` of
             :meth:`recon.mbir.unrolled.Unrolled.forward`.
 
@@ -83,7 +83,7 @@ class Mbir:
     ) -> None:
         fidelity_frequency(fidelity)
         if prior is not None:
-            prior = parts["prior"] = prior_of(prior)
+            prior = parts["prior"] = _ready(prior)
         if model is None:
             model = Unrolled(prior, steps=1) if prior is not None else Mbir.load().model
         self.model = model.eval().requires_grad_(False)
@@ -109,12 +109,16 @@ class Mbir:
         source = Path(path) if path is not None else Path(str(resources.files("recon") / "mbir" / "weights" / SHIPPED))
         if not source.is_file():
             raise FileNotFoundError(f"no weights at {source}: train them (torchpcct train) or name a file")
+        foreign = network is not None
         try:
             tensors, config = read_tensors(source, WEIGHTS_FORMAT)
+            foreign = foreign or "class" in config["network"]
             prior = network_of(config["network"], network)
             model = Unrolled(prior, steps=config["unroll"], voxel_mm=config.get("voxel_mm"))
             _fill(model, tensors)
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
+            if foreign:
+                raise ValueError(f"{source}: {error}") from error
             raise ValueError(
                 f"{source} holds no weights of this unrolled reconstruction: {error} (shipped weights come back with "
                 "a new installation of the package)"
@@ -211,7 +215,7 @@ class Mbir:
             ValueError, TypeError: what is no prior.
         """
         other = copy.copy(self)
-        other.parts = {**self.parts, "prior": prior_of(prior)}
+        other.parts = {**self.parts, "prior": _ready(prior)}
         return other
 
     def with_fidelity(self, fidelity: float) -> Self:
@@ -279,6 +283,12 @@ class Mbir:
                 else f"{more} {largest}: {what}"
             )
         return found
+
+
+def _ready(given: Prior | str) -> Prior:
+    """A prior, in evaluation mode if it is a module."""
+    prior = prior_of(given)
+    return prior.eval() if isinstance(prior, nn.Module) else prior
 
 
 def _fill(model: Unrolled, tensors: Mapping[str, Tensor]) -> None:

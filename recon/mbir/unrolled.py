@@ -40,7 +40,6 @@ from torchpcct.validate import number, whole
 __all__ = [
     "DEFAULT_FIDELITY",
     "REFERENCE_SCALE_HU",
-    "Prior",
     "Unrolled",
     "Views",
     "bound",

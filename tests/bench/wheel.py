@@ -44,6 +44,23 @@ print("reconstructed", tuple(volume.data.shape), f"{float(volume.data.mean()):.0
 """
 
 
+NETWORK = """
+from torch import nn
+
+
+class Mine(nn.Conv3d):
+    def __init__(self):
+        super().__init__(1, 1, 3, padding=1)
+
+    def forward(self, estimate, towards, condition, smoothed):
+        return smoothed + super().forward(towards[:, None])[:, 0]
+"""
+TRAINING = """
+{network: nets:Mine, unroll: 1, steps: 20, batch: 2, validate_every: 20, objective: {held_out: 4},
+ data: {scenes_kept: 8, views: 120, shape: [16, 16, 16], situations: [{x: 42.0, y: 0.0}]}}
+"""
+
+
 def build(folder: Path) -> Path:
     """The source distribution of what git knows (an old ``build`` folder would add modules that are gone), and the
     wheel that is built from it, as installing the source distribution would do; both in ``folder``."""
@@ -81,6 +98,20 @@ def main(options: list[str]) -> int:
         run(scripts / "torchpcct", "study", "phantom", "--quick", "--no-progress", "--out", "out", folder=folder)
         run(python, "-c", SMOKE, folder=folder)
         run(scripts / "torchpcct", "info", "scan.h5", folder=folder)
+        (folder / "nets.py").write_text(NETWORK, encoding="utf-8")
+        (folder / "mine.yaml").write_text(TRAINING, encoding="utf-8")
+        # A network of a user's own, in the folder where the command is run.
+        run(
+            scripts / "torchpcct",
+            "train",
+            "--config",
+            "mine.yaml",
+            "--out",
+            "own",
+            "--no-progress",
+            "--no-tensorboard",
+            folder=folder,
+        )
     print("the wheel, built from the source distribution, works in an empty environment")
     return 0
 

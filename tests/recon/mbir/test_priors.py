@@ -225,6 +225,7 @@ def test_denoisers_of_deepinv_are_known_by_their_module(kind):
         torch.testing.assert_close(found(volume, lambda: 20.0), volume / 2)
         assert seen.pop() == ((3, 1, 4, 5) if kind is nn.Conv2d else (1, 1, 3, 4, 5), 0.02)
     assert name_of(prior_of(Denoiser())) == "Denoiser"
+    assert not Mbir(prior=Denoiser()).parts["prior"].denoiser.training
 
 
 def test_a_filter_knows_any_noise_and_says_that_it_is_the_prior(clean, problem):
@@ -263,6 +264,8 @@ def test_a_file_alone_imports_nothing(saved, nets):
     with pytest.raises(ValueError, match=rf"of a class of its own, {nets}:MyNet, .*--network {nets}:MyNet"):
         Mbir.load(path)
     assert nets not in sys.modules
+    with pytest.raises(ValueError, match=r"^(?!.*(new installation|holds no weights))"):
+        Mbir.load(path)
     found = Mbir.load(path, network=f"{nets}:MyNet")
     assert nets in sys.modules
     made = sys.modules[nets].MyNet
