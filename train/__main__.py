@@ -19,6 +19,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from torch import nn
+
     from recon.cli.parsing import Parser
     from recon.mbir.unrolled import Unrolled
     from train.config import TrainConfig
@@ -104,16 +106,12 @@ def build(config: TrainConfig, views: Path, device: str = "cpu") -> tuple[Unroll
     except (RuntimeError, AssertionError) as error:
         raise ValueError(f"no device {device!r} here: take cpu, or cuda on a machine with a GPU ({error})") from error
     torch.manual_seed(config.seed)
-    own = "class" not in config.network
-    network = network_of(config.network, config.network.get("class"))
-    if not any(p.requires_grad for p in network.parameters()):
-        raise ValueError(f"network {config.network['class']} has no parameters that a training could change")
-    model = Unrolled(network, steps=config.unroll, voxel_mm=None if own else config.data.voxel_mm).to(where)
-    if model.network is not network:
-        raise TypeError(
-            f"network {config.network['class']} is a denoiser: one to be trained takes (estimate, towards, condition, "
-            "smoothed) as forward of recon.mbir.network.Network does"
-        )
+    named = config.network.get("class")
+    network = network_of(config.network, named)
+    model = Unrolled(network, steps=config.unroll, voxel_mm=None if named is None else config.data.voxel_mm)
+    if named is not None:
+        _require_trainable(named, model, network, config.data.shape)
+    model.to(where)
     fast = where.type == "cuda" or torch.ops.mkldnn._is_mkldnn_bf16_supported()
     if isinstance(model.network, Network):
         model.network.half_precision = config.bfloat16 and fast
@@ -121,6 +119,29 @@ def build(config: TrainConfig, views: Path, device: str = "cpu") -> tuple[Unroll
     few = replace(config.data, scenes_kept=config.objective.held_out)
     held_out = Data(few, seed_of("held out", config.seed), views, where)
     return model, data, held_out, Objective(config.objective, config.single)
+
+
+def _require_trainable(name: str, model: Unrolled, network: nn.Module, shape: Sequence[int]) -> None:
+    """Refuse a network of a user's own that no training can use, before anything is written (ValueError, TypeError)."""
+    import torch
+
+    from recon.mbir.priors import same_kind
+
+    if not any(p.requires_grad for p in network.parameters()):
+        raise ValueError(f"network {name} has no parameters that a training could change")
+    takes = "(estimate, towards, condition, smoothed) as forward of recon.mbir.network.Network does"
+    if model.network is not network:
+        raise TypeError(f"network {name} is a denoiser: one to be trained takes {takes}")
+    volumes = torch.zeros((2, *shape))
+    was = network.training
+    try:
+        with torch.no_grad():
+            made = network.eval()(volumes, volumes, torch.zeros((2, 3)), volumes)
+    except (RuntimeError, TypeError, ValueError, AttributeError, IndexError) as error:
+        raise ValueError(f"network {name} must take {takes}, volumes of {tuple(volumes.shape)}: {error}") from error
+    finally:
+        network.train(was)
+    same_kind(made, volumes, network)
 
 
 @contextmanager

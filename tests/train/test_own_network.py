@@ -38,6 +38,10 @@ def nets(tmp_path, monkeypatch):
         "        return smoothed\n"
         "\nclass Denoiser(nn.Conv3d):\n    def __init__(self):\n        super().__init__(1, 1, 1)\n"
         "    def forward(self, volume, sigma):\n        return volume\n"
+        "\nclass Channel(MyNet):\n    def forward(self, estimate, towards, condition, smoothed):\n"
+        "        return self.layers(torch.stack([estimate, towards, smoothed], 1))\n"
+        "\nclass Other(MyNet):\n    def forward(self, estimate, towards, condition, smoothed):\n"
+        "        return self.layers(torch.stack([estimate, towards], 1))[:, 0]\n"
     )
     name = f"nets_{tmp_path.name}"
     (tmp_path / f"{name}.py").write_text(block("mylab/nets.py") + others, encoding="utf-8")
@@ -72,6 +76,8 @@ def test_a_network_is_named_alone_or_with_its_arguments():
         ("NETS:Filter", "NETS:Filter has no parameters that a training could change"),
         ("NETS:Denoiser", r"NETS:Denoiser is a denoiser: one to be trained takes \(estimate, towards"),
         ("{class: builtins:dict}", "dict must make a torch.nn.Module"),
+        ("NETS:Channel", r"the prior Channel returned the shape \(2, 1, 40, 32, 32\) for \(2, 40, 32, 32\)"),
+        ("NETS:Other", r"NETS:Other must take \(estimate, .* volumes of \(2, 40, 32, 32\): .*channels"),
     ],
 )
 def test_what_cannot_be_trained_is_named(nets, tmp_path, network, text):
