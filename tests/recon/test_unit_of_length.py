@@ -70,13 +70,12 @@ def test_fbp_and_pwls(name, method):
         assert len(found.report["warnings"]) == len(wanted.report["warnings"])
 
 
-@pytest.mark.parametrize("method", ["fbp", "pwls"])
-@pytest.mark.parametrize("name", ["parallel", "vectors", "cone"])
+@pytest.mark.parametrize(("name", "method"), [("parallel", "fbp"), ("vectors", "pwls"), ("cone", "pwls")])
 def test_scans_that_do_not_know_water(name, method):
     """Volumes in mm⁻¹: as many times smaller as lengths are larger."""
     wanted = reconstruct(*without_water(name, 1.0), method)
     assert wanted.unit == "mm^-1"
-    for k in SCALES:
+    for k in (SCALES[0], SCALES[-1]):
         found = reconstruct(*without_water(name, k), method)
         torch.testing.assert_close(k * found.data, wanted.data, atol=0.02 * 1e-4, rtol=0)
         assert len(found.report["warnings"]) == len(wanted.report["warnings"])
