@@ -208,10 +208,10 @@ def _note(scan: Scan, grid: VolumeGrid) -> str:
     def text(sizes: Any) -> str:
         return " × ".join(f"{s:.3g}" for s in (sizes if len(set(sizes)) > 1 else sizes[:1]))
 
-    cells = [c for c in cells_at_axis(scan.geometry)[-grid.ndim :] if math.isfinite(c)]
-    fine = [s / k for s, k in zip(grid.spacing, parts, strict=True)]
+    cells = [c for c in cells_at_axis(scan.geometry)[-grid.ndim :] if math.isfinite(c)]  # slices have no cells along z
+    voxels, fine = grid.spacing[-len(cells) :], [s / k for s, k in zip(grid.spacing, parts, strict=True)][-len(cells) :]
     return (
-        f"voxels of {text(grid.spacing)} mm are coarser than the detector's cells, {text(cells)} mm at the axis, and "
+        f"voxels of {text(voxels)} mm are coarser than the detector's cells, {text(cells)} mm at the axis, and "
         f"FBP on them aliases noise. FBP, {_REFERENCE} too, was therefore reconstructed on voxels of {text(fine)} mm "
         "and resampled without aliasing, also as the base of denoisers: its noise is less than on the coarse voxels"
     )

@@ -52,6 +52,7 @@ def test_a_softer_kernel_saves_no_dose_on_coarse_voxels(scans, voxel):
         assert bool(row["note"]) == (voxel > 1.0)
     if voxel > 1.0:
         assert f"voxels of {voxel:g} mm are coarser than the detector's cells, 1 mm at the axis" in rows[0]["note"]
+        assert f"on voxels of {voxel / math.ceil(voxel):g} mm and" in rows[0]["note"]
         assert f"Note: {rows[0]['note']}.\n" in measured_text(rows, "HU", "fbp:ram-lak")
 
 
