@@ -167,7 +167,8 @@ class Network(nn.Module):
             fine = self.up[1](fine + _doubled(self.widen[1](middle)), condition)
             out = self.leave(fine)
         volumes = [
-            from_blocks(part)[..., : shape[0], : shape[1], : shape[2]] for part in out.float().split(_BLOCK**3, dim=1)
+            from_blocks(part)[..., : shape[0], : shape[1], : shape[2]]
+            for part in out.to(x.dtype).split(_BLOCK**3, dim=1)
         ]
         if not self.config.bilateral:
             return volumes[0]
