@@ -3,6 +3,7 @@
 A reconstruction that knows what vessels look like may close an ulcer, flatten a thrombus or draw a wall that is not
 there. Each :class:`Anatomy` is a pair of scenes about the middle of an inset, with a feature and without it. On the
 same noise draw the difference of two volumes is what a method shows of the feature, and what it shows beside.
+:class:`recon.evaluate.tasks.AnatomyTask` measures it.
 
 Scenes are made of parts, laid over each other in order. Shapes and CT numbers are our own choice of what coronary
 arteries look like on CT: lumens of 2 to 3 mm with 460 HU, walls of 0.2 mm, fat of -90 HU around.
@@ -17,14 +18,13 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from recon.evaluate.vessels import Centreline
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scene.plaque import Plaque
 from torchpcct.validate import choice
 
-__all__ = ["ANATOMIES", "TISSUES_HU", "Anatomy", "Part", "Regions", "anatomy", "coarsened"]
+__all__ = ["ANATOMIES", "TISSUES_HU", "Anatomy", "Part", "anatomy"]
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -47,12 +47,6 @@ TISSUES_HU: Mapping[str, float] = {
 }
 """CT numbers of the tissues; all but fat, which fills the rest, are those of parts."""
 
-_FINER = 2
-"""Scenes are painted on voxels of half the inset's size: thin parts are found there, and data are projected from them.
-"""
-_NEAR_MM, _ABOUT_MM = 0.6, 1.5
-"""What is beside a feature; what is about a vessel."""
-
 _STRAIGHT = Centreline((0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
 
 
@@ -72,35 +66,20 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Regions:
-    """Where an anatomy is read on a grid, bool masks ``grid.shape``.
-
-    Attributes:
-        feature: voxels that the feature changes by more than half of what it changes at most.
-        beside: within 0.6 mm of them, the feature included.
-        elsewhere: within 1.5 mm of a vessel, and not ``beside``: nothing differs there.
-    """
-
-    feature: Bools
-    beside: Bools
-    elsewhere: Bools
-
-
-@dataclass(frozen=True)
 class Anatomy:
     """A feature in its surroundings, and the same surroundings without it.
 
     Args:
         title: one line on what it is.
         base: what is there in both scenes.
-        feature: what is laid over it in one of them; empty: nothing, both scenes are the same.
+        feature: what is laid over it in one of them.
         line: the vessel's centreline.
         hu: CT numbers other than those of :data:`TISSUES_HU`.
     """
 
     title: str
     base: tuple[Part, ...]
-    feature: tuple[Part, ...] = ()
+    feature: tuple[Part, ...]
     line: Centreline = _STRAIGHT
     hu: Mapping[str, float] = field(default_factory=dict)
 
@@ -109,54 +88,47 @@ class Anatomy:
         """Tissue → HU, fat first."""
         return {**TISSUES_HU, **self.hu}
 
-    @property
-    def base_key(self) -> tuple[object, ...]:
-        """What the scene without the feature is made of: equal for anatomies that share it."""
-        return self.base, self.line, tuple(self.values[part.tissue] for part in self.base)
+    def labels(self, points: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Index of the tissue in :attr:`values` with and without the feature, at points ``(..., 3)`` x, y, z in mm
+        about the inset's middle."""
+        names, local = list(self.values), np.moveaxis(self.line.local(points), -1, 0)
 
-    def labels(self, points: Floats, *, feature: bool) -> NDArray[np.int64]:
-        """Index of the tissue in :attr:`values` at points ``(..., 3)`` x, y, z in mm about the inset's middle."""
-        names = list(self.values)
-        towards, across, along = np.moveaxis(self.line.local(points), -1, 0)
-        labels = np.zeros(towards.shape, np.int64)
-        for part in (*self.base, *(self.feature if feature else ())):
-            inside = part.inside(towards, across, along)
-            if part.over:
-                inside = inside & np.isin(labels, [names.index(tissue) for tissue in part.over])
-            labels[inside] = names.index(part.tissue)
-        return labels
+        def laid(over: NDArray[np.int64], parts: tuple[Part, ...]) -> NDArray[np.int64]:
+            found = over.copy()
+            for part in parts:
+                inside = part.inside(*local)
+                if part.over:
+                    inside = inside & np.array([name in part.over for name in names])[found]
+                found[inside] = names.index(part.tissue)
+            return found
 
-    def painted(self, grid: VolumeGrid, *, feature: bool) -> Floats:
-        """HU on voxels of half the size of an inset's ``grid``, means over each voxel to 0.5 HU rms."""
+        without = laid(np.zeros(local.shape[1:], np.int64), self.base)
+        return laid(without, self.feature), without
+
+    def shares(self, grid: VolumeGrid) -> dict[tuple[str, str], Floats]:
+        """(tissue with the feature, tissue without it) → its share of each voxel ``grid.shape``.
+
+        See :func:`torchpcct.scene.raster.label_fractions`; ``grid`` is about the inset's middle as its origin.
+        """
         from torchpcct.scene.raster import label_fractions  # its kernels need numba, a slow import
 
-        fine = VolumeGrid(tuple(_FINER * n for n in grid.shape), tuple(s / _FINER for s in grid.spacing), (0.0,) * 3)
-        shares = label_fractions(lambda p: self.labels(p, feature=feature), len(self.values), fine)
-        # One tissue at a time: all shares at once would be a copy of what is large already.
-        return np.sum([hu * share for hu, share in zip(self.values.values(), shares, strict=True)], axis=0)
+        names = list(self.values)
+        before = [*dict.fromkeys(["fat", *(part.tissue for part in self.base)])]
+        # A part of the feature may lie over another one of it, and so over whatever that has replaced.
+        pairs = [*dict.fromkeys([*((t, t) for t in before), *((p.tissue, t) for p in self.feature for t in before)])]
+        index = np.full((len(names), len(names)), -1)
+        for k, (after, without) in enumerate(pairs):
+            index[names.index(after), names.index(without)] = k
 
-    def regions(self, with_feature: Floats, without: Floats, grid: VolumeGrid) -> Regions:
-        """Where to read, from the true volumes ``grid.shape`` (:func:`coarsened`) with and without the feature."""
-        change = np.abs(with_feature - without)
-        feature = change > 0.5 * change.max() if self.feature else np.zeros(grid.shape, bool)
-        touched = change > 0.0
-        bodies = (np.maximum(with_feature, without) > self.values["fat"] + 1.0) & ~touched
-        beside = _within(feature, _NEAR_MM, grid) | touched
-        elsewhere = _within(bodies, _ABOUT_MM, grid) & ~beside & ~_within(touched, _NEAR_MM, grid)
-        return Regions(feature, beside, elsewhere)
+        shares = label_fractions(lambda points: index[self.labels(points)], len(pairs), grid)
+        return {pair: share for pair, share in zip(pairs, shares, strict=True) if share.any()}
 
-
-def coarsened(fine: Floats) -> Floats:
-    """Means over blocks of what was painted on voxels of half the size."""
-    z, y, x = (n // _FINER for n in fine.shape)
-    means: Floats = fine.reshape(z, _FINER, y, _FINER, x, _FINER).mean((1, 3, 5))
-    return means
-
-
-def _within(mask: Bools, mm: float, grid: VolumeGrid) -> Bools:
-    if not mask.any():
-        return np.zeros_like(mask)
-    return np.asarray(ndimage.distance_transform_edt(~mask, sampling=grid.spacing) <= mm)
+    def painted(self, grid: VolumeGrid, values: Mapping[str, float], *, feature: bool) -> Floats:
+        """Mean over each voxel ``grid.shape`` of ``values`` of the tissues; of other tissues 0."""
+        result = np.zeros(grid.shape)
+        for pair, share in self.shares(grid).items():
+            result += values.get(pair[0 if feature else 1], 0.0) * share
+        return result
 
 
 # --- shapes, in the vessel's coordinates: a towards the plaque, b across, s along -----------------------------------
@@ -275,7 +247,7 @@ _BENT = Centreline((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), 3.5)
 _HEALTHY, _WITH_PLAQUE = tuple(_vessel()), tuple(_plaque())
 
 ANATOMIES: dict[str, Anatomy] = {
-    "healthy": Anatomy("a healthy vessel, nothing more", _HEALTHY),
+    "healthy": Anatomy("a healthy vessel in fat, nothing more", (), _HEALTHY),
     "core": Anatomy("a necrotic core in an eccentric plaque", _WITH_PLAQUE, tuple(_core())),
     "lipid_core": Anatomy("a core of lipid", _WITH_PLAQUE, tuple(_core("lipid"))),
     "thin_cap": Anatomy("a necrotic core under a cap of 0.12 mm", tuple(_plaque(_THIN)), tuple(_core(plaque=_THIN))),

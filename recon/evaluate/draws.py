@@ -144,7 +144,7 @@ class Simulated:
 
     Attributes:
         exposure_s: of the scan; grid: of the volume; label: for files.
-        drawn: whether MBIR has drawn a vessel; None: it does not draw.
+        drawn, warned: whether MBIR has drawn a vessel, and has warned of something; None: it was not asked.
     """
 
     def __init__(
@@ -159,6 +159,7 @@ class Simulated:
         self._draws, self._scan, self._with_signal = draws, scan, with_signal
         self.exposure_s, self.k, self.present = exposure_s, k, present
         self.drawn: bool | None = None
+        self.warned: bool | None = None
 
     @property
     def grid(self) -> VolumeGrid:
@@ -221,7 +222,8 @@ class Simulated:
         """HU ``(z, y, x)``."""
         with torch.no_grad():
             found = network.solved(self.problem, self.statistic[None], self.exposure_s)
-        self.drawn = found.notes[0].get("vessel", {}).get("drawn")
+        note = found.notes[0]
+        self.drawn, self.warned = note.get("vessel", {}).get("drawn"), bool(note.get("warnings"))
         return network.in_hu(self.problem, found.u, found.normal)[0]
 
     def sigma(self, method: Method, smooths: float = 0.0) -> float:

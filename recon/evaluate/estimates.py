@@ -10,9 +10,13 @@ linear functionals of the same noise, whose moments are exactly known: of MBIR b
 
 * slope: contrast that the signal adds over the true one; a method may buy low noise with it, so contrasts are compared
   at slope 1: variance over slope²;
-* ``without signal``: contrast that is read where there is none;
+* ``without signal``: contrast that is read where there is none (less what other tissues in the ROIs make);
 * the paper's CNR: (background − signal) / √(σ² + σ²) of the ROI means over realisations;
 * d′: a Hotelling observer on the channels of :class:`recon.evaluate.measure.Reader`, trained on the other pairs;
+* invented contrast: where one tissue is so far from all edges that their blur does not reach, the error should have no
+  sign. Of two halves of the realisations one names the hundredth of the voxels with the largest mean errors, the other
+  tells its own mean error there, in their direction; so what is noise adds nothing on average;
+* false contour: the mean error's largest fall over 0.4 mm with the distance from the bodies, where no border is;
 * limit: the variance of the best unbiased estimate if all outlines were known, the same ratio.
 """
 
@@ -40,6 +44,8 @@ _CONTRAST = (-1.0, 1.0)
 """Background less signal."""
 _LEAST_SLOPE = 0.05
 """Less contrast than that of the true one cannot be corrected for."""
+_SHARE, _ENOUGH = 0.01, 200
+"""Of the voxels where nothing is, the share in which something is looked for; so many there must be."""
 
 
 Figure = Jackknifed | float
@@ -67,12 +73,15 @@ class _Figures:
     Args:
         readings: of its volumes.
         true: ``(rois,)`` contrasts that the signal adds, HU: background less signal.
+        absent: ``(rois,)`` true contrasts without the signal, HU.
         reference: on the same draws; what is drawn is controlled by it.
         exact: the method's own covariance of ROI means as :attr:`Known.covariance`; None: it is drawn.
     """
 
-    def __init__(self, readings: Readings, true: Floats, reference: Known, exact: Floats | None) -> None:
-        self.r, self.true, self.reference, self.exact = readings, true, reference, exact
+    def __init__(
+        self, readings: Readings, true: Floats, absent: Floats, reference: Known, exact: Floats | None
+    ) -> None:
+        self.r, self.true, self.absent, self.reference, self.exact = readings, true, absent, reference, exact
         self._sign = np.sign(true)
 
     def _row(self, roi: int, row: Any) -> Floats:
@@ -106,8 +115,9 @@ class _Figures:
         return joint(lambda m: m / true, _mean(np.einsum("nrs,rs->n", self.r.rois[:, 0] - self.r.rois[:, 1], row)))
 
     def without(self, roi: int) -> Figure:
-        """Contrast where there is none, in the direction of the true one."""
-        return joint(lambda m: m * self._sign[roi], self.mean(self._row(roi, _CONTRAST), 1))
+        """Contrast beyond what there is without the signal, in the direction of the true one."""
+        known = self.absent[roi]
+        return joint(lambda m: (m - known) * self._sign[roi], self.mean(self._row(roi, _CONTRAST), 1))
 
     def log_corrected(self, roi: int) -> Figure:
         """ln of the contrast's variance at slope 1."""
@@ -135,9 +145,40 @@ class _Figures:
             return None
         return d_prime(*hotelling_scores(present, absent))
 
-    def rmse(self) -> Jackknifed:
+    def rmse(self, square: Floats) -> Jackknifed:
         """HU."""
-        return combined(np.sqrt, _mean(self.r.square))
+        return combined(np.sqrt, _mean(square))
+
+    def invented(self) -> Jackknifed:
+        """See the module, HU."""
+
+        def both(errors: Floats, halves: tuple[Any, Any]) -> float:
+            means = [errors[half].mean(0) for half in halves]
+            return float(np.mean([_confirmed(*means), _confirmed(*means[::-1])]))
+
+        errors, index = self.r.invented.astype(np.float64), np.arange(self.r.n)
+        halves = index[::2], index[1::2]
+        left_out = [both(errors, (halves[0][halves[0] != k], halves[1][halves[1] != k])) for k in index]
+        return Jackknifed(both(errors, halves), np.array(left_out))
+
+    def contour(self) -> Jackknifed:
+        """See the module, HU."""
+        shells, n = self.r.shells, self.r.n
+        mean = shells.mean(0)
+        return Jackknifed(_fall(mean), np.array([_fall((n * mean - own) / (n - 1)) for own in shells]))
+
+
+def _confirmed(found: Floats, other: Floats) -> float:
+    """Mean of the other half's errors where the largest ones were found, in their direction."""
+    count = max(1, round(_SHARE * found.size))
+    at = np.argpartition(np.abs(found), -count)[-count:]
+    return float((np.sign(found[at]) * other[at]).mean())
+
+
+def _fall(profile: Floats) -> float:
+    """Largest fall to one of the next two shells; 0: it falls nowhere."""
+    falls = [profile[:-step] - profile[step:] for step in (1, 2)]
+    return max(0.0, float(np.concatenate(falls).max()))
 
 
 def joint(function: Callable[..., Any], *figures: Figure) -> Figure:
@@ -149,7 +190,7 @@ def joint(function: Callable[..., Any], *figures: Figure) -> Figure:
 
 def records_of(
     task: str, method: str, exposure_s: float, readings: Readings, base: Readings, reference: Known, facts: Facts,
-    true: Floats, rois: tuple[str, ...], exact: Floats | None = None,
+    true: Floats, absent: Floats, rois: tuple[str, ...], exact: Floats | None = None,
 ) -> list[Record]:  # fmt: skip
     """All figures of a method at an exposure, one record each: task, method, exposure, figure, where, value, interval.
 
@@ -158,7 +199,8 @@ def records_of(
         readings: of the method; base: of the linear reference on the same realisations.
         reference: what is exactly known of the reference.
         facts: of the task.
-        true: ``(rois,)`` true contrasts, HU.
+        true: ``(rois,)`` contrasts that the signal adds, HU.
+        absent: ``(rois,)`` true contrasts without it, HU.
         rois: their names.
         exact: covariance of a linear method's ROI means; None: drawn.
     """
@@ -166,7 +208,10 @@ def records_of(
     if readings.control is not None:
         drawn, mean, covariance = readings.control
         control = Known(covariance, mean, drawn)
-    own, other = _Figures(readings, true, control, exact), _Figures(base, true, reference, reference.covariance)
+    own, other = (
+        _Figures(readings, true, absent, control, exact),
+        _Figures(base, true, absent, reference, reference.covariance),
+    )
     found: list[Record] = []
 
     def add(figure: str, where: str, value: Any, unit: str = "", transform: float | None = None) -> None:
@@ -187,7 +232,12 @@ def records_of(
     for tissue in readings.flat:
         add("noise", tissue, own.log_noise(tissue), "HU", transform=0.5)
         factor("noise", tissue, other.log_noise(tissue), own.log_noise(tissue))
-    add("error", "near the bodies", own.rmse(), "HU")
+    add("error", "near the bodies", own.rmse(readings.square), "HU")
+    add("error", "beside the signal", own.rmse(readings.square_beside), "HU")
+    if readings.invented.shape[1] >= _ENOUGH:
+        add("invented contrast", "about the bodies", own.invented(), "HU")
+    if readings.shells.shape[1] >= 3:
+        add("false contour", "about the bodies", own.contour(), "HU")
     add("error without noise", "near the bodies", math.sqrt(readings.clean_square), "HU")
     add("undershoot without noise", "beside the bodies", readings.clean_rim, "HU")
     for k, roi in enumerate(rois):
@@ -209,8 +259,10 @@ def records_of(
         if d is not None and e is not None and d.value > 0 and e.value > 0:
             factor("d'", observer, _log_square(d), _log_square(e))
     add("seconds", "a volume", readings.seconds, "s")
-    if not math.isnan(readings.drawn):
-        add("share drawn", "vessels", readings.drawn)
+    for figure, shares in (("share drawn", readings.drawn), ("share with a warning", readings.warned)):
+        for where, share in zip(("with the signal", "without the signal"), shares, strict=True):
+            if not math.isnan(share):
+                add(figure, where, share)
     return found
 
 

@@ -225,7 +225,7 @@ def _estimate(task: Task, methods: Sequence[Method], n: int) -> tuple[float, flo
     """Rough seconds of realisations on one core, and bytes that are kept."""
     volumes = 2 * n * task.grid.voxels / 1e5
     seconds = volumes * sum(_SECONDS.get(m.name.partition(":")[0], _OTHER_S) for m in methods)
-    return seconds + n * _DRAW_S, len(methods) * (2.0 * task.grid.voxels + 8e3 * n * (1 + len(task.names)))
+    return seconds + n * _DRAW_S, len(methods) * (2.0 * task.grid.voxels + 8e3 * n * (3 + len(task.names)))
 
 
 class _Bench:
@@ -280,7 +280,10 @@ def _task(
     if progress is not None:
         progress(f"{task.name}: scan", 0.0)
     draws, reader, facts, truth = bench.draws, bench.reader, bench.draws.facts, bench.reader.truth
-    true = np.array([float(((truth[0] - truth[1]).double() * (b - a)).sum()) for a, b in task.regions.values()])
+    true, absent = (
+        np.array([float((hu.double() * (b - a)).sum()) for a, b in task.regions.values()])
+        for hu in (truth[0] - truth[1], truth[1])
+    )
     records: list[Record] = []
     volumes = {}
     at_1_s = draws.exact_covariances(list(dict.fromkeys(m.kernels[0] for m in everyone if m.is_fbp)))
@@ -301,7 +304,9 @@ def _task(
             own = found[method.name]
             exact = at_1_s[method.kernels[0]] / exposure if method.is_fbp else None
             volumes[method.name, exposure] = (own.first, own.first_clean)
-            records += records_of(task.name, method.name, exposure, own, base, control, facts, true, reader.rois, exact)
+            records += records_of(
+                task.name, method.name, exposure, own, base, control, facts, true, absent, reader.rois, exact
+            )
     true_hu = dict(zip(reader.rois, true.tolist(), strict=True))
     return records, TaskResult(task, facts, true_hu, truth[0].numpy(), volumes)
 

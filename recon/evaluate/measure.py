@@ -22,7 +22,7 @@ from torch import Tensor
 
 from recon.evaluate.draws import Draws
 from recon.evaluate.methods import Draw, Method
-from recon.evaluate.task import Task
+from recon.evaluate.task import BESIDE_MM, Task
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.observer import dog_channels, template_channel
 from torchpcct.volume import Volume
@@ -42,6 +42,10 @@ _LONGEST = 120
 """Bytes of a folder's name that is a method's."""
 _SHIFT_VOXELS = 0.5
 """A volume that lies so much off is on another grid."""
+_SMOOTHED_MM, _SOME_VOXELS = 0.3, 4000
+"""Invented contrast is looked for in errors smoothed by a Gaussian of this standard deviation, in so many voxels."""
+_BORDER_HU, _FEWEST = 50.0, 50
+"""A border that a reader would take for a wall; no shell of fewer voxels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +56,9 @@ class Readings:
         rois: ``(n, 2, rois, 2)`` means of signal and background, HU.
         channels: observer → ``(n, 2, channels)``.
         square: ``(n,)`` mean square error with the signal near the bodies, HU².
+        square_beside: ``(n,)`` the same beside the signal.
+        invented: ``(n, voxels)`` smoothed error with the signal where nothing is, HU.
+        shells: ``(n, shells)`` mean error with the signal around the bodies, from near to far, HU.
         flat: tissue → ``(n, voxels)`` HU, with the signal.
         clean_rois: ``(2, rois, 2)`` of noise-free data; clean_square: likewise; clean_rim: least error
             there in the rim of the largest tissue, HU.
@@ -59,12 +66,16 @@ class Readings:
             ``(2, rois, 2)`` and covariance ``(rois, 2, rois, 2)``; None: the reference's ROI means serve.
         first: first volume with the signal, float16, and that of noise-free data.
         seconds: of a volume.
-        drawn: share of volumes in which MBIR drew a vessel; NaN: the method draws none.
+        drawn, warned: shares of volumes with and without the signal in which MBIR drew a vessel, or warned of
+            something; NaN: the method does not say.
     """
 
     rois: Floats
     channels: dict[str, Floats]
     square: Floats
+    square_beside: Floats
+    invented: NDArray[np.float32]
+    shells: Floats
     flat: dict[str, NDArray[np.float32]]
     clean_rois: Floats
     clean_square: float
@@ -73,7 +84,8 @@ class Readings:
     first: NDArray[np.float16]
     first_clean: NDArray[np.float16]
     seconds: float
-    drawn: float
+    drawn: Floats
+    warned: Floats
 
     @property
     def n(self) -> int:
@@ -121,9 +133,44 @@ class Reader:
         """Of an observer's channels."""
         return np.asarray(torch.einsum("zyx,czyx->c", volume.double(), self.channels[observer]).numpy())
 
-    def square(self, volume: Tensor) -> float:
-        """Mean square error with the signal, HU²."""
-        return float((volume - self.truth[0])[self.task.near].double().square().mean())
+    def square(self, volume: Tensor, mask: Tensor) -> float:
+        """Mean square error with the signal in a mask, HU²."""
+        return float((volume - self.truth[0])[mask].double().square().mean())
+
+    def invented(self, volume: Tensor) -> NDArray[np.float32]:
+        """Error in some voxels of where nothing is, smoothed within that."""
+        mask, sigmas = self.task.quiet.double().numpy(), [_SMOOTHED_MM / s for s in self.task.grid.spacing]
+        error = ndimage.gaussian_filter((volume - self.truth[0]).double().numpy() * mask, sigmas)
+        at, weights = self._quiet
+        return np.asarray(error.reshape(-1)[at] / weights, np.float32)
+
+    @cached_property
+    def _quiet(self) -> tuple[NDArray[np.int64], Floats]:
+        """Indices of some voxels where nothing is, and the weight of their smoothing."""
+        mask = self.task.quiet.double().numpy()
+        at = np.flatnonzero(mask)
+        at = at[:: -(-len(at) // _SOME_VOXELS)] if len(at) else at
+        weights = ndimage.gaussian_filter(mask, [_SMOOTHED_MM / s for s in self.task.grid.spacing])
+        return at, weights.reshape(-1)[at]
+
+    def shells(self, volume: Tensor) -> list[float]:
+        """Mean error around the bodies, away from borders that are there."""
+        error = (volume - self.truth[0]).double()
+        return [float(error[shell].mean()) for shell in self._shells]
+
+    @cached_property
+    def _shells(self) -> list[Tensor]:
+        reach = [math.ceil(BESIDE_MM / s) for s in self.task.grid.spacing]
+        at = np.stack(np.meshgrid(*(np.arange(-r, r + 1) for r in reach), indexing="ij"), axis=-1)
+        ball = np.linalg.norm(at * self.task.grid.spacing, axis=-1) <= BESIDE_MM
+        borders = np.zeros(self.task.grid.shape, bool)
+        for truth in self.truth:
+            hu = truth.numpy()
+            borders |= (
+                ndimage.maximum_filter(hu, footprint=ball) - ndimage.minimum_filter(hu, footprint=ball) > _BORDER_HU
+            )
+        free = torch.from_numpy(~borders)
+        return [kept for shell in self.task.shells if int((kept := shell & free).sum()) >= _FEWEST]
 
     def rim(self, volume: Tensor) -> float:
         """Least error beside the bodies, HU; below 0 a dark rim."""
@@ -192,7 +239,7 @@ def kept_as(method: Method, exposure_s: float, task: Task, seed: int) -> tuple[s
     name = "".join(c if c.isalnum() or c in "-_." else "_" for c in method.name)
     if name.startswith(".") or len(name.encode()) > _LONGEST:
         name = f"{name.strip('.')[:40]}-{hashlib.sha256(method.name.encode()).hexdigest()[:12]}"
-    return f"{name}/{exposure_s:g}s", f"6 {method.name} {method.key} {seed} {task.fingerprint}"
+    return f"{name}/{exposure_s:g}s", f"7 {method.name} {method.key} {seed} {task.fingerprint}"
 
 
 class Measurement:
@@ -235,13 +282,25 @@ class Measurement:
         joined = {
             name: np.concatenate([p[name] for p in pieces]) for name in pieces[0] if name not in ("first", "seconds")
         }
+        known_moments = None if known is None else (joined["control"], known["mean"], known["covariance"])
         return Readings(
-            joined["rois"], {o: joined[f"channels_{o}"] for o in OBSERVERS}, joined["square"],
-            {t: joined[f"flat_{t}"] for t in self.reader.task.flat}, clean["rois"][0], float(clean["square"][0]),
-            float(clean["rim"][0]), None if known is None else (joined["control"], known["mean"], known["covariance"]),
-            pieces[0]["first"], clean["first"], float(np.mean([p["seconds"] for p in pieces])),
-            float(np.mean(joined["drawn"])),
-        )  # fmt: skip
+            rois=joined["rois"],
+            channels={o: joined[f"channels_{o}"] for o in OBSERVERS},
+            square=joined["square"],
+            square_beside=joined["square_beside"],
+            invented=joined["invented"],
+            shells=joined["shells"],
+            flat={t: joined[f"flat_{t}"] for t in self.reader.task.flat},
+            clean_rois=clean["rois"][0],
+            clean_square=float(clean["square"][0]),
+            clean_rim=float(clean["rim"][0]),
+            control=known_moments,
+            first=pieces[0]["first"],
+            first_clean=clean["first"],
+            seconds=float(np.mean([p["seconds"] for p in pieces])),
+            drawn=joined["drawn"].mean(0),
+            warned=joined["warned"].mean(0),
+        )
 
 
 def _of(
@@ -249,7 +308,10 @@ def _of(
     fbp: Tensor | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """A piece of pairs; with ``fbp``, which then is that of the first draw, the first volume is checked against it."""
-    rois, square, rim, seconds, control, drawn = [], [], [], [], [], []
+    lists: dict[str, list[Any]] = {
+        name: [] for name in ("rois", "drawn", "warned", "square", "square_beside", "invented", "shells", "rim")
+    }
+    seconds, control = [], []
     channels: dict[str, list[Any]] = {o: [] for o in OBSERVERS}
     flat: dict[str, list[Any]] = {t: [] for t in reader.task.flat}
     first = None
@@ -259,28 +321,27 @@ def _of(
             began = time.perf_counter()
             volumes.append(volume_of(method, draw))
             seconds.append(time.perf_counter() - began)
-            seen = getattr(draw, "drawn", None)
-            drawn.append(math.nan if seen is None else float(seen))
             if fbp is not None and len(seconds) == 1:
                 check_volume(volumes[0], method, reader, fbp)
-        rois.append([reader.pair(v) for v in volumes])
+        lists["rois"].append([reader.pair(v) for v in volumes])
+        for name in ("drawn", "warned"):
+            said = [getattr(draw, name, None) for draw in pair]
+            lists[name].append([math.nan if answer is None else float(answer) for answer in said])
         if adjoints is not None:
             control.append([functionals(adjoints, draw.statistic) for draw in pair])
         for o in OBSERVERS:
             channels[o].append([reader.responses(v, o) for v in volumes])
-        square.append(reader.square(volumes[0]))
-        rim.append(reader.rim(volumes[0]))
+        lists["square"].append(reader.square(volumes[0], reader.task.near))
+        lists["square_beside"].append(reader.square(volumes[0], reader.task.beside))
+        lists["invented"].append(reader.invented(volumes[0]))
+        lists["shells"].append(reader.shells(volumes[0]))
+        lists["rim"].append(reader.rim(volumes[0]))
         for t, values in reader.flat(volumes[0]).items():
             flat[t].append(values)
         if keep and first is None:
             first = volumes[0].numpy().astype(np.float16)
-    found = {
-        "rois": np.array(rois),
-        "square": np.array(square),
-        "rim": np.array(rim),
-        "seconds": np.array(np.median(seconds)),
-        "drawn": np.array(drawn),
-    }
+    found = {name: np.array(values) for name, values in lists.items()}
+    found["seconds"] = np.array(np.median(seconds))
     found |= {"control": np.array(control)} if control else {}
     found |= {f"channels_{o}": np.array(v) for o, v in channels.items()}
     found |= {f"flat_{t}": np.array(v, dtype=np.float32) for t, v in flat.items()}

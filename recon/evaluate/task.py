@@ -5,7 +5,9 @@ without signal has the background's material in its place. From these follows wh
 
 * ``lesion``: mean over the whole signal less mean over the background around it; ``slice``: the same in the axial slice
   that holds most of the signal; ``small``: of some voxels in the signal's middle and the nearest of the background;
-* the root mean square error near the bodies, and the noise in every tissue that fills a part of the inset;
+* the root mean square error near the bodies and beside the signal, and the noise in every tissue that fills a part of
+  the inset;
+* contrast invented where nothing is, and contours that are not there;
 * whether the signal is there, by an observer who knows where (:mod:`recon.evaluate.estimates`).
 
 Ready ones are in :mod:`recon.evaluate.tasks`; ``torchpcct show-task NAME`` prints one as YAML to start from.
@@ -41,7 +43,7 @@ from torchpcct.scanner.scanner import Scanner
 from torchpcct.scene.scene import Scene
 from torchpcct.validate import numbers
 
-__all__ = ["ROIS", "Facts", "SomeViews", "Task", "contrast_limit"]
+__all__ = ["BESIDE_MM", "ROIS", "Facts", "SomeViews", "Task", "contrast_limit"]
 
 Floats = NDArray[np.float64]
 Pair = tuple[Tensor, Tensor]
@@ -56,6 +58,10 @@ _SMALL_MM2 = 0.25
 """Area of the small ROIs, about that of the paper's."""
 _NEAR_MM, _RIM_MM = 0.4, 0.8
 """The error is that of bodies and of what lies so close to them; a rim is looked for so far from them."""
+BESIDE_MM = 0.6
+"""So far the blur of an edge reaches; what is so close to the signal is beside it."""
+_ABOUT_MM, _SHELL_MM, _INSET_RIM_MM = 1.5, 0.2, 0.8
+"""What is about a body; width of the shells around it; of the inset's rim, where little is measured."""
 _FLAT_MM, _FLAT_VOXELS, _KEPT_VOXELS = 1.0, 150, 2000
 """Noise is that of voxels so far from any edge; of tissues with so many; of so many at most."""
 _LINES = 32
@@ -249,9 +255,7 @@ class Task:
     @cached_property
     def regions(self) -> dict[str, Pair]:
         """ROI → weights of signal and background, float64, each of sum 1."""
-        signal = self._pure("signal", self.shares["signal"])
-        away = ndimage.distance_transform_edt(~signal, sampling=self.grid.spacing)
-        around = self._pure(self.background, self._beside) & (away <= _AROUND_MM)
+        signal, around = self._signal_voxels, self._around
         rows = np.asarray(signal.any((1, 2)))
         fullest = int(signal.sum((1, 2)).argmax())
         one = np.zeros_like(signal)
@@ -270,6 +274,17 @@ class Task:
                 )
         pairs = {n: (_mean(a), _mean(b)) for n, (a, b) in found.items()}
         return {**pairs, **self.rois}
+
+    @cached_property
+    def _signal_voxels(self) -> NDArray[np.bool_]:
+        """Voxels that are read as the signal."""
+        return self._pure("signal", self.shares["signal"])
+
+    @property
+    def _around(self) -> NDArray[np.bool_]:
+        """Voxels that are read as the background around it."""
+        away = ndimage.distance_transform_edt(~self._signal_voxels, sampling=self.grid.spacing)
+        return self._pure(self.background, self._beside) & (away <= _AROUND_MM)
 
     def _pure(self, name: str, share: Floats) -> NDArray[np.bool_]:
         for least in (_PURE, _MOSTLY):
@@ -303,6 +318,46 @@ class Task:
         return torch.from_numpy(away <= _NEAR_MM)
 
     @cached_property
+    def beside(self) -> Tensor:
+        """Mask ``grid.shape`` of the signal and what is beside it."""
+        signal = self._signal_voxels | (self.shares["signal"] > 0.5)
+        return torch.from_numpy(ndimage.distance_transform_edt(~signal, sampling=self.grid.spacing) <= BESIDE_MM)
+
+    @cached_property
+    def quiet(self) -> Tensor:
+        """Mask ``grid.shape`` of tissue about the bodies, so far from all edges that their blur does not reach there:
+        whatever contrast a volume shows within it is invented."""
+        tissue = np.argmax(self._constant, axis=0)
+        mixed = np.max(self._constant, axis=0) < 1.0 - 1e-6
+        edges = mixed | (ndimage.maximum_filter(tissue, 3) != ndimage.minimum_filter(tissue, 3))
+        away = ndimage.distance_transform_edt(~edges, sampling=self.grid.spacing)
+        rest = self.shares[self._largest] > 0.5
+        about = ndimage.distance_transform_edt(rest, sampling=self.grid.spacing) <= _ABOUT_MM
+        return torch.from_numpy((away > BESIDE_MM) & about & self._inner)
+
+    @property
+    def _constant(self) -> list[Floats]:
+        """Share of every voxel of what has one value."""
+        return list(self.shares.values())
+
+    @cached_property
+    def _inner(self) -> NDArray[np.bool_]:
+        """All but the rim of the inset."""
+        width = math.ceil(_INSET_RIM_MM / self.grid.spacing[0])
+        inner = np.zeros(self.grid.shape, bool)
+        inner[(slice(width, -width),) * 3] = True
+        return inner
+
+    @cached_property
+    def shells(self) -> tuple[Tensor, ...]:
+        """Masks ``grid.shape`` about the bodies, the signal none of them if there are others, from near to far."""
+        names = [t for t in self.shares if t not in ("signal", self._largest)] or ["signal"]
+        bodies = np.sum([self.shares[t] for t in names], axis=0) > 0.5
+        away = ndimage.distance_transform_edt(~bodies, sampling=self.grid.spacing)
+        ends = np.arange(BESIDE_MM, _ABOUT_MM + BESIDE_MM, _SHELL_MM)
+        return tuple(torch.from_numpy((away > end) & (away <= end + _SHELL_MM) & self._inner) for end in ends)
+
+    @cached_property
     def rim(self) -> Tensor:
         """Mask ``grid.shape`` of the largest tissue's pure voxels beside bodies, where sharpening undershoots."""
         pure = self.shares[self._largest] > 1.0 - 1e-6
@@ -312,12 +367,9 @@ class Task:
     def flat(self) -> dict[str, Tensor]:
         """Tissue → indices (of the flat volume) of voxels away from its edges and the rim of the inset."""
         found = {}
-        width = math.ceil(0.8 / self.grid.spacing[0])
-        inner = np.zeros(self.grid.shape, bool)
-        inner[(slice(width, -width),) * 3] = True
         for tissue, share in self.shares.items():
             deep = _depth(share > 1.0 - 1e-6, self.grid.spacing) > _FLAT_MM
-            at = np.flatnonzero(deep & inner)
+            at = np.flatnonzero(deep & self._inner)
             if len(at) >= _FLAT_VOXELS:
                 found[tissue] = torch.from_numpy(at[:: -(-len(at) // _KEPT_VOXELS)])
         return found

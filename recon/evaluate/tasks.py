@@ -13,10 +13,13 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy import ndimage
+from torch import Tensor
 
+from recon.evaluate.anatomies import ANATOMIES, Anatomy
 from recon.evaluate.names import TASKS
 from recon.evaluate.store import Store
-from recon.evaluate.task import Facts, SomeViews, Task, contrast_limit
+from recon.evaluate.task import BESIDE_MM, Facts, SomeViews, Task, contrast_limit
 from recon.evaluate.vessels import SHAPES, Vessel
 from recon.mbir.mbir import overlap
 from torchpcct import Projector, VolumeGrid
@@ -31,15 +34,31 @@ from torchpcct.scene.scene import Scene
 from torchpcct.validate import choice, number, numbers, whole
 from torchpcct.volume import Volume
 
-__all__ = ["VesselTask", "VoxelTask", "read_task", "task_text"]
+__all__ = ["AnatomyTask", "VesselTask", "VoxelTask", "read_task", "task_text"]
 
 Floats = NDArray[np.float64]
 
 _FOLDER = resources.files("recon") / "evaluate" / "tasks"
-_KEYS = ("name", "title", "scene", "scanner", "signal", "background", "inset", "exposures_s", "reference", "rois",
-         "tolerance_hu", "vessel", "voxels")  # fmt: skip
+_KEYS = (
+    "name",
+    "title",
+    "scene",
+    "scanner",
+    "signal",
+    "background",
+    "inset",
+    "exposures_s",
+    "reference",
+    "rois",
+    "tolerance_hu",
+    "vessel",
+    "voxels",
+    "anatomy",
+)
 _VOXEL_MM = 0.2
 """What MBIR's network was trained on."""
+_FEATURE, _FAT = "feature", "fat"
+"""The signal of an anatomy; its tissue that is the patient's."""
 
 
 def task_text(name: str) -> str:
@@ -90,15 +109,19 @@ def _task(values: Any, name: str, folder: Path) -> Task:
     given: dict[str, Any] = {k: values[k] for k in ("background", "title", "reference") if k in values}
     if "exposures_s" in values:
         given["exposures_s"] = tuple(np.ravel(values["exposures_s"]).tolist())
+    kinds = [key for key in ("vessel", "voxels", "anatomy") if key in values]
+    if len(kinds) > 1:
+        raise ValueError(f"task {name}: {' and '.join(kinds)} are of different kinds of task: give one of them")
     make: Any = Task
     if "voxels" in values:
         make, given = VoxelTask, given | _labels(f"task {name}: voxels", values["voxels"], folder)
-    grid = _inset(f"task {name}: inset", values["inset"], scene, () if make is VoxelTask else signal)
-    if "vessel" in values:
+    elif "vessel" in values:
         given["direction"], make = choice("vessel", values["vessel"], tuple(SHAPES)), VesselTask
-    task: Task = make(
-        name, scene, signal, config.scanner, grid, tolerance_hu=config.tolerance_hu, **given,
-    )  # fmt: skip
+    elif "anatomy" in values:
+        given["anatomy"], make = choice("anatomy", values["anatomy"], tuple(ANATOMIES)), AnatomyTask
+    painted = issubclass(make, _PaintedTask)
+    grid = _inset(f"task {name}: inset", values["inset"], scene, () if painted else signal)
+    task: Task = make(name, scene, signal, config.scanner, grid, tolerance_hu=config.tolerance_hu, **given)
     if values.get("rois") is None:
         return task
     choice("rois", values["rois"], ("protocol",))
@@ -214,11 +237,90 @@ class VesselTask(Task):
 
 
 @dataclass(frozen=True, eq=False)
-class VoxelTask(Task):
-    """A segmented lesion of the user's own: labels of voxels, put into a patient made of bodies.
+class _PaintedTask(Task):
+    """Tissues of given HU, painted over a patient made of bodies.
 
-    The scene is the patient alone, round about the axis. What the labels stand for is painted over it on voxels half as
-    large as the inset's, projected, and changes the patient's counts.
+    The scene is the patient alone, round about the axis. The tissues are painted over it on voxels half as large as the
+    inset's, projected, and change the patient's counts.
+    """
+
+    def __post_init__(self) -> None:
+        both = set(self.tissues_hu) & set(self.scene.names)
+        if both or not self.background:
+            tissues = ", ".join(self.tissues_hu)
+            why = f"{', '.join(sorted(both))} is a tissue and a body" if both else f"name the background, of {tissues}"
+            raise ValueError(f"task {self.name}: {why}")
+        super().__post_init__()
+
+    @property
+    def tissues_hu(self) -> Mapping[str, float]:
+        """HU of all tissues but the patient's."""
+        raise NotImplementedError
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """See :attr:`Task.names`."""
+        return (*self.tissues_hu, *self.scene.names)
+
+    @cached_property
+    def patient(self) -> str:
+        """The body in which the middle of the inset lies."""
+        z, y, x = self.grid.center
+        return self.scene.names[int(self.scene.labels(np.array([[x, y, z]]))[0])]
+
+    def _painted(self, grid: VolumeGrid, values: Mapping[str, float], *, signal: bool) -> Floats:
+        """Mean over each voxel of ``values`` of the tissues, with or without the signal."""
+        raise NotImplementedError
+
+    def scan(self, store: Store, signal: str) -> Scan:
+        """See :meth:`Task.scan`."""
+        path = self.scan_file(store, signal)
+        if not path.exists():
+            plain = self._alone(store)
+            seen = SomeViews(plain)
+            here = self._patient_hu(seen, self._bodies(seen))
+            hu = {tissue: value - here for tissue, value in self.tissues_hu.items()}
+            painted = partial(self._painted, values=hu, signal=signal == "present")
+            store.keep_scan(_with(plain, self.grid, painted), path)
+        return Scan.load(path)
+
+    def _alone(self, store: Store) -> Scan:
+        """The patient without what is painted."""
+        return Task.scan(self, Store(store.folder / "patient"), "present")
+
+    def _bodies(self, seen: SomeViews) -> dict[str, Tensor]:
+        """Body → its path lengths, mm, without what is painted."""
+        names = list(self.scene.names)
+        return dict(zip(names, seen.path_lengths(self, [[n] for n in names]), strict=True))
+
+    def _patient_hu(self, seen: SomeViews, bodies: Mapping[str, Tensor]) -> float:
+        maps = list(bodies.values())
+        return float(seen.values(maps, seen.information(maps))[list(bodies).index(self.patient)])
+
+    @property
+    def _signal_hu(self) -> float:
+        return self.tissues_hu[self.signal[0]]
+
+    def facts(self, store: Store) -> Facts:
+        """The values are given; the limit is that of tissues with these shapes in this patient."""
+        seen = SomeViews(self._alone(store))
+        project = Projector(seen.geometry, self.grid, seen.window)
+        bodies = self._bodies(seen)
+        maps = {t: project(torch.from_numpy(own).float()) for t, own in self.shares.items() if t != self.patient}
+        values = {**self.tissues_hu, "signal": self._signal_hu, self.patient: self._patient_hu(seen, bodies)}
+        bodies[self.patient] = bodies[self.patient] - torch.stack(list(maps.values())).sum(0)
+        ordered = [(maps | bodies)[tissue] for tissue in [*self.shares, *(n for n in bodies if n != self.patient)]]
+        limit = contrast_limit(seen.information(ordered))
+        return Facts(tuple(self.shares), tuple(values[tissue] for tissue in self.shares), limit)
+
+    @property
+    def _beside(self) -> Floats:
+        return self.shares[self.background]
+
+
+@dataclass(frozen=True, eq=False)
+class VoxelTask(_PaintedTask):
+    """A segmented lesion of the user's own: labels of voxels, put into a patient made of bodies.
 
     Args:
         labels: ``(z, y, x)`` whole numbers; 0 and whatever ``tissues`` does not name is the patient. Their middle lies
@@ -242,70 +344,27 @@ class VoxelTask(Task):
         for tissue, (label, _) in self.tissues.items():
             if not (labels == label).any():
                 raise ValueError(f"task {self.name}: no voxel has the label {label} of {tissue!r}")
-        both = set(self.tissues) & set(self.scene.names)
-        if both or not self.background:
-            why = f"{', '.join(sorted(both))} is a tissue and a body" if both else "name the background, one of tissues"
-            raise ValueError(f"task {self.name}: {why}")
         object.__setattr__(self, "labels", labels.astype(np.int64))
         super().__post_init__()
         if len(self.signal) != 1 or not {*self.signal, self.background} <= set(self.tissues):
             raise ValueError(f"task {self.name}: signal and background must each be one of {', '.join(self.tissues)}")
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """See :attr:`Task.names`."""
-        return (*self.tissues, *self.scene.names)
-
-    @property
-    def _patient(self) -> str:
-        """The body in which the middle of the inset lies."""
-        z, y, x = self.grid.center
-        return self.scene.names[int(self.scene.labels(np.array([[x, y, z]]))[0])]
+    def tissues_hu(self) -> Mapping[str, float]:
+        """HU of all tissues but the patient's."""
+        return {tissue: hu for tissue, (_, hu) in self.tissues.items()}
 
     @cached_property
     def _groups(self) -> dict[str, list[str]]:
         others = [t for t in self.tissues if t not in (*self.signal, self.background)]
         tissues = {"signal": list(self.signal), **{t: [t] for t in (self.background, *others)}}
-        return {**tissues, self._patient: [self._patient]}
+        return {**tissues, self.patient: [self.patient]}
 
-    def scan(self, store: Store, signal: str) -> Scan:
-        """See :meth:`Task.scan`."""
-        path = self.scan_file(store, signal)
-        if not path.exists():
-            plain = self._alone(store)
-            here = self._patient_hu(plain)
-            hu = {t: value - here for t, (_, value) in self.tissues.items()}
-            if signal == "absent":
-                hu[self.signal[0]] = hu[self.background]
+    def _painted(self, grid: VolumeGrid, values: Mapping[str, float], *, signal: bool) -> Floats:
+        hu = dict(values) if signal else {**values, self.signal[0]: values[self.background]}
+        return np.sum([share * hu[tissue] for tissue, share in self._shares_on(grid).items()], axis=0)
 
-            def painted(grid: VolumeGrid) -> Floats:
-                return np.sum([share * hu[t] for t, share in self._painted(grid).items()], axis=0)
-
-            store.keep_scan(_with(plain, self.grid, painted), path)
-        return Scan.load(path)
-
-    def _alone(self, store: Store) -> Scan:
-        """The patient without the labels."""
-        return Task.scan(self, Store(store.folder / "patient"), "present")
-
-    def _patient_hu(self, alone: Scan) -> float:
-        seen, names = SomeViews(alone), list(self.scene.names)
-        maps = seen.path_lengths(self, [[n] for n in names])
-        return float(seen.values(maps, seen.information(maps))[names.index(self._patient)])
-
-    def facts(self, store: Store) -> Facts:
-        """The values are given; the limit is that of tissues with these shapes in this patient."""
-        alone = self._alone(store)
-        seen, painted = SomeViews(alone), [names[0] for names in self._groups.values() if names[0] in self.tissues]
-        project = Projector(seen.geometry, self.grid, seen.window)
-        maps = [project(torch.from_numpy(share).float()) for t, share in self.shares.items() if t != self._patient]
-        bodies = seen.path_lengths(self, [[n] for n in self.scene.names])
-        around = self.scene.names.index(self._patient)
-        values = [*(self.tissues[t][1] for t in painted), float(seen.values(bodies, seen.information(bodies))[around])]
-        bodies[around] = bodies[around] - torch.stack(maps).sum(0)
-        return Facts(tuple(self._groups), tuple(values), contrast_limit(seen.information(maps + bodies)))
-
-    def _painted(self, grid: VolumeGrid) -> dict[str, Floats]:
+    def _shares_on(self, grid: VolumeGrid) -> dict[str, Floats]:
         """Tissue → its share of every voxel of a grid, exactly."""
         along = [overlap(VolumeGrid(self.labels.shape, self.spacing, self.grid.center), grid, a) for a in range(3)]
         return {
@@ -316,13 +375,101 @@ class VoxelTask(Task):
     @cached_property
     def shares(self) -> dict[str, Floats]:
         """See :attr:`Task.shares`."""
-        own = self._painted(self.grid)
+        own = self._shares_on(self.grid)
         order = {("signal" if n in self.signal else n): own[n] for ns in self._groups.values() for n in ns if n in own}
-        return {**order, self._patient: 1.0 - np.sum(list(own.values()), axis=0)}
+        return {**order, self.patient: 1.0 - np.sum(list(own.values()), axis=0)}
+
+
+@dataclass(frozen=True, eq=False)
+class AnatomyTask(_PaintedTask):
+    """A vessel that breaks assumptions, in a patient made of bodies.
+
+    The signal is the anatomy's feature; without it there is what the anatomy has in its place, which may be several
+    tissues. It is read in the voxels that it changes by more than half of what it changes at most, thin as it may be.
+
+    Args:
+        anatomy: a name of :data:`recon.evaluate.anatomies.ANATOMIES`.
+
+    Raises:
+        ValueError: another signal than ``"feature"``, a background that is neither a tissue of the anatomy's base nor
+            the patient.
+    """
+
+    anatomy: str = "healthy"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        grounds = [*dict.fromkeys(part.tissue for part in self._what.base), self.patient]
+        if self.signal != (_FEATURE,) or self.background not in grounds:
+            raise ValueError(
+                f"task {self.name}: of an anatomy the signal is {_FEATURE!r} and the background one of "
+                f"{', '.join(grounds)}, got {', '.join(self.signal)} and {self.background!r}"
+            )
 
     @property
-    def _beside(self) -> Floats:
-        return self.shares[self.background]
+    def _what(self) -> Anatomy:
+        return ANATOMIES[self.anatomy]
+
+    @property
+    def tissues_hu(self) -> Mapping[str, float]:
+        """HU of all tissues but the patient's, which is the anatomy's fat; the feature's is the mean over it."""
+        tissues = {t: hu for t, hu in self._what.values.items() if t != _FAT}
+        return {_FEATURE: 0.0, **tissues}
+
+    def _painted(self, grid: VolumeGrid, values: Mapping[str, float], *, signal: bool) -> Floats:
+        return self._what.painted(_about_middle(grid, self.grid), values, feature=signal)
+
+    @cached_property
+    def _changes(self) -> dict[tuple[str, str], Floats]:
+        """(tissue with the signal, without it) → its share of every voxel."""
+        return self._what.shares(_about_middle(self.grid, self.grid))
+
+    @property
+    def _signal_hu(self) -> float:
+        changed = {pair: float(own.sum()) for pair, own in self._changes.items() if pair[0] != pair[1]}
+        return sum(self._what.values[pair[0]] * size for pair, size in changed.items()) / sum(changed.values())
+
+    @cached_property
+    def shares(self) -> dict[str, Floats]:
+        """See :attr:`Task.shares`."""
+        signal = np.sum([own for (after, before), own in self._changes.items() if after != before], axis=0)
+        kept = {t: self._changes.get((t, t), np.zeros(self.grid.shape)) for t in self._what.values}
+        kept[self.patient] = kept.pop(_FAT)
+        background = kept.pop(self.background)
+        return {"signal": signal, self.background: background, **{t: own for t, own in kept.items() if own.any()}}
+
+    def truth(self, facts: Facts) -> tuple[Tensor, Tensor]:
+        """See :meth:`Task.truth`."""
+        patient = dict(zip(facts.tissues, facts.values_hu, strict=True))[self.patient]
+        present, absent = self._hu(patient)
+        return torch.from_numpy(present).float(), torch.from_numpy(absent).float()
+
+    def _hu(self, patient: float) -> tuple[Floats, Floats]:
+        """With and without the signal."""
+        values = {**self._what.values, _FAT: patient}
+        both = [[values[pair[k]] * own for pair, own in self._changes.items()] for k in (0, 1)]
+        return np.sum(both[0], axis=0), np.sum(both[1], axis=0)
+
+    @cached_property
+    def _signal_voxels(self) -> NDArray[np.bool_]:
+        present, absent = self._hu(self._what.values[_FAT])
+        change = np.abs(present - absent)
+        return np.asarray(change > 0.5 * change.max())
+
+    @property
+    def _constant(self) -> list[Floats]:
+        return list(self._changes.values())
+
+    @property
+    def _around(self) -> NDArray[np.bool_]:
+        """Of the background, so far from the signal that its blur does not reach there."""
+        away = ndimage.distance_transform_edt(self.shares["signal"] == 0.0, sampling=self.grid.spacing)
+        return self._pure(self.background, np.where(away > BESIDE_MM, self._beside, 0.0))
+
+
+def _about_middle(grid: VolumeGrid, inset: VolumeGrid) -> VolumeGrid:
+    """A grid in the coordinates about the inset's middle."""
+    return replace(grid, center=tuple(a - b for a, b in zip(grid.center, inset.center, strict=True)))
 
 
 def _without_inset(scan: Scan) -> Scan:
