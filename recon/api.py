@@ -22,6 +22,7 @@ from torchpcct.checks.defects import dead_readings, repair_defects
 from torchpcct.checks.readings import reading_warnings
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
+from torchpcct.scan_grid import finite_cells
 from torchpcct.validate import checked
 from torchpcct.volume import Volume, from_hu
 
@@ -119,8 +120,9 @@ def reconstruct(
 
     Returns:
         A :class:`torchpcct.Volume` (a list of them for a sequence of scans), float32 HU; its ``report`` says how it was
-        made: method, options, seconds, ``warnings``, how many ``dead_readings`` were bridged, and for iterative methods
-        iterations and residual. In mm⁻¹ if ``scan.unit`` says so.
+        made: method, options, seconds, ``warnings``, how many ``dead_readings`` were bridged, ``cells_mm`` of the
+        detector as they are seen at the axis ([z,] y, x), and for iterative methods iterations and residual. In mm⁻¹ if
+        ``scan.unit`` says so.
 
     Raises:
         ValueError: an unknown method, kernel or option value, a grid outside the field of view, a starved scan.
@@ -167,7 +169,8 @@ def reconstruct(
         for solution in batch:
             s, before = whole[len(volumes)]
             volume, report, found = _finished(s, grid, solution)
-            report |= {"seconds": seconds, "dead_readings": dead_readings(s), "warnings": [*before, *found]}
+            report |= {"seconds": seconds, "cells_mm": finite_cells(s.geometry), "dead_readings": dead_readings(s)}
+            report["warnings"] = [*before, *found]
             for text in found:
                 if text not in told:
                     _LOG.warning("%s", text)

@@ -15,7 +15,7 @@ from torchpcct.geometry import ConeBeam, ParallelBeam, VolumeGrid
 from torchpcct.validate import number, numbers
 from torchpcct.vector_geometry import VectorGeometry
 
-__all__ = ["cells_at_axis", "grid_of"]
+__all__ = ["cells_at_axis", "finite_cells", "grid_of"]
 
 Floats = NDArray[np.float64]
 
@@ -115,6 +115,11 @@ def cells_at_axis(geometry: Any) -> tuple[float, float, float]:
         columns, rows = (np.linalg.norm(geometry.poses[:, k], axis=1) for k in (2, 3))
         return cell * float(np.median(rows / columns)), cell, cell
     return math.inf, cell, cell
+
+
+def finite_cells(geometry: Any) -> list[float]:
+    """:func:`cells_at_axis` without z, where there are no rows."""
+    return [cell for cell in cells_at_axis(geometry) if math.isfinite(cell)]
 
 
 # --- a part of the detector -----------------------------------------------------------------------------------------

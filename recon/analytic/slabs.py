@@ -58,7 +58,7 @@ from torchpcct.projector import Projector
 from torchpcct.readings import MOST_DEAD
 from torchpcct.scan import Scan
 from torchpcct.scan_file import NoSlicesError
-from torchpcct.scan_grid import grid_of
+from torchpcct.scan_grid import finite_cells, grid_of
 from torchpcct.validate import checked, choice, memory_bytes
 from torchpcct.volume import from_hu, to_hu
 
@@ -517,6 +517,7 @@ def reconstruct_to(
         "method": method, **({"kernel": kernel} if fbp else {}),
         "seconds": round(time.perf_counter() - start, 3), "warnings": warnings,
         "notes": [*notes["notes"], *(view_notes(g) if fbp else [])],
+        "cells_mm": finite_cells(source.geometry),
         "dead_readings": notes["dead_readings"],
         "slabs": len(plan.slabs), "memory_bytes": plan.memory, "resumed_at": begun,
         "minimum": low, "maximum": high, "mean": total / max((grid.shape[0] - begun) * math.prod(grid.shape[1:]), 1),

@@ -215,7 +215,17 @@ def _volumes(arguments: argparse.Namespace) -> tuple[list[dict[str, Any]], str, 
             )
     data = {name: [v.data for v in both] for name, both in pairs.items()}
     base = data.pop(reference)
-    return evaluate_volumes(data, base, grid.spacing, _region(arguments.region, grid)), unit, reference
+    cells = _cells(stems[0][reference])
+    found = evaluate_volumes(data, base, grid.spacing, _region(arguments.region, grid), cells_mm=cells)
+    return found, unit, reference
+
+
+def _cells(path: Path) -> list[float] | None:
+    """What ``reconstruct`` wrote beside a volume of the detector's cells at the axis, mm; None: nothing."""
+    try:
+        return [float(c) for c in json.loads(Path(f"{path}.json").read_text(encoding="utf-8"))["cells_mm"]]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 def _region(text: str | None, grid: VolumeGrid) -> Any:

@@ -29,7 +29,7 @@ from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.equal_resolution import noise_at_equal_resolution
 from torchpcct.metrics.half_split import HalfSplit, halves
 from torchpcct.scan import Scan
-from torchpcct.scan_grid import cells_at_axis
+from torchpcct.scan_grid import cells_at_axis, finite_cells
 from torchpcct.validate import checked, whole
 
 __all__ = ["MeasuredDraw", "evaluate_scans", "evaluate_volumes"]
@@ -199,21 +199,23 @@ def _unaliased(scan: Scan, grid: VolumeGrid, kernel: str) -> Tensor:
     return volume.float()
 
 
+def _lengths(sizes: Sequence[float]) -> str:
+    """One length, or as many as differ."""
+    return " × ".join(f"{s:.3g}" for s in (sizes if len(set(sizes)) > 1 else sizes[:1]))
+
+
 def _note(scan: Scan, grid: VolumeGrid) -> str:
     """What is said of FBP that was made on finer voxels."""
     parts = _finer(scan, grid)
     if max(parts) == 1:
         return ""
 
-    def text(sizes: Any) -> str:
-        return " × ".join(f"{s:.3g}" for s in (sizes if len(set(sizes)) > 1 else sizes[:1]))
-
-    cells = [c for c in cells_at_axis(scan.geometry)[-grid.ndim :] if math.isfinite(c)]  # slices have no cells along z
+    cells = finite_cells(scan.geometry)
     voxels, fine = grid.spacing[-len(cells) :], [s / k for s, k in zip(grid.spacing, parts, strict=True)][-len(cells) :]
     return (
-        f"voxels of {text(voxels)} mm are coarser than the detector's cells, {text(cells)} mm at the axis, and "
-        f"FBP on them aliases noise. FBP, {_REFERENCE} too, was therefore reconstructed on voxels of {text(fine)} mm "
-        "and resampled without aliasing, also as the base of denoisers: its noise is less than on the coarse voxels"
+        f"voxels of {_lengths(voxels)} mm are coarser than the detector's cells, {_lengths(cells)} mm at the axis, and "
+        f"FBP on them aliases noise. FBP, {_REFERENCE} too, was therefore reconstructed on voxels of {_lengths(fine)} "
+        "mm and resampled without aliasing, also as the base of denoisers: its noise is less than on the coarse voxels"
     )
 
 
@@ -227,7 +229,9 @@ def _mean(rows: list[Record]) -> Record:
 
 
 @checked
-def evaluate_volumes(volumes: Any, reference: Any, voxel_mm: Any, region: Any = None) -> list[Record]:
+def evaluate_volumes(
+    volumes: Any, reference: Any, voxel_mm: Any, region: Any = None, *, cells_mm: Sequence[float] | None = None
+) -> list[Record]:
     """Noise, resolution and the dose factor of noise at equal resolution of pairs of volumes.
 
     Args:
@@ -235,6 +239,7 @@ def evaluate_volumes(volumes: Any, reference: Any, voxel_mm: Any, region: Any = 
         reference: the two of a linear method that has smoothed nothing (FBP, kernel "ram-lak").
         voxel_mm: edge length of the voxels, one or ``(z, y, x)``.
         region: bool mask of a volume where noise is measured; resolution is that of the whole volume. None: everywhere.
+        cells_mm: of the detector as they are seen at the axis, ([z,] y, x), in mm; None: not known.
 
     Returns:
         For each method: ``method``; ``noise`` of a voxel of one volume; ``noise_shared``, the same at the frequencies
@@ -243,7 +248,7 @@ def evaluate_volumes(volumes: Any, reference: Any, voxel_mm: Any, region: Any = 
         ``f50_z``, line pairs per mm in the plane and along z at which half of the reference's signal is left (inf: it
         does not fall so far as the object shows); ``resolution`` and ``resolution_z``, up to which the reference's
         volumes agree; ``why`` there is no factor, which then is NaN (else empty); ``note``: on what the factors depend,
-        as the voxels of the reference must not be coarser than the detector's cells.
+        as the voxels of the reference must not be coarser than the detector's cells (empty: they are not).
 
     Raises:
         ValueError: volumes of other shapes, NaN; constant ones, or two that are the same.
@@ -252,12 +257,7 @@ def evaluate_volumes(volumes: Any, reference: Any, voxel_mm: Any, region: Any = 
     spacing = np.ravel(voxel_mm).astype(np.float64)
     spacing = np.array([spacing[0], *spacing]) if spacing.size == 2 else np.broadcast_to(spacing, 3)
     mask = None if region is None else np.asarray(region, bool).reshape(base.first.shape)
-    found = []
-    note = (
-        "it is taken that the detector's cells at the axis are no smaller than the voxels, "
-        f"{max(spacing[1:]):.3g} mm in the plane: on coarser voxels FBP aliases noise, and every smoother method seems "
-        "to save dose"
-    )
+    found, note = [], _condition(tuple(spacing), cells_mm)
     for name, pair in dict(volumes).items():
         split = _split(name, pair)
         if split.first.shape != base.first.shape:
@@ -276,6 +276,24 @@ def evaluate_volumes(volumes: Any, reference: Any, voxel_mm: Any, region: Any = 
             "resolution_z": seen.shown_z, "why": seen.why, "note": note,
         })  # fmt: skip
     return found
+
+
+def _condition(spacing: Sequence[float], cells: Sequence[float] | None) -> str:
+    """On what the factors of given volumes depend."""
+    if cells is None:
+        return (
+            "it is taken that the detector's cells at the axis are no smaller than the voxels, "
+            f"{max(spacing[1:]):.3g} mm in the plane: on coarser voxels FBP aliases noise, and every smoother method "
+            "seems to save dose"
+        )
+    voxels = spacing[-len(cells) :]
+    if all(s <= _COARSE * cell for s, cell in zip(voxels, cells, strict=True)):
+        return ""
+    return (
+        f"these factors are not to be trusted: the voxels of {_lengths(voxels)} mm are coarser than the detector's "
+        f"cells, {_lengths(cells)} mm at the axis, so FBP aliases noise and every smoother method seems to save dose; "
+        "give a reference on voxels no coarser than the cells or averaged from such, or the scans (--scans)"
+    )
 
 
 def _split(name: str, pair: Any) -> HalfSplit:

@@ -430,6 +430,8 @@ def test_volumes_in_two_folders(here, cli):
     for text in (said, page):
         assert "no smaller than the voxels, 0.5 mm in the plane" in text.replace("&#39;", "'")
     assert "along z" in page
+    (here / "one" / "fbp.nii.gz.json").write_text(json.dumps({"cells_mm": [0.3, 0.2, 0.2]}), encoding="utf-8")
+    assert "not to be trusted: the voxels of 1 × 0.5 × 0.5 mm" in cli("evaluate --volumes one two --out coarse")
     cli("evaluate --volumes one two --region :,4:60,4:60 --out part")
     part = json.loads((here / "part" / "report.json").read_text(encoding="utf-8"))["records"]
     assert part[0]["noise"] != report["records"][0]["noise"]

@@ -57,13 +57,22 @@ def test_a_softer_kernel_saves_no_dose_on_coarse_voxels(scans, voxel):
 
 
 def test_of_volumes_the_condition_is_stated(scans):
-    """Nothing is known of the detector that they are of."""
+    """Of files of others nothing is known of the detector; where it is, the factors are sound, or said not to be."""
     grid = VolumeGrid((28, 28), 3.0)
-    sharp, soft = ([reconstruct(s, grid, "fbp", kernel=kernel).data for s in scans] for kernel in ("ram-lak", "soft"))
-    (row,) = evaluate_volumes({"theirs": soft}, sharp, 3.0)
-    assert row["dose_factor"] > 2.0
-    assert "no smaller than the voxels, 3 mm in the plane" in row["note"]
-    assert f"Note: {row['note']}.\n" in measured_text([row], "HU", "theirs")
+    sharp, soft = ([reconstruct(s, grid, "fbp", kernel=kernel) for s in scans] for kernel in ("ram-lak", "soft"))
+    cells = sharp[0].report["cells_mm"]
+    assert cells == [1.0, 1.0]
+    volumes = ({"theirs": [v.data for v in soft]}, [v.data for v in sharp], 3.0)
+    for known, said in (
+        (None, "no smaller than the voxels, 3 mm in the plane"),
+        (cells, "not to be trusted: the voxels of 3 mm"),
+    ):
+        (row,) = evaluate_volumes(*volumes, cells_mm=known)
+        assert row["dose_factor"] > 2.0
+        assert said in row["note"]
+        assert f"Note: {row['note']}.\n" in measured_text([row], "HU", "theirs")
+    (row,) = evaluate_volumes(*volumes, cells_mm=[3.0, 3.0])
+    assert row["note"] == ""
 
 
 def test_views_are_exchanged_with_their_flux(scans):
