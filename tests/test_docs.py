@@ -176,6 +176,14 @@ def test_links_of_the_repository_lead_somewhere():
     assert found > 40
 
 
+def test_the_limits_say_what_the_hard_cases_say():
+    report = json.loads((ROOT / "notebooks/hardcases/report.json").read_text(encoding="utf-8"))
+    text = " ".join((ROOT / "notebooks/docs/limits.md").read_text(encoding="utf-8").split())
+    unseen, rows = report["verdicts"].get("unseen", 0), len(report["rows"])
+    assert f"* {unseen} of the {rows} results of the hard cases are wrong in a way that the data cannot show" in text
+    assert f"; {report['silent']} are wrong without a word otherwise." in text
+
+
 def test_the_readme_is_short():
     """At most 100 lines; at most 40 numerals, code blocks left out (the whole of it has about 60)."""
     text = (ROOT / "README.md").read_text(encoding="utf-8")
