@@ -347,6 +347,18 @@ def test_a_denoiser_of_deepinv(slices):
     assert seen == [((3, 1, 4, 5) if slices else (1, 1, 3, 4, 5), 0.5, 0.02)]
 
 
+def test_the_weights_in_a_denoiser_count_for_what_is_kept_of_it():
+    """The same function with other weights is another method; with equal ones it is the same in every process."""
+    layers = [torch.nn.Conv3d(1, 1, 3, padding=1) for _ in range(2)]
+    twin = torch.nn.Conv3d(1, 1, 3, padding=1)
+    twin.load_state_dict(layers[0].state_dict())
+
+    def key(layer):
+        return denoiser(deepinv_denoiser(layer), "fbp:soft").key
+
+    assert key(layers[0]) == key(twin) != key(layers[1])
+
+
 def test_rivals_come_with_their_tuned_settings():
     assert tuned("bilateral", "detail", 2.0) == {"edge": 2.0, "reach": 2.5, "sigma": 1.4}
     assert tuned("bilateral", "detail", 0.3) == tuned("bilateral", "detail", 0.35) != tuned("bilateral", "detail", 2.0)
