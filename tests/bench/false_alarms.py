@@ -1,28 +1,38 @@
-"""Sound scans drawn at random: how many are told that something is wrong with them?
+"""Sound scans drawn at random: how many are told that something is wrong with them? Wrong ones: are sizes right?
 
     python tests/bench/false_alarms.py [--n 500] [--first 0] [--kind cone] [--method fbp] [--readings 600000]
+    python tests/bench/false_alarms.py --errors [--n 500] [--first 0] [--kind cone]
 
 Without ``--method`` only the checks run that :func:`recon.reconstruct` runs for every method; with it the whole
 reconstruction, and every warning of its report counts. Each alarm is printed with the seed of its scan; ``--seed N``
 looks at one. The exit status is 1 if there is any.
+
+``--errors`` describes each scan wrongly by a size drawn at random (the centre, the fan angles, the steps between views,
+a roll of the detector) and counts how often the error is found, is named, and lies within what is said after ±, of
+which 95 % should.
 """
 
 import argparse
 import logging
 import sys
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "helpers"))  # where pytest finds them, too
 
-from sound_scans import KINDS, Drawn, draw
+from sound_scans import KINDS, Drawn, draw, transmissions
 
 import recon
 from recon.analytic.coverage import consistency_warnings
 from torchpcct.checks.defects import repair_defects
+from torchpcct.checks.opposite_rays import geometry_test
 from torchpcct.checks.readings import reading_warnings
+from torchpcct.geometry import ConeBeam
 
 
 def alarms(drawn: Drawn, method: str | None = None) -> list[str]:
@@ -36,6 +46,64 @@ def alarms(drawn: Drawn, method: str | None = None) -> list[str]:
     return drawn.wrongly(texts)
 
 
+CAUSES = ("centre", "scale", "step", "roll")
+
+
+def misdescribed(drawn: Drawn, cause: str, size: float) -> tuple[Any, Any]:
+    """Line integrals of a scan and a geometry that is wrong by a size of one cause, as ``geometry_test`` counts it."""
+    g, shone = drawn.geometry, None
+    if cause == "roll":  # each row beside its place
+        rows = []
+        for height in g.row_positions:
+            moved = g.offset[1] - size * float(height)
+            row = replace(g, rows=1, offset=(float(height), moved))
+            rows.append(transmissions(row, drawn.solids, **drawn.options))
+        shone = np.concatenate(rows, 1)
+    wrong = g
+    if cause == "step":
+        wrong = replace(g, angles=g.angles / (1.0 + size))
+    elif cause in ("centre", "scale"):
+        cone = isinstance(g, ConeBeam)
+        pitch, offset = (g.pitch[1], g.offset[1]) if cone else (g.pitch, g.offset)
+        factor, shift = (1.0, size * pitch) if cause == "centre" else (1.0 / (1.0 + size), 0.0)
+        pitch, offset = factor * pitch, factor * offset + shift
+        wrong = replace(
+            g,
+            pitch=(g.pitch[0], pitch) if cone else pitch,
+            offset=(g.offset[0], offset) if cone else offset,
+        )
+    scan = repair_defects(drawn.scan(wrong, shone))[0]
+    return scan.line_integrals(), wrong
+
+
+def measured(options: argparse.Namespace) -> int:
+    """The table of errors that are found, named and covered; 1 if less than nine of ten sizes lie within their ±."""
+    table = {cause: np.zeros(4, int) for cause in CAUSES}
+    for seed in range(options.first, options.first + options.n):
+        drawn = draw(seed, kind=options.kind, readings=options.readings)
+        rng = np.random.default_rng([seed, 2])
+        causes = [
+            c for c in CAUSES if (c != "roll" or drawn.kind == "cone") and (c != "scale" or drawn.kind != "parallel")
+        ]
+        cause = str(rng.choice(causes))
+        low, high = {"centre": (0.2, 2.0), "scale": (0.01, 0.06), "step": (0.003, 0.02), "roll": (0.01, 0.06)}[cause]
+        size = float(rng.choice((-1, 1)) * rng.uniform(low, high))
+        lines, wrong = misdescribed(drawn, cause, size)
+        test = geometry_test(lines, wrong)
+        words = {"centre": "rotation centre", "scale": "fan angles", "step": "steps between", "roll": "rolled"}
+        named = any(words[cause] in text for text in test.findings)
+        covered = named and abs(test.sizes[cause] - size) <= 2.0 * test.errors[cause]
+        table[cause] += (1, bool(test.findings), named, covered)
+        if named and not covered:
+            said = f"{test.sizes[cause]:.4g} ± {2 * test.errors[cause]:.2g}"
+            print(f"{seed} | {drawn.text}\n      {cause} {size:.4g}, said {said}")
+    print(f"\n{'cause':10}{'scans':>8}{'found':>8}{'named':>8}{'within ±':>10}")
+    for cause, (count, found, named, covered) in table.items():
+        print(f"{cause:10}{count:8}{found:8}{named:8}{covered:10}")
+    named, covered = (sum(int(row[k]) for row in table.values()) for k in (2, 3))
+    return int(covered < 0.9 * named)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--n", type=int, default=500, help="scans (500)")
@@ -44,9 +112,14 @@ def main() -> int:
     parser.add_argument("--kind", choices=KINDS, help="only such scans")
     parser.add_argument("--method", choices=("fbp", "pwls", "mbir"), help="reconstruct with it")
     parser.add_argument("--readings", type=int, default=600_000, help="the most of a scan")
+    parser.add_argument(
+        "--errors", action="store_true", help="wrong descriptions instead: are they found and measured?"
+    )
     options = parser.parse_args()
     logging.getLogger("recon").setLevel(logging.ERROR)
     torch.set_num_threads(1)
+    if options.errors:
+        return measured(options)
     seeds = [options.seed] if options.seed is not None else range(options.first, options.first + options.n)
     drawn_of, alarmed, texts = Counter[str](), Counter[str](), Counter[str]()
     for seed in seeds:

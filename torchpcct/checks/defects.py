@@ -239,8 +239,8 @@ def _alone(deviation: NDArray[np.float64], found: NDArray[np.bool_], known: NDAr
     """Those cells of a wrong gain that stand out of a smooth row, up to :data:`_TOGETHER` side by side.
 
     The outline of a body that is round about the axis stays on its cells, too, and on others in every row: many of the
-    cells about one of its own deviate. Gains are gone once their cells are bridged: those beside them then lie on a
-    line with the next. An outline bends the row wherever it is bridged.
+    cells about one of its own deviate, and so does one on the other side of the axis. Gains are gone once their cells
+    are bridged: those beside them then lie on a line with the next. An outline bends the row wherever it is bridged.
 
     Args:
         deviation: how far cells lie above the mean of their neighbours in the row.
@@ -248,10 +248,16 @@ def _alone(deviation: NDArray[np.float64], found: NDArray[np.bool_], known: NDAr
         known: of which that is known.
     """
     columns = deviation.shape[1]
+    reach = max(4, columns // 20)
     hot = np.zeros_like(found)
     for r, c in np.argwhere(found):
         about = np.abs(deviation[max(r - 1, 0) : r + 2, max(c - _ABOUT, 0) : c + _ABOUT + 1])
         if np.quantile(about, 0.8) > _BENT * abs(deviation[r, c]):
+            continue
+        # The other side of an outline: the axis is not far from the middle.
+        other = columns - 1 - c
+        mirrored = deviation[r, max(other - reach, 0) : other + reach + 1] / deviation[r, c]
+        if abs(other - c) > 2 * reach and bool(((mirrored > 0.5) & (mirrored < 2.0)).any()):
             continue
         least, start_of, alone = math.inf, 0, 0
         for count in range(1, _TOGETHER + 1):
