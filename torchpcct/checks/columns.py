@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchpcct.checks.opposite_rays import UNKNOWN, ScanTest, check_lines
+from torchpcct.checks.scan_test import UNKNOWN, ScanTest, check_lines
 from torchpcct.geometry import ConeBeam, Geometry
 from torchpcct.readings import MEDIAN_TO_SD
 from torchpcct.validate import checked
@@ -53,7 +53,7 @@ def column_test(lines: Tensor, geometry: Geometry) -> ScanTest:
     Returns:
         The test of ``gain`` (largest factor by which a cell reads more or less than its neighbours, less 1) and
         ``place`` (columns by which those of even and odd number lie beside their places).
-        :data:`~torchpcct.checks.opposite_rays.UNKNOWN` of fewer than 16 columns or 32 views.
+        :data:`~torchpcct.checks.scan_test.UNKNOWN` of fewer than 16 columns or 32 views.
 
     Raises:
         ValueError: a wrong shape, NaN or Inf.

@@ -25,8 +25,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchpcct.checks.opposite_rays import UNKNOWN, ScanTest, check_lines
 from torchpcct.checks.orbit_plane import lack_of_cells, orbit_plane
+from torchpcct.checks.scan_test import UNKNOWN, ScanTest, check_lines
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, view_step
 
 __all__ = ["STEP_TOLERANCE", "WEIGHT_TOLERANCE", "moment_test"]
@@ -69,7 +69,7 @@ def moment_test(lines: Tensor, geometry: Geometry) -> ScanTest:
         size by which the steps between the views are described too small; of less than a full turn), ``centre`` (mm at
         the axis by which the centre of mass leaves its sinusoid, root mean square) and, of a cone beam, ``axial`` (mm
         at the axis by which the object's height changes beyond a wave of one turn).
-        :data:`~torchpcct.checks.opposite_rays.UNKNOWN` where far less than half a turn of directions was measured.
+        :data:`~torchpcct.checks.scan_test.UNKNOWN` where far less than half a turn of directions was measured.
 
     Raises:
         ValueError: a wrong shape, NaN or Inf.

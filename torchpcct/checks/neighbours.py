@@ -36,7 +36,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchpcct.checks.opposite_rays import UNKNOWN, ScanTest, check_lines
+from torchpcct.checks.scan_test import UNKNOWN, ScanTest, check_lines
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, view_step
 from torchpcct.readings import MEDIAN_TO_SD
 from torchpcct.validate import checked
@@ -98,7 +98,7 @@ def neighbour_test(lines: Tensor, geometry: Geometry) -> ScanTest:
         The test of ``order`` (mean squared difference of neighbours over that of any two views: 1 in random order),
         ``jump`` (largest distance of two neighbours beyond the described one, in steps), ``alternation`` (shift of
         views that alternate, in cells at the axis) and ``scatter`` (of the angles about the described ones, in steps).
-        :data:`~torchpcct.checks.opposite_rays.UNKNOWN` of fewer than 24 views or 24 columns.
+        :data:`~torchpcct.checks.scan_test.UNKNOWN` of fewer than 24 views or 24 columns.
 
     Raises:
         ValueError: a wrong shape, NaN or Inf.

@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
-from torchpcct.checks.opposite_rays import OppositeRays, centre_test
+from torchpcct.checks.opposite_rays import centre_test
 from torchpcct.checks.orbit_plane import orbit_plane
+from torchpcct.checks.ray_pairs import OppositeRays
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, view_step
 from torchpcct.readings import MEDIAN_TO_SD

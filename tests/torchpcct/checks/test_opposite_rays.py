@@ -16,10 +16,10 @@ from torchpcct.checks.opposite_rays import (
     FALSE_ALARMS,
     SCALE_TOLERANCE,
     STEP_TOLERANCE,
-    OppositeRays,
     centre_test,
     geometry_test,
-)  # fmt: skip
+)
+from torchpcct.checks.ray_pairs import OppositeRays
 from torchpcct.detector_window import DetectorWindow
 
 VIEWS, RODS = 180, ((12.0, -7.0, 6.0, 0.02), (12.0, -7.0, 3.0, 0.01), (-20.0, 15.0, 9.0, 0.015))

@@ -10,8 +10,9 @@ from sound_scans import BOX, CYLINDER, Solid, transmissions
 
 from torchpcct import ConeBeam, full_turn
 from torchpcct.checks.moments import moment_test
-from torchpcct.checks.opposite_rays import OppositeRays, geometry_test
+from torchpcct.checks.opposite_rays import geometry_test
 from torchpcct.checks.orbit_plane import PARTED, orbit_plane
+from torchpcct.checks.ray_pairs import OppositeRays
 from torchpcct.detector_window import DetectorWindow
 
 SOD = 400.0
