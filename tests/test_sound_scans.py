@@ -8,7 +8,8 @@ import pytest
 from analytic import Ellipsoid, line_integrals
 from sound_scans import BALL, BOX, CYLINDER, Solid, draw, transmissions
 
-from torchpcct import ConeBeam, FanBeam, ParallelBeam
+from torchpcct import ConeBeam, FanBeam, ParallelBeam, full_turn
+from torchpcct.checks.opposite_rays import geometry_test
 
 _SPEC = importlib.util.spec_from_file_location("false_alarms", Path(__file__).parent / "bench/false_alarms.py")
 false_alarms = importlib.util.module_from_spec(_SPEC)
@@ -19,6 +20,26 @@ _SPEC.loader.exec_module(false_alarms)
 def test_sound_scans_raise_no_alarm(seed):
     drawn = draw(seed, readings=25_000)
     assert false_alarms.alarms(drawn) == [], drawn.text
+
+
+@pytest.mark.parametrize(
+    ("kind", "seed", "cause", "size"),
+    [("fan", 1, "centre", -0.7), ("fan", 22, "scale", 0.03), ("fan", 1, "step", -0.012), ("cone", 2, "centre", 1.3)],
+)
+def test_wrong_descriptions_are_measured(kind, seed, cause, size):
+    drawn = draw(seed, kind=kind, readings=25_000)
+    found = geometry_test(*false_alarms.misdescribed(drawn, cause, size))
+    assert found.findings, drawn.text
+    assert abs(found.sizes[cause] - size) < 2.0 * found.errors[cause] < abs(size)
+
+
+def test_all_parts_of_a_focal_spot_shine():
+    """A spot to one side would be a centre in another place."""
+    g = ConeBeam(full_turn(4), 300.0, 500.0, 40, 3, (2.0, 2.0))
+    for subs in ((3, 2, 1), (3, 2, 3), (3, 7, 1)):
+        shone = transmissions(g, [Solid(BALL, (0.0, 0.0, 0.0), (20.0, 20.0, 50.0), 0.02)], subs=subs, spot=6.0)
+        middle = ((1.0 - shone) * (np.arange(40) - 19.5)).sum(2) / (1.0 - shone).sum(2)
+        assert np.abs(middle).max() < 0.002
 
 
 @pytest.mark.parametrize(

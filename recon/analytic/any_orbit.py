@@ -209,15 +209,40 @@ def _resampled(sinogram: Tensor, circle: IdealCircle) -> Tensor:
     positions: Any = circle.geometry
     u, v = positions.column_positions, circle.rows
     place = np.stack([np.tile(u, v.size), np.repeat(v, u.size), np.ones(u.size * v.size)])
-    scale = np.array([[max((columns - 1) / 2, 0.5)], [max((rows - 1) / 2, 0.5)]])
+    middle = np.array([[(columns - 1) / 2], [(rows - 1) / 2]])
     out = []
     for view, to_actual in enumerate(circle.maps):
         at = to_actual @ place
-        grid = torch.from_numpy((at[:2] / at[2] / scale).T.reshape(1, v.size, u.size, 2)).to(sinogram)
-        flat = sinogram[..., view, :, :].reshape(1, -1, rows, columns)
-        if rows == 1:  # equal rows make a plane of a line
-            flat = flat.expand(-1, -1, 4, -1)
-            grid = torch.stack([grid[..., 0], torch.zeros_like(grid[..., 0])], -1)
-        one = torch.nn.functional.grid_sample(flat, grid, mode="bicubic", padding_mode="border", align_corners=True)
+        at = at[:2] / at[2] + middle
+        across, low = _weights(at[0], columns)
+        along, lower = _weights(at[1], rows)
+        flat = sinogram[..., view, :, :]
+        one: Any = 0.0
+        for i in range(along.shape[0]):
+            for j in range(across.shape[0]):
+                weight = torch.from_numpy(along[i] * across[j]).to(sinogram)
+                one = one + weight * flat[..., torch.from_numpy(lower[i]), torch.from_numpy(low[j])]
         out.append(one.reshape(*sinogram.shape[:-3], v.size, u.size))
     return torch.stack(out, -3)
+
+
+def _weights(at: Floats, cells: int) -> tuple[Floats, NDArray[np.int64]]:
+    """Of the four cells about each place their weights ``(4, places)`` and numbers; one cell weighs 1.
+
+    Keys (1981, IEEE Trans. Acoust. 29:1153), a = -1/2: straight lines and parabolas are kept. What torch interpolates
+    with, a = -3/4, moves a slope by up to a twentieth of a cell, there and back between two cells.
+    """
+    if cells == 1:
+        return np.ones((1, at.size)), np.zeros((1, at.size), np.int64)
+    at = np.clip(at, 0.0, cells - 1.0)
+    low = np.minimum(np.floor(at), cells - 2.0)
+    s = at - low
+    weights = np.stack(
+        [
+            -0.5 * s * (1.0 - s) ** 2,
+            1.0 + s * s * (1.5 * s - 2.5),
+            s * (0.5 + s * (2.0 - 1.5 * s)),
+            -0.5 * s * s * (1.0 - s),
+        ]
+    )
+    return weights, np.clip(low + np.arange(-1, 3)[:, None], 0, cells - 1).astype(np.int64)

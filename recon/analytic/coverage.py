@@ -182,7 +182,6 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
         window, about = footprint(scan.geometry, grid, margin=_CENTRE_MARGIN).within(window), tuple(grid.center[-2:])
         scan = scan.crop(window)
     lines, geometry = scan.line_integrals(), scan.geometry
-    rebinned = isinstance(geometry, VectorGeometry)
     if isinstance(geometry, VectorGeometry):
         try:
             lines, circle = rebin_to_circle(lines, geometry)
@@ -195,13 +194,13 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
         lines = lines[lines.shape[0] // 2]
     if window is not None:
         lines = lines - window.take(scan.surround_line_integrals())
-        opposite = geometry_test(lines, geometry, window, about, rebinned)
+        opposite = geometry_test(lines, geometry, window, about)
         return [*_surround_texts(_thinned_out(whole)), *opposite.findings]
     order = neighbour_test(lines, geometry)
     columns = list(column_test(lines, geometry).findings)
     if order.findings and "jump" not in order.sizes:  # in no order at all: opposite rays and moments are, too
         return [*order.findings, *columns]
-    opposite = geometry_test(lines, geometry, rebinned=rebinned)
+    opposite = geometry_test(lines, geometry)
     found = [*_stuck_texts(scan, geometry), *order.findings, *opposite.findings]
     try:
         weights = angular_weights(geometry)

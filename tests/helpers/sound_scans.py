@@ -95,14 +95,19 @@ def _mean_transmissions(bodies, angles, arc, u, w, pitches, subs, kind, sod, sdd
     """``kind``: 0 parallel, 1 flat, 2 curved; ``subs``: rays a cell along columns, rows and the arc of a view."""
     columns, rows, arcs = subs
     total = columns * rows * arcs
+    # Coprime to the number of rays, so that all parts of the focal spot have one and none is to one side.
+    stride = 7 if total % 7 else 11
+    cosines, sines = np.empty(arcs), np.empty(arcs)
     for v in range(angles.size):
+        for m in range(arcs):
+            b = angles[v] + arc * ((m + 0.5) / arcs - 0.5)
+            cosines[m], sines[m] = math.cos(b), math.sin(b)
         for r in range(w.size):
             for k in range(u.size):
                 mean = 0.0
                 for n in range(total):
                     i, j, m = n % columns, (n // columns) % rows, n // (columns * rows)
-                    b = angles[v] + arc * ((m + 0.5) / arcs - 0.5)
-                    c, s = math.cos(b), math.sin(b)
+                    c, s = cosines[m], sines[m]
                     at = u[k] + pitches[1] * ((i + 0.5) / columns - 0.5)
                     height = w[r] + pitches[0] * ((j + 0.5) / rows - 0.5)
                     if kind == 0:
@@ -110,7 +115,7 @@ def _mean_transmissions(bodies, angles, arc, u, w, pitches, subs, kind, sod, sdd
                         dx, dy, dz = c, s, 0.0
                     else:
                         # Each ray of a cell starts at another part of the focal spot.
-                        shift = spot * (((i * 7 + j * 3 + m * 5) % total + 0.5) / total - 0.5)
+                        shift = spot * (((stride * n) % total + 0.5) / total - 0.5)
                         px, py, pz = sod * c - shift * s, sod * s + shift * c, 0.0
                         far, across = (sdd, at) if kind == 1 else (sdd * math.cos(at / sdd), sdd * math.sin(at / sdd))
                         qx, qy = sod * c - far * c - across * s, sod * s - far * s + across * c

@@ -37,6 +37,8 @@ _SIGMAS = 8.0
 _TOGETHER, _BENT, _ABOUT = 2, 0.25, 5
 """Most cells of a wrong gain side by side; the bend beside them, over their error, that is no outline; and the columns
 to either side in which outlines are looked for."""
+_MIRRORED = 0.25
+"""What deviates on the other side by that share, up to its inverse, is an outline."""
 _LASTING = 3
 """Views from which a cell that reads 0 without a break is dead for part of the turn, and not a lost reading."""
 _WIDTH = 6
@@ -239,7 +241,7 @@ def _alone(deviation: NDArray[np.float64], found: NDArray[np.bool_], known: NDAr
     """Those cells of a wrong gain that stand out of a smooth row, up to :data:`_TOGETHER` side by side.
 
     The outline of a body that is round about the axis stays on its cells, too, and on others in every row: many of the
-    cells about one of its own deviate, and so does one on the other side of the axis. Gains are gone once their cells
+    cells about one of its own deviate, and so does one on the other side. Gains are gone once their cells
     are bridged: those beside them then lie on a line with the next. An outline bends the row wherever it is bridged.
 
     Args:
@@ -248,16 +250,12 @@ def _alone(deviation: NDArray[np.float64], found: NDArray[np.bool_], known: NDAr
         known: of which that is known.
     """
     columns = deviation.shape[1]
-    reach = max(4, columns // 20)
     hot = np.zeros_like(found)
     for r, c in np.argwhere(found):
         about = np.abs(deviation[max(r - 1, 0) : r + 2, max(c - _ABOUT, 0) : c + _ABOUT + 1])
         if np.quantile(about, 0.8) > _BENT * abs(deviation[r, c]):
             continue
-        # The other side of an outline: the axis is not far from the middle.
-        other = columns - 1 - c
-        mirrored = deviation[r, max(other - reach, 0) : other + reach + 1] / deviation[r, c]
-        if abs(other - c) > 2 * reach and bool(((mirrored > 0.5) & (mirrored < 2.0)).any()):
+        if _mirrored(deviation, r, c):
             continue
         least, start_of, alone = math.inf, 0, 0
         for count in range(1, _TOGETHER + 1):
@@ -279,6 +277,22 @@ def _alone(deviation: NDArray[np.float64], found: NDArray[np.bool_], known: NDAr
                     least, start_of, alone = left, start, count
         hot[r, start_of : start_of + alone] = True
     return hot
+
+
+def _mirrored(deviation: NDArray[np.float64], row: int, column: int) -> bool:
+    """Whether a cell deviates about as much on the other side of the axis, or of the plane of the source.
+
+    Neither is far from the middle of the detector.
+    """
+    rows, columns = deviation.shape
+    reach, other, above = max(4, columns // 20), columns - 1 - column, rows - 1 - row
+    sides = []
+    if abs(other - column) > 2 * reach:
+        sides.append(deviation[row, max(other - reach, 0) : other + reach + 1])
+    beyond = [r for r in (above - 1, above, above + 1) if 0 <= r < rows and r != row]
+    sides.append(deviation[beyond, max(column - 1, 0) : column + 2].ravel())
+    alike = np.concatenate(sides) / deviation[row, column]
+    return bool(((alike > _MIRRORED) & (alike < 1.0 / _MIRRORED)).any())
 
 
 def _beside(cells: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -9,7 +9,8 @@ and each error of the description has its own a and e:
 
 * columns described ε above where they are: e = −2ε (of a detector rolled by θ ε = θ v changes with the row's height v);
 * fan angles (pitch over sdd) too small by the factor 1 + κ: a = 2κγ, nothing in the middle, most at the edges;
-* steps between the views too small by the factor 1 + s: a = s (β' − β), β' the described angle of the opposite ray.
+* steps between the views too small by the factor 1 + s: a = s (β' − β), β' the described angle at which the scanner was
+  when it read the opposite ray: half a turn later, or earlier.
 
 r is regressed on each pattern. The slopes of the two rays have independent noise, so the product of one's, smoothed,
 and the other's, raw, neither shrinks nor stretches the estimate (instrumental variables, Durbin 1954, Rev. Int. Stat.
@@ -40,7 +41,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchpcct.checks.ray_pairs import BLOCKS, RayPairs, product
+from torchpcct.checks.ray_pairs import BLOCKS, RayPairs, product, unwrapped
 from torchpcct.checks.scan_test import UNKNOWN, ScanTest
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, Geometry, view_step
@@ -63,9 +64,9 @@ _EXPLAINED = 0.1
 """Share of the difference that a cause must explain to be named where opposite rays have little in common."""
 _LARGEST = 0.3
 """Relative errors and angles in rad beyond which nothing is linear: no cause is named for what is larger."""
+_KNOWN = 0.1
+"""Part of its tolerance to which a size is known at best."""
 _FINE_STEP_RAD = math.radians(2.5)
-_REBINNED = 15.0
-"""Factor on the tolerances of readings that are interpolated from another orbit."""
 
 Floats = NDArray[np.float64]
 
@@ -104,14 +105,11 @@ def geometry_test(
     geometry: Geometry,
     window: DetectorWindow | None = None,
     about: tuple[float, float] = (0.0, 0.0),
-    rebinned: bool = False,
 ) -> ScanTest:
     """Test the description of a scan by its opposite rays: centre, fan angles, steps between views, roll.
 
     Args:
         lines, geometry, window, about: see :func:`centre_test`.
-        rebinned: the readings are interpolated from another orbit, so causes beside the centre must be larger to be
-            told (:data:`_REBINNED`).
 
     Returns:
         The test of ``centre`` (see :func:`centre_test`), ``scale`` (fan angles described too small, relative), ``step``
@@ -139,15 +137,15 @@ def geometry_test(
     for of, name in causes:
         if of is None or of.pattern(name) is None:
             continue
-        tolerance = _tolerance(of, name) * (_REBINNED if rebinned else 1.0)
+        tolerance = _tolerance(of, name)
         fits = _fits(of, name, tolerance)
         if not fits:
             continue
         # The wider slopes reach farther, the narrower ones see smaller errors.
         level = FALSE_ALARMS / (3.0 * len(causes) * len(_COLUMNS))
-        best = next((f for f in reversed(fits) if f.found(level, tolerance, _LARGEST)), fits[0])
+        best = next((f for f in reversed(fits) if f.found(level, _LARGEST)), fits[0])
         sizes[name], errors[name] = best.size, best.error
-        if best.found(level, tolerance, _LARGEST) and best.explained > of.unexplained(name):
+        if best.found(level, _LARGEST):
             ranked.append((best.explained / of.here.numel(), name, ""))
     mismatch, differ = _mismatch(pairs, FALSE_ALARMS / 3.0)
     mirrored = differ > 0 and pairs.agrees_mirrored(min(_DIFFER, mismatch / 4.0))
@@ -191,7 +189,7 @@ def _measured(
             pairs = described(total)
         except ValueError:  # no such geometry
             break
-        fits = [] if pairs is None else _fits(pairs, name)
+        fits = [] if pairs is None else _fits(pairs, name, _tolerance(pairs, name))
         if not fits:
             break
         best = min(fits, key=lambda f: f.error)
@@ -199,7 +197,7 @@ def _measured(
             total = (1.0 + total) * (1.0 + min(max(best.size, -0.1), 0.1)) - 1.0
         else:
             total += best.size
-        if abs(best.size) < 0.2 * best.error:
+        if abs(best.size) < 0.1 * best.error:
             return total, best.error
     return size, max(error, abs(size) / 3.0)
 
@@ -207,8 +205,8 @@ def _measured(
 def _described(geometry: Any, name: str, size: float) -> Any:
     """The geometry without an error of a size: of the ``centre``, ``scale`` or ``step``."""
     if name == "step":
-        first = geometry.angles[0]
-        return replace(geometry, angles=first + (1.0 + size) * (geometry.angles - first))
+        turned = unwrapped(geometry.angles)
+        return replace(geometry, angles=turned[0] + (1.0 + size) * (turned - turned[0]))
     cone = isinstance(geometry, ConeBeam)
     pitch, offset = (geometry.pitch[1], geometry.offset[1]) if cone else (geometry.pitch, geometry.offset)
     if name == "centre":
@@ -291,32 +289,27 @@ def _centre(pairs: RayPairs, false_alarms: float) -> tuple[ScanTest, float]:
     for columns in _COLUMNS:
         sums = pairs.sums(pairs.shifted(), columns)
         if sums is not None:
-            score, power = sums
             turn = 2.0 * pairs.angles
-            waves = [_blocks(power * wave(turn), pairs.used(columns)) for wave in (np.cos, np.sin)]
-            score, power = (_blocks(v, pairs.used(columns)) for v in sums)
-            design = np.stack([power, *waves], 1)
-            test = _tested(score, power, design, false_alarms / len(_COLUMNS), pairs)
-            found.append((test, test.sizes.get("centre", 0.0) ** 2 * float(power.sum())))
+            waves = [_blocks(sums[1] * wave(turn), pairs.used(columns)) for wave in (np.cos, np.sin)]
+            score, power, bent = (_blocks(v, pairs.used(columns)) for v in sums)
+            if power.sum() > 0:
+                design = np.stack([power, *waves], 1)
+                test = _tested(score, bent, design, false_alarms / len(_COLUMNS), pairs.aligned("centre"))
+                found.append((test, test.sizes["centre"] ** 2 * float(power.sum())))
     return next((f for f in found if f[0].findings), found[0] if found else (UNKNOWN, 0.0))
 
 
 @dataclass(frozen=True)
 class _Fit:
-    """Size of one cause, its standard error, p-value against the tolerance, and the squared difference explained.
-
-    ``noise`` is the part of the error that noise has.
-    """
+    """Size of one cause, its standard error, p-value against the tolerance, and the squared difference explained."""
 
     size: float
     error: float
     p_value: float
     explained: float
-    noise: float
 
-    def found(self, level: float, tolerance: float, most: float = math.inf) -> bool:
-        # Where nearly nothing is to be seen the slopes' product is noise, and the size anything.
-        return self.p_value < level and max(tolerance, 2.0 * self.noise) < abs(self.size) < most
+    def found(self, level: float, most: float = math.inf) -> bool:
+        return self.p_value < level and abs(self.size) < most
 
 
 def _tolerance(pairs: RayPairs, name: str) -> float:
@@ -342,30 +335,43 @@ def _above(blocks: Floats) -> float:
     return float(stats.t.sf(float(blocks.sum()) / _spread(blocks), blocks.size - 1))
 
 
-def _fitted(score: Floats, power: Floats, tolerance: float, stray: float) -> _Fit:
-    """Regression of the blocks' scores on their powers, and Student's test of a size beyond ``tolerance``.
+def _fitted(score: Floats, power: Floats, bent: Floats, tolerance: float, parted: float) -> _Fit:
+    """Regression of the blocks' scores on their powers, and Student's test of a size beyond the tolerance.
 
-    ``stray``: square of the difference that is neither noise nor the cause's, and pulls the size aside.
+    The scatter is that of sizes without one block each (the jackknife; MacKinnon and White 1985, J. Econometrics
+    29:305), its degrees of freedom those of as many equal blocks as the powers are worth (Satterthwaite 1946,
+    Biometrics Bull. 2:110): an edge may be seen by few views.
+
+    Args:
+        bent: part of the scores that second order has taken off; half of it may be left.
+        parted: squared difference that may look like the cause and is none.
     """
+    from scipy import stats
+
     total = float(power.sum())
-    size = float(score.sum()) / total
-    beyond = math.copysign(1.0, size) * (score - math.copysign(tolerance, size) * power)
-    noise = _spread(score - size * power) / total
-    error = math.hypot(noise, math.sqrt(stray / max(total, 1e-300)))
-    return _Fit(size, error, min(1.0, 2.0 * _above(beyond)), size**2 * total, noise)
+    size, share = float(score.sum()) / total, power / total
+    left = (score - size * power) / (total * np.maximum(np.abs(1.0 - share), 1e-3))
+    noise = max(float(np.sqrt(np.square(left).sum())), float(np.finfo(np.float64).tiny))
+    freedom = 1.0 / float(np.square(share).sum()) - 1.0
+    stray = 0.5 * abs(float(bent.sum())) / total + math.sqrt(parted / total)
+    beyond = abs(size) - tolerance - stray
+    p_value = 2.0 * float(stats.t.sf(beyond / noise, freedom)) if freedom > 0 and beyond > 0 else 1.0
+    usual = float(stats.t.ppf(0.975, max(freedom, 1.0)) / stats.norm.ppf(0.975))
+    error = math.sqrt((usual * noise) ** 2 + (stray / 2.0) ** 2 + (_KNOWN * tolerance) ** 2)
+    return _Fit(size, error, min(p_value, 1.0), size**2 * total)
 
 
-def _fit(pairs: RayPairs, name: str, columns: int, tolerance: float = 0.0) -> _Fit | None:
+def _fit(pairs: RayPairs, name: str, columns: int, tolerance: float) -> _Fit | None:
     """The size of one cause, by slopes over so many columns."""
     pattern = pairs.pattern(name)
     sums = None if pattern is None else pairs.sums(pattern, columns)
     if sums is None:
         return None
-    score, power = (_blocks(v, pairs.used(columns)) for v in sums)
-    return _fitted(score, power, tolerance, pairs.stray(name)) if power.sum() > 0 else None
+    score, power, bent = (_blocks(v, pairs.used(columns)) for v in sums)
+    return _fitted(score, power, bent, tolerance, pairs.aligned(name)) if power.sum() > 0 else None
 
 
-def _fits(pairs: RayPairs, name: str, tolerance: float = 0.0) -> list[_Fit]:
+def _fits(pairs: RayPairs, name: str, tolerance: float) -> list[_Fit]:
     """By narrow slopes and by wide ones; those that there are."""
     tried = (_fit(pairs, name, columns, tolerance) for columns in _COLUMNS)
     return [fit for fit in tried if fit is not None]
@@ -403,16 +409,15 @@ def _mismatch(pairs: RayPairs, false_alarms: float) -> tuple[float, int]:
     return max(share, 0.0), grade
 
 
-def _tested(score: Floats, power: Floats, waves: Floats, false_alarms: float, pairs: RayPairs) -> ScanTest:
-    if power.sum() <= 0.0:
-        return UNKNOWN
-    fit = _fitted(score, power, CENTRE_TOLERANCE, pairs.stray("centre"))
-    swing, swinging = _swing(score, waves)
-    findings = []
-    if fit.found(false_alarms / 2, CENTRE_TOLERANCE) and fit.explained > pairs.aligned("centre"):
-        findings.append(_centre_text(fit.size, 2.0 * fit.error))
+def _tested(score: Floats, bent: Floats, design: Floats, false_alarms: float, parted: float) -> ScanTest:
+    power = design[:, 0]
+    fit = _fitted(score, power, bent, CENTRE_TOLERANCE, parted)
     # A wave has half the square of its amplitude.
-    if swinging < false_alarms / 2 and 0.5 * swing**2 * power.sum() > pairs.unexplained("centre"):
+    swing, swinging = _swing(score, bent, design, math.sqrt(2.0 * parted / float(power.sum())))
+    findings = []
+    if fit.found(false_alarms / 2):
+        findings.append(_centre_text(fit.size, 2.0 * fit.error))
+    if swinging < false_alarms / 2:
         findings.append(
             f"opposite rays disagree by {swing:.2f} columns to either side in the course of a turn: the object moved, "
             "or the angles of the views are wrong"
@@ -421,11 +426,15 @@ def _tested(score: Floats, power: Floats, waves: Floats, false_alarms: float, pa
     return ScanTest(sizes, {"centre": fit.error}, tuple(findings))
 
 
-def _swing(score: Floats, waves: Floats) -> tuple[float, float]:
+def _swing(score: Floats, bent: Floats, waves: Floats, parted: float) -> tuple[float, float]:
     """Amplitude of the second and third of ``waves`` ``(blocks, 3)`` in the scores, and its p-value.
 
     Where a few blocks hold most of what is seen, theirs is what noise leaves: the likelier of the usual covariance
-    and that of White (1980, Econometrica 48:817).
+    and that of the jackknife (MacKinnon and White 1985, J. Econometrics 29:305).
+
+    Args:
+        bent: see :func:`_fitted`.
+        parted: amplitude that may be none.
     """
     from scipy import stats
 
@@ -433,15 +442,18 @@ def _swing(score: Floats, waves: Floats) -> tuple[float, float]:
     design, y = waves / scale, score / scale
     if np.linalg.cond(design) > 20.0:
         return math.nan, 1.0  # a part of the turn: the wave is not told from the constant
-    found = np.linalg.lstsq(design, y, rcond=None)[0]
+    inverse = np.linalg.inv(design.T @ design)
+    found, left = (inverse @ (design.T @ values) for values in (y, 0.5 * bent / scale))
     count = y.size - 3
     residuals = y - design @ found
-    inverse = np.linalg.inv(design.T @ design)
     usual = max(float(residuals @ residuals) / count, np.finfo(np.float64).tiny) * inverse
-    white = inverse @ ((design * residuals[:, None] ** 2).T @ design) @ inverse * (y.size / count)
+    own = np.einsum("ij,jk,ik->i", design, inverse, design)
+    without = residuals / np.maximum(1.0 - own, 1e-3)
+    jackknife = inverse @ ((design * without[:, None] ** 2).T @ design) @ inverse
     amplitude = float(np.hypot(*found[1:]))
-    if amplitude <= CENTRE_TOLERANCE:
+    tolerance = CENTRE_TOLERANCE + float(np.hypot(*left[1:])) + parted
+    if amplitude <= tolerance:
         return amplitude, 1.0
-    rest = found[1:] * (1.0 - CENTRE_TOLERANCE / amplitude)
-    statistic = min(rest @ np.linalg.solve(covariance[1:, 1:], rest) / 2.0 for covariance in (usual, white))
+    rest = found[1:] * (1.0 - tolerance / amplitude)
+    statistic = min(rest @ np.linalg.solve(covariance[1:, 1:], rest) / 2.0 for covariance in (usual, jackknife))
     return amplitude, float(stats.f.sf(statistic, 2, count))

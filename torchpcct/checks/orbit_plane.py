@@ -44,7 +44,6 @@ class OrbitPlane:
         parted: mean square by which opposite rays of a sound scan may differ, since they part along z.
         part: of the sum of a view, what changes between the rows and their border, or from row to row.
         away: root mean square distance of the object from the axis, over sod.
-        guarded: whether rows on both sides tell where the object ends.
         rows: how many were averaged.
         lacking: ``(views, columns)``, what they may lack because cells average transmissions (:func:`lack_of_cells`).
     """
@@ -53,7 +52,6 @@ class OrbitPlane:
     parted: float
     part: float
     away: float
-    guarded: bool
     rows: int
     lacking: Tensor
 
@@ -117,7 +115,7 @@ def orbit_plane(lines: Tensor, geometry: ConeBeam) -> OrbitPlane | None:
             ends_within = max(float(sums.abs().mean()), stepping / rows)
             share = ends_within / all_of_it if all_of_it > 0 else 1.0
             far = math.sqrt(_spread(mean, off_axis)) / geometry.sod
-            best = cost, OrbitPlane(mean[:, None], parted, min(share, 1.0), far, guarded, rows, lacking / rows)
+            best = cost, OrbitPlane(mean[:, None], parted, min(share, 1.0), far, rows, lacking / rows)
     return None if best is None else best[1]
 
 

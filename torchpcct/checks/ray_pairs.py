@@ -21,7 +21,7 @@ from torchpcct.checks.scan_test import check_lines
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, view_step
 
-__all__ = ["BLOCKS", "OppositeRays", "Pattern", "RayPairs", "product"]
+__all__ = ["BLOCKS", "OppositeRays", "Pattern", "RayPairs", "product", "unwrapped"]
 
 BLOCKS = 24
 """Parts of the views whose scatter tells the error of a sum."""
@@ -33,11 +33,10 @@ _ROWS = 9
 """Most rows over which slopes are smoothed."""
 _FLAT_CELLS = 2.0
 """Rows count whose opposite rays part by less, along z."""
-_INTERPOLATED = 0.5
-"""What a cause explains at least, of what interpolation leaves: a sound scan of few readings 0.2, errors of 1 % 1.3."""
-_ALIGNED = {"centre": 0.05, "step": 0.08, "scale": 0.25}
-"""Share of what rays may part by that looks like a cause, where no row tells how much that is: of 45 sound scans of two
-or three rows without noise 0.035, 0.042 and 0.13 at most."""
+_ALIGNED = {"centre": 0.05, "step": 0.06, "scale": 0.25, "roll": 0.05}
+"""Share of the squared difference by which rays may part that looks like a cause at most: of 300 sound cone beams drawn
+at random, without noise, 0.021, 0.026, 0.056 and 0.009 (of two plates 0.13 and 0.61, as fan angles by more than a
+third)."""
 
 Floats = NDArray[np.float64]
 Pattern = tuple[Tensor, str]
@@ -47,7 +46,7 @@ Pattern = tuple[Tensor, str]
 class RayPairs:
     """Readings, those of their opposite rays, and the slopes of both."""
 
-    def __init__(self, rays: OppositeRays, values: Tensor, parted: float = 0.0, *, guarded: bool = True) -> None:
+    def __init__(self, rays: OppositeRays, values: Tensor, parted: float = 0.0) -> None:
         self.rays, self._values = rays, values
         angles = rays.geometry.angles
         self._order = np.argsort(angles % (2 * math.pi), kind="stable")
@@ -56,7 +55,7 @@ class RayPairs:
         self.angles = angles[self.base]
         self.here, self.opposite, self.known = self._look(self.base)
         self.difference = self.here - self.opposite
-        self.parted, self._guarded = parted * float(self.known.sum()), guarded
+        self.parted = parted * float(self.known.sum())
         self._slopes: dict[tuple[str, int], tuple[Any, ...]] = {}
         self._whole: dict[int, Tensor] = {}
         self._beside: Any = None
@@ -73,7 +72,7 @@ class RayPairs:
         if plane is None:
             return None
         fan = geometry.central_fan
-        return cls(OppositeRays(fan, DetectorWindow.full(fan), about), plane.lines, plane.parted, guarded=plane.guarded)
+        return cls(OppositeRays(fan, DetectorWindow.full(fan), about), plane.lines, plane.parted)
 
     @classmethod
     def stacked(
@@ -119,9 +118,9 @@ class RayPairs:
                 return None
             factor = 2.0 * gamma
         else:
-            turn = self.angles[:, None] % (2 * math.pi)
-            across = (turn + math.pi - (0.0 if self.rays.parallel else 2.0) * gamma) % (2 * math.pi)
-            factor = across - turn + 0.0 * gamma
+            turned = unwrapped(self.rays.geometry.angles)
+            places, _ = self.rays.places(self.base)
+            factor = sum(part * turned[views] for views, part, *_ in places) - turned[self.base][:, None]
         return torch.from_numpy(factor)[:, None].float(), "angles"
 
     def whole(self, columns: int) -> Tensor:
@@ -167,16 +166,18 @@ class RayPairs:
             self._beside = sides, *(torch.from_numpy(v)[:, None, None].float() for v in (step, rate))
         return self._beside
 
-    def sums(self, pattern: Pattern, columns: int) -> tuple[Floats, Floats] | None:
-        """Score and power of a pattern in every view; None: too few views."""
+    def sums(self, pattern: Pattern, columns: int) -> tuple[Floats, Floats, Floats] | None:
+        """Score and power of a pattern in every view, and which part of the score interpolation would have left had it
+        been in straight lines; None: too few views."""
         if self.used(columns).size < BLOCKS:
             return None
         factor, along = pattern
         smooth, raw, known = self.slopes(along, columns)
-        score = -self.difference * factor * (smooth[0] + smooth[1]) / 2
+        slope = factor * (smooth[0] + smooth[1]) / 2
         power = factor.square() * (smooth[0] * raw[1] + smooth[1] * raw[0]) / 2
-        score, power = (torch.where(known, v, 0.0).double().sum((1, 2)).numpy() for v in (score, power))
-        return score, power
+        values = (-self.residue * slope, power, -self.curvature * slope)
+        score, power, bent = (torch.where(known, v, 0.0).double().sum((1, 2)).numpy() for v in values)
+        return score, power, bent
 
     def between_views(self) -> Tensor:
         """How far readings lie from the mean of those in the views before and behind."""
@@ -185,34 +186,18 @@ class RayPairs:
         return difference
 
     @cached_property
-    def interpolated(self) -> float:
-        """What linear interpolation between views and columns leaves of a difference, summed squares, noise taken off.
+    def curvature(self) -> Tensor:
+        """By how much the opposite is too low for having been interpolated in straight lines."""
+        return self.rays.curvature(self._values, self.base, self.between_views())
 
-        The second difference is eight times the error in the middle between two readings, 120 times its mean square.
-        """
-        n = self._order.size
-        bend = self.here[..., 2:] - 2.0 * self.here[..., 1:-1] + self.here[..., :-2]
-        beside = self._values[torch.from_numpy(self._order[(self._at + 1) % n])]
-        other = beside[..., 2:] - 2.0 * beside[..., 1:-1] + beside[..., :-2]
-        along = float(torch.where(self.known[..., 1:-1], bend * other, 0.0).double().sum())
-        turned = 4.0 * float(product(self.between_views(), self.known).sum())
-        return max(along, 0.0) / 120.0 + max(turned, 0.0) / 120.0
+    @property
+    def residue(self) -> Tensor:
+        """The difference without what interpolation leaves, to second order."""
+        return self.difference - self.curvature
 
     def aligned(self, name: str) -> float:
-        """Of the squared difference that rays part by, what may look like one cause.
-
-        What rows show bounds it. Where no row tells where the object ends, all of it may end there, and that bound is
-        worth little: of what it allows at most so much looked like the cause in sound scans drawn at random.
-        """
-        return self.parted * (1.0 if self._guarded else _ALIGNED.get(name, 1.0))
-
-    def unexplained(self, name: str) -> float:
-        """Of the squared difference, what a cause must explain more than to be one."""
-        return _INTERPOLATED * self.interpolated + self.aligned(name)
-
-    def stray(self, name: str) -> float:
-        """Of the squared difference, what pulls a size aside, as a variance: little of it looks like a cause."""
-        return self.aligned(name) / 4.0 + self.interpolated / 16.0
+        """Of the squared difference that rays part by, what may look like one cause."""
+        return self.parted * _ALIGNED[name]
 
     @property
     def disagreement(self) -> float:
@@ -228,6 +213,13 @@ class RayPairs:
         difference = product(self.here.flip(-1) - other, known).sum()
         here = self.here.flip(-1)
         return bool(difference < most * 2.0 * product(here - here.mean(0), known).sum())
+
+
+def unwrapped(angles: Floats) -> Floats:
+    """Angles as the scanner turned, where they are given from 0 to 2π; views in no order stay as they are."""
+    turned: Floats = np.unwrap(angles)
+    steps = np.diff(turned)
+    return turned if bool((steps > 0).all() or (steps < 0).all()) else angles
 
 
 def _check(lines: Tensor, geometry: Geometry, window: DetectorWindow) -> None:
@@ -337,6 +329,39 @@ class OppositeRays:
 
         Each pair counts once, with its ray of positive fan angle.
         """
+        places, known = self.places(base)
+        total = torch.zeros(known.shape)
+        for views, part, row, column in places:
+            found, inside = _bilinear(values, views, row, column)
+            total += torch.from_numpy(part)[:, None].float() * found
+            known &= inside
+        return total, known
+
+    def curvature(self, values: Tensor, base: NDArray[np.int64], between: Tensor) -> Tensor:
+        """By how much :meth:`opposite` is too low, to second order, since it is interpolated in straight lines.
+
+        A second difference D from neighbour to neighbour leaves -s (1 - s) D / 2 at the part s of the way.
+
+        Args:
+            values, base: see :meth:`opposite`.
+            between: ``(base, rows, columns)``, how far the readings themselves lie from the mean of those in the views
+                before and behind, -D / 2 along the views, which their opposites share.
+        """
+        bend = F.pad(values[..., 2:] - 2.0 * values[..., 1:-1] + values[..., :-2], (1, 1))
+        places, known = self.places(base)
+        total = torch.zeros(known.shape)
+        for views, part, row, column in places:
+            way = column - np.floor(column)
+            part = part * -0.5 * way * (1.0 - way)
+            total += torch.from_numpy(part)[:, None].float() * _bilinear(bend, views, row, column)[0]
+        share = places[1][1]
+        return total + torch.from_numpy(share * (1.0 - share))[:, None].float() * between
+
+    def places(self, base: NDArray[np.int64]) -> tuple[list[tuple[NDArray[np.int64], Floats, Floats, Floats]], Tensor]:
+        """The two views that opposites lie between, the part, row and column of each; and which rays have a pair.
+
+        Views and parts are ``(base, columns)``.
+        """
         g, w = self.geometry, self.window
         gamma = self.fan_angles(base)
         turn = g.angles % (2 * math.pi)
@@ -350,7 +375,7 @@ class OppositeRays:
         known = torch.from_numpy((gamma > 0) & close)[:, None].expand(-1, w.rows, -1).clone()
         target, depth = self.path(beta)
         own_depth = self.path(turn[base])[1][:, None]
-        total = torch.zeros(known.shape)
+        places = []
         for views, part in zip(ends, (1.0 - share, share), strict=True):
             there, depth = self.path(turn[views])
             angle = there - target - gamma
@@ -359,11 +384,8 @@ class OppositeRays:
             column = (position - self.start) / self.step - w.first_column[views]
             height = self.rows[w.first_row : w.first_row + w.rows][:, None] * (own_depth / depth)[:, None]
             pitch = self.rows[1] - self.rows[0] if self.rows.size > 1 else 1.0
-            row = (height - self.rows[0]) / pitch - w.first_row
-            found, inside = _bilinear(values, views, row, column)
-            total += torch.from_numpy(part)[:, None].float() * found
-            known &= inside
-        return total, known
+            places.append((views, part, (height - self.rows[0]) / pitch - w.first_row, column))
+        return places, known
 
 
 def _bilinear(values: Tensor, views: NDArray[np.int64], row: Floats, column: Floats) -> tuple[Tensor, Tensor]:

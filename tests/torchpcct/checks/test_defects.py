@@ -190,6 +190,24 @@ def test_outlines_of_round_bodies_are_no_gains(radii, cell):
         assert find_defects(torch.from_numpy(n), torch.full(g.shape[1:], 4e4)).text == ""
 
 
+@pytest.mark.parametrize(
+    ("columns", "rows", "pitch", "aside", "radius", "height", "most"),
+    [
+        (97, 15, 7.342, -1.069, 35.21, 18.1, 4.49),  # alike on both sides of the axis
+        (45, 15, 3.968, 0.25, 23.87, 29.06, 4.7),
+        (48, 12, 2.231, 0.25, 27.66, 26.1, 2.84),  # a quarter column aside: above and below the plane
+    ],
+)
+def test_outlines_on_both_sides_are_no_gains(columns, rows, pitch, aside, radius, height, most):
+    """2 to 4 cells of a wrong gain were found in each: one cell of the outline stands out of a row that is smooth."""
+    cell = 180.0 / columns
+    g = ConeBeam(full_turn(24), 500.0, 800.0, columns, rows, (pitch, cell), (0.0, aside * cell))
+    shone = transmissions(g, [Solid(BALL, (0.0, 0.0, 0.0), (radius, radius, height), most / (2.0 * radius))])
+    for seed in range(2):
+        n = np.random.default_rng(seed).poisson(4e4 * shone).astype(np.float32)
+        assert find_defects(torch.from_numpy(n), torch.full(g.shape[1:], 4e4)).text == ""
+
+
 def test_a_detail_as_narrow_as_a_cell_is_no_lost_reading():
     """A thin dense post along the rows' axis, dim in every row: a reading of it that is 0 is noise."""
     columns = (30 + 12 * np.sin(full_turn(VIEWS))).astype(int)
