@@ -16,7 +16,7 @@ false_alarms = importlib.util.module_from_spec(_SPEC)
 _SPEC.loader.exec_module(false_alarms)
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", [*range(20), 50_439])  # the last: coarse cells and a wide spot, which blur
 def test_sound_scans_raise_no_alarm(seed):
     drawn = draw(seed, readings=25_000)
     assert false_alarms.alarms(drawn) == [], drawn.text
@@ -30,7 +30,7 @@ def test_wrong_descriptions_are_measured(kind, seed, cause, size):
     drawn = draw(seed, kind=kind, readings=25_000)
     found = geometry_test(*false_alarms.misdescribed(drawn, cause, size))
     assert found.findings, drawn.text
-    assert abs(found.sizes[cause] - size) < 2.0 * found.errors[cause] < abs(size)
+    assert abs(found.sizes[cause] - size) < 3.0 * found.errors[cause] < abs(size)  # ± is two of them
 
 
 def test_all_parts_of_a_focal_spot_shine():

@@ -195,9 +195,25 @@ class RayPairs:
         """The difference without what interpolation leaves, to second order."""
         return self.difference - self.curvature
 
+    @cached_property
+    def blurred(self) -> float:
+        """Squared difference, noise taken off, that cells and the focal spot may leave where rays spread.
+
+        They average over more of the object behind the axis than before it, s / sod of the width at the axis either
+        way: of the second difference D from column to column s / (6 sod) by the cells, as much again by the spot.
+        """
+        if self.rays.parallel:
+            return 0.0
+        bend = self.here[..., 2:] - 2.0 * self.here[..., 1:-1] + self.here[..., :-2]
+        beside = self._values[torch.from_numpy(self._order[(self._at + 1) % self._order.size])]
+        other = beside[..., 2:] - 2.0 * beside[..., 1:-1] + beside[..., :-2]
+        square = float(torch.where(self.known[..., 1:-1], bend * other, 0.0).double().sum())
+        reach = float(np.sin(np.abs(self.rays.fan_angles(self.base)).max()))
+        return max(square, 0.0) * (reach / 3.0) ** 2
+
     def aligned(self, name: str) -> float:
-        """Of the squared difference that rays part by, what may look like one cause."""
-        return self.parted * _ALIGNED[name]
+        """Of the squared difference that rays part by or that blur leaves, what may look like one cause."""
+        return _ALIGNED[name] * (self.parted + self.blurred)
 
     @property
     def disagreement(self) -> float:
