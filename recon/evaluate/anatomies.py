@@ -242,6 +242,9 @@ def _bulging(s: Floats) -> Floats:
 
 _BRANCH = (0.0, math.sin(0.85), math.cos(0.85))
 _THIN = replace(_PLAQUE, cap_thickness=0.12)
+_PAPER = Plaque(position=(0.0, 0.0, 0.0))
+_PAPER_HU = {"wall": 63.5, "fibrous": 103.2, "lumen": 480.0, "core": 41.1}
+"""The plaque of the paper, and what its tissues read on its scanner."""
 _BENT = Centreline((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), 3.5)
 
 _HEALTHY, _WITH_PLAQUE = tuple(_vessel()), tuple(_plaque())
@@ -307,6 +310,18 @@ ANATOMIES: dict[str, Anatomy] = {
         "a necrotic core, muscle 2 mm off the vessel", (*_WITH_PLAQUE, *_muscle(_R + 2.0)), tuple(_core())
     ),
     "muscle_touching": Anatomy("a necrotic core, muscle that touches", (*_WITH_PLAQUE, *_muscle(_R)), tuple(_core())),
+    "paper_muscle_2mm": Anatomy(
+        "the paper's plaque, muscle 2 mm off the vessel",
+        (*_plaque(_PAPER), *_muscle(_PAPER.vessel_diameter / 2 + 2.0)),
+        tuple(_core(plaque=_PAPER)),
+        hu=_PAPER_HU,
+    ),
+    "paper_muscle_touching": Anatomy(
+        "the paper's plaque, muscle that touches",
+        (*_plaque(_PAPER), *_muscle(_PAPER.vessel_diameter / 2)),
+        tuple(_core(plaque=_PAPER)),
+        hu=_PAPER_HU,
+    ),
     "stenosis": Anatomy(
         "a round stenosis of 72 %",
         _HEALTHY,

@@ -309,10 +309,15 @@ class Task:
         """The tissue that fills most of the inset."""
         return max(self.shares, key=lambda t: float(self.shares[t].sum()))
 
+    @property
+    def _rest(self) -> Floats:
+        """Share of what the bodies lie in."""
+        return self.shares[self._largest]
+
     @cached_property
     def near(self) -> Tensor:
-        """Mask ``grid.shape`` in which the error counts: all but the largest tissue, and what is close to it."""
-        bodies = self.shares[self._largest] < 0.5
+        """Mask ``grid.shape`` in which the error counts: all but what the bodies lie in, and what is close to it."""
+        bodies = self._rest < 0.5
         bodies |= self.shares["signal"] > 0.5
         away = ndimage.distance_transform_edt(~bodies, sampling=self.grid.spacing)
         return torch.from_numpy(away <= _NEAR_MM)
@@ -331,8 +336,7 @@ class Task:
         mixed = np.max(self._constant, axis=0) < 1.0 - 1e-6
         edges = mixed | (ndimage.maximum_filter(tissue, 3) != ndimage.minimum_filter(tissue, 3))
         away = ndimage.distance_transform_edt(~edges, sampling=self.grid.spacing)
-        rest = self.shares[self._largest] > 0.5
-        about = ndimage.distance_transform_edt(rest, sampling=self.grid.spacing) <= _ABOUT_MM
+        about = ndimage.distance_transform_edt(self._rest > 0.5, sampling=self.grid.spacing) <= _ABOUT_MM
         return torch.from_numpy((away > BESIDE_MM) & about & self._inner)
 
     @property
@@ -351,8 +355,9 @@ class Task:
     @cached_property
     def shells(self) -> tuple[Tensor, ...]:
         """Masks ``grid.shape`` about the bodies, the signal none of them if there are others, from near to far."""
-        names = [t for t in self.shares if t not in ("signal", self._largest)] or ["signal"]
-        bodies = np.sum([self.shares[t] for t in names], axis=0) > 0.5
+        signal = self.shares["signal"]
+        others = np.sum(list(self.shares.values()), axis=0) - self._rest - signal > 0.5
+        bodies = others if others.any() else signal > 0.5
         away = ndimage.distance_transform_edt(~bodies, sampling=self.grid.spacing)
         ends = np.arange(BESIDE_MM, _ABOUT_MM + BESIDE_MM, _SHELL_MM)
         return tuple(torch.from_numpy((away > end) & (away <= end + _SHELL_MM) & self._inner) for end in ends)

@@ -461,6 +461,11 @@ class AnatomyTask(_PaintedTask):
         return list(self._changes.values())
 
     @property
+    def _rest(self) -> Floats:
+        """Fat, and muscle as far as there is any: the vessel alone is looked at, whatever it lies on."""
+        return self.shares[self.patient] + self.shares.get("muscle", 0.0)
+
+    @property
     def _around(self) -> NDArray[np.bool_]:
         """Of the background, so far from the signal that its blur does not reach there."""
         away = ndimage.distance_transform_edt(self.shares["signal"] == 0.0, sampling=self.grid.spacing)

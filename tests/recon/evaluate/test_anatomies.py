@@ -1,10 +1,12 @@
 """Anatomies that break assumptions: each feature is there, in the tissue it belongs to, and the base is not changed."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import yaml
+from scipy import ndimage
 
 from recon.evaluate.anatomies import ANATOMIES, TISSUES_HU, anatomy
 from recon.evaluate.names import TASKS
@@ -154,3 +156,16 @@ def test_anatomies_that_make_no_task(change, said, tmp_path):
 def test_broken_anatomies_are_ready_tasks():
     kinds = {read_task(name).anatomy for name in BROKEN}
     assert kinds >= {"ulcer", "thrombus", "flap", "calcification", "stent", "inflamed_30", "branch", "healthy"}
+
+
+def test_the_muscle_that_a_vessel_lies_on_is_no_body():
+    """So figures of the vessel are those of the same vessel in fat."""
+    whole = read_task("plaque_on_muscle")
+    beside = replace(whole, grid=VolumeGrid((12, *whole.grid.shape[1:]), whole.grid.spacing, whole.grid.center))
+    muscle = beside.shares["muscle"]
+    assert (muscle[:, :, :8] == 1.0).all()
+    assert not beside.near[:, :, :8].any()
+    deep = ndimage.distance_transform_edt(muscle > 0.5, sampling=beside.grid.spacing) > 0.8
+    assert not (beside.near.numpy() & deep).any()
+    # What is invented within the muscle counts as in fat.
+    assert (beside.quiet.numpy() & (muscle == 1.0)).any()
