@@ -200,6 +200,14 @@ def test_only_what_lies_away_from_edges_is_read_as_nothing(task, found):
     assert abs(value(found, "invented contrast", "fbp:soft", "about the bodies")["value"]) < square
 
 
+def test_the_report_names_who_shows_less_and_does_not_say_so(found):
+    slope = value(found, "slope", "shrunk@fbp:soft", "lesion")
+    for share, named in ((0.25, True), (1.0, False)):
+        said = {**slope, "figure": "share with a warning", "where": "with the signal", "value": share}
+        text = text_of(replace(found, records=[*found.records, said]))
+        assert ("without always saying so: shrunk@fbp:soft (slope" in text) is named
+
+
 def test_report_and_tidy_table(found, tmp_path):
     files = {p.name: p for p in save(found, tmp_path, "torchpcct evaluate")}
     assert {"report.md", "report.json", "report.csv", "report.html", "insert.png"} == set(files)
