@@ -51,6 +51,8 @@ the rays pass along do), and cells at the border of the object that are no findi
 ALTERNATION = 0.25
 """Shift between views (or columns) that alternate, in cells at the axis, that is no finding."""
 _SIGMAS, _JUMP_SIGMAS = 8.0, 10.0
+_GOES_ON = 0.25
+"""Part of a step back that one of the next pairs makes up for at least."""
 _BURST, _BURST_AT_THE_END = 25.0, 9.0
 """How many times larger than beside it a squared residual must be; where a turn closes, the one pair of its kind."""
 _SHARE, _SHARE_AT_THE_END, _SHARE_OF_MANY, _FEW_WINDOWS = 0.4, 0.25, 0.15, 5
@@ -284,6 +286,10 @@ class _Views:
         shift = np.where(seen, along / np.where(seen, usual, 1.0), 0.0)
         # No step forward, or many: a step back is none of a gantry.
         along_it = seen & (shift**2 * usual > 0.6 * square) & (shift > -1.5)
+        # Views that are stuck or exchanged go back and on again; an opaque face that the rays pass along need not.
+        padded = np.pad(shift, 2)
+        onward = np.max([padded[k : k + pairs] for k in (0, 1, 3, 4)], axis=0)
+        along_it &= (shift > 0.0) | (onward > _GOES_ON * np.abs(shift))
         # Pair k is of the views k + 2 and k + 3 of the longer sequence.
         first = (np.arange(pairs) + 2 - (_REACH if self.closes else 0)) % n
         burst = np.where(self.closes & (first == n - 1), _BURST_AT_THE_END, _BURST)
