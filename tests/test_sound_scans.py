@@ -28,7 +28,7 @@ def test_sound_scans_raise_no_alarm(seed, readings):
 
 @pytest.mark.parametrize(
     ("kind", "seed", "cause", "size"),
-    [("fan", 1, "centre", -0.7), ("fan", 22, "scale", 0.03), ("fan", 1, "step", -0.012), ("cone", 2, "centre", 1.3)],
+    [("fan", 1, "centre", -0.7), ("fan", 22, "scale", 0.03), ("fan", 1, "step", -0.012), ("cone", 5, "centre", 1.3)],
 )
 def test_wrong_descriptions_are_measured(kind, seed, cause, size):
     drawn = draw(seed, kind=kind, readings=25_000)

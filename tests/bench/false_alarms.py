@@ -14,6 +14,7 @@ which 95 % should.
 
 import argparse
 import logging
+import math
 import sys
 from collections import Counter
 from dataclasses import replace
@@ -32,7 +33,7 @@ from recon.analytic.coverage import consistency_warnings
 from torchpcct.checks.defects import repair_defects
 from torchpcct.checks.opposite_rays import geometry_test
 from torchpcct.checks.readings import reading_warnings
-from torchpcct.geometry import ConeBeam
+from torchpcct.geometry import ConeBeam, VolumeGrid
 
 
 def alarms(drawn: Drawn, method: str | None = None) -> list[str]:
@@ -42,8 +43,22 @@ def alarms(drawn: Drawn, method: str | None = None) -> list[str]:
         repaired, texts = repair_defects(scan)
         texts = [*texts, *reading_warnings(repaired), *consistency_warnings(repaired, drawn.grid)]
     else:
-        texts = recon.reconstruct(scan, drawn.grid, method).report.get("warnings", [])
+        grid = drawn.grid if method == "fbp" else as_fine_as_cells(drawn)
+        try:
+            texts = recon.reconstruct(scan, grid, method).report.get("warnings", [])
+        except ValueError as error:  # a refusal is an alarm, too
+            texts = [str(error)]
     return drawn.wrongly(texts)
+
+
+def as_fine_as_cells(drawn: Drawn) -> VolumeGrid:
+    """The grid of a scan in voxels as large as cells at the axis: others cannot hold what the readings say."""
+    g, grid = drawn.geometry, drawn.grid
+    zoom = 1.0 if drawn.kind == "parallel" else g.magnification
+    pitch = g.pitch if drawn.kind == "cone" else (g.pitch,)
+    cells = (*pitch[:-1], pitch[-1], pitch[-1])
+    shape = tuple(max(1, math.ceil(size * zoom / cell)) for size, cell in zip(grid.extent, cells, strict=True))
+    return VolumeGrid(shape, tuple(size / number for size, number in zip(grid.extent, shape, strict=True)))
 
 
 CAUSES = ("centre", "scale", "step", "roll")

@@ -53,8 +53,9 @@ CENTRE_TOLERANCE = 0.1
 """Error of the centre in columns that is no finding: alignment, and what interpolation between the views leaves."""
 SCALE_TOLERANCE, STEP_TOLERANCE = 0.003, 0.001
 """Relative errors of the fan angles and of the steps between views that are none: what mechanics leave."""
-FALSE_ALARMS = 0.005
-"""Share of scans with an error of :data:`CENTRE_TOLERANCE` that are taken for wrong; of faultless ones it is less."""
+FALSE_ALARMS = 0.0005
+"""Share of scans with an error of :data:`CENTRE_TOLERANCE` that are taken for wrong; of faultless ones it is less.
+None of 500 sound scans should be told anything."""
 _COLUMNS = (5, 25)
 """Columns over which the slope is smoothed: a few for small errors, many for those of several columns."""
 _DIFFER, _STRANGERS = 0.03, 0.3
@@ -445,6 +446,7 @@ def _swing(score: Floats, bent: Floats, waves: Floats, parted: float) -> tuple[f
     inverse = np.linalg.inv(design.T @ design)
     found, left = (inverse @ (design.T @ values) for values in (y, 0.5 * bent / scale))
     count = y.size - 3
+    freedom = 1.0 / float(np.square(waves[:, 0] / waves[:, 0].sum()).sum()) - 3.0
     residuals = y - design @ found
     usual = max(float(residuals @ residuals) / count, np.finfo(np.float64).tiny) * inverse
     own = np.einsum("ij,jk,ik->i", design, inverse, design)
@@ -452,8 +454,8 @@ def _swing(score: Floats, bent: Floats, waves: Floats, parted: float) -> tuple[f
     jackknife = inverse @ ((design * without[:, None] ** 2).T @ design) @ inverse
     amplitude = float(np.hypot(*found[1:]))
     tolerance = CENTRE_TOLERANCE + float(np.hypot(*left[1:])) + parted
-    if amplitude <= tolerance:
+    if amplitude <= tolerance or freedom <= 0.0:
         return amplitude, 1.0
     rest = found[1:] * (1.0 - tolerance / amplitude)
     statistic = min(rest @ np.linalg.solve(covariance[1:, 1:], rest) / 2.0 for covariance in (usual, jackknife))
-    return amplitude, float(stats.f.sf(statistic, 2, count))
+    return amplitude, float(stats.f.sf(statistic, 2, freedom))
