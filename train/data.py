@@ -253,7 +253,7 @@ class Data:
         pieces = [numbers[k : k + _PIECE] for k in range(0, len(numbers), _PIECE)]
         with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as workers:
             if not self._accelerated:
-                make = partial(_keep, self.config, self.seed, self.views.folder.parent)
+                make = partial(_compute_views, self.config, self.seed, self.views.folder.parent)
                 for _ in workers.map(make, pieces):
                     pass
                 return
@@ -358,7 +358,7 @@ class Data:
         )
 
 
-def _keep(config: DataConfig, seed: int, folder: Path, numbers: Sequence[int]) -> None:
+def _compute_views(config: DataConfig, seed: int, folder: Path, numbers: Sequence[int]) -> None:
     """Paint scenes and keep their views, in a process of its own."""
     data = Data(config, seed, folder)
     for number in numbers:
