@@ -158,7 +158,8 @@ class ObjectiveConfig:
     Args:
         data: of eᵀH e.
         white: of ‖e‖², against ``data``; edge: by how much more within two voxels of an edge; body: in
-            bodies and one voxel about them.
+            bodies and one voxel about them; flat: in bodies, where the truth is constant for three voxels around, such
+            as deep in a lumen; flat_from: share of the training after which ``flat`` counts.
         noise_free: of ``data`` and ``white`` of the same scene without noise, against those with noise: what is left
             there is blur and overshoot.
         contrast: of the ROI contrasts' errors at fidelity 1; viewing: share of it that is left at fidelity 0, linear
@@ -176,6 +177,8 @@ class ObjectiveConfig:
     white: float = 0.2
     edge: float = 2.0
     body: float = 0.0
+    flat: float = 0.0
+    flat_from: float = 0.0
     noise_free: float = 0.0
     contrast: float = 0.2
     viewing: float = 1.0
@@ -185,8 +188,9 @@ class ObjectiveConfig:
     held_out: int = 64
 
     def __post_init__(self) -> None:
-        for name in ("data", "white", "edge", "body", "noise_free", "contrast"):
+        for name in ("data", "white", "edge", "body", "flat", "noise_free", "contrast"):
             _set(self, **{name: number(name, getattr(self, name), low=0.0)})
+        _set(self, flat_from=number("flat_from", self.flat_from, low=0.0, high=1.0))
         _set(self, viewing=number("viewing", self.viewing, low=0.0, high=1.0))
         _set(self, contrast_sd=number("contrast_sd", self.contrast_sd, positive=True))
         first, last = numbers("bias", self.bias, 2)

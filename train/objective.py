@@ -5,7 +5,8 @@ terms, all from two independent noise draws of each scene with errors e₁, e₂
 
 * ``data``: eᵀH e per voxel, the error as the scanner would see it, which is the noise-whitened squared error;
 * ``white``: ‖e‖² per voxel, for the frequencies that the scanner does not see; more on both sides of edges, where blur
-  and undershoot are, and in bodies, which are small beside what surrounds them;
+  and undershoot are, and in bodies, which are small beside what surrounds them; more again deep in wide bodies, where
+  no contrast can be lost and noise alone is left;
 * ``noise_free``: both of the same scene without noise, where all that is left is blur and overshoot beside edges;
 * ``contrast``: the errors d of ROI contrasts, small ones and that of a whole core, (d₁² + d₂²) / 2 + κ d₁ d₂. The
   product of two draws is an unbiased estimate of the squared bias, so κ trades variance against bias.
@@ -41,6 +42,10 @@ _NOISE_FREE_SHARE = 0.5
 _LEAST_CONTRAST_HU = 10.0
 """Contrasts below are none: what is read there is invented."""
 _AT_ONCE = 4
+_FLAT_VOXELS = 7
+"""Width of the cube in which the truth must be constant, in voxels of 0.2 mm."""
+_FLAT_HU = 1.0
+"""Range of the truth, in HU, that is called constant."""
 
 
 @dataclass(frozen=True)
@@ -115,6 +120,8 @@ class Objective:
         error = made - batch.truth[scene] / problem.scale_hu.reshape(-1, 1, 1, 1)
         data = (error * problem.apply(error)).mean(dim=(1, 2, 3))
         places = c.edge * batch.edges + c.body * batch.bodies
+        if c.flat and progress >= c.flat_from:
+            places = places + c.flat * batch.bodies * _flat(batch.truth)
         white = (error.square() * (1.0 + places[scene])).mean(dim=(1, 2, 3))
         image = c.data * (data + c.white * white) / (1.0 + data.detach() / _TAME_ERROR)
         noisy, error = image[: 2 * n], error[: 2 * n]
@@ -198,3 +205,13 @@ class Objective:
             figures[f"false_hu_{name}"] = float(np.abs(of["read"])[has & ~real].mean()) if (has & ~real).any() else 0.0
             score -= math.log(figures[f"error_{name}"]) + 0.5 * math.log(figures[f"all_{name}"])
         return Validation(score, figures, pictures)
+
+
+def _flat(truth: Tensor) -> Tensor:
+    """1 where the truth is constant for three voxels around, else 0; ``(size, z, y, x)``."""
+    highest, lowest = truth[:, None], -truth[:, None]
+    for axis in range(3):
+        size, margin = [1, 1, 1], [0, 0, 0]
+        size[axis], margin[axis] = _FLAT_VOXELS, _FLAT_VOXELS // 2
+        highest, lowest = (nn.functional.max_pool3d(v, size, 1, margin) for v in (highest, lowest))
+    return (highest + lowest < _FLAT_HU).to(truth.dtype)[:, 0]
